@@ -1,0 +1,3 @@
+"""Offline sideslip estimation, scoring and annotation of drive logs."""
+
+__version__ = "0.1.0"

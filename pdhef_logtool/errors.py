@@ -1,0 +1,67 @@
+"""One exception tree; every error says what was expected, what came, where, and what to do."""
+
+from __future__ import annotations
+
+EXIT_OK = 0
+EXIT_FAILURE = 1
+EXIT_USAGE = 2
+EXIT_PARTIAL = 3
+EXIT_GATE = 4
+
+
+class PdhefError(Exception):
+    """Base of all errors that a user can cause or repair.
+
+    Parameters
+    ----------
+    expected : what would have been right.
+    got : what was found instead.
+    where : file, topic, field or option.
+    remedy : what the user can do; empty if nothing helps.
+    """
+
+    exit_code: int = EXIT_FAILURE
+
+    def __init__(self, *, expected: str, got: str, where: str, remedy: str = "") -> None:
+        self.expected = expected
+        self.got = got
+        self.where = where
+        self.remedy = remedy
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        """One line, without a traceback's noise."""
+        text = f"{self.where}: expected {self.expected}, got {self.got}"
+        if self.remedy:
+            text += f"; {self.remedy}"
+        return " ".join(text.split())
+
+
+class UsageError(PdhefError):
+    """The command line or a configuration value cannot be used."""
+
+    exit_code = EXIT_USAGE
+
+
+class LogError(PdhefError):
+    """A file is no log, or nothing in it can be read."""
+
+
+class MappingError(PdhefError):
+    """A mapping file is wrong, or it names what the log does not hold."""
+
+
+class VehicleError(PdhefError):
+    """A vehicle file is wrong."""
+
+
+class EstimatorError(PdhefError):
+    """No estimator can run on this log."""
+
+
+class SimulationError(PdhefError):
+    """A drive cannot be simulated as asked."""
+
+
+class OutputError(PdhefError):
+    """An output cannot be written, or an output folder cannot be read back."""

@@ -1,0 +1,120 @@
+"""What every log reader offers: topics, field types, and columns of the fields asked for, in windows of log time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from numpy.typing import NDArray
+
+from pdhef_logtool.signals import IntArray, Loss
+
+
+@dataclass(frozen=True, slots=True)
+class TopicInfo:
+    """One topic of a log. ``type_name`` is in ROS 2 form (``sensor_msgs/msg/Imu``) for ROS messages."""
+
+    name: str
+    type_name: str
+    encoding: str  # "cdr" | "ros1" | "json" | "protobuf" | ...
+    messages: int
+
+
+@dataclass(frozen=True, slots=True)
+class FieldInfo:
+    """One scalar leaf of a topic's schema.
+
+    ``path`` is dotted (``linear_acceleration.x``); fixed arrays appear as ``name[i]`` per element when they have at
+    most 16 elements, sequences as ``name[]``. ``kind`` is ``number``, ``bool``, ``string`` or ``time`` (a ROS
+    builtin time, whose path names the whole struct, for example ``header.stamp``).
+    """
+
+    path: str
+    kind: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Columns:
+    """Fields of one topic over a window, in order of log time (stable).
+
+    Attributes
+    ----------
+    log_time_ns, publish_time_ns : int64 [N].
+    fields : by path; float64 [N] for numbers and booleans, float64 [N, k] for a path that names an array as a whole
+        (or a vector struct such as x, y, z), int64 nanoseconds [N] for a ``time`` path. NaN where a message lacks
+        the field or the index.
+    """
+
+    topic: str
+    log_time_ns: IntArray
+    publish_time_ns: IntArray
+    fields: Mapping[str, NDArray]  # type: ignore[type-arg]
+
+    def __len__(self) -> int:
+        """Return the number of messages."""
+        return int(self.log_time_ns.shape[0])
+
+
+class DriveLog(Protocol):
+    """A readable log. Instances come from :func:`pdhef_logtool.logs.open_log.open_log`."""
+
+    @property
+    def path(self) -> Path:
+        """The file or folder."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """``mcap``, ``rosbag1``, ``rosbag2-sqlite3`` or ``rosbag2-mcap``."""
+        ...
+
+    @property
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """All topics, by name."""
+        ...
+
+    @property
+    def start_ns(self) -> int:
+        """First log time; 0 for a log without messages."""
+        ...
+
+    @property
+    def end_ns(self) -> int:
+        """Last log time + 1 (intervals are [start, end)); 0 for a log without messages."""
+        ...
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """What could not be read, as far as is known by now (complete after a full read)."""
+        ...
+
+    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
+        """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
+        ...
+
+    def read(
+        self,
+        requests: Mapping[str, Sequence[str]],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> dict[str, Columns]:
+        """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded."""
+        ...
+
+    def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
+        """Read only log and publish times of every topic (``fields`` empty); payloads are not decoded."""
+        ...
+
+    def close(self) -> None:
+        """Release the files."""
+        ...
+
+
+def windows(start_ns: int, end_ns: int, length_ns: int) -> Iterator[tuple[int, int]]:
+    """Cut [start, end) into consecutive windows of at most ``length_ns``."""
+    at = start_ns
+    while at < end_ns:
+        yield at, min(at + length_ns, end_ns)
+        at += length_ns

@@ -1,0 +1,129 @@
+"""Named signals: columns on their own clocks, and their aligned form on the IMU's stamps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray: TypeAlias = NDArray[np.float64]
+IntArray: TypeAlias = NDArray[np.int64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+WHEELS = ("fl", "fr", "rl", "rr")
+
+#: Every signal that a mapping may name, with its SI unit (ISO 8855: x forward, y left, z up, positive left).
+SIGNAL_UNITS: dict[str, str] = {
+    "steer_rad": "rad",  # mean road-wheel angle
+    "steering_wheel_rad": "rad",
+    "ax_m_s2": "m/s^2",
+    "ay_m_s2": "m/s^2",
+    "yaw_rate_rad_s": "rad/s",
+    "speed_m_s": "m/s",
+    **{f"wheel_speed_{w}_m_s": "m/s" for w in WHEELS},
+    **{f"wheel_speed_{w}_rad_s": "rad/s" for w in WHEELS},
+    "friction": "1",
+}
+
+#: Every truth channel that a mapping may name, with its unit. ``*_ecef*``, ``enu_*`` have 3 columns, ``quat_wxyz`` 4.
+TRUTH_UNITS: dict[str, str] = {
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "sideslip_rad": "rad",
+    "yaw_rate_rad_s": "rad/s",
+    "ax_m_s2": "m/s^2",
+    "ay_m_s2": "m/s^2",
+    "x_m": "m",
+    "y_m": "m",
+    "lat_deg": "deg",
+    "lon_deg": "deg",
+    "alt_m": "m",
+    "ecef_position_m": "m",
+    "ecef_velocity_m_s": "m/s",
+    "enu_velocity_m_s": "m/s",
+    "quat_wxyz": "1",
+    "course_rad": "rad",  # ENU: counter-clockwise from east
+    "yaw_rad": "rad",  # ENU: counter-clockwise from east
+    "position_std_m": "m",
+}
+
+#: Signals the alignment's output carries as one column each.
+ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """Something in the input that was not used, and why.
+
+    ``severity`` ``"lost"`` means data that the log should have held is gone (exit code 3);
+    ``"note"`` means something the reader of a report must know, with nothing gone.
+    """
+
+    kind: str  # short slug: "truncated", "bad-chunk", "nan", "duplicate-stamp", "gap", ...
+    what: str  # one sentence for a person
+    where: str  # file, topic or signal
+    start_ns: int | None = None
+    end_ns: int | None = None
+    count: int | None = None
+    severity: Literal["lost", "note"] = "lost"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Channel:
+    """One mapped signal on its own clock, in SI units.
+
+    Attributes
+    ----------
+    name : signal or truth name.
+    unit : SI unit.
+    source : ``topic`` and dotted field it came from, as ``/topic.field``.
+    stamps_ns : int64 [N], measurement time (stamp − latency, in the log's clock), ascending and unique.
+    arrival_ns : int64 [N], when the recorder had it (log time); never before ``stamps_ns``.
+    values : float64 [N] or [N, k]; finite.
+    """
+
+    name: str
+    unit: str
+    source: str
+    stamps_ns: IntArray
+    arrival_ns: IntArray
+    values: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.stamps_ns.shape[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signals:
+    """What an estimator may see, aligned on the IMU's stamps; holds no truth.
+
+    All columns have length N and NaN where the channel has no usable sample. ``speed_m_s`` and the columns of
+    ``wheel_speed_m_s`` are finite only at the first stamp after a new sample (a measurement is used once);
+    ``steer_rad``, ``ax_m_s2`` are inputs and are interpolated or held within the alignment's limits.
+
+    Attributes
+    ----------
+    stamps_ns : int64 [N], strictly increasing, irregular steps kept.
+    ready_ns : int64 [N], non-decreasing: when everything used at this stamp had arrived.
+    steer_rad, ax_m_s2, ay_m_s2, yaw_rate_rad_s, speed_m_s, friction : float64 [N].
+    wheel_speed_m_s : float64 [N, 4] in the order fl, fr, rl, rr.
+    available : names of the signals that the log's mapping provides at all.
+    """
+
+    stamps_ns: IntArray
+    ready_ns: IntArray
+    steer_rad: FloatArray
+    ax_m_s2: FloatArray
+    ay_m_s2: FloatArray
+    yaw_rate_rad_s: FloatArray
+    speed_m_s: FloatArray
+    friction: FloatArray
+    wheel_speed_m_s: FloatArray
+    available: frozenset[str] = field(default_factory=frozenset)
+
+    def __len__(self) -> int:
+        """Return the number of stamps."""
+        return int(self.stamps_ns.shape[0])
