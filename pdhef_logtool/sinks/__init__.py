@@ -1,0 +1,1 @@
+"""What a run leaves: Parquet tables, annotated MCAP, Rerun recording, reports."""

@@ -1,0 +1,271 @@
+"""estimates.parquet (wide, a row a stamp and estimator) and metrics.parquet (long, a row a figure)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from pdhef_logtool.errors import OutputError
+from pdhef_logtool.signals import FloatArray, Signals
+from pdhef_logtool.sinks.base import Event, PendingFile
+from pdhef_logtool.sinks.schema import arrow_schema
+from pdhef_logtool.tracks import TRACK_COLUMNS, StateTrack, make_track
+
+#: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
+#: estimator, and what waits of six estimators stays below 30 MB.
+ROWS_A_GROUP = 32768
+
+_STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
+
+
+class EstimatesSink:
+    """Writes estimates.parquet; a row group holds one estimator, so that one can be read without the others.
+
+    Parameters
+    ----------
+    path : where the finished file stands.
+    rows_a_group : rows of one row group.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+
+    def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP) -> None:
+        self._schema = arrow_schema("estimates.parquet.json")
+        self._rows_a_group = rows_a_group
+        self._waiting: dict[str, list[pa.Table]] = {}
+        self._pending = PendingFile(path)
+        try:
+            self._writer = pq.ParquetWriter(
+                self._pending.path,
+                self._schema,
+                compression="zstd",
+                use_dictionary=["estimator"],
+                write_statistics=True,
+                store_schema=True,
+            )
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+
+    def append_signals(self, signals: Signals) -> None:
+        """Take nothing: estimates.parquet holds no inputs."""
+
+    def append(self, track: StateTrack) -> None:
+        """Take one track of this window; [N] rows."""
+        waiting = self._waiting.setdefault(track.name, [])
+        waiting.append(_table_from_track(track, self._schema))
+        if sum(t.num_rows for t in waiting) < self._rows_a_group:
+            return
+        joined = pa.concat_tables(waiting)
+        whole = joined.num_rows - joined.num_rows % self._rows_a_group
+        self._write(joined.slice(0, whole))
+        waiting[:] = [joined.slice(whole)]
+
+    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
+        """Write what waits and give the file its name; the report is not part of this file."""
+        try:
+            for tables in self._waiting.values():
+                self._write(pa.concat_tables(tables))
+            self._waiting.clear()
+            self._writer.close()
+        except BaseException:
+            self.abort()
+            raise
+        self._pending.commit()
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        self._waiting.clear()
+        self._writer.close()
+        self._pending.discard()
+
+    def _write(self, table: pa.Table) -> None:
+        if table.num_rows == 0:
+            return
+        try:
+            self._writer.write_table(table, row_group_size=self._rows_a_group)
+        except OSError as error:
+            raise _cannot_write(self._pending.target, error) from error
+
+
+def _table_from_track(track: StateTrack, schema: pa.Schema) -> pa.Table:
+    columns: dict[str, Any] = dict(track.columns())
+    columns["estimator"] = pa.DictionaryArray.from_arrays(np.zeros(len(track), dtype=np.int32), [track.name])
+    arrays = [pa.array(columns[f.name], type=f.type, from_pandas=True) for f in schema]
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def list_estimators(path: Path) -> tuple[str, ...]:
+    """Return the names of the tracks in an estimates.parquet, in order of their first row group."""
+    names: dict[str, None] = {}
+    with _open(path) as file:
+        for group in range(file.num_row_groups):
+            names.update(dict.fromkeys(_estimators_of(file, group)))
+    return tuple(names)
+
+
+def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None) -> StateTrack:
+    """Read one track of an estimates.parquet; the row groups of other estimators are not touched.
+
+    Parameters
+    ----------
+    path : an estimates.parquet.
+    estimator : name of the track.
+    columns : of :data:`pdhef_logtool.tracks.TRACK_COLUMNS`; the others stay NaN (``valid`` True). All when None.
+
+    Returns
+    -------
+    StateTrack
+        In order of time. The file holds standard deviations only: ``covariance`` has them on its diagonal, NaN
+        elsewhere, and length 0 if none was read or known. ``nis_dof`` is NaN and ``diverged`` False.
+
+    Raises
+    ------
+    OutputError
+        When the file is no estimates.parquet or holds no such track.
+    """
+    wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in set(columns)]
+    unknown = set(columns or ()) - set(TRACK_COLUMNS)
+    if unknown:
+        raise OutputError(
+            expected=f"columns of {', '.join(TRACK_COLUMNS)}", got=", ".join(sorted(unknown)), where=str(path)
+        )
+    tables: list[pa.Table] = []
+    with _open(path) as file:
+        absent = set(wanted) - set(file.schema_arrow.names)
+        if absent:
+            raise OutputError(
+                expected="an estimates.parquet",
+                got=f"a Parquet file without {', '.join(sorted(absent))}",
+                where=str(path),
+                remedy="run the log again",
+            )
+        for group in range(file.num_row_groups):
+            names = _estimators_of(file, group)
+            if estimator not in names:
+                continue
+            if len(names) == 1:
+                tables.append(file.read_row_group(group, columns=wanted))
+            else:
+                table = file.read_row_group(group, columns=[*wanted, "estimator"])
+                tables.append(table.filter(pc.field("estimator") == estimator).select(wanted))
+    if not tables:
+        raise OutputError(expected=f"one of {', '.join(list_estimators(path))}", got=estimator, where=str(path))
+    return _track_from_table(estimator, pa.concat_tables(tables))
+
+
+def _track_from_table(name: str, table: pa.Table) -> StateTrack:
+    def numbers(column: str) -> FloatArray:
+        if column not in table.column_names:
+            return np.full(table.num_rows, np.nan)
+        return np.asarray(table[column].to_numpy(), dtype=np.float64)
+
+    floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", "valid", *_STD_COLUMNS)}
+    valid = {"valid": np.asarray(table["valid"].to_numpy(), dtype=np.bool_)} if "valid" in table.column_names else {}
+    return make_track(
+        name,
+        np.asarray(table["stamp_ns"].to_numpy(), dtype=np.int64),
+        covariance=_diagonal([numbers(c) for c in _STD_COLUMNS]),
+        **floats,
+        **valid,
+    )
+
+
+def _diagonal(stds: list[FloatArray]) -> FloatArray:
+    std = np.stack(stds, axis=1)
+    if not np.isfinite(std).any():
+        return np.empty((0, 3, 3))
+    covariance = np.full((std.shape[0], 3, 3), np.nan)
+    for i in range(3):
+        covariance[:, i, i] = std[:, i] ** 2
+    return covariance
+
+
+def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
+    """Return the names in one row group, from its statistics when they leave no doubt."""
+    index = file.schema_arrow.get_field_index("estimator")
+    if index < 0:
+        raise OutputError(
+            expected="an estimates.parquet", got="a Parquet file without a column estimator", where="column estimator"
+        )
+    statistics = file.metadata.row_group(group).column(index).statistics
+    if statistics is not None and statistics.has_min_max and statistics.min == statistics.max:
+        return (str(statistics.min),)
+    column = file.read_row_group(group, columns=["estimator"])["estimator"]
+    return tuple(str(v) for v in pc.unique(column).to_pylist())
+
+
+def _open(path: Path) -> pq.ParquetFile:
+    try:
+        return pq.ParquetFile(path)
+    except (OSError, pa.ArrowException) as error:
+        raise OutputError(
+            expected="a readable Parquet file", got=str(error), where=str(path), remedy="run the log again"
+        ) from error
+
+
+class MetricRowLike(Protocol):
+    """One figure, as :class:`pdhef_logtool.evaluation.metrics.MetricRow` holds it."""
+
+    @property
+    def log(self) -> str:
+        """Stem of the log."""
+        ...
+
+    @property
+    def estimator(self) -> str:
+        """Name of the estimator."""
+        ...
+
+    @property
+    def signal(self) -> str:
+        """Scored signal."""
+        ...
+
+    @property
+    def segment(self) -> str:
+        """Part of the drive."""
+        ...
+
+    @property
+    def metric(self) -> str:
+        """Name of the figure."""
+        ...
+
+    @property
+    def value(self) -> float:
+        """The figure; NaN when it cannot be computed."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Unit of the figure."""
+        ...
+
+    @property
+    def n(self) -> int:
+        """Number of samples behind it."""
+        ...
+
+
+def write_metrics(path: Path, rows: Sequence[MetricRowLike]) -> None:
+    """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
+    schema = arrow_schema("metrics.parquet.json")
+    arrays = [pa.array([getattr(r, f.name) for r in rows], type=f.type, from_pandas=True) for f in schema]
+    with PendingFile(path) as pending:
+        try:
+            pq.write_table(pa.Table.from_arrays(arrays, schema=schema), pending.path, compression="zstd")
+        except OSError as error:
+            raise _cannot_write(path, error) from error
+
+
+def _cannot_write(target: Path, error: OSError) -> OutputError:
+    return OutputError(expected="a place to write to", got=str(error), where=str(target))

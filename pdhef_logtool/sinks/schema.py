@@ -1,0 +1,45 @@
+"""The schema files that are shipped with the package, and Arrow schemas from them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+
+def load_schema(name: str) -> dict[str, Any]:
+    """Return one of the JSON documents of ``schemas/`` by file name."""
+    document: dict[str, Any] = json.loads((Path(__file__).parents[2] / "schemas" / name).read_text(encoding="utf-8"))
+    return document
+
+
+def arrow_schema(name: str) -> pa.Schema:
+    """Return the Arrow schema that ``schemas/<name>`` describes.
+
+    Each field carries its unit; the schema's own metadata carry format, version and all units once more, because
+    only Arrow readers see metadata of fields.
+    """
+    import pyarrow as pa
+
+    types = {
+        "int64": pa.int64(),
+        "double": pa.float64(),
+        "bool": pa.bool_(),
+        "string": pa.string(),
+        "dictionary<int32, string>": pa.dictionary(pa.int32(), pa.string()),
+    }
+    document = load_schema(name)
+    columns = document["columns"]
+    units = {column["name"]: column["unit"] for column in columns}
+    return pa.schema(
+        [pa.field(c["name"], types[c["type"]], nullable=c["nullable"], metadata={"unit": c["unit"]}) for c in columns],
+        metadata={
+            "format": document["format"],
+            "version": str(document["version"]),
+            "units": json.dumps(units),
+            "missing": document["missing"],
+        },
+    )

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.signals import Signals
+from pdhef_logtool.tracks import StateTrack, make_track
+
+START_NS = 1_700_000_000_000_000_123
+STEP_NS = 10_000_000
+RADIUS_M = 40.0
+SPEED_M_S = 10.0
+SIDESLIP_RAD = 0.05
+
+TrackMaker = Callable[..., StateTrack]
+
+
+@pytest.fixture
+def circle() -> TrackMaker:
+    """Return a maker of a window of a steady circle drive; rows [first, first + n) of it."""
+
+    def make(name: str, first: int = 0, n: int = 200, bias: float = 0.0, covariance: bool = True) -> StateTrack:
+        at = np.arange(first, first + n)
+        stamps_ns = START_NS + STEP_NS * at.astype(np.int64)
+        rate = SPEED_M_S / RADIUS_M
+        course = rate * at * STEP_NS * 1e-9
+        beta = SIDESLIP_RAD + bias + 0.01 * np.sin(at / 30)
+        cov = np.tile(np.array([[0.04, 0.001, 0.0], [0.001, 0.09, 0.002], [0.0, 0.002, 0.0004]]), (n, 1, 1))
+        estimate = name != "truth"
+        nis = np.where(at % 7 == 3, np.nan, 1.5 + 0.001 * at) if estimate else np.full(n, np.nan)
+        return make_track(
+            name,
+            stamps_ns,
+            vx_m_s=SPEED_M_S * np.cos(beta),
+            vy_m_s=SPEED_M_S * np.sin(beta),
+            yaw_rate_rad_s=np.full(n, rate) + bias,
+            ay_m_s2=np.full(n, SPEED_M_S * rate),
+            x_m=RADIUS_M * np.sin(course),
+            y_m=RADIUS_M * (1 - np.cos(course)),
+            yaw_rad=course - beta,
+            covariance=cov if covariance and estimate else np.empty((0, 3, 3)),
+            sideslip_std_rad=np.full(n, 0.03) if estimate else np.full(n, np.nan),
+            network_trust=np.full(n, 0.25) if estimate else np.full(n, np.nan),
+            r_scale=np.full(n, 1.25) if estimate else np.full(n, np.nan),
+            nis=nis,
+            nis_dof=np.where(np.isfinite(nis), 2.0, np.nan),
+            friction=np.full(n, 0.85),
+            valid=at % 50 != 49,
+            diverged=at == 120,
+        )
+
+    return make
+
+
+@pytest.fixture
+def circle_signals() -> Callable[..., Signals]:
+    """Return a maker of the inputs of the same drive."""
+
+    def make(first: int = 0, n: int = 200) -> Signals:
+        at = np.arange(first, first + n)
+        stamps_ns = START_NS + STEP_NS * at.astype(np.int64)
+        return Signals(
+            stamps_ns=stamps_ns,
+            ready_ns=stamps_ns + 2_000_000,
+            steer_rad=np.full(n, 0.07),
+            ax_m_s2=np.zeros(n),
+            ay_m_s2=np.full(n, 2.5),
+            yaw_rate_rad_s=np.full(n, 0.25),
+            speed_m_s=np.where(at % 2 == 0, SPEED_M_S, np.nan),
+            friction=np.full(n, np.nan),
+            wheel_speed_m_s=np.full((n, 4), np.nan),
+            available=frozenset({"steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}),
+        )
+
+    return make

@@ -1,0 +1,283 @@
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pyarrow.parquet as pq
+import pytest
+from numpy.testing import assert_array_equal
+
+from pdhef_logtool.errors import OutputError
+from pdhef_logtool.sinks.parquet import EstimatesSink, list_estimators, read_track, write_metrics
+from pdhef_logtool.tracks import concatenate
+
+ESTIMATE_COLUMNS = {
+    "stamp_ns": pl.Int64,
+    "estimator": pl.Categorical,
+    "vx_m_s": pl.Float64,
+    "vy_m_s": pl.Float64,
+    "yaw_rate_rad_s": pl.Float64,
+    "sideslip_rad": pl.Float64,
+    "ay_m_s2": pl.Float64,
+    "x_m": pl.Float64,
+    "y_m": pl.Float64,
+    "yaw_rad": pl.Float64,
+    "vx_std_m_s": pl.Float64,
+    "vy_std_m_s": pl.Float64,
+    "yaw_rate_std_rad_s": pl.Float64,
+    "sideslip_std_rad": pl.Float64,
+    "network_trust": pl.Float64,
+    "r_scale": pl.Float64,
+    "nis": pl.Float64,
+    "friction": pl.Float64,
+    "valid": pl.Boolean,
+}
+UNITS = {
+    "stamp_ns": "ns",
+    "estimator": "",
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "yaw_rate_rad_s": "rad/s",
+    "sideslip_rad": "rad",
+    "ay_m_s2": "m/s^2",
+    "x_m": "m",
+    "y_m": "m",
+    "yaw_rad": "rad",
+    "vx_std_m_s": "m/s",
+    "vy_std_m_s": "m/s",
+    "yaw_rate_std_rad_s": "rad/s",
+    "sideslip_std_rad": "rad",
+    "network_trust": "1",
+    "r_scale": "1",
+    "nis": "1",
+    "friction": "1",
+    "valid": "",
+}
+METRIC_COLUMNS = {
+    "log": pl.String,
+    "estimator": pl.String,
+    "signal": pl.String,
+    "segment": pl.String,
+    "metric": pl.String,
+    "value": pl.Float64,
+    "unit": pl.String,
+    "n": pl.Int64,
+}
+NAMES = ("phy-ukf", "zero", "truth")
+
+
+def write(path: Path, circle, windows: int = 3, n: int = 200, rows_a_group: int = 256) -> None:
+    sink = EstimatesSink(path, rows_a_group)
+    for k in range(windows):
+        for name in NAMES:
+            sink.append(circle(name, k * n, n))
+    sink.finish({})
+
+
+def test_polars_reads_every_column_with_its_type(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    frame = pl.read_parquet(path)
+    assert list(frame.schema.items()) == list(ESTIMATE_COLUMNS.items())
+    assert frame.height == 3 * 3 * 200
+    for name in NAMES:
+        rows = frame.filter(pl.col("estimator") == name)
+        whole = circle(name, 0, 600)
+        assert_array_equal(rows["stamp_ns"].to_numpy(), whole.stamps_ns)
+        for column in set(ESTIMATE_COLUMNS) - {"stamp_ns", "estimator"}:
+            assert_array_equal(rows[column].to_numpy(), getattr(whole, column), err_msg=column)
+
+
+def test_unknown_is_null_for_polars(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    frame = pl.read_parquet(path)
+    assert frame.filter(pl.col("estimator") == "truth")["nis"].null_count() == 600
+    nis = circle("phy-ukf", 0, 600).nis
+    mean = frame.filter(pl.col("estimator") == "phy-ukf")["nis"].mean()
+    assert mean == pytest.approx(nis[np.isfinite(nis)].mean())
+
+
+def test_units_stand_in_the_file(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    metadata = pl.read_parquet_metadata(path)
+    assert metadata["format"] == "pdhef.estimates"
+    assert metadata["version"] == "1"
+    assert json.loads(metadata["units"]) == UNITS
+    assert {f.name: f.metadata[b"unit"].decode() for f in pq.read_schema(path)} == UNITS
+
+
+def test_file_is_zstd_with_dictionary_and_one_estimator_a_row_group(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    metadata = pq.ParquetFile(path).metadata
+    assert metadata.num_row_groups == 9
+    for g in range(metadata.num_row_groups):
+        group = metadata.row_group(g)
+        assert group.num_rows <= 256
+        assert {group.column(c).compression for c in range(group.num_columns)} == {"ZSTD"}
+        estimator = group.column(1)
+        assert estimator.path_in_schema == "estimator"
+        assert "RLE_DICTIONARY" in estimator.encodings
+        assert estimator.statistics.min == estimator.statistics.max
+
+
+def test_bytes_do_not_depend_on_chance(tmp_path, circle):
+    write(tmp_path / "a", circle)
+    write(tmp_path / "b", circle)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_track_comes_back(tmp_path, circle, name):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    assert list_estimators(path) == NAMES
+    track = read_track(path, name)
+    whole = concatenate([circle(name, 0, 600)])
+    for column, values in whole.columns().items():
+        got = track.columns()[column]
+        assert got.dtype == values.dtype
+        np.testing.assert_allclose(got, values, rtol=1e-15, err_msg=column)
+    assert track.name == name
+    if name == "truth":
+        assert track.covariance.shape == (0, 3, 3)
+    else:
+        assert np.isnan(track.covariance[:, 0, 1]).all()
+
+
+def test_only_the_row_groups_of_the_estimator_are_read(tmp_path, circle, monkeypatch):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    metadata = pq.ParquetFile(path).metadata
+    own = [g for g in range(metadata.num_row_groups) if metadata.row_group(g).column(1).statistics.min == "zero"]
+    read: list[tuple[int, tuple[str, ...]]] = []
+    original = pq.ParquetFile.read_row_group
+
+    def spy(self, i, columns=None, **kwargs):
+        read.append((i, tuple(columns)))
+        return original(self, i, columns=columns, **kwargs)
+
+    monkeypatch.setattr(pq.ParquetFile, "read_row_group", spy)
+    track = read_track(path, "zero", ["sideslip_rad"])
+    assert read == [(g, ("stamp_ns", "sideslip_rad")) for g in own]
+    assert len(own) == 3
+    assert_array_equal(track.sideslip_rad, circle("zero", 0, 600).sideslip_rad)
+    assert np.isnan(track.vx_m_s).all()
+    assert np.isnan(read_track(path, "zero", ["vx_m_s", "vy_m_s"]).sideslip_rad).all()
+
+
+def test_mixed_row_groups_of_other_writers_are_read(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    shuffled = tmp_path / "by_stamp.parquet"
+    pl.read_parquet(path).sort("stamp_ns", "estimator").write_parquet(shuffled)
+    track = read_track(shuffled, "phy-ukf")
+    assert_array_equal(track.sideslip_rad, circle("phy-ukf", 0, 600).sideslip_rad)
+    assert set(list_estimators(shuffled)) == set(NAMES)
+
+
+def test_windows_with_and_without_covariance_stay_aligned(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    sink = EstimatesSink(path, 300)
+    sink.append(circle("phy-ukf", 0, 200, covariance=False))
+    sink.append(circle("phy-ukf", 200, 200))
+    sink.finish({})
+    std = read_track(path, "phy-ukf").vx_std_m_s
+    assert np.isnan(std[:200]).all()
+    np.testing.assert_allclose(std[200:], 0.2)
+
+
+def test_what_is_not_there_is_said(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    with pytest.raises(OutputError, match=r"expected one of phy-ukf, zero, truth, got pd-hef"):
+        read_track(path, "pd-hef")
+    with pytest.raises(OutputError, match="no_such_column"):
+        read_track(path, "zero", ["no_such_column"])
+    with pytest.raises(OutputError, match=r"readable Parquet"):
+        read_track(tmp_path / "absent.parquet", "zero")
+    (tmp_path / "text.parquet").write_text("no parquet")
+    with pytest.raises(OutputError, match=r"readable Parquet"):
+        read_track(tmp_path / "text.parquet", "zero")
+    pl.DataFrame({"stamp_ns": [1]}).write_parquet(tmp_path / "other.parquet")
+    with pytest.raises(OutputError, match=r"estimates\.parquet"):
+        read_track(tmp_path / "other.parquet", "zero")
+
+
+def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
+    path = tmp_path / "out" / "estimates.parquet"
+    sink = EstimatesSink(path, 100)
+    sink.append(circle("zero"))
+    assert not path.exists()
+    sink.abort()
+    sink.abort()
+    assert list(path.parent.iterdir()) == []
+    sink = EstimatesSink(path)
+    sink.append(circle("zero"))
+    sink.finish({})
+    sink.abort()
+    assert [p.name for p in path.parent.iterdir()] == ["estimates.parquet"]
+
+
+def test_failure_while_finishing_leaves_the_old_file(tmp_path, circle, monkeypatch):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    before = path.read_bytes()
+    sink = EstimatesSink(path)
+    sink.append(circle("zero"))
+
+    def full_disk(self, table, row_group_size=None):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(pq.ParquetWriter, "write_table", full_disk)
+    with pytest.raises(OutputError, match="No space left"):
+        sink.finish({})
+    assert path.read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["estimates.parquet"]
+
+
+def test_unwritable_place_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="expected a place to write to"):
+        EstimatesSink(tmp_path / "file" / "estimates.parquet")
+
+
+def test_empty_log_gives_an_empty_table(tmp_path):
+    path = tmp_path / "estimates.parquet"
+    EstimatesSink(path).finish({})
+    assert pl.read_parquet(path).schema.names() == list(ESTIMATE_COLUMNS)
+
+
+@dataclass(frozen=True)
+class Row:
+    log: str
+    estimator: str
+    signal: str
+    segment: str
+    metric: str
+    value: float
+    unit: str
+    n: int
+
+
+ROWS = [
+    Row("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600),
+    Row("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
+]
+
+
+def test_polars_reads_the_metrics(tmp_path):
+    path = tmp_path / "metrics.parquet"
+    write_metrics(path, ROWS)
+    frame = pl.read_parquet(path)
+    assert list(frame.schema.items()) == list(METRIC_COLUMNS.items())
+    assert frame.rows() == [
+        ("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600),
+        ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0),
+    ]
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.parquet"]
