@@ -1,0 +1,1 @@
+"""Estimators: from aligned signals to a state track, window by window with carried state."""

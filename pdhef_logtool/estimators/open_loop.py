@@ -1,0 +1,90 @@
+"""``open-loop``: the nominal model driven by steering and measured speed, corrected by no other sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from numba import njit
+
+from pdhef_logtool.estimators.stepwise import (
+    AY,
+    RESTART_GAP_S,
+    VX,
+    VY,
+    YAW_RATE,
+    StepCarry,
+    advance_speed,
+    run_stepwise,
+)
+from pdhef_logtool.nominal_model import (
+    model_parameters,
+    planar_lateral_acceleration,
+    rk4_step,
+    state_derivative,
+    substeps,
+)
+from pdhef_logtool.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.vehicle import VehicleParameters
+
+
+@njit(cache=True)
+def _open_loop(dt, steer, ax, speed, friction, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
+    # state: v_x, age of the speed sample, v_y, r, steering and friction of the step before
+    for k in range(dt.shape[0]):
+        before = state[0]
+        advance_speed(state, dt[k], ax[k], speed[k])
+        mu = friction[k] if math.isfinite(friction[k]) else default_friction
+        ok = math.isfinite(state[0]) and math.isfinite(steer[k])
+        if (
+            ok
+            and dt[k] <= RESTART_GAP_S
+            and math.isfinite(before)
+            and math.isfinite(state[2])
+            and math.isfinite(state[4])
+        ):
+            n = substeps(before, dt[k], state[5], p)
+            _, state[2], state[3] = rk4_step(before, state[2], state[3], state[4], 0.0, state[5], dt[k], n, p)
+        elif ok:
+            state[3] = state[0] * math.tan(steer[k]) / (p.front_m + p.rear_m)
+            state[2] = p.rear_m * state[3]
+        state[4] = steer[k]
+        state[5] = mu
+        valid[k] = ok
+        if ok:
+            _, vy_dot, r_dot = state_derivative(state[0], state[2], state[3], steer[k], 0.0, mu, p)
+            values[k, VX] = state[0]
+            values[k, VY] = state[2]
+            values[k, YAW_RATE] = state[3]
+            values[k, AY] = planar_lateral_acceleration(state[0], state[2], state[3], steer[k], mu, p)
+            rates[k, VY] = vy_dot
+            rates[k, YAW_RATE] = r_dot
+
+
+@dataclass(frozen=True, slots=True)
+class OpenLoop:
+    """The model of this file as an estimator."""
+
+    vehicle: VehicleParameters
+    name: str = "open-loop"
+    causal: bool = True
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Steering and speed."""
+        return frozenset({"steer_rad", "speed_m_s"})
+
+    def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
+        """Process one window (see :class:`~.base.Estimator`)."""
+        p = model_parameters(self.vehicle)
+        mu = self.vehicle.assumed_friction
+
+        def step(
+            dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
+        ) -> None:
+            _open_loop(
+                dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction, mu, p, state, values, rates, valid
+            )  # fmt: skip
+
+        return run_stepwise(self.name, signals, carry, 6, step)

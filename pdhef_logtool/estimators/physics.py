@@ -1,0 +1,421 @@
+"""``phy-ukf``: the pure physics unscented Kalman filter on the nominal single-track model (METHOD §1, §2, §6).
+
+State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Measurements
+[a_y, r, v_x], each of which may be missing at any step. This is the paper's physics baseline and frozen: R at sensor
+level from the vehicle file, Q by innovation likelihood (``benchmarks/tune_physics_q.py``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.estimators.unscented import (
+    draw_sigma_points,
+    innovation_moments,
+    kalman_update,
+    mean_and_covariance,
+    unscented_weights,
+)
+from pdhef_logtool.nominal_model import (
+    ModelParameters,
+    measured_lateral_acceleration,
+    model_parameters,
+    planar_lateral_acceleration,
+    rk4_step,
+    substeps,
+)
+from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.vehicle import VehicleParameters
+
+# State entries and measurement entries, by name.
+VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3
+STATES = 4
+Z_AY, Z_YAW_RATE, Z_SPEED = 0, 1, 2
+MEASUREMENTS = 3
+
+#: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
+#: over the recorded sample drives by ``benchmarks/tune_physics_q.py`` and frozen.
+PHY_UKF_Q_STD = (0.05, 0.3, 0.15, 0.05)
+#: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk (METHOD §1).
+NO_AX_Q_STD = 3.0
+
+INITIAL_STD = (0.5, 0.5, 0.1, 0.3)
+#: Longer steps are no steps: the filter starts anew behind such a gap.
+RESTART_GAP_S = 0.5
+#: The last steering angle is kept for this long where the signal is missing.
+STEER_HOLD_S = 0.2
+#: A sample further from its prediction than this many standard deviations is not used ...
+GATE_SIGMA = 6.0
+#: ... unless it has been so for this long: then the filter is wrong, not the sensor (METHOD §6, no lock-out).
+GATE_OPENS_AFTER_S = 0.2
+GATE_INFLATION = 10.0
+STANDSTILL_SPEED_M_S = 0.05
+STANDSTILL_YAW_RATE_RAD_S = 0.05
+STANDSTILL_AFTER_S = 0.3
+STANDSTILL_STD = (0.02, 0.01, 0.002, 0.0)
+#: Divergence: the filter's own normalised innovation stays this far above its expectation, averaged over the time.
+DIVERGED_NIS_RATIO = 25.0
+DIVERGED_AVERAGE_S = 1.0
+DIVERGED_SIDESLIP_RAD = math.radians(60.0)
+
+# Entries of the filter's scalar memory.
+M_INITIALISED, M_STEER, M_AX, M_FRICTION, M_STEER_AGE, M_STILL, M_NIS = range(7)
+M_REJECTED = 7  # and the two after it, one a measurement
+MEMORY = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilterCarry:
+    """What the filter takes from window to window, and the steps that no output has used yet."""
+
+    x: FloatArray
+    P: FloatArray
+    memory: FloatArray
+    last_stamp_ns: int
+    steps: PosteriorSteps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosteriorSteps:
+    """Filter posteriors on measurement time: [K] each, state [K, 4], covariance [K, 4, 4], inputs [K, 3]."""
+
+    stamps_ns: IntArray
+    ready_ns: IntArray
+    x: FloatArray
+    P: FloatArray
+    inputs: FloatArray
+    nis: FloatArray
+    nis_dof: FloatArray
+    log_likelihood: FloatArray
+    innovation: FloatArray
+    valid: BoolArray
+    diverged: BoolArray
+
+    def joined(self, other: PosteriorSteps) -> PosteriorSteps:
+        """Append the steps of the next window."""
+        return PosteriorSteps(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__slots__))
+
+    def since(self, index: int) -> PosteriorSteps:
+        """Keep the steps from ``index`` on."""
+        return PosteriorSteps(*(getattr(self, n)[index:] for n in self.__slots__))
+
+
+@njit(cache=True)
+def _propagate(chi, steer, ax, friction, dt, p):  # type: ignore[no-untyped-def]
+    """Move sigma points [s, 4] by ``dt`` through the nominal model, in place."""
+    n = substeps(chi[0, 0], dt, friction, p)
+    for i in range(chi.shape[0]):
+        vx, vy, r = rk4_step(chi[i, 0], chi[i, 1], chi[i, 2], steer, ax - chi[i, 3], friction, dt, n, p)
+        chi[i, 0] = vx
+        chi[i, 1] = vy
+        chi[i, 2] = r
+
+
+@njit(cache=True)
+def _measure(chi, steer, friction, p, zeta):  # type: ignore[no-untyped-def]
+    """Write what the sensors would read at sigma points chi [s, 4] to zeta [s, 3]."""
+    for i in range(chi.shape[0]):
+        zeta[i, Z_AY] = measured_lateral_acceleration(chi[i, 0], chi[i, 1], chi[i, 2], steer, friction, p)
+        zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
+        zeta[i, Z_SPEED] = chi[i, VX]
+
+
+@njit(cache=True)
+def _add_process_noise(P, q_std, dt):  # type: ignore[no-untyped-def]
+    for i in range(P.shape[0]):
+        P[i, i] += q_std[i] * q_std[i] * dt
+
+
+@njit(cache=True)
+def _filter(  # type: ignore[no-untyped-def]
+    dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, default_friction, p, q_std, r_std, wm, wc, scale,
+    x, P, memory, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu, out_valid, out_diverged,
+):  # fmt: skip
+    """Run over one window; x [4], P [4, 4] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start."""
+    n = STATES
+    chi = np.empty((2 * n + 1, n))
+    L = np.empty((n, n))
+    zeta = np.empty((2 * n + 1, MEASUREMENTS))
+    z_hat = np.empty(MEASUREMENTS)
+    S = np.empty((MEASUREMENTS, MEASUREMENTS))
+    Pxz = np.empty((n, MEASUREMENTS))
+    nu = np.empty(MEASUREMENTS)
+    z = np.empty(MEASUREMENTS)
+    use = np.empty(MEASUREMENTS, dtype=np.bool_)
+    q = q_std.copy()
+    for k in range(dt.shape[0]):
+        restart = not dt[k] <= RESTART_GAP_S
+        if restart:
+            memory[:] = 0.0
+        if math.isfinite(steer[k]):
+            steer_k = steer[k]
+            memory[M_STEER_AGE] = 0.0
+        else:
+            steer_k = memory[M_STEER]
+            memory[M_STEER_AGE] += 0.0 if restart else dt[k]
+        steer_ok = math.isfinite(steer[k]) or (memory[M_INITIALISED] > 0.0 and memory[M_STEER_AGE] <= STEER_HOLD_S)
+        has_ax = math.isfinite(ax[k])
+        ax_k = ax[k] if has_ax else 0.0
+        if math.isfinite(friction[k]):
+            mu_k = friction[k]
+        else:
+            mu_k = memory[M_FRICTION] if memory[M_FRICTION] > 0.0 else default_friction
+        z[Z_AY] = ay[k]
+        z[Z_YAW_RATE] = yaw_rate[k]
+        z[Z_SPEED] = speed[k] if (use_speed or memory[M_INITIALISED] == 0.0) else math.nan
+        out_nis[k] = math.nan
+        out_dof[k] = 0.0
+        out_ll[k] = 0.0
+        out_nu[k, :] = math.nan
+        out_valid[k] = False
+        out_diverged[k] = False
+
+        if memory[M_INITIALISED] == 0.0:
+            if math.isfinite(z[Z_SPEED]) and math.isfinite(steer[k]):
+                r0 = z[Z_YAW_RATE] if math.isfinite(z[Z_YAW_RATE]) else 0.0
+                x[VX] = z[Z_SPEED]
+                x[VY] = p.rear_m * r0  # the rear axle rolls without slip
+                x[YAW_RATE] = r0
+                x[AX_BIAS] = 0.0
+                P[:, :] = 0.0
+                for i in range(n):
+                    P[i, i] = INITIAL_STD[i] ** 2
+                memory[M_INITIALISED] = 1.0
+                out_valid[k] = True
+        else:
+            draw_sigma_points(x, P, scale, L, chi)
+            _propagate(chi, memory[M_STEER], memory[M_AX], memory[M_FRICTION], dt[k], p)
+            mean_and_covariance(chi, wm, wc, x, P)
+            q[VX] = q_std[VX] if has_ax else NO_AX_Q_STD
+            _add_process_noise(P, q, dt[k])
+            draw_sigma_points(x, P, scale, L, chi)
+            _measure(chi, steer_k, mu_k, p, zeta)
+            innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
+            opens = False
+            for i in range(MEASUREMENTS):
+                S[i, i] += r_std[i] * r_std[i]
+                nu[i] = z[i] - z_hat[i]
+                use[i] = math.isfinite(nu[i]) and (i != Z_AY or steer_ok)
+                if use[i]:
+                    out_nu[k, i] = nu[i]
+                    if nu[i] * nu[i] <= GATE_SIGMA**2 * S[i, i]:
+                        memory[M_REJECTED + i] = 0.0
+                    else:
+                        memory[M_REJECTED + i] += dt[k]
+                        use[i] = memory[M_REJECTED + i] > GATE_OPENS_AFTER_S
+                        opens = opens or use[i]
+            if opens:
+                for i in range(n):
+                    for j in range(n):
+                        P[i, j] *= GATE_INFLATION
+                draw_sigma_points(x, P, scale, L, chi)
+                _measure(chi, steer_k, mu_k, p, zeta)
+                innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
+                for i in range(MEASUREMENTS):
+                    S[i, i] += r_std[i] * r_std[i]
+                    nu[i] = z[i] - z_hat[i]
+                    memory[M_REJECTED + i] = 0.0
+            nis, dof, log_likelihood = kalman_update(x, P, nu, S, Pxz, use)
+            if dof > 0:
+                out_nis[k] = nis
+                out_dof[k] = dof
+                out_ll[k] = log_likelihood
+                memory[M_NIS] += min(1.0, dt[k] / DIVERGED_AVERAGE_S) * (nis / dof - memory[M_NIS])
+            # Standstill: the speed sensor reads zero and nothing turns, for a while.
+            if math.isfinite(z[Z_SPEED]):
+                still = abs(z[Z_SPEED]) < STANDSTILL_SPEED_M_S and not abs(z[Z_YAW_RATE]) > STANDSTILL_YAW_RATE_RAD_S
+                memory[M_STILL] = memory[M_STILL] + dt[k] if still else 0.0
+            elif memory[M_STILL] > 0.0:
+                memory[M_STILL] += dt[k]
+            if memory[M_STILL] >= STANDSTILL_AFTER_S:
+                for i in range(AX_BIAS):
+                    x[i] = 0.0
+                    for j in range(n):
+                        P[i, j] = 0.0
+                        P[j, i] = 0.0
+                    P[i, i] = STANDSTILL_STD[i] ** 2
+            out_valid[k] = steer_ok
+            sideslip = math.atan2(x[VY], x[VX])
+            out_diverged[k] = memory[M_NIS] > DIVERGED_NIS_RATIO or (
+                x[VX] > p.blend_high_m_s and abs(sideslip) > DIVERGED_SIDESLIP_RAD
+            )
+            finite = True
+            for i in range(n):
+                finite = finite and math.isfinite(x[i]) and math.isfinite(P[i, i])
+            if not finite:
+                memory[M_INITIALISED] = 0.0
+                out_valid[k] = False
+                out_diverged[k] = True
+        memory[M_STEER] = steer_k
+        memory[M_AX] = ax_k
+        memory[M_FRICTION] = mu_k
+        for i in range(n):
+            out_x[k, i] = x[i]
+            for j in range(n):
+                out_P[k, i, j] = P[i, j]
+        out_u[k, 0] = steer_k
+        out_u[k, 1] = ax_k
+        out_u[k, 2] = mu_k
+
+
+@njit(cache=True)
+def _predict_outputs(step, horizon_s, x, P, inputs, p, q_std, wm, wc, scale, out_x, out_P, out_ay):  # type: ignore[no-untyped-def]
+    """Predict step ``step[m]`` by ``horizon_s[m]`` with its inputs held; writes state, covariance and planar a_y."""
+    n = STATES
+    chi = np.empty((2 * n + 1, n))
+    L = np.empty((n, n))
+    xm = np.empty(n)
+    Pm = np.empty((n, n))
+    for m in range(step.shape[0]):
+        k = step[m]
+        if k < 0:
+            out_x[m, :] = math.nan
+            out_P[m, :, :] = math.nan
+            out_ay[m] = math.nan
+            continue
+        xm[:] = x[k]
+        Pm[:, :] = P[k]
+        if horizon_s[m] > 0.0:
+            draw_sigma_points(xm, Pm, scale, L, chi)
+            _propagate(chi, inputs[k, 0], inputs[k, 1], inputs[k, 2], horizon_s[m], p)
+            mean_and_covariance(chi, wm, wc, xm, Pm)
+            _add_process_noise(Pm, q_std, horizon_s[m])
+        out_x[m] = xm
+        out_P[m] = Pm
+        out_ay[m] = planar_lateral_acceleration(xm[VX], xm[VY], xm[YAW_RATE], inputs[k, 0], inputs[k, 2], p)
+
+
+def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the 1-sigma of β = atan2(v_y, v_x) in rad, [N], to first order from the covariance [N, ≥2, ≥2]."""
+    v2 = np.maximum(vx_m_s**2 + vy_m_s**2, 1e-6)
+    gx, gy = -vy_m_s / v2, vx_m_s / v2
+    variance = gx**2 * covariance[:, VX, VX] + gy**2 * covariance[:, VY, VY] + 2.0 * gx * gy * covariance[:, VX, VY]
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class PhysicsUkf:
+    """The filter of this file as an estimator.
+
+    Parameters
+    ----------
+    vehicle : parameters; ``sensors`` gives R unless ``r_std`` does.
+    q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax].
+    use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
+    """
+
+    vehicle: VehicleParameters
+    q_std: tuple[float, float, float, float] = PHY_UKF_Q_STD
+    r_std: tuple[float, float, float] | None = None
+    use_speed: bool = True
+    roll_correction: bool = False
+    name: str = "phy-ukf"
+    causal: bool = True
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Aligned signals without which the filter cannot run; a_x is replaced by a random walk if missing."""
+        return frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
+
+    @property
+    def _parameters(self) -> ModelParameters:
+        return model_parameters(self.vehicle, roll_correction=self.roll_correction)
+
+    @property
+    def measurement_std(self) -> FloatArray:
+        """1-sigma of [a_y, r, v_x], [3]."""
+        s = self.vehicle.sensors
+        return np.array(self.r_std or (s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s))
+
+    def filter_steps(self, signals: Signals, carry: FilterCarry | None) -> tuple[PosteriorSteps, FilterCarry]:
+        """Run the filter on measurement time only; the steps and the carry with no pending steps in it."""
+        count = len(signals)
+        if carry is None:
+            x, P, memory = np.zeros(STATES), np.eye(STATES), np.zeros(MEMORY)
+            first_dt = np.nan
+        else:
+            x, P, memory = carry.x.copy(), carry.P.copy(), carry.memory.copy()
+            first_dt = (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9 if count else np.nan
+        dt = np.empty(count)
+        if count:
+            dt[0] = first_dt
+            dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+        steps = PosteriorSteps(
+            stamps_ns=signals.stamps_ns,
+            ready_ns=signals.ready_ns,
+            x=np.empty((count, STATES)),
+            P=np.empty((count, STATES, STATES)),
+            inputs=np.empty((count, 3)),
+            nis=np.empty(count),
+            nis_dof=np.empty(count),
+            log_likelihood=np.empty(count),
+            innovation=np.empty((count, MEASUREMENTS)),
+            valid=np.empty(count, dtype=np.bool_),
+            diverged=np.empty(count, dtype=np.bool_),
+        )
+        wm, wc, scale = unscented_weights(STATES)
+        _filter(
+            dt, signals.steer_rad, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s,
+            signals.friction, self.use_speed, self.vehicle.assumed_friction, self._parameters,
+            np.array(self.q_std), self.measurement_std, wm, wc, scale[0], x, P, memory,
+            steps.x, steps.P, steps.inputs, steps.nis, steps.nis_dof, steps.log_likelihood, steps.innovation,
+            steps.valid, steps.diverged,
+        )  # fmt: skip
+        last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
+        return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count))
+
+    def run(self, signals: Signals, carry: FilterCarry | None) -> tuple[StateTrack, FilterCarry]:
+        """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
+        steps, after = self.filter_steps(signals, carry)
+        if carry is not None:
+            steps = carry.steps.joined(steps)
+        index = released_steps(steps.ready_ns, signals.stamps_ns)
+        horizon = np.where(index >= 0, (signals.stamps_ns - steps.stamps_ns[np.maximum(index, 0)]) * 1e-9, np.nan)
+        usable = (index >= 0) & (horizon <= MAX_PREDICTION_S)
+        usable[usable] &= steps.valid[index[usable]]
+        chosen = np.where(usable, index, -1)
+        count = len(signals)
+        x, P, ay = np.empty((count, STATES)), np.empty((count, STATES, STATES)), np.empty(count)
+        wm, wc, scale = unscented_weights(STATES)
+        _predict_outputs(
+            chosen, horizon, steps.x, steps.P, steps.inputs, self._parameters, np.array(self.q_std), wm, wc, scale[0],
+            x, P, ay,
+        )  # fmt: skip
+        at = np.maximum(chosen, 0)
+        nan = np.full(count, np.nan)
+        covariance = P[:, :3, :3]
+        track = StateTrack(
+            name=self.name,
+            stamps_ns=signals.stamps_ns,
+            vx_m_s=x[:, VX].copy(),
+            vy_m_s=x[:, VY].copy(),
+            yaw_rate_rad_s=x[:, YAW_RATE].copy(),
+            sideslip_rad=np.arctan2(x[:, VY], x[:, VX]),
+            ay_m_s2=ay,
+            x_m=nan,
+            y_m=nan,
+            yaw_rad=nan,
+            covariance=covariance,
+            sideslip_std_rad=sideslip_std(x[:, VX], x[:, VY], covariance),
+            network_trust=nan,
+            r_scale=np.ones(count),
+            nis=np.where(usable, steps.nis[at], np.nan) if len(steps.nis) else nan,
+            nis_dof=np.where(usable, steps.nis_dof[at], 0.0) if len(steps.nis) else np.zeros(count),
+            friction=np.where(usable, steps.inputs[at, 2], np.nan) if len(steps.nis) else nan,
+            valid=usable,
+            diverged=np.where(usable, steps.diverged[at], False) if len(steps.nis) else usable,
+        )
+        newest = int(index[-1]) if count else -1
+        return track, FilterCarry(after.x, after.P, after.memory, after.last_stamp_ns, steps.since(max(newest, 0)))
+
+
+def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, float]:
+    """Return the Gaussian log-likelihood of all innovations of a drive and how many scalar innovations it sums."""
+    steps, _ = estimator.filter_steps(signals, None)
+    return float(steps.log_likelihood.sum()), float(steps.nis_dof.sum())

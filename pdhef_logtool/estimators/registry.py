@@ -1,0 +1,82 @@
+"""Estimators by the names that the command line and the tables use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pdhef_logtool.errors import UsageError
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.vehicle import VehicleParameters
+
+#: Name and one line on each, in the order of the tables.
+DESCRIPTIONS: dict[str, str] = {
+    "zero": "sideslip 0; speed, yaw rate and lateral acceleration from the sensors",
+    "gyro": "the sensors passed through; claims no lateral velocity",
+    "kinematic": "leaky integral of a_y - v_x r",
+    "open-loop": "nominal single-track model from steering and speed alone",
+    "phy-ukf": "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
+}
+
+DEFAULT_ESTIMATORS = tuple(DESCRIPTIONS)
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """An estimator that cannot run on a log, and why."""
+
+    name: str
+    reason: str
+
+
+def check_names(names: tuple[str, ...]) -> None:
+    """Raise UsageError if a name is unknown or occurs twice."""
+    unknown = [n for n in names if n not in DESCRIPTIONS]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if unknown or twice or not names:
+        raise UsageError(
+            expected=f"estimators out of {', '.join(DESCRIPTIONS)}",
+            got=", ".join(unknown + twice) or "none",
+            where="--estimators",
+        )
+
+
+def make_estimator(name: str, vehicle: VehicleParameters, *, use_speed: bool = True) -> Estimator:
+    """Build an estimator; compiled code is imported here and not before.
+
+    Parameters
+    ----------
+    name : one of :data:`DESCRIPTIONS`.
+    use_speed : False is the paper's ``esp`` suite for the filters (METHOD §1).
+    """
+    check_names((name,))
+    if name in ("zero", "gyro"):
+        from pdhef_logtool.estimators.pass_through import PassThrough
+
+        return PassThrough(name, claims_zero_sideslip=name == "zero")
+    if name == "kinematic":
+        from pdhef_logtool.estimators.kinematic import Kinematic
+
+        return Kinematic()
+    if name == "open-loop":
+        from pdhef_logtool.estimators.open_loop import OpenLoop
+
+        return OpenLoop(vehicle)
+    from pdhef_logtool.estimators.physics import PhysicsUkf
+
+    return PhysicsUkf(vehicle, use_speed=use_speed)
+
+
+def runnable(
+    names: tuple[str, ...], vehicle: VehicleParameters, available: frozenset[str], *, use_speed: bool = True
+) -> tuple[list[Estimator], list[Skipped]]:
+    """Split estimators into those whose needs the log meets and those that are skipped with the reason."""
+    estimators: list[Estimator] = []
+    skipped: list[Skipped] = []
+    for name in names:
+        estimator = make_estimator(name, vehicle, use_speed=use_speed)
+        missing = sorted(estimator.needs - available)
+        if missing:
+            skipped.append(Skipped(name, f"the log has no {', '.join(missing)}"))
+        else:
+            estimators.append(estimator)
+    return estimators, skipped

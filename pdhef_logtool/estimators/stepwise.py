@@ -1,0 +1,115 @@
+"""Shared by the simple baselines: measured speed between its samples, and release of steps at the scored stamps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.tracks import StateTrack, make_track
+
+#: A speed sample is carried on by a_x for this long.
+SPEED_HOLD_S = 0.5
+#: Longer steps start an integration anew.
+RESTART_GAP_S = 0.5
+
+# Entries of a step's values and of their time derivatives.
+VX, VY, YAW_RATE, AY = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steps:
+    """Estimates on measurement time: values and rates [K, 4] over [v_x, v_y, r, a_y]; NaN is allowed."""
+
+    stamps_ns: IntArray
+    ready_ns: IntArray
+    values: FloatArray
+    rates: FloatArray
+    valid: BoolArray
+
+    def joined(self, other: Steps) -> Steps:
+        """Append the next window's steps."""
+        return Steps(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__slots__))
+
+    def since(self, index: int) -> Steps:
+        """Keep the steps from ``index`` on."""
+        return Steps(*(getattr(self, n)[index:] for n in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepCarry:
+    """Memory of a baseline between windows: its own state vector and the steps that outputs still need."""
+
+    state: FloatArray
+    last_stamp_ns: int
+    steps: Steps
+
+
+#: (dt [K], signals, state, values [K, 4], rates [K, 4], valid [K]) -> None; writes the last four in place.
+StepFunction = Callable[[FloatArray, Signals, FloatArray, FloatArray, FloatArray, BoolArray], None]
+
+
+def run_stepwise(
+    name: str, signals: Signals, carry: StepCarry | None, state_size: int, step: StepFunction
+) -> tuple[StateTrack, StepCarry]:
+    """Run ``step`` over a window and extrapolate the newest arrived step to each scored stamp, to first order.
+
+    ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log.
+    """
+    count = len(signals)
+    state = np.full(state_size, np.nan) if carry is None else carry.state.copy()
+    dt = np.empty(count)
+    if count:
+        dt[0] = np.nan if carry is None else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
+        dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+    values = np.full((count, 4), np.nan)
+    rates = np.zeros((count, 4))
+    valid = np.zeros(count, dtype=np.bool_)
+    step(dt, signals, state, values, rates, valid)
+    steps = Steps(signals.stamps_ns, signals.ready_ns, values, rates, valid)
+    if carry is not None:
+        steps = carry.steps.joined(steps)
+    index = released_steps(steps.ready_ns, signals.stamps_ns)
+    at = np.maximum(index, 0)
+    horizon = (signals.stamps_ns - steps.stamps_ns[at]) * 1e-9 if len(steps.stamps_ns) else np.zeros(count)
+    usable = (index >= 0) & (horizon <= MAX_PREDICTION_S)
+    if len(steps.stamps_ns):
+        usable &= steps.valid[at]
+        out = steps.values[at] + steps.rates[at] * horizon[:, None]
+        out[~usable] = np.nan
+    else:
+        out = np.empty((0, 4))
+    track = make_track(
+        name,
+        signals.stamps_ns,
+        vx_m_s=out[:, VX].copy(),
+        vy_m_s=out[:, VY].copy(),
+        yaw_rate_rad_s=out[:, YAW_RATE].copy(),
+        ay_m_s2=out[:, AY].copy(),
+        valid=usable,
+    )
+    last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
+    newest = int(index[-1]) if count else -1
+    return track, StepCarry(state, last, steps.since(max(newest, 0)))
+
+
+@njit(cache=True)
+def advance_speed(state, dt, ax, speed):  # type: ignore[no-untyped-def]
+    """Advance [v_x, age of the last speed sample] by one step in place; v_x is NaN where no sample is near.
+
+    Between samples v_x follows a_x (0 where it is missing), at most ``SPEED_HOLD_S``.
+    """
+    if math.isfinite(speed):
+        state[0] = speed
+        state[1] = 0.0
+    elif dt <= SPEED_HOLD_S and state[1] + dt <= SPEED_HOLD_S:
+        state[0] += (ax if math.isfinite(ax) else 0.0) * dt
+        state[1] += dt
+    else:
+        state[0] = math.nan
+        state[1] = 0.0

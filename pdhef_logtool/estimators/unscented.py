@@ -1,0 +1,193 @@
+"""The scaled unscented transform and the Kalman update on it, compiled (Wan & van der Merwe 2000; METHOD §6).
+
+All functions work on small float64 arrays in place of allocation where it matters, and know nothing of vehicles.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.signals import FloatArray
+
+#: Smallest variance that a repaired covariance keeps on its diagonal.
+COVARIANCE_FLOOR = 1e-12
+
+
+def unscented_weights(n: int, alpha: float = 1.0, beta: float = 2.0, kappa: float = 0.0) -> tuple[FloatArray, ...]:
+    """Return mean weights [2n+1], covariance weights [2n+1] and [1] the scale c with χ = x ± columns of √(c P).
+
+    The defaults give a centre weight of 0 for the mean and no negative weight, so that a weighted covariance is
+    never indefinite.
+    """
+    lam = alpha**2 * (n + kappa) - n
+    wm = np.full(2 * n + 1, 0.5 / (n + lam))
+    wc = wm.copy()
+    wm[0] = lam / (n + lam)
+    wc[0] = wm[0] + 1.0 - alpha**2 + beta
+    return wm, wc, np.array([n + lam])
+
+
+@njit(cache=True)
+def cholesky_lower(P, L):  # type: ignore[no-untyped-def]
+    """Write the lower Cholesky factor of P [n, n] to L; return False where P is not positive definite."""
+    n = P.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            s = P[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                if not s > 0.0:
+                    return False
+                L[i, i] = math.sqrt(s)
+            else:
+                L[i, j] = s / L[j, j]
+        for j in range(i + 1, n):
+            L[i, j] = 0.0
+    return True
+
+
+@njit(cache=True)
+def repair_covariance(P):  # type: ignore[no-untyped-def]
+    """Make P [n, n] symmetric positive definite in place: eigenvalues below the floor are raised to it."""
+    n = P.shape[0]
+    for i in range(n):
+        for j in range(i):
+            m = 0.5 * (P[i, j] + P[j, i])
+            P[i, j] = m
+            P[j, i] = m
+    w, v = np.linalg.eigh(P)
+    floor = max(COVARIANCE_FLOOR, 1e-13 * max(w[n - 1], 0.0))
+    for i in range(n):
+        for j in range(n):
+            s = 0.0
+            for k in range(n):
+                s += v[i, k] * max(w[k], floor) * v[j, k]
+            P[i, j] = s
+
+
+@njit(cache=True)
+def draw_sigma_points(x, P, scale, L, chi):  # type: ignore[no-untyped-def]
+    """Write the 2n+1 sigma points of (x, P) to chi [2n+1, n]; L [n, n] is work space. P is repaired if needed."""
+    n = x.shape[0]
+    if not cholesky_lower(P, L):
+        repair_covariance(P)
+        cholesky_lower(P, L)
+    root = math.sqrt(scale)
+    for j in range(n):
+        chi[0, j] = x[j]
+    for i in range(n):
+        for j in range(n):
+            d = root * L[j, i]
+            chi[1 + i, j] = x[j] + d
+            chi[1 + n + i, j] = x[j] - d
+
+
+@njit(cache=True)
+def mean_and_covariance(chi, wm, wc, x, P):  # type: ignore[no-untyped-def]
+    """Write the weighted mean and covariance of chi [s, n] to x [n] and P [n, n]."""
+    s, n = chi.shape
+    for j in range(n):
+        m = 0.0
+        for i in range(s):
+            m += wm[i] * chi[i, j]
+        x[j] = m
+    for a in range(n):
+        for b in range(a + 1):
+            c = 0.0
+            for i in range(s):
+                c += wc[i] * (chi[i, a] - x[a]) * (chi[i, b] - x[b])
+            P[a, b] = c
+            P[b, a] = c
+
+
+@njit(cache=True)
+def innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write predicted measurement [m], its covariance without R [m, m] and the cross covariance [n, m].
+
+    chi [s, n] are the sigma points of mean x, zeta [s, m] their measurements.
+    """
+    s, n = chi.shape
+    m = zeta.shape[1]
+    for k in range(m):
+        v = 0.0
+        for i in range(s):
+            v += wm[i] * zeta[i, k]
+        z_hat[k] = v
+    for k in range(m):
+        for q in range(k + 1):
+            c = 0.0
+            for i in range(s):
+                c += wc[i] * (zeta[i, k] - z_hat[k]) * (zeta[i, q] - z_hat[q])
+            S[k, q] = c
+            S[q, k] = c
+        for a in range(n):
+            c = 0.0
+            for i in range(s):
+                c += wc[i] * (chi[i, a] - x[a]) * (zeta[i, k] - z_hat[k])
+            Pxz[a, k] = c
+
+
+@njit(cache=True)
+def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
+    """Update x [n], P [n, n] in place with the channels of ``use`` (bool [m]).
+
+    nu [m] is the innovation, S [m, m] its covariance with R. P −= K S Kᵀ = (P_xz L⁻ᵀ)(P_xz L⁻ᵀ)ᵀ with S = L Lᵀ: a
+    symmetric form; if rounding makes it indefinite it is repaired.
+
+    Returns
+    -------
+    nis : νᵀ S⁻¹ ν over the used channels. dof : how many. log_likelihood : of the innovation, Gaussian.
+    """
+    n = x.shape[0]
+    m = nu.shape[0]
+    index = np.empty(m, dtype=np.int64)
+    d = 0
+    for k in range(m):
+        if use[k]:
+            index[d] = k
+            d += 1
+    if d == 0:
+        return 0.0, 0, 0.0
+    A = np.empty((d, d))
+    for i in range(d):
+        for j in range(d):
+            A[i, j] = S[index[i], index[j]]
+    L = np.empty((d, d))
+    if not cholesky_lower(A, L):
+        repair_covariance(A)
+        cholesky_lower(A, L)
+    # w = L⁻¹ ν and G = P_xz L⁻ᵀ, by forward substitution
+    w = np.empty(d)
+    log_det = 0.0
+    nis = 0.0
+    for i in range(d):
+        s = nu[index[i]]
+        for j in range(i):
+            s -= L[i, j] * w[j]
+        w[i] = s / L[i, i]
+        nis += w[i] * w[i]
+        log_det += 2.0 * math.log(L[i, i])
+    G = np.empty((n, d))
+    for a in range(n):
+        for i in range(d):
+            s = Pxz[a, index[i]]
+            for j in range(i):
+                s -= L[i, j] * G[a, j]
+            G[a, i] = s / L[i, i]
+    for a in range(n):
+        for i in range(d):
+            x[a] += G[a, i] * w[i]
+        for b in range(a + 1):
+            s = P[a, b]
+            for i in range(d):
+                s -= G[a, i] * G[b, i]
+            P[a, b] = s
+            P[b, a] = s
+    check = np.empty((n, n))
+    if not cholesky_lower(P, check):
+        repair_covariance(P)
+    return nis, d, -0.5 * (nis + log_det + d * math.log(2.0 * math.pi))
