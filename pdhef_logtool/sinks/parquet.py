@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.errors import OutputError
 from pdhef_logtool.signals import FloatArray, Signals
-from pdhef_logtool.sinks.base import Event, PendingFile
+from pdhef_logtool.sinks.base import Event, MetricRowLike, PendingFile
 from pdhef_logtool.sinks.schema import arrow_schema
 from pdhef_logtool.tracks import TRACK_COLUMNS, StateTrack, make_track
 
@@ -210,50 +210,6 @@ def _open(path: Path) -> pq.ParquetFile:
         raise OutputError(
             expected="a readable Parquet file", got=str(error), where=str(path), remedy="run the log again"
         ) from error
-
-
-class MetricRowLike(Protocol):
-    """One figure, as :class:`pdhef_logtool.evaluation.metrics.MetricRow` holds it."""
-
-    @property
-    def log(self) -> str:
-        """Stem of the log."""
-        ...
-
-    @property
-    def estimator(self) -> str:
-        """Name of the estimator."""
-        ...
-
-    @property
-    def signal(self) -> str:
-        """Scored signal."""
-        ...
-
-    @property
-    def segment(self) -> str:
-        """Part of the drive."""
-        ...
-
-    @property
-    def metric(self) -> str:
-        """Name of the figure."""
-        ...
-
-    @property
-    def value(self) -> float:
-        """The figure; NaN when it cannot be computed."""
-        ...
-
-    @property
-    def unit(self) -> str:
-        """Unit of the figure."""
-        ...
-
-    @property
-    def n(self) -> int:
-        """Number of samples behind it."""
-        ...
 
 
 def write_metrics(path: Path, rows: Sequence[MetricRowLike]) -> None:

@@ -1,0 +1,341 @@
+"""report.json of one log, run.json of a run, and the report as Markdown; plain records in, plain JSON out."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import math
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdhef_logtool.signals import Loss
+from pdhef_logtool.sinks.base import Event, MetricRowLike, write_bytes
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+#: Distributions whose version decides what a run computes or writes.
+VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFacts:
+    """One topic of the log, and whether a signal or a truth channel is read from it."""
+
+    name: str
+    type_name: str
+    encoding: str
+    messages: int
+    mapped: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LogFacts:
+    """The log that was read; ``file`` is its file name without folders, [start_ns, end_ns) its log times."""
+
+    name: str
+    file: str
+    kind: str
+    sha256: str
+    start_ns: int
+    end_ns: int
+    topics: Sequence[TopicFacts] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFacts:
+    """Where one signal or truth quantity came from.
+
+    ``source`` is ``/topic.field``; ``derivation`` says in words how it was computed, empty if it was read as it is.
+    """
+
+    name: str
+    source: str
+    unit: str
+    samples: int
+    derivation: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorFacts:
+    """One estimator that was asked for: ``skipped`` holds the reason if it did not run."""
+
+    name: str
+    causal: bool
+    skipped: str | None = None
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TruthFacts:
+    """What was compared with: quantities (with their derivation), its latency, and what is no independent check."""
+
+    quantities: Sequence[SourceFacts] = ()
+    latency_s: float | None = None
+    not_independent: Sequence[str] = ()
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ReportFacts:
+    """Everything that report.json says about one log."""
+
+    log: LogFacts
+    signals: Sequence[SourceFacts]
+    missing_signals: Sequence[str]
+    vehicle_name: str
+    vehicle_sha256: str
+    estimators: Sequence[EstimatorFacts]
+    truth: TruthFacts
+    metrics: Sequence[MetricRowLike] = ()
+    segments: Sequence[Event] = ()
+    losses: Sequence[Loss] = ()
+    warnings: Sequence[str] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class LogOutcome:
+    """How one log of a run ended.
+
+    ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
+    """
+
+    log: str
+    file: str
+    sha256: str | None
+    failed: str | None = None
+    lost: Sequence[str] = ()
+
+    @property
+    def outcome(self) -> str:
+        """``ok``, ``failed: reason`` or ``lost: what``."""
+        if self.failed is not None:
+            return f"failed: {self.failed}"
+        return f"lost: {'; '.join(self.lost)}" if self.lost else "ok"
+
+
+def tool_versions() -> dict[str, str]:
+    """Return the versions of Python and of the installed distributions that decide what a run computes."""
+    versions = {"python": platform.python_version()}
+    for name in VERSIONED:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return versions
+
+
+def build_report(facts: ReportFacts) -> dict[str, Any]:
+    """Return the document of report.json (schemas/report.schema.json); NaN has become None."""
+    log = facts.log
+    document = {
+        "format": "pdhef.report",
+        "version": 1,
+        "log": {
+            "name": log.name,
+            "file": PurePath(log.file).name,
+            "kind": log.kind,
+            "sha256": log.sha256,
+            "start_ns": log.start_ns,
+            "end_ns": log.end_ns,
+            "duration_s": (log.end_ns - log.start_ns) * 1e-9,
+            "topics": [
+                {
+                    "name": t.name,
+                    "type": t.type_name,
+                    "encoding": t.encoding,
+                    "messages": t.messages,
+                    "mapped": t.mapped,
+                }
+                for t in log.topics
+            ],
+        },
+        "mapping": {"signals": list(facts.signals), "missing": list(facts.missing_signals)},
+        "vehicle": {"name": facts.vehicle_name, "sha256": facts.vehicle_sha256},
+        "estimators": [
+            {
+                "name": e.name,
+                "causal": e.causal,
+                "outcome": "ran" if e.skipped is None else "skipped",
+                "reason": e.skipped,
+                "notes": list(e.notes),
+            }
+            for e in facts.estimators
+        ],
+        "truth": {
+            "available": bool(facts.truth.quantities),
+            "quantities": list(facts.truth.quantities),
+            "latency_s": facts.truth.latency_s,
+            "not_independent": sorted(facts.truth.not_independent),
+            "notes": list(facts.truth.notes),
+        },
+        "metrics": [
+            {
+                "log": m.log,
+                "estimator": m.estimator,
+                "signal": m.signal,
+                "segment": m.segment,
+                "metric": m.metric,
+                "value": m.value,
+                "unit": m.unit,
+                "n": m.n,
+            }
+            for m in facts.metrics
+        ],
+        "segments": list(facts.segments),
+        "losses": list(facts.losses),
+        "warnings": list(facts.warnings),
+        "versions": dict(facts.versions),
+    }
+    plain: dict[str, Any] = jsonable(document)
+    return plain
+
+
+def build_run(
+    versions: Mapping[str, str],
+    config: Mapping[str, Any],
+    model: Mapping[str, str] | None,
+    outcomes: Iterable[LogOutcome],
+) -> dict[str, Any]:
+    """Return the document of run.json (schemas/run.schema.json).
+
+    Parameters
+    ----------
+    versions : by distribution, see :func:`tool_versions`.
+    config : the configuration in effect, as JSON-able values.
+    model : ``name`` and ``sha256`` of the model bundle; None when no network ran.
+    outcomes : one a log.
+    """
+    document = {
+        "format": "pdhef.run",
+        "version": 1,
+        "versions": dict(versions),
+        "config": dict(config),
+        "model": None if model is None else dict(model),
+        "logs": [
+            {"log": o.log, "file": PurePath(o.file).name, "sha256": o.sha256, "outcome": o.outcome} for o in outcomes
+        ],
+    }
+    plain: dict[str, Any] = jsonable(document)
+    return plain
+
+
+def jsonable(value: Any) -> Any:
+    """Turn records, mappings, sequences, numpy values and paths into what JSON holds; NaN and infinity become None.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.generic | np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, PurePath):
+        return str(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: jsonable(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if isinstance(value, set | frozenset):
+        return [jsonable(v) for v in sorted(value)]
+    if isinstance(value, Sequence):
+        return [jsonable(v) for v in value]
+    raise TypeError(f"no JSON form of {type(value).__name__}")
+
+
+def json_bytes(document: Mapping[str, Any]) -> bytes:
+    """Return the document as indented UTF-8 JSON with sorted keys and a final line feed; NaN is null."""
+    text = json.dumps(jsonable(document), indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return (text + "\n").encode()
+
+
+def write_json(path: Path, document: Mapping[str, Any]) -> None:
+    """Write a document through a temporary name (see :func:`json_bytes`); raises OutputError."""
+    write_bytes(path, json_bytes(document))
+
+
+def report_markdown(report: Mapping[str, Any]) -> str:
+    """Return the document of :func:`build_report` as Markdown for people; angles in degrees."""
+    log = report["log"]
+    lines = [
+        f"# {log['name']}",
+        "",
+        f"{log['file']} ({log['kind']}), {log['duration_s']:.1f} s, sha256 {log['sha256'][:12]}; "
+        f"vehicle {report['vehicle']['name']}",
+        "",
+    ]
+    lines += _bullets("Warnings", report["warnings"])
+    lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
+    lines += _truth_lines(report["truth"])
+    for signal in dict.fromkeys(m["signal"] for m in report["metrics"]):
+        lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal])
+    lines += ["## Estimators", ""]
+    for e in report["estimators"]:
+        notes = "; ".join([*([f"skipped: {e['reason']}"] if e["reason"] else []), *e["notes"]])
+        kind = "causal" if e["causal"] else "not causal"
+        lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
+    lines += ["", "## Signals", ""]
+    lines += [_source_line(s) for s in report["mapping"]["signals"]]
+    lines += [f"- {name}: missing" for name in report["mapping"]["missing"]]
+    lines += ["", "Versions: " + ", ".join(f"{k} {v}" for k, v in sorted(report["versions"].items()))]
+    return "\n".join(lines) + "\n"
+
+
+def _bullets(title: str, items: Sequence[str]) -> list[str]:
+    return [f"## {title}", "", *(f"- {item}" for item in items), ""] if items else []
+
+
+def _source_line(source: Mapping[str, Any]) -> str:
+    how = f"; {source['derivation']}" if source["derivation"] else ""
+    return f"- {source['name']}: `{source['source']}`, {source['samples']} samples{how}"
+
+
+def _truth_lines(truth: Mapping[str, Any]) -> list[str]:
+    lines = ["## Truth", ""]
+    if not truth["available"]:
+        lines.append("- no truth in this log")
+    lines += [_source_line(q) for q in truth["quantities"]]
+    if truth["latency_s"] is not None:
+        lines.append(f"- latency {truth['latency_s'] * 1e3:.1f} ms")
+    if truth["not_independent"]:
+        lines.append(f"- not independent of the estimators' inputs: {', '.join(truth['not_independent'])}")
+    return [*lines, *(f"- {note}" for note in truth["notes"]), ""]
+
+
+def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    metrics = list(dict.fromkeys((m["metric"], m["unit"]) for m in rows))
+    shown = [(name, unit, _SHOWN_UNITS.get(unit, (unit, 1.0))) for name, unit in metrics]
+    heads = [name if unit[0] in ("", "1") else f"{name} [{unit[0]}]" for name, _, unit in shown]
+    lines = [
+        f"## {signal}",
+        "",
+        "| estimator | segment | " + " | ".join(heads) + " |",
+        "| --- | --- |" + " ---: |" * len(heads),
+    ]
+    for estimator, segment in dict.fromkeys((m["estimator"], m["segment"]) for m in rows):
+        own = {
+            (m["metric"], m["unit"]): m["value"]
+            for m in rows
+            if m["estimator"] == estimator and m["segment"] == segment
+        }
+        cells = [_number(own.get((name, unit)), factor) for name, unit, (_, factor) in shown]
+        lines.append(f"| {estimator} | {segment} | " + " | ".join(cells) + " |")
+    return [*lines, ""]
+
+
+_SHOWN_UNITS = {"rad": ("deg", math.degrees(1.0)), "rad/s": ("deg/s", math.degrees(1.0))}
+
+
+def _number(value: float | None, factor: float) -> str:
+    return "-" if value is None else f"{value * factor:.4g}"
