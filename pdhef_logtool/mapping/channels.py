@@ -1,0 +1,308 @@
+"""Mapped fields into channels: SI values on the log's clock, cleaned, with every dropped sample counted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
+from pdhef_logtool.mapping.checking import resolve_mapping
+from pdhef_logtool.mapping.clocks import ClockModel, apply_clock, clock_key, raw_stamps, stamp_request
+from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
+from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
+
+#: A gate sample holds for this many of its periods, then the truth's quality is unknown.
+GATE_HOLD_PERIODS = 2.0
+#: How much earlier or later than the truth a gate message with the same stamp may be recorded.
+GATE_MARGIN_NS = 2_000_000_000
+
+#: What a loss of each kind says; counts and spans stand beside it.
+LOSS_TEXTS = {
+    "bad-stamp": "messages without a usable stamp (zero, negative or not a number) were dropped",
+    "nan": "samples that are not a number were dropped",
+    "out-of-range": "samples outside valid_min and valid_max were dropped",
+    "duplicate-stamp": "messages that repeat the stamp of another were dropped, the first to arrive was kept",
+    "out-of-order": "messages were recorded after later ones and sorted back by stamp",
+    "truth-quality": "truth samples that the quality gate rejects were dropped",
+    "delay-unknown": "log time is not 0 to 1 s after the stamps: the delay is unknown, arrival is taken as the stamp",
+}
+LOST_KINDS = frozenset({"nan", "bad-stamp"})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedChannels:
+    """Channels of one window of log time; every mapped name is there, if need be with no samples."""
+
+    signals: dict[str, Channel]
+    truth: dict[str, Channel]
+    losses: tuple[Loss, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CleanSamples:
+    """Samples in ascending, unique stamps; ``*_at`` are the indices of the samples that were dropped."""
+
+    stamps_ns: IntArray
+    arrival_ns: IntArray
+    values: FloatArray
+    nan_at: IntArray
+    out_of_range_at: IntArray
+
+
+def clean_samples(
+    stamps_ns: IntArray,
+    arrival_ns: IntArray,
+    values: FloatArray,
+    *,
+    valid_min: float | None = None,
+    valid_max: float | None = None,
+) -> CleanSamples:
+    """Drop what is not finite or out of range, sort by stamp, and keep the first arrival of each stamp.
+
+    The result does not depend on the order of the samples: samples of one stamp and one arrival are told apart by
+    value, the smallest first.
+
+    Parameters
+    ----------
+    stamps_ns, arrival_ns : int64 [N].
+    values : float64 [N] or [N, k]; a row counts as bad when any of its entries is.
+    """
+    columns = values if values.ndim == 2 else values[:, np.newaxis]
+    finite = np.isfinite(columns).all(axis=1)
+    in_range = np.ones(values.shape[0], np.bool_)
+    with np.errstate(invalid="ignore"):
+        if valid_min is not None:
+            in_range &= (columns >= valid_min).all(axis=1)
+        if valid_max is not None:
+            in_range &= (columns <= valid_max).all(axis=1)
+    keep = finite & in_range
+    nan_at = np.flatnonzero(~finite)
+    out_of_range_at = np.flatnonzero(finite & ~in_range)
+    if not keep.all():
+        stamps_ns, arrival_ns, values, columns = stamps_ns[keep], arrival_ns[keep], values[keep], columns[keep]
+    if stamps_ns.shape[0] > 1 and not np.all(stamps_ns[1:] > stamps_ns[:-1]):
+        # The values come last among the keys, so that even equal stamps and arrivals leave nothing to the order.
+        order = np.lexsort((*columns.T[::-1], arrival_ns, stamps_ns))
+        ordered = stamps_ns[order]
+        order = order[np.concatenate([[True], ordered[1:] > ordered[:-1]])]
+        stamps_ns, arrival_ns, values = stamps_ns[order], arrival_ns[order], values[order]
+    return CleanSamples(stamps_ns, arrival_ns, values, nan_at, out_of_range_at)
+
+
+def gate_mask(
+    stamps_ns: IntArray, gate_stamps_ns: IntArray, gate_values: FloatArray, gate: QualityGate, hold_ns: int
+) -> BoolArray:
+    """Return where truth may be used: the last gate sample at or before a stamp passes and is at most ``hold_ns`` old.
+
+    Parameters
+    ----------
+    stamps_ns : int64 [N], truth.
+    gate_stamps_ns, gate_values : int64 [M] ascending, float64 [M]; NaN never passes.
+    """
+    if gate_stamps_ns.shape[0] == 0:
+        return np.zeros(stamps_ns.shape[0], np.bool_)
+    passes = np.zeros(gate_values.shape[0], np.bool_)
+    if gate.minimum is not None or gate.maximum is not None:
+        low = -np.inf if gate.minimum is None else gate.minimum
+        high = np.inf if gate.maximum is None else gate.maximum
+        passes |= (gate_values >= low) & (gate_values <= high)
+    if gate.values:
+        passes |= np.isin(gate_values, np.asarray(gate.values))
+    last = np.searchsorted(gate_stamps_ns, stamps_ns, side="right") - 1
+    known = last >= 0
+    last = np.maximum(last, 0)
+    return np.asarray(known & passes[last] & (stamps_ns - gate_stamps_ns[last] <= hold_ns), dtype=np.bool_)
+
+
+def read_signals(
+    log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], start_ns: int, end_ns: int
+) -> MappedChannels:
+    """Read the mapped fields of the messages with log time in [start, end) into clean channels.
+
+    Each topic is read once. With the same ``clocks`` the windows of a log, joined by :func:`join_channels`, give the
+    same channels as one window over all of it.
+
+    Parameters
+    ----------
+    clocks : from :func:`pdhef_logtool.mapping.fit_clocks` over the whole span that is going to be read.
+    """
+    resolved = resolve_mapping(log, mapping)
+    gate = resolved.quality
+    gate_source = gate.as_source() if gate is not None else None
+    requests: dict[str, list[str]] = {}
+    for source in (*resolved.signals.values(), *resolved.truth.values()):
+        _request(log, source, requests)
+    columns = log.read(requests, start_ns, end_ns) if requests else {}
+    losses = _topic_losses(log, resolved, clocks, columns)
+    signals = {n: _channel(log, s, SIGNAL_UNITS[n], clocks, columns, losses) for n, s in resolved.signals.items()}
+    truth = {n: _channel(log, s, TRUTH_UNITS[n], clocks, columns, losses) for n, s in resolved.truth.items()}
+    if gate is not None and gate_source is not None and truth:
+        truth = _apply_gate(log, gate, gate_source, truth, clocks, start_ns, end_ns, losses)
+    return MappedChannels(signals=signals, truth=truth, losses=merge_losses([losses]))
+
+
+def join_channels(parts: Sequence[Channel]) -> Channel:
+    """Join the windows of one channel; a stamp that two windows hold is kept as it arrived first."""
+    first = parts[0]
+    joined = clean_samples(
+        np.concatenate([p.stamps_ns for p in parts]),
+        np.concatenate([p.arrival_ns for p in parts]),
+        np.concatenate([p.values for p in parts]),
+    )
+    return replace(first, stamps_ns=joined.stamps_ns, arrival_ns=joined.arrival_ns, values=joined.values)
+
+
+def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
+    """Add up losses of one kind at one place, in order of first sight; spans are united."""
+    merged: dict[tuple[str, str, str, str], Loss] = {}
+    for loss in (x for part in parts for x in part):
+        key = (loss.kind, loss.where, loss.what, loss.severity)
+        old = merged.get(key)
+        if old is None:
+            merged[key] = loss
+            continue
+        starts = [x for x in (old.start_ns, loss.start_ns) if x is not None]
+        ends = [x for x in (old.end_ns, loss.end_ns) if x is not None]
+        counted = old.count is not None or loss.count is not None
+        merged[key] = replace(
+            old,
+            start_ns=min(starts) if starts else None,
+            end_ns=max(ends) if ends else None,
+            count=(old.count or 0) + (loss.count or 0) if counted else None,
+        )
+    return tuple(merged.values())
+
+
+def _request(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
+    paths = requests.setdefault(source.topic, [])
+    paths += [p for p in (*stamp_request(log, source), *source.paths) if p not in paths]
+
+
+def _loss(kind: str, where: str, log_time_ns: IntArray) -> Loss:
+    return Loss(
+        kind=kind,
+        what=LOSS_TEXTS[kind],
+        where=where,
+        start_ns=int(log_time_ns.min()) if log_time_ns.shape[0] else None,
+        end_ns=int(log_time_ns.max()) + 1 if log_time_ns.shape[0] else None,
+        count=int(log_time_ns.shape[0]),
+        severity="lost" if kind in LOST_KINDS else "note",
+    )
+
+
+def _topic_losses(
+    log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], columns: dict[str, Columns]
+) -> list[Loss]:
+    """Count what concerns a topic's stamps once, however many signals the topic provides."""
+    losses: list[Loss] = []
+    seen: set[str] = set()
+    for source in (*mapping.signals.values(), *mapping.truth.values()):
+        key = clock_key(source)
+        if key in seen or source.topic not in columns:
+            continue
+        seen.add(key)
+        topic = columns[source.topic]
+        stamps, usable = raw_stamps(log, topic, source)
+        times = topic.log_time_ns
+        if not usable.all():
+            losses.append(_loss("bad-stamp", source.topic, times[~usable]))
+            stamps, times = stamps[usable], times[usable]
+        if stamps.shape[0] > 1 and not np.all(stamps[1:] > stamps[:-1]):
+            late = np.concatenate([[False], stamps[1:] < np.maximum.accumulate(stamps)[:-1]])
+            if late.any():
+                losses.append(_loss("out-of-order", source.topic, times[late]))
+            order = np.argsort(stamps, kind="stable")
+            repeated = np.concatenate([[False], stamps[order][1:] == stamps[order][:-1]])
+            if repeated.any():
+                losses.append(_loss("duplicate-stamp", source.topic, times[order[repeated]]))
+        clock = clocks.get(key)
+        if clock is not None and not clock.delay_known:
+            losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.topic, severity="note"))
+    return losses
+
+
+def _channel(
+    log: DriveLog,
+    source: SignalSource,
+    unit: str,
+    clocks: dict[str, ClockModel],
+    columns: dict[str, Columns],
+    losses: list[Loss],
+) -> Channel:
+    topic = columns.get(source.topic)
+    if topic is None or len(topic) == 0:
+        empty = np.empty(0, np.int64)
+        shape = (0,) if source.columns == 1 else (0, source.columns)
+        return Channel(source.name, unit, source.label, empty, empty, np.empty(shape))
+    stamps, usable = raw_stamps(log, topic, source)
+    values = si_values(topic, source)
+    log_time = topic.log_time_ns
+    if not usable.all():
+        stamps, values, log_time = stamps[usable], values[usable], log_time[usable]
+    clock = clocks.get(clock_key(source), ClockModel())
+    on_log_clock = apply_clock(stamps, clock)
+    measured = on_log_clock - np.int64(round(source.latency_s * 1e9))
+    arrival = np.maximum(log_time if clock.delay_known else on_log_clock, measured)
+    clean = clean_samples(measured, arrival, values, valid_min=source.valid_min, valid_max=source.valid_max)
+    where = f"{source.name} ({source.label})"
+    if clean.nan_at.shape[0]:
+        losses.append(_loss("nan", where, log_time[clean.nan_at]))
+    if clean.out_of_range_at.shape[0]:
+        losses.append(_loss("out-of-range", where, log_time[clean.out_of_range_at]))
+    return Channel(source.name, unit, source.label, clean.stamps_ns, clean.arrival_ns, clean.values)
+
+
+def si_values(topic: Columns, source: SignalSource) -> FloatArray:
+    """Return ``scale * raw + offset`` of a source: [N], or [N, k] for a vector."""
+    parts = [np.asarray(topic.fields[p], dtype=np.float64) for p in source.paths]
+    raw = parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
+    width = source.columns
+    n = raw.shape[0]
+    if width > 1 and raw.ndim == 2 and raw.shape[1] != width:
+        raw = np.full((n, width), np.nan)  # Not the vector that the signal is: every sample is counted as lost.
+    elif (width > 1 and raw.ndim == 1) or (width == 1 and raw.ndim == 2):
+        raw = np.full((n, width) if width > 1 else n, np.nan)
+    return np.asarray(raw * np.asarray(source.scale) + np.asarray(source.offset), dtype=np.float64)
+
+
+def _apply_gate(
+    log: DriveLog,
+    gate: QualityGate,
+    source: SignalSource,
+    truth: dict[str, Channel],
+    clocks: dict[str, ClockModel],
+    start_ns: int,
+    end_ns: int,
+    losses: list[Loss],
+) -> dict[str, Channel]:
+    clock = clocks.get(clock_key(source), ClockModel())
+    period_ns = clock.median_period_s * 1e9
+    # A gate that was sent once holds for the whole log.
+    hold_ns = int(GATE_HOLD_PERIODS * period_ns) if np.isfinite(period_ns) else max(0, log.end_ns - log.start_ns)
+    requests: dict[str, list[str]] = {}
+    _request(log, source, requests)
+    # Truth in this window may hang on a gate message that was recorded before the window, or after it.
+    columns = log.read(requests, start_ns - hold_ns - GATE_MARGIN_NS, end_ns + GATE_MARGIN_NS)
+    topic = columns.get(source.topic)
+    stamps = np.empty(0, np.int64)
+    values = np.empty(0)
+    if topic is not None and len(topic):
+        raw, usable = raw_stamps(log, topic, source)
+        at = apply_clock(raw[usable], clock) - np.int64(round(source.latency_s * 1e9))
+        raw_values = si_values(topic, source)[usable]
+        order = np.lexsort((raw_values, topic.log_time_ns[usable], at))
+        stamps, values = at[order], raw_values[order]
+    gated: dict[str, Channel] = {}
+    for name, channel in truth.items():
+        keep = gate_mask(channel.stamps_ns, stamps, values, gate, hold_ns)
+        if not keep.all():
+            losses.append(_loss("truth-quality", f"{name} ({gate.describe()})", channel.arrival_ns[~keep]))
+        gated[name] = replace(
+            channel,
+            stamps_ns=channel.stamps_ns[keep],
+            arrival_ns=channel.arrival_ns[keep],
+            values=channel.values[keep],
+        )
+    return gated

@@ -1,0 +1,141 @@
+"""What a mapping says against what a log holds: names, near misses, and which stamp each source uses."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from difflib import get_close_matches
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo
+from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, SignalSource
+
+#: Where messages keep their measurement time, best first.
+STAMP_PATHS = ("header.stamp", "stamp")
+
+#: Names that seconds and nanoseconds have in encodings without a time type.
+SECONDS_NAMES = ("sec", "secs")
+NANOSECONDS_NAMES = ("nanosec", "nsec", "nsecs")
+
+_INDEX = re.compile(r"\[\d*\]")
+
+
+def stamp_path_of(fields: tuple[FieldInfo, ...]) -> str:
+    """Return the measurement time's path in a schema, or ``log_time`` where the schema has none."""
+    times = {f.path for f in fields if f.kind == "time"}
+    paths = {f.path for f in fields}
+    for path in STAMP_PATHS:
+        if path in times or split_stamp(path, paths) is not None:
+            return path
+    return RECORDER_STAMPS[0]
+
+
+def split_stamp(path: str, paths: set[str]) -> tuple[str, str] | None:
+    """Return the paths of a stamp's seconds and nanoseconds where a schema writes them as two numbers."""
+    for seconds in SECONDS_NAMES:
+        for nanoseconds in NANOSECONDS_NAMES:
+            pair = (f"{path}.{seconds}", f"{path}.{nanoseconds}")
+            if pair[0] in paths and pair[1] in paths:
+                return pair
+    return None
+
+
+def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:
+    """Return the mapping with every ``auto`` stamp replaced by what the log's schemas offer."""
+
+    def resolved(source: SignalSource) -> SignalSource:
+        return replace(source, stamp=stamp_path_of(log.fields(source.topic)))
+
+    if all(s.stamp != AUTO_STAMP for s in mapping.sources()):
+        return mapping
+    known = {t.name for t in log.topics}
+    auto = {s.topic for s in mapping.sources() if s.stamp == AUTO_STAMP and s.topic in known}
+    quality = mapping.quality
+    if quality is not None and quality.stamp == AUTO_STAMP and quality.topic in auto:
+        quality = replace(quality, stamp=stamp_path_of(log.fields(quality.topic)))
+    return replace(
+        mapping,
+        signals={
+            n: resolved(s) if s.stamp == AUTO_STAMP and s.topic in auto else s for n, s in mapping.signals.items()
+        },
+        truth={n: resolved(s) if s.stamp == AUTO_STAMP and s.topic in auto else s for n, s in mapping.truth.items()},
+        quality=quality,
+    )
+
+
+def check_mapping(mapping: Mapping, log: DriveLog) -> None:
+    """Check that the log holds every topic and field that the mapping names.
+
+    Raises
+    ------
+    MappingError
+        Topics, fields or stamps are not in the log; all are named, with the nearest that are.
+    """
+    topics = {t.name: t for t in log.topics}
+    problems: list[str] = []
+    for source in mapping.sources():
+        if source.topic not in topics:
+            problems.append(f"{source.name}: no topic {source.topic}{_near(source.topic, set(topics))}")
+            continue
+        fields = log.fields(source.topic)
+        if not fields:
+            continue  # The encoding carries no schema: only reading can tell.
+        problems += [f"{source.name}: {text}" for text in _field_problems(source, fields)]
+    if problems:
+        raise MappingError(
+            expected="topics and fields of this log",
+            got="; ".join(dict.fromkeys(problems)),
+            where=str(log.path),
+            remedy="pdhef inspect lists the topics, --write-mapping writes a mapping to start from",
+        )
+
+
+def _field_problems(source: SignalSource, fields: tuple[FieldInfo, ...]) -> list[str]:
+    kinds = {f.path: f.kind for f in fields}
+    problems = []
+    for path in source.paths:
+        kind = _kind_of(path, kinds)
+        if kind is None:
+            problems.append(f"{source.topic} has no field {path}{_near(path, set(kinds))}")
+        elif kind not in ("number", "bool", "struct"):
+            problems.append(f"{source.topic}.{path} is a {kind}, not a number")
+        elif kind == "struct" and (source.columns == 1 or len(source.paths) > 1):
+            below = next(p for p in kinds if p.startswith((f"{path}.", f"{path}[")))
+            problems.append(f"{source.topic}.{path} is no single number: name one, such as {below}")
+        elif kind != "struct" and source.columns > 1 and len(source.paths) == 1 and f"{path}[]" not in kinds:
+            problems.append(f"{source.topic}.{path} is one number, {source.name} needs {source.columns}")
+    if source.stamp in RECORDER_STAMPS or source.stamp == AUTO_STAMP:
+        return problems
+    kind = _kind_of(source.stamp, kinds)
+    if kind is None:
+        times = {p for p, k in kinds.items() if k == "time"} | set(RECORDER_STAMPS)
+        problems.append(f"{source.topic} has no stamp {source.stamp}{_near(source.stamp, times)}")
+    elif source.stamp_unit == "ros" and kind == "number":
+        problems.append(f"stamp {source.topic}.{source.stamp} is a number: give stamp_unit (s, ms, us or ns)")
+    elif source.stamp_unit == "ros" and kind == "struct" and split_stamp(source.stamp, set(kinds)) is None:
+        problems.append(f"stamp {source.topic}.{source.stamp} is no time")
+    elif source.stamp_unit != "ros" and kind != "number":
+        problems.append(f'stamp {source.topic}.{source.stamp} is a {kind}: stamp_unit = "{source.stamp_unit}" is wrong')
+    return problems
+
+
+def _kind_of(path: str, kinds: dict[str, str]) -> str | None:
+    """Return the kind of a path: a leaf, an element of a sequence, or ``struct`` for what has leaves below it."""
+    if path in kinds:
+        return kinds[path]
+    as_sequence = _INDEX.sub("[]", path)
+    for known, kind in kinds.items():
+        if _INDEX.sub("[]", known) == as_sequence and (known == as_sequence or "[]" in known):
+            return kind
+    if any(k.startswith((f"{path}.", f"{path}[")) for k in kinds):
+        return "struct"
+    return None
+
+
+def _near(name: str, known: set[str]) -> str:
+    close = get_close_matches(name, sorted(known), n=1, cutoff=0.5)
+    if close:
+        return f" (did you mean {close[0]}?)"
+    tail = name.rsplit(".", 1)[-1].rsplit("/", 1)[-1]
+    same_tail = sorted(k for k in known if k.rsplit(".", 1)[-1].rsplit("/", 1)[-1] == tail)
+    return f" (did you mean {same_tail[0]}?)" if same_tail else ""

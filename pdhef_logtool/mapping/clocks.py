@@ -1,0 +1,243 @@
+"""Stamps onto the log's clock: offset and drift of device clocks, and whether the transport delay is credible."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
+from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
+from pdhef_logtool.mapping.records import RECORDER_STAMPS, Clock, Mapping, SignalSource, StampUnit
+from pdhef_logtool.signals import FloatArray, IntArray
+
+NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
+
+#: A longer median delay is no transport delay but two clocks that disagree.
+MAX_CREDIBLE_DELAY_NS = 1_000_000_000
+
+#: Logs up to this length are surveyed as a whole, longer ones in evenly spread windows.
+SURVEY_WHOLE_NS = 600_000_000_000
+SURVEY_WINDOWS = 30
+SURVEY_WINDOW_NS = 10_000_000_000
+
+#: The lower envelope is taken from this quantile of the delays in each of at most this many bins.
+ENVELOPE_BINS = 64
+ENVELOPE_QUANTILE = 0.02
+MIN_BIN_SAMPLES = 20
+
+
+@dataclass(frozen=True, slots=True)
+class ClockModel:
+    """How the stamps of one topic relate to the log's clock.
+
+    ``log = reference_log_ns + (stamp - reference_stamp_ns) * (1 + drift)``; the identity for ``utc`` stamps. A
+    device clock's offset is only known up to the smallest transport delay: give that as ``latency_s``.
+
+    Attributes
+    ----------
+    delay_known : False where log time − stamp is systematically negative or above 1 s; the arrival is then the stamp.
+    median_delay_s, p95_delay_s, min_delay_s : of log time − stamp on the log's clock; NaN without samples.
+    residual_s : largest deviation of the envelope from the fitted line; a clock that stepped shows here.
+    median_period_s : median step between stamps; NaN with fewer than two.
+    samples : messages that the survey saw.
+    """
+
+    reference_stamp_ns: int = 0
+    reference_log_ns: int = 0
+    drift: float = 0.0
+    delay_known: bool = True
+    median_delay_s: float = float("nan")
+    p95_delay_s: float = float("nan")
+    min_delay_s: float = float("nan")
+    residual_s: float = 0.0
+    median_period_s: float = float("nan")
+    samples: int = 0
+
+
+def clock_key(source: SignalSource) -> str:
+    """Return the key of a source's clock: the topic and the stamp it uses."""
+    return f"{source.topic}.{source.stamp}"
+
+
+def apply_clock(stamps_ns: IntArray, clock: ClockModel) -> IntArray:
+    """Turn device stamps [N] into the log's clock [N]; the identity without offset and drift."""
+    since_ns = np.asarray(stamps_ns - np.int64(clock.reference_stamp_ns), dtype=np.int64)
+    shifted = np.asarray(since_ns + np.int64(clock.reference_log_ns), dtype=np.int64)
+    if clock.drift == 0.0:
+        return shifted
+    return np.asarray(shifted + np.rint(since_ns * clock.drift).astype(np.int64), dtype=np.int64)
+
+
+def fit_clock_line(stamps_ns: IntArray, log_time_ns: IntArray) -> tuple[int, int, float, float]:
+    """Fit offset and drift of a device clock to the lower envelope of log time − stamp.
+
+    The delay of a message is never negative, so that the messages that came fastest show the clocks' relation. A
+    low quantile in each bin keeps single early messages from deciding; the slope is the median over pairs of bins
+    (Theil–Sen), which one bin without a fast message cannot turn.
+
+    Parameters
+    ----------
+    stamps_ns, log_time_ns : int64 [N], N ≥ 1, any order.
+
+    Returns
+    -------
+    reference stamp in ns, reference log time in ns, drift, and the largest residual of the bins in seconds.
+    """
+    order = np.lexsort((log_time_ns, stamps_ns))
+    stamps, delays = stamps_ns[order], (log_time_ns - stamps_ns)[order]
+    reference = int(stamps[0])
+    base = int(delays.min())
+    bins = min(ENVELOPE_BINS, max(1, stamps.shape[0] // MIN_BIN_SAMPLES))
+    at_s, low_s = np.empty(bins), np.empty(bins)
+    for i, chunk in enumerate(np.array_split(np.arange(stamps.shape[0]), bins)):
+        in_bin = (delays[chunk] - base) * 1e-9
+        low = np.quantile(in_bin, ENVELOPE_QUANTILE, method="lower")
+        low_s[i] = low
+        at_s[i] = float((stamps[chunk[np.argmin(np.abs(in_bin - low))]] - reference) * 1e-9)
+    first, second = np.triu_indices(bins, 1)
+    apart = at_s[second] - at_s[first]
+    usable = apart > 0.0
+    drift = 0.0
+    if np.any(usable):
+        drift = float(np.median((low_s[second] - low_s[first])[usable] / apart[usable]))
+    residual_s = low_s - drift * at_s
+    offset_s = float(np.median(residual_s))
+    worst_s = float(np.abs(residual_s - offset_s).max())
+    return reference, reference + base + round(offset_s * 1e9), drift, worst_s
+
+
+def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> dict[str, ClockModel]:
+    """Survey the stamps of every mapped topic once, so that all windows of a log use the same clocks.
+
+    Parameters
+    ----------
+    start_ns, end_ns : the whole span that will be read, [start, end) in log time.
+
+    Returns
+    -------
+    dict
+        by :func:`clock_key`; one entry for each topic and stamp in use.
+
+    Raises
+    ------
+    MappingError
+        A device clock has no usable stamp in the span.
+    """
+    resolved = resolve_mapping(log, mapping)
+    wanted: dict[str, SignalSource] = {}
+    for source in resolved.sources():
+        wanted.setdefault(clock_key(source), source)
+    requests: dict[str, list[str]] = {}
+    for source in wanted.values():
+        paths = requests.setdefault(source.topic, [])
+        paths += [p for p in stamp_request(log, source) if p not in paths]
+    stamps: dict[str, list[IntArray]] = {key: [] for key in wanted}
+    times: dict[str, list[IntArray]] = {key: [] for key in wanted}
+    steps: dict[str, list[FloatArray]] = {key: [] for key in wanted}
+    for window_start, window_end in _survey_windows(start_ns, end_ns):
+        columns = log.read(requests, window_start, window_end)
+        for key, source in wanted.items():
+            if source.topic not in columns:
+                continue
+            raw, usable = raw_stamps(log, columns[source.topic], source)
+            stamps[key].append(raw[usable])
+            times[key].append(columns[source.topic].log_time_ns[usable])
+            steps[key].append(np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9)
+    return {
+        key: _clock_of(
+            source,
+            np.concatenate(stamps[key]) if stamps[key] else np.empty(0, np.int64),
+            np.concatenate(times[key]) if times[key] else np.empty(0, np.int64),
+            np.concatenate(steps[key]) if steps[key] else np.empty(0),
+        )
+        for key, source in wanted.items()
+    }
+
+
+def stamp_request(log: DriveLog, source: SignalSource) -> tuple[str, ...]:
+    """Return the field paths to read for a source's stamp; none for the recorder's times."""
+    if source.stamp in RECORDER_STAMPS:
+        return ()
+    if source.stamp_unit == "ros":
+        fields = log.fields(source.topic)
+        if not any(f.path == source.stamp and f.kind == "time" for f in fields):
+            pair = split_stamp(source.stamp, {f.path for f in fields})
+            if pair is not None:
+                return pair
+    return (source.stamp,)
+
+
+def raw_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Return a topic's stamps in nanoseconds [N] and where they are usable [N] (finite and positive)."""
+    if source.stamp == "log_time":
+        return columns.log_time_ns, columns.log_time_ns > 0
+    if source.stamp == "publish_time":
+        return columns.publish_time_ns, columns.publish_time_ns > 0
+    paths = stamp_request(log, source)
+    parts = [np.asarray(columns.fields[p]) for p in paths]
+    if len(parts) == 2:
+        return _to_nanoseconds(parts, ("s", "ns"))
+    unit: StampUnit = source.stamp_unit
+    return _to_nanoseconds(parts, ("ns" if unit == "ros" else unit,))
+
+
+def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) -> tuple[IntArray, NDArray[np.bool_]]:
+    total = np.zeros(parts[0].shape[0], np.int64)
+    usable = np.ones(parts[0].shape[0], np.bool_)
+    for part, unit in zip(parts, units, strict=True):
+        if part.dtype.kind in "iu":
+            total += part.astype(np.int64) * np.int64(NANOSECONDS[unit])
+            continue
+        scale = NANOSECONDS[unit]
+        finite = np.isfinite(part.astype(np.float64)) & (np.abs(part.astype(np.float64)) < 9.2e18 / scale)
+        usable &= finite
+        number = np.where(finite, part.astype(np.float64), 0.0)
+        # Whole and fractional parts apart: a float64 of nanoseconds since 1970 has steps of 256 ns.
+        whole = np.floor(number)
+        total += whole.astype(np.int64) * np.int64(scale) + np.rint((number - whole) * scale).astype(np.int64)
+    return total, usable & (total > 0)
+
+
+def _survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+    if end_ns - start_ns <= SURVEY_WHOLE_NS:
+        return list(windows(start_ns, end_ns, max(1, end_ns - start_ns)))
+    starts = np.linspace(start_ns, end_ns - SURVEY_WINDOW_NS, SURVEY_WINDOWS).astype(np.int64)
+    return [(int(s), int(s) + SURVEY_WINDOW_NS) for s in starts]
+
+
+def _clock_of(source: SignalSource, stamps_ns: IntArray, log_time_ns: IntArray, steps_s: FloatArray) -> ClockModel:
+    clock: Clock = source.clock
+    n = int(stamps_ns.shape[0])
+    period_s = float(np.median(steps_s)) if steps_s.shape[0] else float("nan")
+    if n == 0:
+        if clock == "device":
+            raise MappingError(
+                expected="stamps of the device clock",
+                got="no usable stamp in the span that is read",
+                where=f"{source.topic}.{source.stamp}",
+                remedy='use stamp = "log_time"',
+            )
+        return ClockModel()
+    reference, reference_log, drift, residual_s = 0, 0, 0.0, 0.0
+    if clock == "device":
+        reference, reference_log, drift, residual_s = fit_clock_line(stamps_ns, log_time_ns)
+    line = ClockModel(reference_stamp_ns=reference, reference_log_ns=reference_log, drift=drift)
+    delays_ns = log_time_ns - apply_clock(stamps_ns, line)
+    median_ns = float(np.median(delays_ns))
+    low_ns, high_ns = (float(q) for q in np.quantile(delays_ns, [0.0, 0.95]))
+    known = clock == "device" or 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS
+    return ClockModel(
+        reference_stamp_ns=reference,
+        reference_log_ns=reference_log,
+        drift=drift,
+        delay_known=known,
+        median_delay_s=median_ns * 1e-9,
+        p95_delay_s=high_ns * 1e-9,
+        min_delay_s=low_ns * 1e-9,
+        residual_s=residual_s,
+        median_period_s=period_s,
+        samples=n,
+    )

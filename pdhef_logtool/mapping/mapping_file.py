@@ -1,0 +1,362 @@
+"""mapping.toml: strict reading, and writing ready to edit (DESIGN §8)."""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping as MappingABC
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.mapping.records import (
+    AUTO_STAMP,
+    RECORDER_STAMPS,
+    VECTOR_COLUMNS,
+    Clock,
+    Mapping,
+    QualityGate,
+    SignalSource,
+    StampUnit,
+)
+from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, WHEELS
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1)]
+
+
+class _Timed(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    topic: Name
+    stamp: Name = AUTO_STAMP
+    latency_s: Finite = 0.0
+    stamp_unit: StampUnit = "ros"
+    clock: Clock = "utc"
+
+    @model_validator(mode="after")
+    def _device_clock_has_a_stamp(self) -> _Timed:
+        if self.clock == "device" and self.stamp in RECORDER_STAMPS:
+            raise ValueError(f'clock = "device" needs a stamp of the device, not "{self.stamp}"')
+        return self
+
+
+class _SourceTable(_Timed):
+    field: Name | Annotated[list[Name], Field(min_length=1)]
+    scale: Finite | list[Finite] = 1.0
+    offset: Finite | list[Finite] = 0.0
+    valid_min: Finite | None = None
+    valid_max: Finite | None = None
+
+    @model_validator(mode="after")
+    def _values_make_sense(self) -> _SourceTable:
+        if any(s == 0.0 for s in (self.scale if isinstance(self.scale, list) else [self.scale])):
+            raise ValueError("scale must not be 0")
+        if self.valid_min is not None and self.valid_max is not None and self.valid_min >= self.valid_max:
+            raise ValueError("valid_min must be below valid_max")
+        return self
+
+
+class _GateTable(_Timed):
+    field: Name
+    min: Finite | None = None
+    max: Finite | None = None
+    values: list[Finite] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _has_a_condition(self) -> _GateTable:
+        if self.min is None and self.max is None and not self.values:
+            raise ValueError("give min, max or values")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise ValueError("min must not be above max")
+        return self
+
+
+def load_mapping(path: Path) -> Mapping:
+    """Read mapping.toml.
+
+    Raises
+    ------
+    MappingError
+        The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
+    """
+    try:
+        with path.open("rb") as f:
+            raw: dict[str, Any] = tomllib.load(f)
+    except FileNotFoundError:
+        raise MappingError(expected="a mapping TOML file", got="no such file", where=str(path)) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise MappingError(expected="a mapping TOML file", got=str(error), where=str(path)) from None
+    return mapping_from_dict(raw, where=str(path))
+
+
+def mapping_from_dict(raw: dict[str, Any], *, where: str) -> Mapping:
+    """Build a mapping from parsed TOML; every problem is reported in one line.
+
+    Raises
+    ------
+    MappingError
+        Entries are wrong, unknown, missing or contradict one another.
+    """
+    problems: list[str] = []
+    sections = ("signals", "truth", "truth_quality")
+    problems += [f"{key}: unknown table{_near(key, sections)}" for key in raw if key not in sections]
+    signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
+    truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
+    quality = _read_gate(raw["truth_quality"], problems) if "truth_quality" in raw else None
+    mapping = Mapping(signals=signals, truth=truth, quality=quality, origin="file")
+    problems += _contradictions(mapping)
+    if problems:
+        raise MappingError(
+            expected="the entries of mapping.toml",
+            got="; ".join(problems),
+            where=where,
+            remedy="see docs/formats.md for every entry and its unit",
+        )
+    return mapping
+
+
+def _near(name: str, known: tuple[str, ...]) -> str:
+    close = get_close_matches(name, known, n=1, cutoff=0.5)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def _read_section(
+    raw: object, section: str, known: tuple[str, ...], other: tuple[str, ...], problems: list[str]
+) -> dict[str, SignalSource]:
+    if not isinstance(raw, dict):
+        problems.append(f"{section}: must be a table of tables, one a signal")
+        return {}
+    out: dict[str, SignalSource] = {}
+    for name, table in raw.items():
+        where = f"{section}.{name}"
+        if name not in known:
+            if name in other:
+                problems.append(f"{where}: belongs under [{'truth' if section == 'signals' else 'signals'}.{name}]")
+            else:
+                problems.append(f"{where}: unknown name{_near(name, known)}")
+            continue
+        try:
+            model = _SourceTable.model_validate(table)
+        except ValidationError as error:
+            problems += _pydantic_problems(error, where, tuple(_SourceTable.model_fields))
+            continue
+        problem = _shape_problem(name, model)
+        if problem:
+            problems.append(f"{where}: {problem}")
+            continue
+        out[name] = SignalSource(
+            name=name,
+            topic=model.topic,
+            field=tuple(model.field) if isinstance(model.field, list) else model.field,
+            stamp=model.stamp,
+            scale=tuple(model.scale) if isinstance(model.scale, list) else model.scale,
+            offset=tuple(model.offset) if isinstance(model.offset, list) else model.offset,
+            latency_s=model.latency_s,
+            valid_min=model.valid_min,
+            valid_max=model.valid_max,
+            stamp_unit=model.stamp_unit,
+            clock=model.clock,
+        )
+    return out
+
+
+def _shape_problem(name: str, model: _SourceTable) -> str:
+    columns = VECTOR_COLUMNS.get(name, 1)
+    for key, value in (("field", model.field), ("scale", model.scale), ("offset", model.offset)):
+        if isinstance(value, list) and columns == 1:
+            return f"{key} must be a single value, {name} is no vector"
+        if isinstance(value, list) and len(value) != columns:
+            return f"{key} must hold {columns} entries, got {len(value)}"
+    return ""
+
+
+def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
+    try:
+        model = _GateTable.model_validate(raw)
+    except ValidationError as error:
+        problems += _pydantic_problems(error, "truth_quality", tuple(_GateTable.model_fields))
+        return None
+    return QualityGate(
+        topic=model.topic,
+        field=model.field,
+        minimum=model.min,
+        maximum=model.max,
+        values=tuple(model.values),
+        stamp=model.stamp,
+        stamp_unit=model.stamp_unit,
+        clock=model.clock,
+        latency_s=model.latency_s,
+    )
+
+
+def _pydantic_problems(error: ValidationError, where: str, keys: tuple[str, ...]) -> list[str]:
+    found: dict[str, list[str]] = {}
+    for e in error.errors(include_url=False):
+        key = str(e["loc"][0]) if e["loc"] else ""
+        at = f"{where}.{key}" if key else where
+        if e["type"] == "extra_forbidden":
+            text = f"unknown entry{_near(key, keys)}"
+        elif e["type"] == "missing":
+            text = "is missing"
+        else:
+            text = e["msg"].removeprefix("Value error, ")
+        found.setdefault(at, []).append(text)
+    # A union reports one message an alternative; together they are one problem.
+    return [f"{at}: {' or '.join(dict.fromkeys(texts))}" for at, texts in found.items()]
+
+
+def _contradictions(mapping: Mapping) -> list[str]:
+    problems = []
+    pairs = [("steer_rad", "steering_wheel_rad")]
+    pairs += [(f"wheel_speed_{w}_m_s", f"wheel_speed_{w}_rad_s") for w in WHEELS]
+    problems += [
+        f"signals.{a} and signals.{b}: give one of them, not both"
+        for a, b in pairs
+        if a in mapping.signals and b in mapping.signals
+    ]
+    for section, sources in (("signals", mapping.signals), ("truth", mapping.truth)):
+        first: dict[tuple[str, tuple[str, ...]], str] = {}
+        for name, source in sources.items():
+            key = (source.topic, source.paths)
+            if key in first:
+                problems.append(f"{section}.{name}: duplicates {section}.{first[key]} ({source.label})")
+            first.setdefault(key, name)
+    units: dict[tuple[str, str], tuple[str, str]] = {}
+    for source in mapping.sources():
+        if source.stamp in RECORDER_STAMPS:
+            continue
+        kind = (source.stamp_unit, source.clock)
+        if units.setdefault((source.topic, source.stamp), kind) != kind:
+            problems.append(f"{source.name}: {source.topic}.{source.stamp} has another stamp_unit or clock elsewhere")
+    return problems
+
+
+# ------------------------------------------------------------------------------------------------ writing
+
+
+def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = None) -> str:
+    """Write a mapping as TOML that is ready to edit; ``load_mapping`` gives the same sources back.
+
+    Parameters
+    ----------
+    comments : text by signal or truth name, by ``truth_quality``, or under ``""`` for the head of the file; it
+        stands above the entry as a comment.
+
+    Signals that the mapping lacks appear as commented examples, so that they only need a topic and a field.
+    """
+    notes = dict(comments or {})
+    lines = [
+        "# Where each signal of the log comes from: value_SI = scale * raw + offset, measured at stamp - latency_s.",
+        "# ISO 8855: x forward, y left, z up; angles and rates are positive to the left. See docs/formats.md.",
+    ]
+    lines += _comment(notes.get("", ""))
+    for note in mapping.notes:
+        lines += _comment(note)
+    for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):
+        for name, source in sources.items():
+            lines.append("")
+            lines += _comment(notes.get(name, ""))
+            lines.append(f"[{section}.{name}]{' ' * max(1, 30 - len(section) - len(name))}# {units[name]}")
+            lines += _source_lines(source)
+    if mapping.quality is not None:
+        lines.append("")
+        lines += _comment(notes.get("truth_quality", "truth is kept where this holds"))
+        lines.append("[truth_quality]")
+        lines += _gate_lines(mapping.quality)
+    missing = missing_signals(mapping)
+    if missing:
+        lines += ["", "# Not mapped. To add one, remove the # and name its topic and field:"]
+        for name in missing:
+            lines += ["#", f"# [signals.{name}]{' ' * max(1, 21 - len(name))}# {SIGNAL_UNITS[name]}"]
+            lines += [f"# {text}" for text in _example_lines()]
+            lines += _comment(notes.get(name, ""))
+    if not mapping.truth:
+        lines += ["", "# No truth is mapped. For a comparison name at least a body velocity, for example:"]
+        for name in ("vx_m_s", "vy_m_s"):
+            lines += ["#", f"# [truth.{name}]{' ' * max(1, 23 - len(name))}# {TRUTH_UNITS[name]}"]
+            lines += [f"# {text}" for text in _example_lines()]
+    return "\n".join(lines) + "\n"
+
+
+def missing_signals(mapping: Mapping) -> tuple[str, ...]:
+    """Return the signals that an estimator looks for and the mapping lacks; the speed may come from any wheel."""
+    have = set(mapping.signals)
+    out = []
+    if not have & {"steer_rad", "steering_wheel_rad"}:
+        out.append("steer_rad")
+    out += [name for name in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s") if name not in have]
+    if "speed_m_s" not in have and not any(name.startswith("wheel_speed_") for name in have):
+        out.append("speed_m_s")
+    return tuple(out)
+
+
+def _example_lines() -> list[str]:
+    return [
+        'topic = "/..."',
+        'field = "..."          # dotted path, [3] indexes an array',
+        "scale = 1.0            # to SI and ISO 8855: 0.017453292519943295 for deg, 0.2777777777777778 for km/h",
+    ]
+
+
+def _source_lines(source: SignalSource) -> list[str]:
+    lines = [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}"]
+    if source.stamp != AUTO_STAMP:
+        lines.append(f"stamp = {_toml(source.stamp)}")
+    lines.append(f"scale = {_toml(source.scale)}")
+    for key in ("offset", "latency_s"):
+        value = getattr(source, key)
+        if value != 0.0:
+            lines.append(f"{key} = {_toml(value)}")
+    for key in ("valid_min", "valid_max"):
+        value = getattr(source, key)
+        if value is not None:
+            lines.append(f"{key} = {_toml(value)}")
+    if source.stamp_unit != "ros":
+        lines.append(f"stamp_unit = {_toml(source.stamp_unit)}")
+    if source.clock != "utc":
+        lines.append(f"clock = {_toml(source.clock)}")
+    return lines
+
+
+def _gate_lines(gate: QualityGate) -> list[str]:
+    lines = [f"topic = {_toml(gate.topic)}", f"field = {_toml(gate.field)}"]
+    if gate.stamp != AUTO_STAMP:
+        lines.append(f"stamp = {_toml(gate.stamp)}")
+    if gate.minimum is not None:
+        lines.append(f"min = {_toml(gate.minimum)}")
+    if gate.maximum is not None:
+        lines.append(f"max = {_toml(gate.maximum)}")
+    if gate.values:
+        lines.append(f"values = {_toml(gate.values)}")
+    if gate.latency_s != 0.0:
+        lines.append(f"latency_s = {_toml(gate.latency_s)}")
+    if gate.stamp_unit != "ros":
+        lines.append(f"stamp_unit = {_toml(gate.stamp_unit)}")
+    if gate.clock != "utc":
+        lines.append(f"clock = {_toml(gate.clock)}")
+    return lines
+
+
+def _toml(value: str | float | tuple[str, ...] | tuple[float, ...]) -> str:
+    if isinstance(value, str):
+        # A JSON string is a TOML basic string, but for DEL, which TOML wants escaped.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, tuple):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    number = float(value)
+    if not math.isfinite(number):
+        raise MappingError(expected="finite numbers in a mapping", got=repr(value), where="mapping")
+    return repr(number)
+
+
+def _comment(text: str) -> list[str]:
+    return [
+        "# " + "".join(c if c.isprintable() else " " for c in line).strip()
+        for line in text.splitlines()
+        if line.strip()
+    ]

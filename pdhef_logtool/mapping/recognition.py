@@ -1,0 +1,463 @@
+"""A mapping by recognising well-known message types; what is ambiguous is said, never guessed silently."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.checking import stamp_path_of
+from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
+from pdhef_logtool.signals import WHEELS, FloatArray
+
+#: Words of a topic's name that make it a reference to score against; never an input.
+TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys"})
+#: Words of satellite and inertial navigation: velocities and poses of such topics are truth, their IMU is a sensor.
+NAVIGATION_WORDS = frozenset(
+    {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk"}
+)
+#: Words of measured vehicle speed.
+VEHICLE_WORDS = frozenset({"wheel", "wheels", "odom", "odometry", "can", "vehicle", "encoder", "encoders", "speed"})
+COMMAND_WORDS = frozenset({"cmd", "command", "commands", "setpoint", "target", "desired", "control", "plan", "planner"})
+ESTIMATE_WORDS = frozenset(
+    {"filtered", "ekf", "ukf", "estimate", "estimated", "estimator", "localization", "slam", "fused", "kinematic"}
+)
+#: Words of IMUs that sit in another device than the vehicle's own.
+DEVICE_WORDS = frozenset(
+    {"camera", "lidar", "realsense", "zed", "ouster", "livox", "velodyne", "phone", "os1", "radar"}
+)
+
+PERFECT_PREFIX = "/truth/perfect"
+OWN_PREFIX = "/pdhef/"
+
+PROBE_NS = 2_000_000_000
+PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+TWIST_FIELDS = {
+    "nav_msgs/Odometry": "twist.twist",
+    "geometry_msgs/TwistStamped": "twist",
+    "geometry_msgs/TwistWithCovarianceStamped": "twist.twist",
+    "geometry_msgs/Twist": "",
+}
+POSE_FIELDS = {
+    "nav_msgs/Odometry": "pose.pose",
+    "geometry_msgs/PoseStamped": "pose",
+    "geometry_msgs/PoseWithCovarianceStamped": "pose.pose",
+}
+STEERING_FIELDS = {
+    "autoware_vehicle_msgs/SteeringReport": "steering_tire_angle",
+    "autoware_auto_vehicle_msgs/SteeringReport": "steering_tire_angle",
+    "ackermann_msgs/AckermannDriveStamped": "drive.steering_angle",
+    "ackermann_msgs/AckermannDrive": "steering_angle",
+}
+SPEED_FIELDS = {
+    "autoware_vehicle_msgs/VelocityReport": "longitudinal_velocity",
+    "autoware_auto_vehicle_msgs/VelocityReport": "longitudinal_velocity",
+}
+WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
+IMU_TYPES = frozenset({"sensor_msgs/Imu"})
+FIX_TYPES = frozenset({"sensor_msgs/NavSatFix"})
+
+
+@dataclass(frozen=True, slots=True)
+class Ambiguity:
+    """More than one reading of a log.
+
+    Attributes
+    ----------
+    subject : what could be read in several ways, for example ``imu``.
+    candidates : topics (and fields).
+    chosen : what was taken, None when nothing was.
+    reason : why.
+    remedy : how to decide.
+    """
+
+    subject: str
+    candidates: tuple[str, ...]
+    chosen: str | None
+    reason: str
+    remedy: str = "name the topic in a mapping file (pdhef inspect --write-mapping writes one)"
+
+    def __str__(self) -> str:
+        """One line for a report."""
+        taken = f"took {self.chosen}" if self.chosen else "took none"
+        return f"{self.subject}: {', '.join(self.candidates)}; {taken}: {self.reason}; {self.remedy}"
+
+
+@dataclass(frozen=True, slots=True)
+class AutoMapping:
+    """A recognised mapping, what was ambiguous in it, and the signals that no topic provides."""
+
+    mapping: Mapping
+    ambiguities: tuple[Ambiguity, ...]
+    missing: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class _Finding:
+    """What one call of :func:`auto_map` has gathered so far."""
+
+    log: DriveLog
+    samples: dict[str, dict[str, FloatArray]]
+    signals: dict[str, SignalSource] = field(default_factory=dict)
+    truth: dict[str, SignalSource] = field(default_factory=dict)
+    quality: QualityGate | None = None
+    ambiguities: list[Ambiguity] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def source(self, name: str, topic: str, path: str | tuple[str, ...]) -> SignalSource:
+        return SignalSource(name=name, topic=topic, field=path, stamp=stamp_path_of(self.log.fields(topic)))
+
+    def values(self, topic: str, path: str) -> FloatArray:
+        return self.samples.get(topic, {}).get(path, np.empty(0))
+
+    def is_given(self, topic: str, path: str) -> bool:
+        """Return whether a field holds anything: nothing seen counts as given, only NaN does not."""
+        seen = self.values(topic, path)
+        return seen.shape[0] == 0 or bool(np.isfinite(seen).any())
+
+    def is_disowned(self, topic: str, covariance: str) -> bool:
+        """Return whether the message says, by −1 in its covariance, that it does not provide a quantity (REP 145)."""
+        seen = self.values(topic, covariance)
+        return seen.shape[0] > 0 and bool((seen == -1.0).all())
+
+    def choose(
+        self, subject: str, topics: list[TopicInfo], rank: Callable[[TopicInfo], tuple[object, ...]], why: str
+    ) -> TopicInfo | None:
+        """Return the best topic, and record the choice when there was one."""
+        if not topics:
+            return None
+        ordered = sorted(topics, key=lambda t: (*rank(t), -t.messages, len(t.name), t.name))
+        if len(ordered) > 1:
+            self.ambiguities.append(
+                Ambiguity(subject, tuple(t.name for t in ordered), ordered[0].name, f"{why}, then most messages")
+            )
+        return ordered[0]
+
+
+def auto_map(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfect") -> AutoMapping:
+    """Map a log's topics to signals and truth by their types and names.
+
+    Parameters
+    ----------
+    prefer_truth : which truth to take from a simulated log, the perfect one under ``/truth/perfect`` or the
+        RTK-like one; a log with only one of them gets that.
+    """
+    topics = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
+    found = _Finding(log=log, samples=_probe(log, topics))
+    _map_imu(found, topics)
+    _map_steering(found, topics)
+    _map_speed(found, topics)
+    _map_wheel_speeds(found, topics)
+    _map_truth(found, topics, prefer_truth)
+    mapping = Mapping(
+        signals=found.signals, truth=found.truth, quality=found.quality, origin="auto", notes=tuple(found.notes)
+    )
+    return AutoMapping(mapping=mapping, ambiguities=tuple(found.ambiguities), missing=missing_signals(mapping))
+
+
+def _type(topic: TopicInfo) -> str:
+    return topic.type_name.replace("/msg/", "/")
+
+
+def _words(name: str) -> frozenset[str]:
+    parts = re.split(r"[^a-z0-9]+", name.lower())
+    words = {p for p in parts if p} | {p.rstrip("0123456789") for p in parts}
+    if "ground" in words and "truth" in words:
+        words.add("groundtruth")
+    return frozenset(words)
+
+
+def _is_ours(topic: TopicInfo) -> bool:
+    return topic.name.startswith(OWN_PREFIX) or _type(topic).startswith("pdhef_msgs/")
+
+
+def _is_truth(topic: TopicInfo) -> bool:
+    return bool(_words(topic.name) & (TRUTH_WORDS | NAVIGATION_WORDS))
+
+
+def _join(prefix: str, path: str) -> str:
+    return f"{prefix}.{path}" if prefix else path
+
+
+def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[str, dict[str, FloatArray]]:
+    """Read a few seconds here and there of what tells a measured field from a filler."""
+    requests: dict[str, list[str]] = {}
+    for topic in topics:
+        kind = _type(topic)
+        paths: list[str] = []
+        if kind in IMU_TYPES:
+            paths += ["linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z"]
+            paths += ["linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
+        if kind in TWIST_FIELDS:
+            base = TWIST_FIELDS[kind]
+            paths += [_join(base, p) for p in ("linear.x", "linear.y", "linear.z", "angular.z")]
+            if "Covariance" in kind or "Odometry" in kind:
+                paths.append("twist.covariance[0]")
+        if kind in POSE_FIELDS:
+            base = POSE_FIELDS[kind]
+            paths += [_join(base, f"position.{a}") for a in "xy"] + [_join(base, f"orientation.{a}") for a in "xyzw"]
+            if "Covariance" in kind or "Odometry" in kind:
+                paths.append("pose.covariance[0]")
+        if kind in FIX_TYPES:
+            paths += ["latitude", "longitude", "altitude", "status.status"]
+        if paths:
+            requests[topic.name] = paths
+    if not requests:
+        return {}
+    span = max(0, log.end_ns - log.start_ns - PROBE_NS)
+    starts = sorted({log.start_ns + int(span * at) for at in PROBE_AT})
+    pieces: dict[str, dict[str, list[FloatArray]]] = {t: {p: [] for p in paths} for t, paths in requests.items()}
+    for start in starts:
+        for name, columns in log.read(requests, start, start + PROBE_NS).items():
+            for path in requests[name]:
+                pieces[name][path].append(np.asarray(columns.fields[path], dtype=np.float64))
+    return {t: {p: np.concatenate(v) for p, v in paths.items() if v} for t, paths in pieces.items()}
+
+
+# ------------------------------------------------------------------------------------------------ sensors
+
+
+def _map_imu(found: _Finding, topics: list[TopicInfo]) -> None:
+    imus = [t for t in topics if _type(t) in IMU_TYPES and not _words(t.name) & TRUTH_WORDS]
+    imu = found.choose(
+        "imu",
+        imus,
+        lambda t: (bool(_words(t.name) & DEVICE_WORDS),),
+        "an IMU of the vehicle before one of a camera or lidar",
+    )
+    if imu is None:
+        return
+    if found.is_disowned(imu.name, "linear_acceleration_covariance[0]"):
+        found.notes.append(f"{imu.name} says that it gives no acceleration (covariance -1)")
+    else:
+        for name, axis in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
+            path = f"linear_acceleration.{axis}"
+            if found.is_given(imu.name, path):
+                found.signals[name] = found.source(name, imu.name, path)
+    if found.is_disowned(imu.name, "angular_velocity_covariance[0]"):
+        found.notes.append(f"{imu.name} says that it gives no angular rate (covariance -1)")
+    elif found.is_given(imu.name, "angular_velocity.z"):
+        found.signals["yaw_rate_rad_s"] = found.source("yaw_rate_rad_s", imu.name, "angular_velocity.z")
+
+
+def _map_steering(found: _Finding, topics: list[TopicInfo]) -> None:
+    candidates = [t for t in topics if _type(t) in STEERING_FIELDS]
+    measured = [t for t in candidates if not _is_command(t)]
+    chosen = found.choose("steering", measured or candidates, lambda _: (), "the first of its kind")
+    if chosen is None:
+        return
+    if not measured:
+        found.notes.append(
+            f"steer_rad comes from the command {chosen.name}, not from a measured angle: no lag, no slack"
+        )
+    found.signals["steer_rad"] = found.source("steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
+
+
+def _is_command(topic: TopicInfo) -> bool:
+    return _type(topic).startswith("ackermann_msgs/") or bool(_words(topic.name) & COMMAND_WORDS)
+
+
+def _map_speed(found: _Finding, topics: list[TopicInfo]) -> None:
+    reports = [t for t in topics if _type(t) in SPEED_FIELDS]
+    twists = []
+    for topic in topics:
+        if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & COMMAND_WORDS:
+            continue
+        if _words(topic.name) & ESTIMATE_WORDS:
+            found.ambiguities.append(
+                Ambiguity(
+                    "speed",
+                    (topic.name,),
+                    None,
+                    "its name says that it is an estimate, which is neither a sensor nor the truth",
+                )
+            )
+        elif _words(topic.name) & VEHICLE_WORDS:
+            twists.append(topic)
+        else:
+            found.ambiguities.append(
+                Ambiguity("speed", (topic.name,), None, "its name says neither speed sensor nor truth")
+            )
+    chosen = found.choose(
+        "speed",
+        [*reports, *twists],
+        lambda t: (_type(t) not in SPEED_FIELDS,),
+        "a velocity report before an odometry or a twist",
+    )
+    if chosen is None:
+        return
+    kind = _type(chosen)
+    path = SPEED_FIELDS[kind] if kind in SPEED_FIELDS else _join(TWIST_FIELDS[kind], "linear.x")
+    found.signals["speed_m_s"] = found.source("speed_m_s", chosen.name, path)
+
+
+def _map_wheel_speeds(found: _Finding, topics: list[TopicInfo]) -> None:
+    candidates = [t for t in topics if _type(t) in WHEEL_SPEED_TYPES and not _words(t.name) & TRUTH_WORDS]
+    chosen = found.choose("wheel speeds", candidates, lambda _: (), "the first of its kind")
+    if chosen is None:
+        return
+    for wheel in WHEELS:
+        name = f"wheel_speed_{wheel}_m_s"
+        found.signals[name] = found.source(name, chosen.name, f"{wheel}_m_s")
+
+
+# ------------------------------------------------------------------------------------------------ truth
+
+
+def _truth_group(topic: TopicInfo) -> str:
+    if topic.name.startswith(PERFECT_PREFIX):
+        return "perfect"
+    return "rtk"
+
+
+def _map_truth(found: _Finding, topics: list[TopicInfo], prefer: str) -> None:
+    known = set(TWIST_FIELDS) | set(POSE_FIELDS) | FIX_TYPES
+    candidates = [t for t in topics if _type(t) in known and (_is_truth(t) or _type(t) in FIX_TYPES)]
+    groups = {_truth_group(t) for t in candidates}
+    if len(groups) > 1:
+        kept = [t for t in candidates if _truth_group(t) == prefer]
+        left = sorted(t.name for t in candidates if _truth_group(t) != prefer)
+        found.notes.append(f"{prefer} truth taken; {', '.join(left)} not used")
+        candidates = kept
+    velocity = _map_truth_velocity(found, candidates)
+    _map_truth_position(found, candidates, velocity)
+
+
+def _map_truth_velocity(found: _Finding, candidates: list[TopicInfo]) -> TopicInfo | None:
+    twists = [t for t in candidates if _type(t) in TWIST_FIELDS and _has_twist(found, t)]
+    chosen = found.choose(
+        "truth velocity",
+        twists,
+        lambda t: (not _words(t.name) & TRUTH_WORDS, not _has_pose(found, t)),
+        "a topic that calls itself truth first, then one that has a pose too",
+    )
+    if chosen is None:
+        return None
+    base = TWIST_FIELDS[_type(chosen)]
+    forward = found.values(chosen.name, _join(base, "linear.x"))
+    left = found.values(chosen.name, _join(base, "linear.y"))
+    body = _looks_like_body_frame(forward, left)
+    if _type(chosen) != "nav_msgs/Odometry" and _words(chosen.name) & NAVIGATION_WORDS and body is not True:
+        # Receivers publish their velocity in east, north, up under the same type.
+        up = found.values(chosen.name, _join(base, "linear.z"))
+        readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
+        if body is None or not np.isfinite(up).any():
+            found.ambiguities.append(
+                Ambiguity("truth velocity frame", readings, None, "too little motion to tell the frame")
+            )
+            return None
+        found.ambiguities.append(
+            Ambiguity("truth velocity frame", readings, readings[1], "x is not the direction of travel")
+        )
+        paths = tuple(_join(base, f"linear.{a}") for a in "xyz")
+        found.truth["enu_velocity_m_s"] = found.source("enu_velocity_m_s", chosen.name, paths)
+        return chosen
+    if body is False:
+        found.ambiguities.append(
+            Ambiguity(
+                "truth velocity frame",
+                (f"{chosen.name} as body velocity",),
+                chosen.name,
+                "the type's convention is the body frame, although x is mostly not the direction of travel",
+            )
+        )
+    for name, path in (("vx_m_s", "linear.x"), ("vy_m_s", "linear.y"), ("yaw_rate_rad_s", "angular.z")):
+        full = _join(base, path)
+        values = found.values(chosen.name, full)
+        filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
+        if found.is_given(chosen.name, full) and not filler:
+            found.truth[name] = found.source(name, chosen.name, full)
+    return chosen
+
+
+def _looks_like_body_frame(forward: FloatArray, left: FloatArray) -> bool | None:
+    """Return whether x is the direction of travel in most moving samples; None without motion."""
+    with np.errstate(invalid="ignore"):
+        moving = np.hypot(forward, left) > 1.0
+        along = (forward > 0.0) & (np.abs(left) < forward)
+    if np.count_nonzero(moving) < 10:
+        return None
+    return bool(np.mean(along[moving]) > 0.6)
+
+
+def _has_twist(found: _Finding, topic: TopicInfo) -> bool:
+    base = TWIST_FIELDS[_type(topic)]
+    forward, left = _join(base, "linear.x"), _join(base, "linear.y")
+    if found.is_disowned(topic.name, "twist.covariance[0]"):
+        return False
+    if not (found.is_given(topic.name, forward) and found.is_given(topic.name, left)):
+        return False
+    v = np.concatenate([found.values(topic.name, forward), found.values(topic.name, left)])
+    if v.shape[0] and (v == 0.0).all() and _type(topic) in POSE_FIELDS:
+        # Converters from fixes to odometry leave the twist at zero while the pose moves.
+        x = found.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.x"))
+        y = found.values(topic.name, _join(POSE_FIELDS[_type(topic)], "position.y"))
+        return not (_span(x) > 1.0 or _span(y) > 1.0)
+    return True
+
+
+def _span(values: FloatArray) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if finite.shape[0] else 0.0
+
+
+def _has_pose(found: _Finding, topic: TopicInfo) -> bool:
+    if _type(topic) not in POSE_FIELDS or found.is_disowned(topic.name, "pose.covariance[0]"):
+        return False
+    base = POSE_FIELDS[_type(topic)]
+    if not all(found.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
+        return False
+    # A pose that stays at the origin while messages come is a filler.
+    xy = np.concatenate([found.values(topic.name, _join(base, f"position.{a}")) for a in "xy"])
+    return xy.shape[0] == 0 or bool((xy != 0.0).any())
+
+
+def _has_fix(found: _Finding, topic: TopicInfo) -> bool:
+    return _type(topic) in FIX_TYPES and all(found.is_given(topic.name, p) for p in ("latitude", "longitude"))
+
+
+def _map_truth_position(found: _Finding, candidates: list[TopicInfo], velocity: TopicInfo | None) -> None:
+    if velocity is not None and _has_pose(found, velocity):
+        chosen: TopicInfo | None = velocity
+    else:
+        positions = [t for t in candidates if _has_pose(found, t) or _has_fix(found, t)]
+        chosen = found.choose(
+            "truth position",
+            positions,
+            lambda t: (not _words(t.name) & TRUTH_WORDS, _type(t) in FIX_TYPES),
+            "a topic that calls itself truth first, then a pose before a satellite fix",
+        )
+    if chosen is None:
+        return
+    if _type(chosen) in FIX_TYPES:
+        _map_fix(found, chosen, alone=velocity is None)
+        return
+    base = POSE_FIELDS[_type(chosen)]
+    for name, axis in (("x_m", "x"), ("y_m", "y")):
+        found.truth[name] = found.source(name, chosen.name, _join(base, f"position.{axis}"))
+    quat = np.stack([found.values(chosen.name, _join(base, f"orientation.{a}")) for a in "wxyz"])
+    norms = np.linalg.norm(quat, axis=0)
+    if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < 0.01)):
+        paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")
+        found.truth["quat_wxyz"] = found.source("quat_wxyz", chosen.name, paths)
+
+
+def _map_fix(found: _Finding, fix: TopicInfo, *, alone: bool) -> None:
+    for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude"), ("alt_m", "altitude")):
+        if found.is_given(fix.name, path):
+            found.truth[name] = found.source(name, fix.name, path)
+    status = found.values(fix.name, "status.status")
+    if not alone or status.shape[0] == 0:
+        return
+    # 0 is any fix, 2 a ground-based augmented one, which receivers use for RTK.
+    lowest = 2.0 if "rtk" in _words(fix.name) and bool((status == 2.0).any()) else 0.0
+    found.quality = QualityGate(
+        topic=fix.name, field="status.status", minimum=lowest, stamp=stamp_path_of(found.log.fields(fix.name))
+    )
+    found.notes.append(f"truth is kept where {fix.name}.status.status is at least {lowest:g}")

@@ -1,0 +1,137 @@
+"""The records of a mapping: where each signal of a log comes from, and how it becomes SI."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+#: Number of columns of the truth channels that are vectors; all other signals are scalars.
+VECTOR_COLUMNS: dict[str, int] = {
+    "ecef_position_m": 3,
+    "ecef_velocity_m_s": 3,
+    "enu_velocity_m_s": 3,
+    "quat_wxyz": 4,
+}
+
+StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
+Clock: TypeAlias = Literal["utc", "device"]
+
+#: Values of ``stamp`` that name the recorder's times instead of a field of the message.
+RECORDER_STAMPS = ("log_time", "publish_time")
+#: ``stamp`` when a mapping file says nothing: the message's header.stamp or stamp if its schema has one, else log time.
+AUTO_STAMP = "auto"
+
+
+@dataclass(frozen=True, slots=True)
+class SignalSource:
+    """Where one signal comes from: ``value_SI = scale * raw + offset``, measured at ``stamp - latency_s``.
+
+    Attributes
+    ----------
+    name : signal or truth name, a key of ``SIGNAL_UNITS`` or ``TRUTH_UNITS``.
+    topic : topic name.
+    field : dotted path, ``[3]`` indexes an array; a tuple of paths gives a vector signal column by column.
+    stamp : dotted path of the measurement time, ``log_time``, ``publish_time``, or ``auto``.
+    scale, offset : raw unit to SI; a tuple holds one entry a column of a vector signal.
+    latency_s : what the stamp is late by.
+    valid_min, valid_max : SI values outside are dropped and counted.
+    stamp_unit : ``ros`` (a struct of seconds and nanoseconds) or the unit of a number.
+    clock : ``utc`` when the stamp is on the log's clock, ``device`` when offset and drift are fitted to log time.
+    """
+
+    name: str
+    topic: str
+    field: str | tuple[str, ...]
+    stamp: str = AUTO_STAMP
+    scale: float | tuple[float, ...] = 1.0
+    offset: float | tuple[float, ...] = 0.0
+    latency_s: float = 0.0
+    valid_min: float | None = None
+    valid_max: float | None = None
+    stamp_unit: StampUnit = "ros"
+    clock: Clock = "utc"
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        """The field paths that the signal is made of."""
+        return self.field if isinstance(self.field, tuple) else (self.field,)
+
+    @property
+    def label(self) -> str:
+        """``/topic.field``, for people and for ``Channel.source``."""
+        return f"{self.topic}.{self.field if isinstance(self.field, str) else '{' + ','.join(self.field) + '}'}"
+
+    @property
+    def columns(self) -> int:
+        """Number of columns of the signal's values; 1 for a scalar."""
+        return VECTOR_COLUMNS.get(self.name, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class QualityGate:
+    """When truth may be used: where the field is in [``minimum``, ``maximum``] or one of ``values``."""
+
+    topic: str
+    field: str
+    minimum: float | None = None
+    maximum: float | None = None
+    values: tuple[float, ...] = ()
+    stamp: str = AUTO_STAMP
+    stamp_unit: StampUnit = "ros"
+    clock: Clock = "utc"
+    latency_s: float = 0.0
+
+    def as_source(self) -> SignalSource:
+        """Return the gate's field as a source that can be read like a signal."""
+        return SignalSource(
+            name="truth_quality",
+            topic=self.topic,
+            field=self.field,
+            stamp=self.stamp,
+            stamp_unit=self.stamp_unit,
+            clock=self.clock,
+            latency_s=self.latency_s,
+        )
+
+    def describe(self) -> str:
+        """Return the gate's condition in words."""
+        parts = []
+        if self.minimum is not None or self.maximum is not None:
+            low = "-inf" if self.minimum is None else f"{self.minimum:g}"
+            high = "inf" if self.maximum is None else f"{self.maximum:g}"
+            parts.append(f"in [{low}, {high}]")
+        if self.values:
+            parts.append("one of " + ", ".join(f"{v:g}" for v in self.values))
+        return f"{self.topic}.{self.field} " + " or ".join(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Mapping:
+    """All sources of a log by signal name.
+
+    Attributes
+    ----------
+    signals, truth : by name; what an estimator may see, and what it is scored against.
+    quality : gate on the truth, if any.
+    origin : ``file`` or ``auto`` (recognised types).
+    notes : sentences that the reader of a report must know of this mapping.
+    """
+
+    signals: dict[str, SignalSource] = field(default_factory=dict)
+    truth: dict[str, SignalSource] = field(default_factory=dict)
+    quality: QualityGate | None = None
+    origin: Literal["file", "auto"] = "file"
+    notes: tuple[str, ...] = ()
+
+    def sources(self) -> Iterator[SignalSource]:
+        """Yield every source: signals, truth, the gate."""
+        yield from self.signals.values()
+        yield from self.truth.values()
+        if self.quality is not None:
+            yield self.quality.as_source()
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Names of the topics that the mapping reads, sorted."""
+        return tuple(sorted({s.topic for s in self.sources()}))

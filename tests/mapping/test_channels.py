@@ -1,0 +1,293 @@
+"""Reading mapped fields: values, times, cleaning with counts, the truth gate, and windows that join to the whole."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.logs.drive_log import windows
+from pdhef_logtool.mapping import (
+    Mapping,
+    QualityGate,
+    SignalSource,
+    clean_samples,
+    fit_clocks,
+    gate_mask,
+    join_channels,
+    read_signals,
+)
+from pdhef_logtool.signals import Channel, Loss
+
+T0 = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+
+def imu_log(n: int = 200, seed: int = 1, **changes: np.ndarray) -> FakeLog:
+    rng = np.random.default_rng(seed)
+    stamps = T0 + np.arange(n, dtype=np.int64) * 10 * MS
+    fields = {
+        "header.stamp": stamps,
+        "linear_acceleration.y": rng.normal(size=n),
+        "angular_velocity.z": rng.normal(size=n),
+    }
+    fields |= changes
+    log_time = stamps + 2 * MS
+    return FakeLog({"/imu": FakeTopic("sensor_msgs/msg/Imu", log_time, fields)})
+
+
+def imu_mapping(**changes: object) -> Mapping:
+    ay = SignalSource("ay_m_s2", "/imu", "linear_acceleration.y")
+    yaw = SignalSource("yaw_rate_rad_s", "/imu", "angular_velocity.z")
+    return Mapping(signals={s.name: replace(s, **changes) for s in (ay, yaw)})  # type: ignore[arg-type]
+
+
+def read_all(log: FakeLog, mapping: Mapping) -> tuple[dict[str, Channel], dict[str, Channel], dict[str, Loss]]:
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    got = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    return got.signals, got.truth, {f"{x.kind} {x.where.split(' ')[0]}": x for x in got.losses}
+
+
+def assert_same(a: Channel, b: Channel) -> None:
+    np.testing.assert_array_equal(a.stamps_ns, b.stamps_ns)
+    np.testing.assert_array_equal(a.arrival_ns, b.arrival_ns)
+    np.testing.assert_array_equal(a.values, b.values)
+
+
+def test_scale_offset_latency_and_arrival() -> None:
+    log = imu_log()
+    signals, _, losses = read_all(log, imu_mapping(scale=-9.81, offset=0.5, latency_s=0.0031))
+    topic = log.contents["/imu"]
+    np.testing.assert_allclose(signals["ay_m_s2"].values, 0.5 - 9.81 * topic.fields["linear_acceleration.y"])
+    np.testing.assert_array_equal(signals["ay_m_s2"].stamps_ns, topic.fields["header.stamp"] - 3_100_000)
+    np.testing.assert_array_equal(signals["ay_m_s2"].arrival_ns, topic.log_time_ns)
+    assert signals["ay_m_s2"].unit == "m/s^2"
+    assert signals["ay_m_s2"].source == "/imu.linear_acceleration.y"
+    assert not losses
+
+
+def test_every_topic_is_read_once() -> None:
+    log = imu_log()
+    mapping = imu_mapping()
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    log.reads.clear()
+    read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    assert len(log.reads) == 1
+    assert sorted(log.reads[0]["/imu"]) == ["angular_velocity.z", "header.stamp", "linear_acceleration.y"]
+
+
+def test_without_a_stamp_log_time_less_the_latency_is_the_time() -> None:
+    log = imu_log()
+    del log.contents["/imu"].fields["header.stamp"]
+    signals, _, _ = read_all(log, imu_mapping(latency_s=0.002))
+    np.testing.assert_array_equal(signals["ay_m_s2"].stamps_ns, log.contents["/imu"].log_time_ns - 2 * MS)
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("s", 1e-9), ("ms", 1e-6), ("us", 1e-3)])
+def test_numbers_as_stamps(unit: str, factor: float) -> None:
+    log = imu_log()
+    topic = log.contents["/imu"]
+    topic.fields["t"] = topic.fields.pop("header.stamp") * factor
+    signals, _, _ = read_all(log, imu_mapping(stamp="t", stamp_unit=unit))
+    # float64 seconds since 1970 resolve 0.24 µs.
+    np.testing.assert_allclose(signals["ay_m_s2"].stamps_ns - (topic.log_time_ns - 2 * MS), 0, atol=500)
+
+
+def test_a_stamp_in_two_numbers_is_exact() -> None:
+    log = imu_log()
+    topic = log.contents["/imu"]
+    stamps = topic.fields.pop("header.stamp")
+    topic.fields["header.stamp.sec"] = (stamps // 1_000_000_000).astype(np.float64)
+    topic.fields["header.stamp.nanosec"] = (stamps % 1_000_000_000).astype(np.float64)
+    signals, _, _ = read_all(log, imu_mapping())
+    np.testing.assert_array_equal(signals["ay_m_s2"].stamps_ns, stamps)
+
+
+def test_what_is_dropped_is_counted_and_named() -> None:
+    log = imu_log()
+    topic = log.contents["/imu"]
+    ay, yaw, stamps = (topic.fields[p] for p in ("linear_acceleration.y", "angular_velocity.z", "header.stamp"))
+    ay[[3, 7]] = np.nan
+    ay[[20, 21, 22]] = 100.0
+    yaw[9] = np.inf
+    stamps[50] = stamps[49]
+    stamps[60] = 0
+    stamps[[70, 71]] = stamps[[71, 70]]
+    mapping = imu_mapping(valid_min=-50.0, valid_max=50.0)
+    signals, _, losses = read_all(log, mapping)
+    assert {k: (x.count, x.severity) for k, x in losses.items()} == {
+        "nan ay_m_s2": (2, "lost"),
+        "out-of-range ay_m_s2": (3, "note"),
+        "nan yaw_rate_rad_s": (1, "lost"),
+        "duplicate-stamp /imu": (1, "note"),
+        "bad-stamp /imu": (1, "lost"),
+        "out-of-order /imu": (1, "note"),
+    }
+    assert losses["nan ay_m_s2"].start_ns == topic.log_time_ns[3]
+    assert losses["nan ay_m_s2"].end_ns == topic.log_time_ns[7] + 1
+    assert len(signals["ay_m_s2"]) == 200 - 2 - 3 - 1 - 1
+    assert len(signals["yaw_rate_rad_s"]) == 200 - 1 - 1 - 1
+    for channel in signals.values():
+        assert np.all(np.diff(channel.stamps_ns) > 0)
+        assert np.isfinite(channel.values).all()
+    # Of two messages with one stamp the first to arrive stays.
+    at = np.searchsorted(signals["ay_m_s2"].stamps_ns, stamps[49])
+    assert signals["ay_m_s2"].values[at] == ay[49]
+
+
+def test_arrival_is_never_before_the_measurement() -> None:
+    log = imu_log()
+    topic = log.contents["/imu"]
+    topic.log_time_ns[::5] -= 5 * MS  # A few log times before the stamp: jitter of the recorder's clock.
+    signals, _, losses = read_all(log, imu_mapping())
+    assert np.all(signals["ay_m_s2"].arrival_ns >= signals["ay_m_s2"].stamps_ns)
+    assert not any(k.startswith("delay-unknown") for k in losses)
+
+
+@pytest.mark.parametrize("shift_s", [-3.0, 5.0])
+def test_a_delay_that_cannot_be_is_unknown(shift_s: float) -> None:
+    log = imu_log()
+    log.contents["/imu"].log_time_ns += np.int64(shift_s * 1e9)
+    signals, _, losses = read_all(log, imu_mapping())
+    np.testing.assert_array_equal(signals["ay_m_s2"].arrival_ns, signals["ay_m_s2"].stamps_ns)
+    assert losses["delay-unknown /imu"].severity == "note"
+
+
+def test_vectors_take_a_scale_per_axis_and_lists_of_fields() -> None:
+    n = 20
+    stamps = T0 + np.arange(n, dtype=np.int64) * 50 * MS
+    xyz = np.random.default_rng(3).normal(size=(n, 3))
+    log = FakeLog(
+        {
+            "/gnss": FakeTopic(
+                "gnss/Pose",
+                stamps,
+                {"v": xyz, "q.x": xyz[:, 0], "q.y": xyz[:, 1], "q.z": xyz[:, 2], "q.w": np.full(n, 0.5)},
+            )
+        }
+    )
+    mapping = Mapping(
+        truth={
+            "ecef_velocity_m_s": SignalSource("ecef_velocity_m_s", "/gnss", "v", scale=(1.0, -1.0, 2.0)),
+            "quat_wxyz": SignalSource("quat_wxyz", "/gnss", ("q.w", "q.x", "q.y", "q.z")),
+        }
+    )
+    _, truth, _ = read_all(log, mapping)
+    np.testing.assert_allclose(truth["ecef_velocity_m_s"].values, xyz * [1.0, -1.0, 2.0])
+    np.testing.assert_allclose(truth["quat_wxyz"].values, np.column_stack([np.full(n, 0.5), xyz]))
+
+
+def test_an_empty_window_gives_empty_channels() -> None:
+    log = imu_log()
+    mapping = imu_mapping()
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    got = read_signals(log, mapping, clocks, log.end_ns + 10, log.end_ns + 20)
+    assert [len(c) for c in got.signals.values()] == [0, 0]
+    assert got.losses == ()
+
+
+# --------------------------------------------------------------------------------------------- properties
+
+
+@st.composite
+def messy_samples(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    n = draw(st.integers(0, 30))
+    seed = draw(st.integers(0, 2**31))
+    rng = np.random.default_rng(seed)
+    stamps = rng.integers(1, 12, n)  # Few values, so that stamps collide.
+    arrival = stamps + rng.integers(0, 3, n)
+    values = rng.choice([np.nan, -2.0, 0.0, 1.0, 2.0, 9.0], n)
+    return stamps.astype(np.int64), arrival.astype(np.int64), values
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(samples=messy_samples(), seed=st.integers(0, 1000))
+def test_order_of_messages_does_not_matter(samples: tuple[np.ndarray, ...], seed: int) -> None:
+    stamps, arrival, values = samples
+    shuffle = np.random.default_rng(seed).permutation(len(stamps))
+    a = clean_samples(stamps, arrival, values, valid_max=5.0)
+    b = clean_samples(stamps[shuffle], arrival[shuffle], values[shuffle], valid_max=5.0)
+    for key in ("stamps_ns", "arrival_ns", "values"):
+        np.testing.assert_array_equal(getattr(a, key), getattr(b, key))
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(samples=messy_samples())
+def test_cleaning_agrees_with_a_dictionary(samples: tuple[np.ndarray, ...]) -> None:
+    stamps, arrival, values = samples
+    best: dict[int, tuple[int, float]] = {}
+    for s, a, v in zip(stamps.tolist(), arrival.tolist(), values.tolist(), strict=True):
+        if np.isfinite(v) and v <= 5.0 and (s not in best or (a, v) < best[s]):
+            best[s] = (a, v)
+    got = clean_samples(stamps, arrival, values, valid_max=5.0)
+    assert got.stamps_ns.tolist() == sorted(best)
+    assert got.values.tolist() == [best[s][1] for s in sorted(best)]
+    assert len(got.nan_at) == int(np.isnan(values).sum())
+    assert len(got.out_of_range_at) == int((values > 5.0).sum())
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000), length=st.integers(30 * MS, 900 * MS), device=st.booleans())
+def test_windows_joined_are_the_whole(seed: int, length: int, device: bool) -> None:
+    rng = np.random.default_rng(seed)
+    n = 150
+    log = imu_log(n, seed)
+    topic = log.contents["/imu"]
+    stamps = topic.fields["header.stamp"]
+    topic.log_time_ns += (rng.exponential(15.0, n) * MS).astype(np.int64)  # Messages overtake one another.
+    repeated = rng.choice(n - 1, 10, replace=False)
+    stamps[repeated + 1] = stamps[repeated]
+    topic.fields["linear_acceleration.y"][rng.choice(n, 5)] = np.nan
+    gate_times = T0 + np.arange(0, 1600, 50, dtype=np.int64) * MS
+    log.contents["/gate"] = FakeTopic(
+        "x/Status", gate_times + 3 * MS, {"stamp": gate_times, "mode": rng.choice([3.0, 4.0], gate_times.shape[0])}
+    )
+    if device:
+        topic.fields["header.stamp"] = (stamps - T0) + np.rint((stamps - T0) * 2e-4).astype(np.int64) + 5_000_000_000
+    base = imu_mapping(clock="device" if device else "utc")
+    vx = replace(base.signals["ay_m_s2"], name="vx_m_s")
+    mapping = replace(base, truth={"vx_m_s": vx}, quality=QualityGate("/gate", "mode", values=(4.0,)))
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    whole = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    parts = [read_signals(log, mapping, clocks, s, e) for s, e in windows(log.start_ns, log.end_ns, length)]
+    for name, channel in whole.signals.items():
+        assert_same(join_channels([p.signals[name] for p in parts]), channel)
+    assert 0 < len(whole.truth["vx_m_s"]) < len(whole.signals["ay_m_s2"])
+    assert_same(join_channels([p.truth["vx_m_s"] for p in parts]), whole.truth["vx_m_s"])
+
+
+# --------------------------------------------------------------------------------------------- truth gate
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 10_000))
+def test_gate_agrees_with_a_search_by_hand(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stamps = np.sort(rng.integers(0, 100, 30))
+    gate_stamps = np.sort(rng.integers(0, 100, rng.integers(0, 12)))
+    values = rng.choice([np.nan, 1.0, 2.0, 3.0, 4.0], gate_stamps.shape[0])
+    gate = QualityGate("/g", "f", minimum=2.5, maximum=3.5, values=(1.0,))
+    got = gate_mask(stamps, gate_stamps, values, gate, hold_ns=15)
+    for stamp, keep in zip(stamps, got, strict=True):
+        before = [i for i, g in enumerate(gate_stamps) if g <= stamp]
+        expected = bool(before) and values[before[-1]] in (1.0, 3.0) and stamp - gate_stamps[before[-1]] <= 15
+        assert keep == expected
+
+
+def test_truth_that_the_gate_rejects_is_counted() -> None:
+    log = imu_log(100)
+    stamps = log.contents["/imu"].fields["header.stamp"]
+    mode = np.where((stamps >= stamps[40]) & (stamps < stamps[60]), 1.0, 4.0)
+    log.contents["/status"] = FakeTopic("x/S", stamps + MS, {"stamp": stamps, "mode": mode})
+    base = imu_mapping()
+    vx = replace(base.signals["ay_m_s2"], name="vx_m_s")
+    mapping = replace(base, truth={"vx_m_s": vx}, quality=QualityGate("/status", "mode", values=(4.0,)))
+    signals, truth, losses = read_all(log, mapping)
+    assert len(signals["ay_m_s2"]) == 100
+    np.testing.assert_array_equal(truth["vx_m_s"].stamps_ns, np.delete(stamps, np.arange(40, 60)))
+    assert losses["truth-quality vx_m_s"].count == 20
+    assert losses["truth-quality vx_m_s"].severity == "note"

@@ -1,0 +1,218 @@
+"""mapping.toml: strict reading, all problems at once, and writing that loads back."""
+
+from __future__ import annotations
+
+import string
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.mapping import VECTOR_COLUMNS, Mapping, QualityGate, SignalSource, load_mapping, mapping_to_toml
+from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS
+
+DESIGN_EXAMPLE = """
+[signals.steer_rad]
+topic = "/vehicle/status/steering_status"
+field = "steering_tire_angle"
+stamp = "stamp"
+scale = 1.0
+offset = 0.0
+latency_s = 0.0
+valid_min = -1.0
+valid_max = 1.0
+stamp_unit = "ros"
+clock = "utc"
+[truth.vy_m_s]
+topic = "/ins/odometry"
+field = "twist.twist.linear.y"
+[truth_quality]
+topic = "/ins/status"
+field = "mode"
+values = [4]
+"""
+
+
+def load_text(tmp_path: Path, text: str) -> Mapping:
+    path = tmp_path / "mapping.toml"
+    path.write_text(text, encoding="utf-8")
+    return load_mapping(path)
+
+
+def test_the_documented_example_loads(tmp_path: Path) -> None:
+    mapping = load_text(tmp_path, DESIGN_EXAMPLE)
+    assert mapping.signals["steer_rad"] == SignalSource(
+        name="steer_rad",
+        topic="/vehicle/status/steering_status",
+        field="steering_tire_angle",
+        stamp="stamp",
+        valid_min=-1.0,
+        valid_max=1.0,
+    )
+    assert mapping.truth["vy_m_s"].field == "twist.twist.linear.y"
+    assert mapping.quality == QualityGate(topic="/ins/status", field="mode", values=(4.0,))
+    assert mapping.origin == "file"
+
+
+def test_all_problems_come_in_one_line(tmp_path: Path) -> None:
+    text = """
+    [signals.yaw_rate_rads]
+    topic = "/imu"
+    field = "z"
+    [signals.vy_m_s]
+    topic = "/imu"
+    field = "y"
+    [signals.ax_m_s2]
+    topic = "/imu"
+    fields = "x"
+    scale = "9.81"
+    [signals.ay_m_s2]
+    topic = "/imu"
+    field = "y"
+    scale = 0.0
+    stamp_unit = "hours"
+    [signal.speed_m_s]
+    topic = "/s"
+    field = "v"
+    """
+    with pytest.raises(MappingError) as caught:
+        load_text(tmp_path, text)
+    line = str(caught.value)
+    assert "\n" not in line
+    for part in (
+        "signals.yaw_rate_rads: unknown name (did you mean yaw_rate_rad_s?)",
+        "signals.vy_m_s: belongs under [truth.vy_m_s]",
+        "signals.ax_m_s2.field: is missing",
+        "signals.ax_m_s2.fields: unknown entry (did you mean field?)",
+        "signals.ax_m_s2.scale: ",
+        "signals.ay_m_s2.stamp_unit: ",
+        "signal: unknown table (did you mean signals?)",
+    ):
+        assert part in line, part
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (
+            '[signals.steer_rad]\ntopic="/a"\nfield="x"\n[signals.steering_wheel_rad]\ntopic="/a"\nfield="y"',
+            "signals.steer_rad and signals.steering_wheel_rad",
+        ),
+        ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ay_m_s2]\ntopic="/a"\nfield="x"', "duplicates"),
+        ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\n[signals.ax_m_s2]\ntopic="/a"\nfield="y"', "ax_m_s2"),
+        ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nscale=[1.0,1.0]', "no vector"),
+        ('[truth.ecef_position_m]\ntopic="/a"\nfield="x"\nscale=[1.0,1.0]', "must hold 3 entries"),
+        ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nscale=nan', "finite"),
+        ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nvalid_min=2\nvalid_max=1', "valid_min must be below valid_max"),
+        ('[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nclock="device"\nstamp="log_time"', "needs a stamp of the device"),
+        ('[truth_quality]\ntopic="/a"\nfield="x"', "give min, max or values"),
+        (
+            '[signals.ax_m_s2]\ntopic="/a"\nfield="x"\nstamp="t"\nstamp_unit="s"\n'
+            '[signals.ay_m_s2]\ntopic="/a"\nfield="y"\nstamp="t"\nstamp_unit="ns"',
+            "another stamp_unit",
+        ),
+        ("signals = 3", "must be a table"),
+        ("not toml", "mapping TOML"),
+    ],
+)
+def test_contradictions_are_named(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(MappingError) as caught:
+        load_text(tmp_path, text)
+    assert said in str(caught.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(MappingError, match="no such file"):
+        load_mapping(tmp_path / "none.toml")
+
+
+texts = st.text(
+    st.characters(exclude_categories=["Cs"]) | st.sampled_from(string.printable + '"\\\x7f'), min_size=1, max_size=12
+)
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+nonzero = numbers.filter(lambda x: x != 0.0)
+
+
+@st.composite
+def sources(draw: st.DrawFn, name: str, index: int) -> SignalSource:
+    width = VECTOR_COLUMNS.get(name, 1)
+
+    def entries(element: st.SearchStrategy[object]) -> st.SearchStrategy[object]:
+        return element if width == 1 else element | st.tuples(*[element] * width)
+
+    low, high = sorted(draw(st.tuples(numbers, numbers).filter(lambda x: x[0] != x[1])))
+    return SignalSource(
+        name=name,
+        # One topic a source: that fields and clocks do not contradict one another is tested above.
+        topic=f"/{index}" + draw(texts),
+        field=draw(entries(texts)),  # type: ignore[arg-type]
+        stamp=draw(texts),
+        scale=draw(entries(nonzero)),  # type: ignore[arg-type]
+        offset=draw(entries(numbers)),  # type: ignore[arg-type]
+        latency_s=draw(numbers),
+        valid_min=draw(st.sampled_from([None, low])),
+        valid_max=draw(st.sampled_from([None, high])),
+        stamp_unit=draw(st.sampled_from(["ros", "s", "ms", "us", "ns"])),
+        clock=draw(st.sampled_from(["utc", "device"])),
+    )
+
+
+@st.composite
+def mappings(draw: st.DrawFn) -> Mapping:
+    exclusive = {"steering_wheel_rad"} | {n for n in SIGNAL_UNITS if n.endswith("rad_s") and n.startswith("wheel")}
+    signal_names = draw(st.lists(st.sampled_from(sorted(set(SIGNAL_UNITS) - exclusive)), unique=True, max_size=5))
+    truth_names = draw(st.lists(st.sampled_from(sorted(TRUTH_UNITS)), unique=True, max_size=4))
+    quality = None
+    if draw(st.booleans()):
+        quality = QualityGate(
+            topic="/gate" + draw(texts),
+            field=draw(texts),
+            minimum=draw(st.sampled_from([None, -1.5])),
+            maximum=draw(st.sampled_from([None, 4.0])),
+            values=tuple(draw(st.lists(numbers, min_size=1, max_size=3))),
+            stamp=draw(texts),
+            latency_s=draw(numbers),
+        )
+    return Mapping(
+        signals={n: draw(sources(n, i)) for i, n in enumerate(signal_names)},
+        truth={n: draw(sources(n, 100 + i)) for i, n in enumerate(truth_names)},
+        quality=quality,
+    )
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(mapping=mappings(), comment=texts)
+def test_what_is_written_loads_back(tmp_path_factory: pytest.TempPathFactory, mapping: Mapping, comment: str) -> None:
+    clean = {
+        "signals": {n: s for n, s in mapping.signals.items() if not _device_without_stamp(s)},
+        "truth": {n: s for n, s in mapping.truth.items() if not _device_without_stamp(s)},
+    }
+    mapping = Mapping(signals=clean["signals"], truth=clean["truth"], quality=mapping.quality)
+    text = mapping_to_toml(mapping, comments={"": comment, "ax_m_s2": comment, "vx_m_s": comment})
+    path = tmp_path_factory.mktemp("toml") / "m.toml"
+    path.write_text(text, encoding="utf-8", newline="")
+    assert load_mapping(path) == mapping
+
+
+def _device_without_stamp(source: SignalSource) -> bool:
+    return source.clock == "device" and source.stamp in ("log_time", "publish_time")
+
+
+def test_missing_signals_stand_ready_as_comments(tmp_path: Path) -> None:
+    text = mapping_to_toml(Mapping(), comments={"speed_m_s": "perhaps /can.v"})
+    assert load_text(tmp_path, text) == Mapping()
+    for name in ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"):
+        assert f"# [signals.{name}]" in text
+    assert "# perhaps /can.v" in text
+    # Taking the comment marks away from one example must give a file that loads.
+    lines = text.splitlines()
+    at = next(i for i, line in enumerate(lines) if line.startswith("# [signals.yaw_rate_rad_s]"))
+    edited = "\n".join(line[2:] for line in lines[at : at + 4])
+    assert set(load_text(tmp_path, edited).signals) == {"yaw_rate_rad_s"}
+
+
+def test_notes_become_comments_even_over_several_lines(tmp_path: Path) -> None:
+    mapping = Mapping(notes=("first\nsecond = 3\r[signals]",))
+    assert load_text(tmp_path, mapping_to_toml(mapping)) == Mapping()
