@@ -119,9 +119,13 @@ def dead_reckon(
         a = np.where(ok, a, 0.0)
         return 0.5 * (a[1:] + a[:-1])
 
-    yaw = start[2] + np.concatenate([[0.0], np.cumsum(mid(yaw_rate_rad_s) * dt)])
+    def accumulate(first: float, steps: FloatArray) -> FloatArray:
+        # One running sum from the start value on, so that windows that carry their end on join bit for bit.
+        return np.cumsum(np.concatenate([[first], steps]))
+
+    yaw = accumulate(start[2], mid(yaw_rate_rad_s) * dt)
     heading = 0.5 * (yaw[1:] + yaw[:-1])
     vx, vy = mid(vx_m_s), mid(vy_m_s)
-    x = start[0] + np.concatenate([[0.0], np.cumsum((vx * np.cos(heading) - vy * np.sin(heading)) * dt)])
-    y = start[1] + np.concatenate([[0.0], np.cumsum((vx * np.sin(heading) + vy * np.cos(heading)) * dt)])
+    x = accumulate(start[0], (vx * np.cos(heading) - vy * np.sin(heading)) * dt)
+    y = accumulate(start[1], (vx * np.sin(heading) + vy * np.cos(heading)) * dt)
     return x, y, yaw

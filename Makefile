@@ -1,0 +1,65 @@
+# Two commands do all the set-up: `make demo` and `make test`. They need Python 3.11+ and make, nothing else.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out/demo
+# Test processes; the suite is bound by the processor.
+JOBS ?= 2
+
+.PHONY: help demo test check lint format bench samples clean
+
+help:
+	@echo "make demo     run the main job on the sample logs and say where the outputs are"
+	@echo "make test     run all tests"
+	@echo "make check    formatting, lint, types, import contracts, tests"
+	@echo "make bench    speed against peers, and the tuning tables"
+	@echo "make samples  write sample_logs/ anew with the simulator"
+	@echo "make clean    remove the virtual environment and everything that was built"
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "pdhef-logtool needs Python 3.11 or newer; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || \
+	  { rm -rf $(VENV); echo "$(PYTHON) cannot make virtual environments; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+
+$(VENV)/installed: $(BIN)/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable .
+	@touch $@
+
+$(VENV)/installed-dev: $(VENV)/installed pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	@touch $@
+
+demo: $(VENV)/installed
+	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --vehicle sample_logs/vehicle.toml
+	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --vehicle sample_logs/vehicle_mu03.toml
+	@echo
+	@echo "Outputs: $(OUT)/ and $(OUT)-low-friction/"
+	@echo "  logs/<log>/annotated.mcap   for Foxglove, PlotJuggler or ros2 bag"
+	@echo "  logs/<log>/recording.rrd    open it with: $(BIN)/pdhef view $(OUT)"
+	@echo "  logs/<log>/report.json, estimates.parquet; metrics.parquet and run.json for the whole run"
+
+test: $(VENV)/installed-dev
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/installed-dev
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+check: lint test
+
+bench: $(VENV)/installed-dev
+	$(BIN)/python -m benchmarks
+
+samples: $(VENV)/installed
+	$(BIN)/python -m truthsim.samples sample_logs
+
+clean:
+	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,0 +1,107 @@
+"""Which logs a command line means, and the name each of them has in tables and output folders."""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pdhef_logtool.errors import UsageError
+
+#: Suffixes that a search through folders takes for logs; a file that is named outright may have any.
+LOG_SUFFIXES = (".mcap", ".bag", ".db3")
+COMPRESSED_SUFFIXES = (".zstd", ".zst")
+ROSBAG2_METADATA = "metadata.yaml"
+#: A folder with this file is an output of ours, and its recordings are no input.
+RUN_FILE = "run.json"
+
+
+@dataclass(frozen=True, slots=True)
+class LogInput:
+    """A log and its ``stem``: unique in a run, fit for a folder name, equal to ``log`` in the tables."""
+
+    path: Path
+    stem: str
+
+
+def find_logs(arguments: Sequence[str]) -> list[LogInput]:
+    """Expand files, folders and glob patterns to logs in a stable order; each log once.
+
+    A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders are
+    searched for logs by suffix; a rosbag2 folder counts as one log.
+
+    Raises
+    ------
+    UsageError
+        An argument stands for no log at all.
+    """
+    found: dict[str, Path] = {}
+    for argument in arguments:
+        paths = list(_expand(argument))
+        if not paths:
+            raise UsageError(
+                expected="at least one log (.mcap, .bag, .db3 or a rosbag2 folder)",
+                got="none",
+                where=argument,
+                remedy="name a log, a folder that holds some, or a glob pattern in quotes",
+            )
+        for path in paths:
+            found.setdefault(os.path.realpath(path), path)
+    return _with_stems(list(found.values()))
+
+
+def _expand(argument: str) -> Iterator[Path]:
+    path = Path(argument)
+    if path.is_dir():
+        yield from _search(path)
+    elif path.exists() or not glob.has_magic(argument):
+        yield path
+    else:
+        for name in sorted(glob.glob(argument, recursive=True)):  # noqa: PTH207 (the pattern may be absolute)
+            match = Path(name)
+            if match.is_dir():
+                yield from _search(match)
+            else:
+                yield match
+
+
+def _search(folder: Path) -> Iterator[Path]:
+    if (folder / ROSBAG2_METADATA).is_file():
+        yield folder
+        return
+    if (folder / RUN_FILE).is_file():
+        return
+    for entry in sorted(folder.iterdir()):
+        if entry.name.startswith("."):
+            continue
+        if entry.is_dir():
+            yield from _search(entry)
+        elif _bare_name(entry.name) != entry.name:
+            yield entry
+
+
+def _bare_name(name: str) -> str:
+    """Return the name without the suffixes of a log, or unchanged if it has none."""
+    bare = name
+    for suffix in COMPRESSED_SUFFIXES:
+        bare = bare.removesuffix(suffix)
+    for suffix in LOG_SUFFIXES:
+        if bare.endswith(suffix) and bare != suffix:
+            return bare.removesuffix(suffix)
+    return name
+
+
+def _with_stems(paths: list[Path]) -> list[LogInput]:
+    parents = [os.path.realpath(p.parent) for p in paths]
+    root = os.path.commonpath(parents)
+    relative = [Path(os.path.relpath(Path(parent) / p.name, root)) for parent, p in zip(parents, paths, strict=True)]
+    stems = ["__".join([*r.parts[:-1], _bare_name(r.name)]) for r in relative]
+    counts = Counter(stems)
+    return [
+        LogInput(p, s if counts[s] == 1 else f"{s}-{hashlib.sha256(str(r).encode()).hexdigest()[:8]}")
+        for p, s, r in zip(paths, stems, relative, strict=True)
+    ]
