@@ -1,0 +1,166 @@
+"""The driver: follows a path by preview, holds a speed, stops where the plan says, and has a human's lag."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from numba.extending import register_jitable
+
+from pdhef_logtool.signals import FloatArray
+
+
+class Driver(NamedTuple):
+    """How the driver looks ahead and acts."""
+
+    preview_s: float = 0.55
+    preview_min_m: float = 4.0
+    steering_lag_s: float = 0.06
+    steer_rate_limit_rad_s: float = 0.9
+    steer_limit_rad: float = 0.6
+    #: What a driver has learnt of the car: road-wheel angle beyond L/R per lateral acceleration.
+    understeer_rad_per_m_s2: float = 0.0034
+    wheelbase_m: float = 2.87
+    speed_gain_per_s: float = 0.9
+    speed_integral_per_s2: float = 0.15
+    pedal_lag_s: float = 0.12
+    acceleration_limit_m_s2: float = 3.0
+    braking_limit_m_s2: float = 8.0
+    hold_brake_n_m: float = 600.0
+    max_power_w: float = 110_000.0
+    max_drive_n_m: float = 2400.0
+    mass_kg: float = 1440.0
+    wheel_radius_m: float = 0.30
+
+
+#: Slots of the driver's memory.
+PROGRESS, STEER, PEDAL, INTEGRAL, STOP, DWELL = range(6)
+MEMORY_SIZE = 6
+#: Columns of a path table, one row every ``step_m`` of arc length.
+PATH_X, PATH_Y, PATH_YAW, PATH_SPEED = range(4)
+
+
+@register_jitable
+def _path_at(path: FloatArray, step_m: float, at_m: float, column: int) -> float:
+    """Interpolate one column of a path table; beyond its end the last row holds."""
+    place = at_m / step_m
+    last = path.shape[0] - 1
+    if place <= 0.0:
+        return float(path[0, column])
+    if place >= last:
+        return float(path[last, column])
+    i = int(place)
+    return float(path[i, column] + (place - i) * (path[i + 1, column] - path[i, column]))
+
+
+@register_jitable
+def track_progress_m(
+    path: FloatArray, step_m: float, progress_m: float, x_m: float, y_m: float, ahead_m: float
+) -> float:
+    """Arc length of the path's point beside the car, found by stepping on from the last one; never backwards."""
+    progress = progress_m
+    for _ in range(3):
+        yaw = _path_at(path, step_m, progress, PATH_YAW)
+        along = (x_m - _path_at(path, step_m, progress, PATH_X)) * math.cos(yaw) + (
+            y_m - _path_at(path, step_m, progress, PATH_Y)
+        ) * math.sin(yaw)
+        progress = max(progress_m, progress + min(along, ahead_m))
+    return progress
+
+
+@register_jitable
+def preview_steer_rad(
+    driver: Driver,
+    path: FloatArray,
+    step_m: float,
+    progress_m: float,
+    x_m: float,
+    y_m: float,
+    course_rad: float,
+    speed_m_s: float,
+) -> float:
+    """Road-wheel angle whose circle leads from the present course to the path's point at the preview distance.
+
+    A straight path's point dead ahead asks for none; e to the side at distance d asks for curvature 2 e / d².
+    """
+    distance = max(driver.preview_min_m, driver.preview_s * speed_m_s)
+    last_m = step_m * (path.shape[0] - 1)
+    at_m = progress_m + distance
+    dx = _path_at(path, step_m, at_m, PATH_X) - x_m
+    dy = _path_at(path, step_m, at_m, PATH_Y) - y_m
+    if at_m > last_m:
+        yaw = path[path.shape[0] - 1, PATH_YAW]
+        dx += (at_m - last_m) * math.cos(yaw)
+        dy += (at_m - last_m) * math.sin(yaw)
+    aside = -dx * math.sin(course_rad) + dy * math.cos(course_rad)
+    curvature = 2.0 * aside / (dx * dx + dy * dy)
+    steer = math.atan(curvature * driver.wheelbase_m) + (
+        driver.understeer_rad_per_m_s2 * curvature * speed_m_s * speed_m_s
+    )
+    return float(min(max(steer, -driver.steer_limit_rad), driver.steer_limit_rad))
+
+
+@register_jitable
+def move_steering(driver: Driver, memory: FloatArray, demand_rad: float, dt_s: float) -> float:
+    """Let the hands follow the demand (first-order lag, limited rate); returns the mean road-wheel angle in rad."""
+    rate = (demand_rad - memory[STEER]) / driver.steering_lag_s
+    rate = min(max(rate, -driver.steer_rate_limit_rad_s), driver.steer_rate_limit_rad_s)
+    memory[STEER] += rate * dt_s
+    return float(memory[STEER])
+
+
+@register_jitable
+def pedal_torques_n_m(
+    driver: Driver, memory: FloatArray, target_m_s: float, target_rate_m_s2: float, speed_m_s: float, dt_s: float
+) -> tuple[float, float]:
+    """Drive and brake torque (N m, all wheels) that hold a target speed (m/s) and its rate (m/s²)."""
+    error = target_m_s - speed_m_s
+    demand = target_rate_m_s2 + driver.speed_gain_per_s * error + memory[INTEGRAL]
+    limited = min(max(demand, -driver.braking_limit_m_s2), driver.acceleration_limit_m_s2)
+    if limited == demand and speed_m_s > 1.0:
+        memory[INTEGRAL] += driver.speed_integral_per_s2 * error * dt_s
+        memory[INTEGRAL] = min(max(memory[INTEGRAL], -0.6), 0.6)
+    memory[PEDAL] += (limited - memory[PEDAL]) / driver.pedal_lag_s * dt_s
+    torque = memory[PEDAL] * driver.mass_kg * driver.wheel_radius_m
+    if torque < 0.0:
+        return 0.0, -torque
+    most = min(driver.max_drive_n_m, driver.max_power_w * driver.wheel_radius_m / max(speed_m_s, 1.0))
+    return min(torque, most), 0.0
+
+
+@register_jitable
+def target_speed_m_s(path: FloatArray, step_m: float, stops: FloatArray, memory: FloatArray) -> tuple[float, float]:
+    """Speed (m/s) that the path asks for beside the car, and its rate (m/s²) along the path.
+
+    ``stops`` is [K, 2]: arc length in m, dwell in s. A driver does not roll past a stop that is still to be made, and
+    sets off from one towards the speed a little further on.
+    """
+    k = int(memory[STOP])
+    at_m = memory[PROGRESS]
+    if k < stops.shape[0]:
+        at_m = min(at_m, stops[k, 0])
+    if k > 0:
+        at_m = max(at_m, stops[k - 1, 0] + 2.0)
+    speed = _path_at(path, step_m, at_m, PATH_SPEED)
+    ahead = _path_at(path, step_m, at_m + 0.5, PATH_SPEED)
+    behind = _path_at(path, step_m, at_m - 0.5, PATH_SPEED)
+    return speed, 0.5 * (ahead * ahead - behind * behind)
+
+
+@register_jitable
+def standing(stops: FloatArray, memory: FloatArray, speed_m_s: float, dt_s: float) -> bool:
+    """Tell whether the driver keeps the brake on at a stop, and count its dwell (``stops`` as above)."""
+    k = int(memory[STOP])
+    if k >= stops.shape[0]:
+        return False
+    close = memory[PROGRESS] > stops[k, 0] - 0.6
+    if memory[DWELL] <= 0.0 and not (close and speed_m_s < 0.35):
+        return False
+    memory[DWELL] += dt_s
+    memory[INTEGRAL] = 0.0
+    if memory[DWELL] >= stops[k, 1]:
+        memory[STOP] += 1.0
+        memory[DWELL] = 0.0
+        memory[PEDAL] = 0.0
+        return False
+    return True

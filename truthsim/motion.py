@@ -1,0 +1,163 @@
+"""Driver and vehicle in one compiled loop: a plan goes in, the vehicle's motion comes out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.signals import FloatArray
+from truthsim.driver import (
+    MEMORY_SIZE,
+    PROGRESS,
+    Driver,
+    move_steering,
+    pedal_torques_n_m,
+    preview_steer_rad,
+    standing,
+    target_speed_m_s,
+    track_progress_m,
+)
+from truthsim.manoeuvres import CONTROL_STEP_S, PATH_STEP_M, Plan
+from truthsim.vehicle import OBSERVED, OBSERVED_SIZE, STATE_SIZE, Vehicle, derivative, observe, standing_state
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """What the vehicle did.
+
+    Attributes
+    ----------
+    times_s : [N], every ``period_s``.
+    observed : [N, phases, columns of ``truthsim.vehicle.OBSERVED``]; phase j is ``phases_s[j]`` after the row's time.
+    finite : False when the integration left the finite numbers.
+    """
+
+    times_s: FloatArray
+    phases_s: FloatArray
+    observed: FloatArray
+
+    def column(self, name: str, phase: int = 0) -> FloatArray:
+        """Return one observed quantity, [N]."""
+        return self.observed[:, phase, OBSERVED.index(name)]
+
+
+@cache
+def _compiled_loop() -> Callable[..., None]:
+    """Compile (or load from the cache) the loop.
+
+    Numba's cache watches the file of the compiled function alone. The digest of all files that are compiled into it is
+    a closure variable, which Numba does put into its key: an edited tyre is never run from an old cache entry.
+    """
+    folder = Path(__file__).parent
+    digest = hashlib.sha256()
+    for name in ("motion.py", "driver.py", "vehicle.py", "tyres.py", "manoeuvres.py"):
+        digest.update((folder / name).read_bytes())
+    sources = digest.hexdigest()
+
+    @njit(cache=True)
+    def loop(
+        start_speed_m_s: float,
+        steer_table: FloatArray,
+        path: FloatArray,
+        stops: FloatArray,
+        friction: float,
+        vehicle: Vehicle,
+        driver: Driver,
+        state: FloatArray,
+        rows: int,
+        period: int,
+        phases: FloatArray,
+        substeps: int,
+        observed: FloatArray,
+    ) -> str:
+        follows = path.shape[0] > 0
+        memory = np.zeros(MEMORY_SIZE)
+        scratch, view = np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
+        k1, k2, k3, k4 = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
+        dt = CONTROL_STEP_S / substeps
+        steer, next_steer = 0.0, 0.0
+        if not follows:
+            next_steer = steer_table[0]
+        for k in range((rows - 1) * period + int(phases[-1]) + 1):
+            steer = next_steer
+            observe(state, steer, 0.0, 0.0, friction, vehicle, scratch, view)
+            speed = view[3]
+            brake_hold = False
+            if follows:
+                memory[PROGRESS] = track_progress_m(path, PATH_STEP_M, memory[PROGRESS], view[0], view[1], 5.0)
+                target, target_rate = target_speed_m_s(path, PATH_STEP_M, stops, memory)
+                brake_hold = standing(stops, memory, speed, CONTROL_STEP_S)
+                course = view[2] + (np.arctan2(view[4], speed) if speed > 3.0 else 0.0)
+                demand = preview_steer_rad(driver, path, PATH_STEP_M, memory[PROGRESS], view[0], view[1], course, speed)
+                next_steer = steer if brake_hold else move_steering(driver, memory, demand, CONTROL_STEP_S)
+            else:
+                target, target_rate = start_speed_m_s, 0.0
+                next_steer = steer_table[min(k + 1, steer_table.shape[0] - 1)]
+            drive, brake = pedal_torques_n_m(driver, memory, target, target_rate, speed, CONTROL_STEP_S)
+            if brake_hold:
+                drive, brake = 0.0, driver.hold_brake_n_m
+
+            row = k // period
+            for j in range(phases.shape[0]):
+                if k - row * period == int(phases[j]) and row < rows:
+                    observe(state, steer, drive, brake, friction, vehicle, scratch, observed[row, j])
+
+            for i in range(substeps):
+                a = steer + (next_steer - steer) * i / substeps
+                c = steer + (next_steer - steer) * (i + 1) / substeps
+                b = 0.5 * (a + c)
+                derivative(state, a, drive, brake, friction, vehicle, k1, view)
+                derivative(state + 0.5 * dt * k1, b, drive, brake, friction, vehicle, k2, view)
+                derivative(state + 0.5 * dt * k2, b, drive, brake, friction, vehicle, k3, view)
+                derivative(state + dt * k3, c, drive, brake, friction, vehicle, k4, view)
+                state += dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        return sources
+
+    return loop  # type: ignore[no-any-return]
+
+
+def simulate_motion(
+    plan: Plan,
+    friction: float,
+    *,
+    vehicle: Vehicle | None = None,
+    driver: Driver | None = None,
+    period_s: float = 0.01,
+    phases_s: tuple[float, ...] = (0.0,),
+    substeps: int = 1,
+) -> Motion:
+    """Drive a plan (RK4 at 1 ms over ``substeps``) and record what can be observed.
+
+    Parameters
+    ----------
+    friction : of the road under all wheels.
+    period_s, phases_s : when to record, in whole milliseconds; phases ascend and lie in [0, period).
+    """
+    vehicle = Vehicle() if vehicle is None else vehicle
+    driver = Driver() if driver is None else driver
+    period = round(period_s / CONTROL_STEP_S)
+    phases = np.round(np.array(phases_s) / CONTROL_STEP_S)
+    rows = int(np.floor(plan.duration_s / period_s + 1e-9)) + 1
+    observed = np.full((rows, phases.shape[0], OBSERVED_SIZE), np.nan)
+    _compiled_loop()(
+        plan.start_speed_m_s,
+        plan.steer_rad,
+        plan.path,
+        plan.stops,
+        friction,
+        vehicle,
+        driver,
+        standing_state(vehicle, plan.start_speed_m_s),
+        rows,
+        period,
+        phases,
+        substeps,
+        observed,
+    )
+    return Motion(np.arange(rows, dtype=np.float64) * period_s, phases * CONTROL_STEP_S, observed)
