@@ -1,0 +1,410 @@
+"""recording.rrd: plots, uncertainty bands, plan view, events and the text report, with a blueprint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from pdhef_logtool.errors import OutputError
+from pdhef_logtool.geometry import wrap_angle
+from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.sinks.base import TRUTH, Event, PendingFile
+from pdhef_logtool.sinks.palette import colour_rgb
+from pdhef_logtool.sinks.report import report_markdown
+from pdhef_logtool.tracks import StateTrack
+
+APPLICATION_ID = "pdhef-logtool"
+
+#: Half width of the 95 % interval of a normal distribution, in standard deviations.
+STD_OF_95_PERCENT = 1.959963985
+
+#: A line is broken where nothing is known for longer than this.
+LONGEST_BRIDGE_NS = 1_000_000_000
+
+#: Points of one trajectory in the plan view; it is thinned when it would grow beyond.
+MOST_TRAJECTORY_POINTS = 20_000
+
+#: Steps of the moving dot in the plan view.
+DOT_STEP_NS = 50_000_000
+
+_DEG = float(np.rad2deg(1.0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Plot:
+    """One plotted quantity: entity, track column, factor to the plotted unit, and its standard deviation's column."""
+
+    entity: str
+    column: str
+    factor: float
+    std: str | None = None
+    is_angle: bool = False
+    sparse: bool = False
+    from_low_speed: bool = True
+
+
+_STATES = (
+    _Plot("sideslip_deg", "sideslip_rad", _DEG, "sideslip_std_rad", is_angle=True, from_low_speed=False),
+    _Plot("yaw_rate_deg_s", "yaw_rate_rad_s", _DEG, "yaw_rate_std_rad_s"),
+    _Plot("vx_m_s", "vx_m_s", 1.0, "vx_std_m_s"),
+    _Plot("vy_m_s", "vy_m_s", 1.0, "vy_std_m_s"),
+    _Plot("ay_m_s2", "ay_m_s2", 1.0),
+)
+_HEALTH = (
+    _Plot("nis", "nis", 1.0, sparse=True),
+    _Plot("network_trust", "network_trust", 1.0),
+    _Plot("r_scale", "r_scale", 1.0),
+    _Plot("friction", "friction", 1.0),
+)
+_INPUTS = (
+    ("steer_deg", "steer_rad", _DEG),
+    ("speed_m_s", "speed_m_s", 1.0),
+    ("ax_m_s2", "ax_m_s2", 1.0),
+    ("ay_m_s2", "ay_m_s2", 1.0),
+    ("yaw_rate_deg_s", "yaw_rate_rad_s", _DEG),
+)
+_INPUT_RGB = (0x56, 0xB4, 0xE9)
+
+
+class RerunSink:
+    """Writes recording.rrd window by window; memory does not grow with the log but for the thinned trajectories.
+
+    Errors are drawn at stamps that truth and estimate share.
+
+    Parameters
+    ----------
+    path : where the finished recording stands.
+    log_name : shown as the recording's name.
+    input_hash : hexadecimal hash of all that went into the run; names the recording, so that the viewer takes two
+        recordings of the same run as one and of different runs as two.
+    start_ns : zero of the timeline ``elapsed``.
+    min_speed_m_s : sideslip is not drawn below, where it has no meaning.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written or Rerun is switched off by its environment variable.
+    """
+
+    def __init__(
+        self, path: Path, *, log_name: str, input_hash: str, start_ns: int, min_speed_m_s: float = 1.0
+    ) -> None:
+        self._start_ns = start_ns
+        self._min_speed_m_s = min_speed_m_s
+        self._lines: dict[str, _Line] = {}
+        self._paths: dict[str, _Trajectory] = {}
+        self._window: dict[str, StateTrack] = {}
+        self._compared: set[str] = set()
+        self._pending = PendingFile(path)
+        self._recording = rr.RecordingStream(APPLICATION_ID, recording_id=input_hash[:32], send_properties=False)
+        if not rr.is_enabled(self._recording):
+            raise OutputError(
+                expected="Rerun switched on",
+                got="switched off by the environment variable RERUN",
+                where=str(path),
+                remedy="unset RERUN",
+            )
+        try:
+            self._recording.save(self._pending.path, default_blueprint=_blueprint())
+        except (OSError, RuntimeError) as error:
+            raise OutputError(expected="a place to write to", got=str(error), where=str(path)) from error
+        self._recording.send_recording_name(log_name)
+        self._recording.send_recording_start_time_nanos(start_ns)
+
+    def append_signals(self, signals: Signals) -> None:
+        """Draw what the estimators saw in this window."""
+        for entity, column, factor in _INPUTS:
+            values = np.asarray(getattr(signals, column)) * factor
+            self._draw(f"/inputs/{entity}", entity, _INPUT_RGB, signals.stamps_ns, values, sparse=True)
+
+    def append(self, track: StateTrack) -> None:
+        """Draw one track of this window."""
+        if track.name in self._window:
+            self._window.clear()
+            self._compared.clear()
+        self._window[track.name] = track
+        rgb = colour_rgb(track.name)
+        fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
+        for plot in _STATES + _HEALTH:
+            values = np.asarray(getattr(track, plot.column)) * plot.factor
+            known = track.valid if plot.from_low_speed else track.valid & fast
+            values = np.where(known, values, np.nan)
+            entity = f"/{plot.entity}/{track.name}"
+            self._draw(entity, track.name, rgb, track.stamps_ns, values, sparse=plot.sparse)
+            if plot.std is not None:
+                half = STD_OF_95_PERCENT * plot.factor * np.asarray(getattr(track, plot.std))
+                self._draw_band(f"{entity}/band95", track.name, rgb, track.stamps_ns, values, half)
+        self._draw_path(track, rgb)
+        self._draw_errors()
+
+    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:
+        """Add trajectories, events and the text report, and give the recording its name."""
+        try:
+            for name, path in self._paths.items():
+                self._log_static(
+                    f"/plan/{name}",
+                    rr.LineStrips2D(path.strips(), colors=[colour_rgb(name)], radii=[rr.Radius.ui_points(1.5)]),
+                )
+            if events:
+                ordered = sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
+                rr.send_columns(
+                    "/events",
+                    indexes=self._times(np.array([e.start_ns for e in ordered], dtype=np.int64)),
+                    columns=rr.TextLog.columns(text=[_event_text(e) for e in ordered], level=["INFO"] * len(ordered)),
+                    recording=self._recording,
+                    strict=True,
+                )
+            self._log_static("/report", rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN))
+            self._close()
+        except BaseException:
+            self.abort()
+            raise
+        self._pending.commit()
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        self._close()
+        self._pending.discard()
+
+    def _close(self) -> None:
+        self._recording.disconnect()
+
+    def _times(self, stamps_ns: IntArray) -> list[rr.TimeColumn]:
+        return [
+            rr.TimeColumn("time", timestamp=stamps_ns.astype("datetime64[ns]")),
+            rr.TimeColumn("elapsed", duration=(stamps_ns - self._start_ns).astype("timedelta64[ns]")),
+        ]
+
+    def _log_static(self, entity: str, what: rr.AsComponents) -> None:
+        self._recording.log(entity, what, static=True, strict=True)
+
+    def _draw(
+        self,
+        entity: str,
+        label: str,
+        rgb: tuple[int, int, int],
+        stamps_ns: IntArray,
+        values: FloatArray,
+        *,
+        sparse: bool = False,
+    ) -> None:
+        """Send one line; [N] stamps and values, NaN where unknown."""
+        self._send(entity, [label], [rgb], 2.0 if label == TRUTH else 1.5, stamps_ns, values[:, None], sparse=sparse)
+
+    def _draw_band(
+        self,
+        entity: str,
+        label: str,
+        rgb: tuple[int, int, int],
+        stamps_ns: IntArray,
+        middle: FloatArray,
+        half: FloatArray,
+    ) -> None:
+        labels = [f"{label} 95 % low", f"{label} 95 % high"]
+        edges = np.stack([middle - half, middle + half], axis=1)
+        self._send(entity, labels, [(*rgb, 110)] * 2, 0.75, stamps_ns, edges)
+
+    def _send(
+        self,
+        entity: str,
+        labels: list[str],
+        colours: Sequence[tuple[int, ...]],
+        width: float,
+        stamps_ns: IntArray,
+        values: FloatArray,
+        *,
+        sparse: bool = False,
+    ) -> None:
+        """Send the known rows of ``values`` [N, k]; an empty row, which breaks the line, stands for missing ones."""
+        line = self._lines.get(entity)
+        known: BoolArray = np.all(np.isfinite(values), axis=1)
+        if line is None:
+            if not known.any():
+                return
+            self._log_static(entity, rr.SeriesLines(names=labels, colors=list(colours), widths=[width] * len(labels)))
+            line = self._lines[entity] = _Line(LONGEST_BRIDGE_NS if sparse else 0)
+        stamps, rows, is_break = line.rows(stamps_ns, known)
+        if len(stamps) == 0:
+            return
+        lengths = np.where(is_break, 0, values.shape[1])
+        rr.send_columns(
+            entity,
+            indexes=self._times(stamps),
+            columns=rr.Scalars.columns(scalars=values[rows].reshape(-1)).partition(lengths),
+            recording=self._recording,
+            strict=True,
+        )
+
+    def _draw_path(self, track: StateTrack, rgb: tuple[int, int, int]) -> None:
+        # North is drawn up: the y axis of Rerun's 2D views points down.
+        plan = np.stack([track.x_m, -track.y_m], axis=1)
+        known = np.isfinite(plan).all(axis=1) & track.valid
+        if not known.any():
+            return
+        if track.name not in self._paths:
+            self._paths[track.name] = _Trajectory(MOST_TRAJECTORY_POINTS)
+            style = rr.Points2D.from_fields(colors=[rgb], radii=[rr.Radius.ui_points(5.0)], labels=[track.name])
+            self._log_static(f"/plan/{track.name}/now", style)
+        self._paths[track.name].append(np.where(known[:, None], plan, np.nan))
+        slot = track.stamps_ns // DOT_STEP_NS
+        shown = known & (np.diff(slot, prepend=slot[:1] - 1) != 0)
+        if shown.any():
+            rr.send_columns(
+                f"/plan/{track.name}/now",
+                indexes=self._times(track.stamps_ns[shown]),
+                columns=rr.Points2D.columns(positions=plan[shown]),
+                recording=self._recording,
+                strict=True,
+            )
+
+    def _draw_errors(self) -> None:
+        truth = self._window.get(TRUTH)
+        if truth is None:
+            return
+        for name, track in self._window.items():
+            if name == TRUTH or name in self._compared:
+                continue
+            self._compared.add(name)
+            _, of_track, of_truth = np.intersect1d(
+                track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True
+            )
+            valid = track.valid[of_track] & truth.valid[of_truth]
+            fast = np.hypot(truth.vx_m_s, truth.vy_m_s)[of_truth] >= self._min_speed_m_s
+            for plot in _STATES:
+                error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
+                error = plot.factor * (wrap_angle(error) if plot.is_angle else error)
+                known = valid if plot.from_low_speed else valid & fast
+                self._draw(
+                    f"/error/{plot.entity}/{name}",
+                    name,
+                    colour_rgb(name),
+                    track.stamps_ns[of_track],
+                    np.where(known, error, np.nan),
+                )
+
+
+@dataclass(slots=True)
+class _Line:
+    """Where a line stands between windows: its last known stamp, and whether unknown rows followed it."""
+
+    bridge_ns: int
+    last_ns: int | None = None
+    unknown_since: bool = False
+
+    def rows(self, stamps_ns: IntArray, known: BoolArray) -> tuple[IntArray, IntArray, BoolArray]:
+        """Choose the rows to send: stamps [M], indices of known rows, and which of the M are breaks.
+
+        A break stands 1 ns behind the last known stamp before a gap: where unknown rows lie between two known ones
+        that are further apart than ``bridge_ns``, or where they are further apart than LONGEST_BRIDGE_NS.
+        """
+        at = np.flatnonzero(known)
+        if len(at) == 0:
+            self.unknown_since |= len(known) > 0
+            return np.empty(0, dtype=np.int64), at, np.empty(0, dtype=np.bool_)
+        stamps = stamps_ns[at]
+        before = np.concatenate([[stamps[0] if self.last_ns is None else self.last_ns], stamps[:-1]])
+        unknown_between = np.diff(at, prepend=-1) > 1
+        unknown_between[0] |= self.unknown_since
+        step = stamps - before
+        gap = (unknown_between & (step > self.bridge_ns)) | (step > LONGEST_BRIDGE_NS)
+        if self.last_ns is None:
+            gap[0] = False
+        self.last_ns = int(stamps[-1])
+        self.unknown_since = bool(at[-1] < len(known) - 1)
+        places = np.flatnonzero(gap)
+        all_stamps = np.insert(stamps, places, before[places] + 1)
+        is_break = np.insert(np.zeros(len(stamps), dtype=np.bool_), places, True)
+        return all_stamps, at, is_break
+
+
+@dataclass(slots=True)
+class _Trajectory:
+    """Points of a path, thinned to every 2^k-th as it grows; NaN rows part its strips."""
+
+    most_points: int
+    stride: int = 1
+    seen: int = 0
+    parts: list[FloatArray] = field(default_factory=list)
+
+    def append(self, points: FloatArray) -> None:
+        """Add [N, 2] points."""
+        first = -self.seen % self.stride
+        self.parts.append(np.array(points[first :: self.stride]))
+        self.seen += len(points)
+        while sum(map(len, self.parts)) > self.most_points:
+            self.parts = [np.concatenate(self.parts)[::2]]
+            self.stride *= 2
+
+    def strips(self) -> list[FloatArray]:
+        """Return the strips of at least two points, each [N, 2]."""
+        points = np.concatenate(self.parts)
+        known = np.isfinite(points).all(axis=1)
+        pieces = np.split(points, np.flatnonzero(np.diff(known)) + 1)
+        return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]
+
+
+def _event_text(event: Event) -> str:
+    return f"{event.name}, {(event.end_ns - event.start_ns) * 1e-9:.2f} s: {event.text}"
+
+
+def _blueprint() -> rrb.Blueprint:
+    """Open on the drive: sideslip with bands, yaw rate, a_y, inputs and the plan; errors, filter and report as tabs."""
+
+    def plot(origin: str, name: str) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(origin=origin, name=name)
+
+    drive = rrb.Horizontal(
+        rrb.Vertical(
+            plot("/sideslip_deg", "Sideslip [deg]"),
+            plot("/yaw_rate_deg_s", "Yaw rate [deg/s]"),
+            plot("/ay_m_s2", "Lateral acceleration [m/s²]"),
+            rrb.TimeSeriesView(
+                origin="/inputs",
+                contents=["$origin/speed_m_s", "$origin/steer_deg"],
+                name="Speed [m/s], road-wheel angle [deg]",
+            ),
+            row_shares=[3, 2, 2, 2],
+        ),
+        rrb.Vertical(
+            rrb.Spatial2DView(origin="/plan", name="Plan, north up [m]"),
+            rrb.TextLogView(origin="/events", name="Events"),
+            row_shares=[3, 1],
+        ),
+        column_shares=[3, 2],
+        name="Drive",
+    )
+    errors = rrb.Vertical(
+        *(plot(f"/error/{entity}", f"Error of {name}") for entity, name in _ERROR_NAMES), name="Errors"
+    )
+    filters = rrb.Vertical(
+        plot("/nis", "Normalised innovation squared"),
+        plot("/network_trust", "Network trust"),
+        plot("/r_scale", "Factor on R"),
+        plot("/vx_m_s", "Longitudinal velocity [m/s]"),
+        plot("/vy_m_s", "Lateral velocity [m/s]"),
+        name="Filter",
+    )
+    report = rrb.TextDocumentView(origin="/report", name="Report")
+    return rrb.Blueprint(
+        rrb.Tabs(drive, errors, filters, report, active_tab=0),
+        rrb.TimePanel(state="collapsed", timeline="time"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.BlueprintPanel(state="collapsed"),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+_ERROR_NAMES = (
+    ("sideslip_deg", "sideslip [deg]"),
+    ("yaw_rate_deg_s", "yaw rate [deg/s]"),
+    ("vx_m_s", "longitudinal velocity [m/s]"),
+    ("vy_m_s", "lateral velocity [m/s]"),
+    ("ay_m_s2", "lateral acceleration [m/s²]"),
+)
