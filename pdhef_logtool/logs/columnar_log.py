@@ -1,0 +1,320 @@
+"""A drive log over one or several containers: columns of the fields asked for, in windows of log time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError
+from pdhef_logtool.logs.decoding import (
+    ChannelDecoder,
+    channel_schema,
+    compile_decoder,
+    concatenate_columns,
+    empty_column,
+    missing_column,
+    undecodable_topic,
+)
+from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves
+from pdhef_logtool.signals import IntArray, Loss
+
+#: Neighbouring windows share the span at their border; this many decoded spans are kept for the next window.
+_KEPT_SPANS = 2
+
+
+class ColumnarLog:
+    """See :class:`~pdhef_logtool.logs.drive_log.DriveLog`.
+
+    Parameters
+    ----------
+    path : file or folder as the user named it.
+    kind : ``mcap``, ``rosbag1``, ``rosbag2-sqlite3`` or ``rosbag2-mcap``.
+    containers : the log's files in order of recording.
+    lost : damage found while the log was opened, beside the containers' own.
+    distro : ROS distribution for types without definitions.
+    """
+
+    def __init__(
+        self, path: Path, kind: str, containers: Sequence[Container], lost: Sequence[Loss] = (), distro: str = ""
+    ) -> None:
+        self._path = path
+        self._kind = kind
+        self._containers = tuple(containers)
+        self._opened_lost = tuple(lost)
+        self._distro = distro
+        self._damaged: dict[tuple[int, int], Loss] = {}
+        self._undecodable: dict[tuple[int, int], int] = {}  # messages that do not decode, by container and channel
+        self._seen_undecodable: set[tuple[int, int, int, int]] = set()
+        self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
+        self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
+        self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
+
+    @property
+    def path(self) -> Path:
+        """The file or folder."""
+        return self._path
+
+    @property
+    def kind(self) -> str:
+        """The container format."""
+        return self._kind
+
+    @property
+    def containers(self) -> tuple[Container, ...]:
+        """The files of the log."""
+        return self._containers
+
+    @property
+    def distro(self) -> str:
+        """ROS distribution that types without definitions are taken from; empty if unknown."""
+        return self._distro
+
+    @property
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """All topics by name; ``messages`` leaves out those of spans found damaged so far."""
+        counts: Counter[str] = Counter()
+        first: dict[str, ChannelRecord] = {}
+        for c, container in enumerate(self._containers):
+            for channel in container.channels.values():
+                first.setdefault(channel.topic, channel)
+            for span in container.spans:
+                if (c, span.index) not in self._damaged:
+                    for id_, n in span.counts.items():
+                        counts[container.channels[id_].topic] += n
+        return tuple(
+            TopicInfo(name, first[name].type_name, first[name].encoding, counts[name]) for name in sorted(first)
+        )
+
+    @property
+    def start_ns(self) -> int:
+        """First log time; 0 for a log without messages."""
+        return min((s.start_ns for c in self._containers for s in c.spans), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        """Last log time + 1; 0 for a log without messages."""
+        return max((s.end_ns for c in self._containers for s in c.spans), default=0)
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """What could not be read, as far as is known by now."""
+        found = list(self._opened_lost)
+        for c, container in enumerate(self._containers):
+            found.extend(container.lost)
+            found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
+            for (of, channel), n in sorted(self._undecodable.items()):
+                if of == c and n:
+                    topic = container.channels[channel].topic
+                    what = f"{n} messages do not fit the type of their topic"
+                    found.append(Loss("undecodable", what, topic, count=n))
+        return tuple(found)
+
+    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
+        """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
+        for c, container in enumerate(self._containers):
+            for channel in container.channels.values():
+                if channel.topic == topic:
+                    schema = self._schema(c, channel)
+                    if isinstance(schema, MessageSchema):
+                        return tuple(leaves(schema.root))
+        return ()
+
+    def read(
+        self,
+        requests: Mapping[str, Sequence[str]],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> dict[str, Columns]:
+        """Read the fields asked for of messages with log time in [start, end).
+
+        Raises
+        ------
+        MappingError : the log has no such topic, no such field, or cannot decode the topic.
+        """
+        plans = {topic: self._cached_plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
+        return self._collect(plans, start_ns, end_ns)
+
+    def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
+        """Read only log and publish times of every topic."""
+        return self._collect({t.name: _Plan((), {}) for t in self.topics}, start_ns, end_ns)
+
+    def close(self) -> None:
+        """Release the files."""
+        self._kept.clear()
+        for container in self._containers:
+            container.close()
+
+    def load(self, c: int, span: Span, want: frozenset[int] | None = None) -> Block | None:
+        """Read a span of the c-th container; None and a recorded loss if it is damaged."""
+        container = self._containers[c]
+        want = want if container.selective else None
+        key = (c, span.index)
+        if key in self._damaged:
+            return None
+        kept = self._kept.get((*key, want))
+        if kept is not None:
+            return kept
+        try:
+            block = container.load(span, want)
+        except SpanDamageError as error:
+            count = sum(span.counts.values()) or None
+            held = f"{count} messages" if count else "an unknown number of messages"
+            self._damaged[key] = Loss(
+                "bad-chunk", f"{held} lost: {error}", str(container.path), span.start_ns, span.end_ns, count
+            )
+            return None
+        self._kept[(*key, want)] = block
+        while len(self._kept) > _KEPT_SPANS:
+            self._kept.pop(next(iter(self._kept)))
+        return block
+
+    def _schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
+        key = (c, channel.id)
+        if key not in self._schemas:
+            try:
+                self._schemas[key] = channel_schema(channel, self._distro, self._example(c, channel))
+            except SchemaError as error:
+                self._schemas[key] = error
+        return self._schemas[key]
+
+    def _example(self, c: int, channel: ChannelRecord) -> bytes | None:
+        """Return a channel's first message if its schema has to be taken from it."""
+        if channel.encoding != "json" or channel.schema_data.strip():
+            return None
+        for span in self._containers[c].spans:
+            if channel.id in span.counts:
+                block = self.load(c, span)
+                if block is None:
+                    continue
+                rows = np.flatnonzero(block.channel == channel.id)
+                if rows.size:
+                    row = int(rows[0])
+                    at, n = int(block.offset[row]), int(block.length[row])
+                    return bytes(block.buffer[at : at + n])
+        return None
+
+    def _cached_plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:
+        key = (topic, paths)
+        if key not in self._plans:
+            self._plans[key] = self._plan(topic, paths)
+        return self._plans[key]
+
+    def _plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:
+        decoders: dict[tuple[int, int], ChannelDecoder] = {}
+        problems: list[MappingError] = []
+        found = False
+        for c, container in enumerate(self._containers):
+            for channel in container.channels.values():
+                if channel.topic != topic:
+                    continue
+                found = True
+                if not paths:
+                    continue
+                schema = self._schema(c, channel)
+                if isinstance(schema, SchemaError):
+                    problems.append(undecodable_topic(topic, str(schema)))
+                    continue
+                try:
+                    decoders[(c, channel.id)] = compile_decoder(schema, topic, paths)
+                except MappingError as error:
+                    problems.append(error)
+        if not found:
+            raise self._no_such_topic(topic)
+        if paths and not decoders:
+            raise problems[0]
+        # A second publisher of another type under the same topic lacks the fields: NaN there.
+        selections = next(iter(decoders.values())).selections if decoders else ()
+        return _Plan(selections, decoders)
+
+    def _no_such_topic(self, topic: str) -> MappingError:
+        import difflib
+
+        names = [t.name for t in self.topics]
+        near = difflib.get_close_matches(topic, names, n=3, cutoff=0.3) or names[:5]
+        return MappingError(
+            expected="a topic of the log",
+            got=repr(topic),
+            where=str(self._path),
+            remedy=f"nearest: {', '.join(near)}" if near else "the log has no topics",
+        )
+
+    def _overlapping(self, start_ns: int | None, end_ns: int | None) -> Iterator[tuple[int, Container, Span]]:
+        for c, container in enumerate(self._containers):
+            for span in container.spans:
+                if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
+                    yield c, container, span
+
+    def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
+        parts: dict[str, list[_Part]] = {topic: [] for topic in plans}
+        for c, container, span in self._overlapping(start_ns, end_ns):
+            topic_of = {i: ch.topic for i, ch in container.channels.items() if ch.topic in plans and i in span.counts}
+            if not topic_of:
+                continue
+            block = self.load(c, span, frozenset(topic_of))
+            if block is None:
+                continue
+            keep = np.ones(len(block), dtype=np.bool_)
+            if start_ns is not None:
+                keep &= block.log_time_ns >= start_ns
+            if end_ns is not None:
+                keep &= block.log_time_ns < end_ns
+            for id_, topic in topic_of.items():
+                rows = np.flatnonzero(keep & (block.channel == id_))
+                if rows.size:
+                    part = self._decode(plans[topic], c, span, id_, block, rows)
+                    if part is not None:
+                        parts[topic].append(part)
+        return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
+
+    def _decode(self, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray) -> _Part | None:
+        if not plan.selections:
+            return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], {})
+        decoder = plan.decoders.get((c, id_))
+        if decoder is None:
+            fields = {s.path: missing_column(s, len(rows)) for s in plan.selections}
+            return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], fields)
+        before = decoder.undecodable
+        fields = decoder.columns(block, rows)
+        if decoder.undecodable > before:
+            key = (c, span.index, id_, int(rows[0]))
+            if key not in self._seen_undecodable:
+                self._seen_undecodable.add(key)
+                self._undecodable[(c, id_)] = self._undecodable.get((c, id_), 0) + decoder.undecodable - before
+        return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], fields)
+
+
+class _Plan:
+    """What is read of one topic: the resolved paths and a decoder a channel."""
+
+    def __init__(self, selections: tuple[Selection, ...], decoders: Mapping[tuple[int, int], ChannelDecoder]) -> None:
+        self.selections = selections
+        self.decoders = decoders
+
+
+class _Part:
+    """Columns of one topic from one span."""
+
+    def __init__(self, log_time_ns: IntArray, publish_time_ns: IntArray, fields: dict[str, NDArray[Any]]) -> None:
+        self.log_time_ns = log_time_ns
+        self.publish_time_ns = publish_time_ns
+        self.fields = fields
+
+
+def _join(topic: str, plan: _Plan, parts: Sequence[_Part]) -> Columns:
+    if not parts:
+        none = np.empty(0, dtype=np.int64)
+        return Columns(topic, none, none.copy(), {s.path: empty_column(s) for s in plan.selections})
+    log_time = np.concatenate([p.log_time_ns for p in parts])
+    publish_time = np.concatenate([p.publish_time_ns for p in parts])
+    fields = {s.path: concatenate_columns([p.fields[s.path] for p in parts]) for s in plan.selections}
+    if np.all(log_time[1:] >= log_time[:-1]):
+        return Columns(topic, log_time, publish_time, fields)
+    order = np.argsort(log_time, kind="stable")
+    return Columns(topic, log_time[order], publish_time[order], {p: f[order] for p, f in fields.items()})

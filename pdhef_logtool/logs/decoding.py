@@ -1,0 +1,342 @@
+"""Undecoded messages of one channel to columns of the fields asked for.
+
+ROS messages are read as fixed-layout records as long as their strings and sequences keep their lengths, and one by
+one through the rosbags deserialiser where they do not. A path is resolved once per channel, never per message.
+
+A quaternion struct (members x, y, z, w) read as a whole gives the columns w, x, y, z; x, y, z structs keep that order.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.container import Block, ChannelRecord
+from pdhef_logtool.logs.message_schema import (
+    TIME_MEMBERS,
+    VECTOR_ORDERS,
+    MessageSchema,
+    SchemaError,
+    Selection,
+    Step,
+    json_schema,
+    resolve,
+    ros_schema,
+    schema_from_example,
+    value_at,
+)
+from pdhef_logtool.logs.wire_layout import (
+    NoLayoutError,
+    WireLayout,
+    layout_of_message,
+    leaf_values,
+    matches,
+    records,
+)
+from pdhef_logtool.signals import IntArray
+
+#: Stands in a time column where the message lacks the time (NaN of int64).
+NO_TIME_NS = int(np.iinfo(np.int64).min)
+_LAYOUTS_PER_CHANNEL = 8
+
+
+def channel_schema(channel: ChannelRecord, distro: str = "", example: bytes | None = None) -> MessageSchema:
+    """Parse the schema of a channel.
+
+    Parameters
+    ----------
+    channel : channel to decode.
+    distro : ROS distribution for types without a definition.
+    example : first message, for JSON without a schema.
+
+    Raises
+    ------
+    SchemaError : the encoding is not supported, or the schema does not parse.
+    """
+    if channel.encoding in ("cdr", "ros1"):
+        if channel.schema_encoding not in ("ros2msg", "ros2idl", "ros1msg", ""):
+            raise SchemaError(f"{channel.encoding} messages with a {channel.schema_encoding!r} schema")
+        text = channel.schema_data.decode("utf-8", errors="replace")
+        if not channel.type_name:
+            raise SchemaError("no type name")
+        return ros_schema(channel.type_name, channel.schema_encoding, text, channel.encoding, distro)
+    if channel.encoding == "json":
+        if channel.schema_encoding == "jsonschema" and channel.schema_data.strip():
+            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"))
+        if example is not None:
+            try:
+                return schema_from_example(channel.type_name, json.loads(example))
+            except ValueError as error:
+                raise SchemaError(f"the first message is no JSON: {error}") from error
+        raise SchemaError("JSON without a schema and without a message")
+    raise SchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
+
+
+@dataclass(slots=True)
+class ChannelDecoder:
+    """Decodes the messages of one channel for one set of paths; made by :func:`compile_decoder`.
+
+    ``undecodable`` counts the messages so far whose payload does not fit their type (their fields are NaN).
+    """
+
+    schema: MessageSchema
+    selections: tuple[Selection, ...]
+    undecodable: int = 0
+    _layouts: list[WireLayout] = field(default_factory=list)
+    _columns_of: dict[str, tuple[str, int]] = field(default_factory=dict)
+
+    def columns(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
+        """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
+        partial: list[tuple[IntArray, dict[str, NDArray[Any]]]] = []
+        left = np.arange(len(rows))
+        if self.schema.wire in ("cdr", "ros1"):
+            left = self._read_records(block, rows, left, partial)
+        if left.size or not partial:
+            partial.append((left, self._read_singly(block, rows[left])))
+        if len(partial) == 1 and len(partial[0][0]) == len(rows):
+            order = partial[0][0]
+            return {p: c if _is_sorted(order) else c[np.argsort(order)] for p, c in partial[0][1].items()}
+        joined = {s.path: concatenate_columns([part[s.path] for _, part in partial]) for s in self.selections}
+        back = np.argsort(np.concatenate([at for at, _ in partial]), kind="stable")
+        return {path: column[back] for path, column in joined.items()}
+
+    def _read_records(
+        self, block: Block, rows: IntArray, left: IntArray, partial: list[tuple[IntArray, dict[str, NDArray[Any]]]]
+    ) -> IntArray:
+        """Read what has a fixed layout; returns the rows that have none."""
+        no_layout: list[IntArray] = []
+        tried = 0
+        while left.size and tried <= len(self._layouts):
+            if tried == len(self._layouts):
+                if tried >= _LAYOUTS_PER_CHANNEL:
+                    break
+                at, n = int(block.offset[rows[left[0]]]), int(block.length[rows[left[0]]])
+                try:
+                    layout = layout_of_message(self.schema.root, self.schema.wire, bytes(block.buffer[at : at + n]))
+                except NoLayoutError:
+                    no_layout.append(left[:1])
+                    left = left[1:]
+                    if len(no_layout) >= _LAYOUTS_PER_CHANNEL:
+                        break
+                    continue
+                self._layouts.append(layout)
+            layout = self._layouts[tried]
+            tried += 1
+            # Up to three bytes of padding may follow a CDR message.
+            surplus = block.length[rows[left]] - layout.size
+            fits = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
+            candidates = left[fits]
+            data = records(block.buffer, block.offset[rows[candidates]], layout.size)
+            good = matches(layout, data, self.schema.wire)
+            fits[np.flatnonzero(fits)[~good]] = False
+            if np.any(good):
+                partial.append((left[fits], self._record_columns(layout, data[good])))
+            left = left[~fits]
+        return np.concatenate([*no_layout, left]) if no_layout else left
+
+    def _record_columns(self, layout: WireLayout, data: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+        return {s.path: _record_column(layout, data, s) for s in self.selections}
+
+    def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
+        decode = self._single_decoder()
+        values: dict[str, list[object]] = {s.path: [] for s in self.selections}
+        for at, n in zip(block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
+            message = decode(bytes(block.buffer[at : at + n]))
+            if message is None:
+                self.undecodable += 1
+            for s in self.selections:
+                values[s.path].append(_single_value(message, s))
+        return {s.path: self._single_column(s, values[s.path]) for s in self.selections}
+
+    def _single_decoder(self) -> Callable[[bytes], object]:
+        store, name = self.schema.store, self.schema.type_name
+        if store is None:
+
+            def decode_json(data: bytes) -> object:
+                try:
+                    return json.loads(data)
+                except ValueError:
+                    return None
+
+            return decode_json
+        from rosbags.serde import SerdeError
+
+        function = store.deserialize_cdr if self.schema.wire == "cdr" else store.deserialize_ros1
+
+        def decode_ros(data: bytes) -> object:
+            try:
+                return function(data, name)
+            except (SerdeError, ValueError, IndexError, KeyError, MemoryError, OverflowError, AssertionError):
+                return None
+            except Exception as error:
+                # The generated code unpacks with struct, whose error has no narrower base.
+                if type(error).__name__ != "error":
+                    raise
+                return None
+
+        return decode_ros
+
+    def _single_column(self, selection: Selection, values: list[object]) -> NDArray[Any]:
+        if selection.shape == "dynamic":
+            shape, width = self._columns_of.get(selection.path, ("", 0))
+            if not shape:
+                shape, width = _shape_of_values(values)
+                if shape:
+                    self._columns_of[selection.path] = (shape, width)
+            return _column(shape or "scalar", values, width or None)
+        width_known = selection.length if selection.shape == "array" else len(selection.components)
+        return _column(selection.shape, values, width_known)
+
+
+def compile_decoder(schema: MessageSchema, topic: str, paths: Sequence[str]) -> ChannelDecoder:
+    """Resolve paths against a schema once.
+
+    Raises
+    ------
+    MappingError : the schema has no such path; the nearest ones are named.
+    """
+    return ChannelDecoder(schema, tuple(resolve(schema, topic, path) for path in paths))
+
+
+def undecodable_topic(topic: str, reason: str) -> MappingError:
+    """Return the error for fields asked of a topic whose messages cannot be decoded."""
+    return MappingError(
+        expected="messages as ROS 2 CDR, ROS 1 or JSON with a schema that parses",
+        got=reason,
+        where=topic,
+        remedy="map another topic",
+    )
+
+
+def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Join parts of one column; arrays of unequal width are filled up with NaN on the right."""
+    if len(parts) == 1:
+        return parts[0]
+    filled = [p for p in parts if p.shape[0]] or list(parts[:1])
+    width = max((p.shape[1] for p in filled if p.ndim == 2), default=None)
+    if width is None:
+        return np.concatenate(filled)
+    wide = []
+    for part in filled:
+        columns = part if part.ndim == 2 else part[:, None]
+        if columns.shape[1] < width:
+            columns = np.pad(columns, ((0, 0), (0, width - columns.shape[1])), constant_values=np.nan)
+        wide.append(columns)
+    return np.concatenate(wide)
+
+
+def empty_column(selection: Selection) -> NDArray[Any]:
+    """Return the column of a path over no messages."""
+    if selection.shape == "time":
+        return np.empty(0, dtype=np.int64)
+    if selection.shape == "vector":
+        return np.empty((0, len(selection.components)))
+    if selection.shape == "array":
+        return np.empty((0, selection.length or 0))
+    return np.empty(0)
+
+
+def missing_column(selection: Selection, n: int) -> NDArray[Any]:
+    """Return the column of a path that none of the N messages has."""
+    empty = empty_column(selection)
+    fill: float | int = NO_TIME_NS if selection.shape == "time" else np.nan
+    return np.full((n, *empty.shape[1:]), fill, dtype=empty.dtype)
+
+
+def _is_sorted(order: IntArray) -> bool:
+    return bool(np.all(order[1:] >= order[:-1]))
+
+
+def _record_column(layout: WireLayout, data: NDArray[np.uint8], selection: Selection) -> NDArray[Any]:
+    found = [leaf_values(layout, data, steps) for steps in selection.components]
+    n = data.shape[0]
+    if selection.shape == "time":
+        seconds, nanoseconds = found
+        if seconds is None or nanoseconds is None:
+            return np.full(n, NO_TIME_NS, dtype=np.int64)
+        return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+    if selection.shape == "vector":
+        return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in found])
+    if found[0] is None:
+        return missing_column(selection, n)
+    return found[0].astype(np.float64)
+
+
+def _single_value(message: object, selection: Selection) -> object:
+    if len(selection.components) == 1:
+        return value_at(message, selection.components[0])
+    return tuple(value_at(message, steps) for steps in selection.components)
+
+
+def _time_ns(seconds: object, nanoseconds: object) -> int:
+    if not isinstance(seconds, (int, np.integer)) or not isinstance(nanoseconds, (int, np.integer)):
+        return NO_TIME_NS
+    total = int(seconds) * 1_000_000_000 + int(nanoseconds)
+    return total if abs(total) < 2**63 else NO_TIME_NS
+
+
+def _number(value: object) -> float:
+    if isinstance(value, (bool, int, float, np.number, np.bool_)):
+        try:
+            return float(value)
+        except OverflowError:
+            return math.inf
+    return math.nan
+
+
+def _shape_of_values(values: Sequence[object]) -> tuple[str, int]:
+    """Judge a place that the schema leaves open by its first value."""
+    for value in values:
+        if value is None:
+            continue
+        if isinstance(value, (list, tuple)):
+            return "array", 0
+        if isinstance(value, dict):
+            names = frozenset(value)
+            if any(names == set(pair) for pair in TIME_MEMBERS):
+                return "time", 0
+            if names in VECTOR_ORDERS:
+                return "vector", len(VECTOR_ORDERS[names])
+        return "scalar", 0
+    return "", 0
+
+
+def _column(shape: str, values: Sequence[object], width: int | None) -> NDArray[Any]:
+    if shape == "scalar":
+        return np.array([_number(v) for v in values], dtype=np.float64)
+    if shape == "time":
+        return np.array([_time_ns(*_time_parts(v)) for v in values], dtype=np.int64)
+    rows = [_row(v) for v in values]
+    k = width if width is not None else max((len(r) for r in rows), default=0)
+    filled = np.full((len(rows), k), np.nan)
+    for i, row in enumerate(rows):
+        n = min(len(row), k)
+        filled[i, :n] = row[:n]
+    return filled
+
+
+def _time_parts(value: object) -> tuple[object, object]:
+    if isinstance(value, dict):
+        pair = next((p for p in TIME_MEMBERS if set(value) == set(p)), None)
+        return (value[pair[0]], value[pair[1]]) if pair else (None, None)
+    if isinstance(value, tuple) and len(value) == 2:
+        return value[0], value[1]
+    return None, None
+
+
+def _row(value: object) -> Sequence[float]:
+    if isinstance(value, np.ndarray):
+        return [float(v) for v in value]
+    if isinstance(value, dict):
+        order: Sequence[Step] = VECTOR_ORDERS.get(frozenset(value), ())
+        return [_number(value[name]) for name in order]
+    if isinstance(value, (list, tuple)):
+        return [_number(v) for v in value]
+    return []

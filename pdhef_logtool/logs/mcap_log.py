@@ -1,0 +1,508 @@
+"""MCAP files as a container: one walk over the record headers, chunks decoded one at a time, every CRC checked.
+
+The walk visits every top-level record by its length and trusts no index, so that a file without a summary, with
+channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other.
+"""
+
+from __future__ import annotations
+
+import mmap
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment as AttachmentRecord
+from mcap.records import Channel, ChunkIndex, Metadata, Schema
+
+from pdhef_logtool.errors import LogError
+from pdhef_logtool.logs.container import (
+    MAX_TIME_NS,
+    Attachment,
+    Block,
+    ChannelRecord,
+    MetadataRecord,
+    Span,
+    SpanDamageError,
+    block_from_lists,
+)
+from pdhef_logtool.logs.type_names import ros2_type_name
+from pdhef_logtool.signals import IntArray, Loss
+
+MAGIC = b"\x89MCAP0\r\n"
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<HIQQ")
+_CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
+_FOOTER_BYTES = 9 + 20
+_UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
+_HIGHEST_OPCODE = 0x0F
+_MESSAGE_HEAD = np.dtype(
+    {
+        "names": ["op", "size", "channel", "sequence", "log", "publish"],
+        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+        "offsets": [0, 1, 9, 11, 15, 23],
+        "itemsize": 31,
+    }
+)
+
+
+class McapContainer:
+    """One MCAP file; see :class:`~pdhef_logtool.logs.container.Container`.
+
+    Parameters
+    ----------
+    path : file to read.
+    shown_path : what to call it in messages (a decompressed copy has another name than its source).
+
+    Raises
+    ------
+    LogError : no MCAP file, or a draft of the format before 1.0.
+    """
+
+    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
+        self.path = shown_path or path
+        self.profile = ""
+        self.library = ""
+        self._lost: list[Loss] = []
+        self._schemas: dict[int, Schema] = {}
+        self._raw_channels: dict[int, Channel] = {}
+        self._channels: dict[int, ChannelRecord] = {}
+        self._spans: list[Span] = []
+        self._extents: list[tuple[int, int, bool, tuple[int, int]]] = []  # start, end, is chunk, its message indexes
+        self._attachment_at: list[tuple[int, int]] = []
+        self._metadata_at: list[tuple[int, int]] = []
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise self._no_log("the MCAP magic bytes", "other content")
+            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        try:
+            self._walk()
+        except BaseException:
+            self._data.close()
+            raise
+
+    @property
+    def channels(self) -> Mapping[int, ChannelRecord]:
+        """Channels that have a message or are declared, by id."""
+        return self._channels
+
+    @property
+    def spans(self) -> Sequence[Span]:
+        """Chunks and runs of unchunked messages, in file order."""
+        return self._spans
+
+    @property
+    def selective(self) -> bool:
+        """A chunk is decompressed as a whole."""
+        return False
+
+    @property
+    def lost(self) -> Sequence[Loss]:
+        """Damage found by the walk."""
+        return self._lost
+
+    def _no_log(self, expected: str, got: str) -> LogError:
+        return LogError(expected=expected, got=got, where=str(self.path), remedy="is it an MCAP 1.0 recording?")
+
+    def _walk(self) -> None:
+        data, size = self._data, len(self._data)
+        at = len(MAGIC)
+        if at + 9 > size or data[at] != Opcode.HEADER:
+            raise self._no_log("a header record after the magic bytes", "none")
+        walk = _Walk(self)
+        header_seen = False
+        while at < size:
+            if size - at == len(MAGIC) and data[at:size] == MAGIC:
+                walk.closed = True
+                break
+            if at + 9 > size:
+                walk.cut(at)
+                break
+            opcode, length = _RECORD.unpack_from(data, at)
+            end = at + 9 + length
+            if end > size or opcode == 0:
+                if not header_seen:
+                    raise self._no_log("a complete header record", "a record that runs past the end of the file")
+                resume = self._next_indexed_chunk(at)
+                if resume is None:
+                    walk.cut(at)
+                    break
+                walk.skipped(at, resume)
+                at = resume
+                continue
+            try:
+                if not header_seen:
+                    self._read_header(at + 9, length)
+                    header_seen = True
+                walk.record(opcode, at, at + 9, end)
+            except (struct.error, UnicodeDecodeError, ValueError, IndexError, McapError) as error:
+                walk.damaged_record(at, error)
+            at = end
+        walk.finish()
+
+    def _read_header(self, at: int, length: int) -> None:
+        try:
+            (n,) = struct.unpack_from("<I", self._data, at)
+            (m,) = struct.unpack_from("<I", self._data, at + 4 + n)
+            profile = self._data[at + 4 : at + 4 + n].decode()
+            library = self._data[at + 8 + n : at + 8 + n + m].decode()
+        except (struct.error, UnicodeDecodeError) as error:
+            raise self._no_log("a header record with profile and library", "a malformed one") from error
+        if 8 + n + m > length:
+            raise self._no_log("a header record with profile and library", "a draft of the format before 1.0")
+        self.profile, self.library = profile, library
+
+    def _next_indexed_chunk(self, after: int) -> int | None:
+        """Return the first chunk behind a damaged place that the summary names, or None."""
+        data, size = self._data, len(self._data)
+        foot = size - len(MAGIC) - _FOOTER_BYTES
+        if foot <= after or data[foot] != Opcode.FOOTER or data[-len(MAGIC) :] != MAGIC:
+            return None
+        (at,) = struct.unpack_from("<Q", data, foot + 9)
+        found: list[int] = []
+        while after < at < foot and at + 9 <= foot:
+            opcode, length = _RECORD.unpack_from(data, at)
+            if opcode == Opcode.CHUNK_INDEX and at + 9 + length <= foot:
+                offset = ChunkIndex.read(ReadDataStream(BytesIO(data[at + 9 : at + 9 + length]))).chunk_start_offset
+                if after < offset < foot and data[offset] == Opcode.CHUNK:
+                    found.append(offset)
+            at += 9 + length
+        return min(found) if found else None
+
+    def add_schema(self, payload: bytes) -> None:
+        """Take note of a schema record."""
+        schema = Schema.read(ReadDataStream(BytesIO(payload)))
+        self._schemas.setdefault(schema.id, schema)
+
+    def add_channel(self, payload: bytes) -> None:
+        """Take note of a channel record."""
+        channel = Channel.read(ReadDataStream(BytesIO(payload)))
+        self._raw_channels.setdefault(channel.id, channel)
+
+    def resolve_channels(self) -> None:
+        """Join channels and schemas once all are known."""
+        for id_, channel in self._raw_channels.items():
+            schema = self._schemas.get(channel.schema_id)
+            name = schema.name if schema else ""
+            encoding = schema.encoding if schema else ""
+            is_ros = channel.message_encoding in ("cdr", "ros1")
+            self._channels[id_] = ChannelRecord(
+                id=id_,
+                topic=channel.topic,
+                type_name=ros2_type_name(name) if is_ros else name,
+                encoding=channel.message_encoding,
+                schema_name=name,
+                schema_encoding=encoding,
+                schema_data=schema.data if schema else b"",
+                metadata=dict(channel.metadata),
+            )
+
+    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+        """Decode one span; see :class:`~pdhef_logtool.logs.container.Container`."""
+        del want
+        start, end, is_chunk, index_extent = self._extents[span.index]
+        if not is_chunk:
+            return _scan_messages(self._data[start:end], None)
+        content = self.chunk_content(start, end)
+        indexed = self._indexed_messages(content, *index_extent)
+        return indexed if indexed is not None else _scan_messages(content, None)
+
+    def chunk_content(self, start: int, end: int) -> bytes:
+        """Decompress the chunk record in [start, end) and check its CRC."""
+        data = self._data
+        try:
+            _, _, size, crc = _CHUNK.unpack_from(data, start)
+            (n,) = struct.unpack_from("<I", data, start + 28)
+            compression = bytes(data[start + 32 : start + 32 + n]).decode()
+            (stored,) = struct.unpack_from("<Q", data, start + 32 + n)
+        except (struct.error, UnicodeDecodeError) as error:
+            raise SpanDamageError(f"malformed chunk header: {error}") from error
+        at = start + 40 + n
+        if at + stored > end:
+            raise SpanDamageError("the chunk's records run past its end")
+        with memoryview(data) as view:
+            content = _decompress(compression, view[at : at + stored], size)
+        if len(content) != size:
+            raise SpanDamageError(f"decompressed to {len(content)} bytes instead of {size}")
+        if crc and zlib.crc32(content) != crc:
+            raise SpanDamageError("its CRC does not match")
+        return content
+
+    def _indexed_messages(self, content: bytes, start: int, end: int) -> Block | None:
+        """Return the chunk's messages through its message indexes; None if these do not name all of them."""
+        offsets: list[IntArray] = []
+        at = start
+        while at < end:
+            _, length = _RECORD.unpack_from(self._data, at)
+            (n,) = struct.unpack_from("<I", self._data, at + 11)
+            if n % 16 or n + 6 > length:
+                return None
+            pairs = np.frombuffer(self._data, dtype="<u8", count=n // 8, offset=at + 15)
+            offsets.append(pairs[1::2].astype(np.int64))
+            at += 9 + length
+        if not offsets:
+            return None
+        offset = np.sort(np.concatenate(offsets))
+        return _gather_messages(content, offset)
+
+    def attachments(self) -> Iterator[Attachment]:
+        """Read the attachments; a damaged one was reported by the walk and is left out."""
+        for start, end in self._attachment_at:
+            record = AttachmentRecord.read(ReadDataStream(BytesIO(self._data[start:end])))
+            yield Attachment(record.name, record.media_type, record.data, record.log_time, record.create_time)
+
+    def metadata_records(self) -> Iterator[MetadataRecord]:
+        """Read the metadata records."""
+        for start, end in self._metadata_at:
+            record = Metadata.read(ReadDataStream(BytesIO(self._data[start:end])))
+            yield MetadataRecord(record.name, dict(record.metadata))
+
+    def close(self) -> None:
+        """Release the file."""
+        self._data.close()
+
+
+class _Walk:
+    """State of the one pass over the top-level records."""
+
+    def __init__(self, container: McapContainer) -> None:
+        self.of = container
+        self.closed = False
+        self.data_end = False
+        self.in_summary = False
+        self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
+        self.run_times: list[int] = []
+        self.run_counts: Counter[int] = Counter()
+        self.chunk: tuple[int, int, int, int] | None = None  # start, end, first log time, last log time
+        self.index_extent = (0, 0)
+        self.index_counts: Counter[int] = Counter()
+        self.last_ns: int | None = None
+
+    def record(self, opcode: int, at: int, start: int, end: int) -> None:
+        """Handle one complete record."""
+        of, data = self.of, self.of._data
+        if opcode == Opcode.MESSAGE_INDEX and self.chunk is not None:
+            (channel,) = struct.unpack_from("<H", data, start)
+            (n,) = struct.unpack_from("<I", data, start + 2)
+            self.index_counts[channel] += n // 16
+            self.index_extent = (self.index_extent[0] or at, end)
+            return
+        self._end_chunk()
+        if opcode == Opcode.MESSAGE:
+            channel, _, log_time, _ = _MESSAGE.unpack_from(data, start)
+            self.run = (self.run[0] if self.run else at, end)
+            self.run_times.append(min(log_time, MAX_TIME_NS))
+            self.run_counts[channel] += 1
+            if end - self.run[0] >= _UNCHUNKED_RUN_BYTES:
+                self._end_run()
+            return
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            # Stay inside a run: writers interleave declarations with the messages.
+            (of.add_schema if opcode == Opcode.SCHEMA else of.add_channel)(data[start:end])
+            return
+        self._end_run()
+        if opcode == Opcode.CHUNK:
+            first, last, _, _ = _CHUNK.unpack_from(data, start)
+            self.chunk = (start, end, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS))
+        elif opcode == Opcode.ATTACHMENT:
+            self._attachment(start, end)
+        elif opcode == Opcode.DATA_END:
+            self._data_end(at, start)
+        elif opcode == Opcode.METADATA:
+            Metadata.read(ReadDataStream(BytesIO(data[start:end])))
+            of._metadata_at.append((start, end))
+
+    def _data_end(self, at: int, start: int) -> None:
+        """Check the CRC of the data section where nothing else protects the messages."""
+        self.data_end = True
+        of = self.of
+        (crc,) = struct.unpack_from("<I", of._data, start)
+        if crc and not all(is_chunk for _, _, is_chunk, _ in of._extents):
+            with memoryview(of._data) as view:
+                actual = zlib.crc32(view[:at])
+            if actual != crc:
+                what = "the CRC of the data section does not match: some unchunked messages are damaged"
+                of._lost.append(Loss("bad-data-crc", what, str(of.path)))
+
+    def _attachment(self, start: int, end: int) -> None:
+        of, data = self.of, self.of._data
+        stream = ReadDataStream(BytesIO(data[start:end]))
+        record = AttachmentRecord.read(stream)
+        crc_at = start + stream.count - 4  # a record may be padded behind its last member
+        (crc,) = struct.unpack_from("<I", data, crc_at)
+        if crc and zlib.crc32(data[start:crc_at]) != crc:
+            of._lost.append(
+                Loss("bad-attachment", f"attachment {record.name!r} has a wrong CRC", str(of.path), count=1)
+            )
+            return
+        of._attachment_at.append((start, end))
+
+    def _end_run(self) -> None:
+        if self.run is None:
+            return
+        of = self.of
+        times = self.run_times
+        of._extents.append((*self.run, False, (0, 0)))
+        of._spans.append(Span(len(of._spans), min(times), max(times) + 1, dict(self.run_counts)))
+        self.last_ns = max(times)
+        self.run, self.run_times, self.run_counts = None, [], Counter()
+
+    def _end_chunk(self) -> None:
+        """Close a chunk; open it now if only its content tells its channels or its messages."""
+        if self.chunk is None:
+            return
+        of = self.of
+        start, end, first, last = self.chunk
+        counts: Mapping[int, int] = dict(self.index_counts)
+        extent, known = self.index_extent, set(of._raw_channels)
+        self.chunk, self.index_extent, self.index_counts = None, (0, 0), Counter()
+        index = len(of._spans)
+        if not counts or not set(counts) <= known:
+            try:
+                content = of.chunk_content(start, end)
+                block = _scan_messages(content, of)
+            except SpanDamageError:
+                # A read of this span reports the damage; without its content the span is kept as it is indexed.
+                pass
+            else:
+                channels, per_channel = np.unique(block.channel, return_counts=True)
+                counts = dict(zip(channels.tolist(), per_channel.tolist(), strict=True))
+                if len(block):
+                    first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
+                else:
+                    return
+        of._extents.append((start, end, True, extent))
+        of._spans.append(Span(index, first, last + 1, counts))
+        self.last_ns = last
+
+    def cut(self, at: int) -> None:
+        """Note that the file ends inside a record."""
+        self._end_chunk()
+        self._end_run()
+        where = str(self.of.path)
+        what = f"the file ends inside a record at byte {at} of {len(self.of._data)}; what follows is gone"
+        self.of._lost.append(Loss("truncated", what, where, start_ns=self._after_last()))
+
+    def skipped(self, at: int, resume: int) -> None:
+        """Note that a damaged stretch was stepped over."""
+        self._end_chunk()
+        self._end_run()
+        what = f"bytes {at} to {resume} hold no readable record; reading resumes at the next chunk"
+        self.of._lost.append(Loss("bad-record", what, str(self.of.path), start_ns=self._after_last()))
+
+    def damaged_record(self, at: int, error: Exception) -> None:
+        """Note that one record cannot be parsed."""
+        self.of._lost.append(Loss("bad-record", f"the record at byte {at} is malformed: {error}", str(self.of.path)))
+
+    def _after_last(self) -> int | None:
+        return None if self.last_ns is None else self.last_ns + 1
+
+    def finish(self) -> None:
+        """Close what is open and check what only the whole file tells."""
+        self._end_chunk()
+        self._end_run()
+        of = self.of
+        if self.closed and not self.data_end:
+            if not of._spans:
+                raise of._no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
+            of._lost.append(Loss("bad-record", "the data end record is missing", str(of.path)))
+        if not self.closed and not any(loss.kind == "truncated" for loss in of._lost):
+            what = "the file ends without its closing magic bytes"
+            of._lost.append(Loss("truncated", what, str(of.path), start_ns=self._after_last()))
+        of.resolve_channels()
+        for i, span in enumerate(of._spans):
+            unknown = {c: n for c, n in span.counts.items() if c not in of._channels}
+            if unknown:
+                count = sum(unknown.values())
+                what = f"{count} messages on channels {sorted(unknown)} that no readable record declares"
+                of._lost.append(Loss("unknown-channel", what, str(of.path), span.start_ns, span.end_ns, count))
+                counts = {c: n for c, n in span.counts.items() if c not in unknown}
+                of._spans[i] = Span(span.index, span.start_ns, span.end_ns, counts)
+
+
+def _decompress(compression: str, stored: memoryview, size: int) -> bytes:
+    """Undo a chunk's compression; every library's own error becomes one."""
+    decode: Callable[[], Any]
+    if compression == "":
+        return bytes(stored)
+    if compression == "zstd":
+        import zstandard
+
+        def decode() -> Any:
+            return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    elif compression == "lz4":
+        import lz4.frame
+
+        def decode() -> Any:
+            return lz4.frame.decompress(stored)
+    else:
+        raise SpanDamageError(f"unknown compression {compression!r}")
+    try:
+        return bytes(decode())
+    except (zlib.error, RuntimeError, EOFError, ValueError, MemoryError) as error:
+        raise SpanDamageError(str(error)) from error
+    except Exception as error:
+        if type(error).__module__.split(".")[0] not in ("zstandard", "zstd"):
+            raise
+        raise SpanDamageError(str(error)) from error
+
+
+def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
+    """Read message headers at known offsets; None unless they are messages and cover the whole content."""
+    if offset.size == 0 or offset[-1] + _MESSAGE_HEAD.itemsize > len(content) or offset[0] < 0:
+        return None
+    heads = np.ndarray((len(content) - 30,), dtype=_MESSAGE_HEAD, buffer=content, strides=(1,))[offset]
+    length = heads["size"].astype(np.int64) - 22
+    if (
+        np.any(heads["op"] != Opcode.MESSAGE)
+        or np.any(length < 0)
+        or int(length.sum()) + 31 * len(offset) != len(content)
+    ):
+        return None
+    return Block(
+        buffer=content,
+        channel=heads["channel"].astype(np.int64),
+        log_time_ns=np.minimum(heads["log"], np.uint64(MAX_TIME_NS)).astype(np.int64),
+        publish_time_ns=np.minimum(heads["publish"], np.uint64(MAX_TIME_NS)).astype(np.int64),
+        sequence=heads["sequence"].astype(np.int64),
+        offset=offset + 31,
+        length=length,
+    )
+
+
+def _scan_messages(content: bytes, declare: McapContainer | None) -> Block:
+    """Walk the records of a chunk's content, noting the schemas and channels it declares."""
+    columns: tuple[list[int], ...] = ([], [], [], [], [], [])
+    channels, logs, publishes, sequences, offsets, lengths = columns
+    at, size = 0, len(content)
+    while at < size:
+        if at + 9 > size:
+            raise SpanDamageError("its last record is cut")
+        opcode, length = _RECORD.unpack_from(content, at)
+        start, end = at + 9, at + 9 + length
+        if end > size:
+            raise SpanDamageError("its last record is cut")
+        if opcode == Opcode.MESSAGE:
+            if length < 22:
+                raise SpanDamageError("a message record is too short")
+            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(content, start)
+            channels.append(channel)
+            sequences.append(sequence)
+            logs.append(min(log_time, MAX_TIME_NS))
+            publishes.append(min(publish_time, MAX_TIME_NS))
+            offsets.append(start + 22)
+            lengths.append(length - 22)
+        elif declare is not None and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            try:
+                (declare.add_schema if opcode == Opcode.SCHEMA else declare.add_channel)(content[start:end])
+            except (struct.error, UnicodeDecodeError, ValueError, McapError) as error:
+                raise SpanDamageError(f"malformed declaration: {error}") from error
+        at = end
+    return block_from_lists(content, channels, logs, publishes, sequences, offsets, lengths)

@@ -1,0 +1,405 @@
+"""Message types as trees of nodes, whatever text they were declared in, and dotted paths resolved against them."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.drive_log import FieldInfo
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+#: Fixed arrays up to this length are listed element by element.
+LISTED_ELEMENTS = 16
+#: Structs with exactly these members are read as one vector, in this order of columns.
+VECTOR_ORDERS: dict[frozenset[str], tuple[str, ...]] = {
+    frozenset("xyz"): ("x", "y", "z"),
+    frozenset("xyzw"): ("w", "x", "y", "z"),
+    frozenset("xy"): ("x", "y"),
+}
+#: Member names of the seconds and nanoseconds of a time struct, as ROS 1, ROS 2 and Foxglove spell them.
+TIME_MEMBERS = (("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("seconds", "nanos"))
+
+Step: TypeAlias = str | int
+
+
+@dataclass(frozen=True, slots=True)
+class Scalar:
+    """A leaf. ``code`` is its NumPy code (``f8``, ``u1``...), or empty for strings and JSON values."""
+
+    kind: Literal["number", "bool", "string"]
+    code: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Struct:
+    """Named members in the order of the wire."""
+
+    members: Mapping[str, Node]
+
+    @property
+    def time(self) -> tuple[str, str] | None:
+        """Names of seconds and nanoseconds if this is a time."""
+        names = set(self.members)
+        return next((pair for pair in TIME_MEMBERS if names == set(pair)), None)
+
+    @property
+    def vector(self) -> tuple[str, ...] | None:
+        """Names of the numeric members, in order of columns, if this is a vector."""
+        order = VECTOR_ORDERS.get(frozenset(self.members))
+        if order and all(isinstance(m, Scalar) and m.kind == "number" for m in self.members.values()):
+            return order
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Array:
+    """Elements of one type; ``length`` is None for a sequence."""
+
+    item: Node
+    length: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """A place that the schema leaves open; what stands there is found in the messages."""
+
+
+Node: TypeAlias = Scalar | Struct | Array | Unknown
+
+
+@dataclass(frozen=True, slots=True)
+class MessageSchema:
+    """A message type: its tree, and for ROS types the definitions to decode with.
+
+    ``wire`` is ``cdr``, ``ros1`` or ``json``.
+    """
+
+    type_name: str
+    wire: str
+    root: Node
+    store: Typestore | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """A path resolved against a schema.
+
+    ``components`` are the places to read, as steps (member name or index): one for a scalar or an array, one a
+    column for a vector, seconds and nanoseconds for a time; ``dynamic`` places are judged by their first value.
+    """
+
+    path: str
+    shape: Literal["scalar", "array", "vector", "time", "dynamic"]
+    components: tuple[tuple[Step, ...], ...]
+    length: int | None = None  # columns of an array of fixed length
+
+
+#: Member that stands in a message type without members.
+_FILLER = "structure_needs_at_least_one_member"
+
+
+class SchemaError(Exception):
+    """A schema cannot be parsed; the topic stays countable, its fields are unknown."""
+
+
+_CODES = {
+    "bool": "u1", "byte": "u1", "char": "u1",
+    "int8": "i1", "int16": "i2", "int32": "i4", "int64": "i8",
+    "uint8": "u1", "uint16": "u2", "uint32": "u4", "uint64": "u8",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+
+
+@lru_cache(maxsize=256)
+def ros_schema(type_name: str, encoding: str, text: str, wire: str, distro: str = "") -> MessageSchema:
+    """Parse a ROS message definition.
+
+    Parameters
+    ----------
+    type_name : in ROS 2 form.
+    encoding : ``ros2msg``, ``ros2idl``, ``ros1msg`` or empty.
+    text : concatenated definitions; empty takes the type from the distribution's own packages.
+    wire : ``cdr`` or ``ros1``.
+    distro : ROS distribution for a type without a text; the latest one if empty or unknown.
+
+    Raises
+    ------
+    SchemaError : the text does not parse, or the type is not known.
+    """
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys.base import TypesysError
+
+    base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
+    try:
+        if text.strip():
+            types = get_types_from_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
+            store = get_typestore(Stores.EMPTY)
+            missing = _referenced(types) - set(types)
+            if missing:
+                default = get_typestore(base)
+                types = {**_closure(default.fielddefs, missing), **types}
+            store.register(types)
+        else:
+            store = get_typestore(base)
+        if type_name not in store.fielddefs:
+            raise SchemaError(f"no definition of {type_name}")
+        root = _ros_node(store.fielddefs, type_name, ())
+    except SchemaError:
+        raise
+    except (TypesysError, KeyError, ValueError, TypeError, IndexError, SyntaxError, RecursionError) as error:
+        raise SchemaError(f"the definition of {type_name} does not parse: {error}") from error
+    return MessageSchema(type_name, wire, root, store)
+
+
+def _store_of(distro: str) -> Any:
+    from rosbags.typesys import Stores
+
+    return getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST) if distro else Stores.LATEST
+
+
+def _referenced(types: Mapping[str, Any]) -> set[str]:
+    from rosbags.interfaces import Nodetype
+
+    names: set[str] = set()
+    for _, members in types.values():
+        for _, (kind, args) in members:
+            inner_kind, inner = (kind, args) if kind in (Nodetype.BASE, Nodetype.NAME) else args[0]
+            if inner_kind == Nodetype.NAME:
+                names.add(inner)
+    return names
+
+
+def _closure(defs: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    todo = set(names)
+    while todo:
+        name = todo.pop()
+        if name not in defs:
+            raise SchemaError(f"no definition of {name}")
+        found[name] = defs[name]
+        todo |= _referenced({name: defs[name]}) - set(found)
+    return found
+
+
+def _ros_node(defs: Mapping[str, Any], name: str, above: tuple[str, ...]) -> Struct:
+    if name in above:
+        raise SchemaError(f"{name} contains itself")
+    members = defs[name][1]
+    if not above and [field for field, _ in members] == [_FILLER]:
+        return Struct({})
+    return Struct({field: _field_node(defs, desc, (*above, name)) for field, desc in members})
+
+
+def _field_node(defs: Mapping[str, Any], desc: Any, above: tuple[str, ...]) -> Node:
+    from rosbags.interfaces import Nodetype
+
+    kind, args = desc
+    if kind == Nodetype.BASE:
+        base = args[0]
+        if base in ("string", "wstring"):
+            return Scalar("string", "wide" if base == "wstring" else "")
+        if base not in _CODES:
+            raise SchemaError(f"type {base} is not supported")
+        return Scalar("bool" if base == "bool" else "number", _CODES[base])
+    if kind == Nodetype.NAME:
+        return _ros_node(defs, args, above)
+    item = _field_node(defs, args[0], above)
+    return Array(item, args[1] if kind == Nodetype.ARRAY else None)
+
+
+def json_schema(type_name: str, text: str) -> MessageSchema:
+    """Parse a JSON Schema; raises :class:`SchemaError`."""
+    try:
+        document = json.loads(text)
+    except ValueError as error:
+        raise SchemaError(f"the JSON Schema of {type_name} does not parse: {error}") from error
+    return MessageSchema(type_name, "json", _json_node(document, document, 0))
+
+
+def _json_node(schema: Any, document: Any, depth: int) -> Node:
+    if not isinstance(schema, dict) or depth > 32:
+        return Unknown()
+    reference = schema.get("$ref")
+    if isinstance(reference, str) and reference.startswith("#/"):
+        target: Any = document
+        for part in reference[2:].split("/"):
+            target = target.get(part) if isinstance(target, dict) else None
+        return _json_node(target, document, depth + 1)
+    declared = schema.get("type")
+    types = [t for t in declared if t != "null"] if isinstance(declared, list) else [declared]
+    kind = types[0] if len(types) == 1 else None
+    if kind == "object" or (kind is None and "properties" in schema):
+        properties = schema.get("properties")
+        if not isinstance(properties, dict) or not properties:
+            return Unknown()
+        return Struct({str(k): _json_node(v, document, depth + 1) for k, v in properties.items()})
+    if kind == "array":
+        least, most = schema.get("minItems"), schema.get("maxItems")
+        length = least if isinstance(least, int) and least == most else None
+        return Array(_json_node(schema.get("items"), document, depth + 1), length)
+    if kind in ("number", "integer"):
+        return Scalar("number")
+    if kind == "boolean":
+        return Scalar("bool")
+    if kind == "string":
+        return Scalar("string")
+    return Unknown()
+
+
+def schema_from_example(type_name: str, value: object) -> MessageSchema:
+    """Take the tree from a decoded JSON message."""
+    return MessageSchema(type_name, "json", _example_node(value))
+
+
+def _example_node(value: object) -> Node:
+    if isinstance(value, dict):
+        return Struct({str(k): _example_node(v) for k, v in value.items()})
+    if isinstance(value, list):
+        return Array(_example_node(value[0]) if value else Unknown(), None)
+    if isinstance(value, bool):
+        return Scalar("bool")
+    if isinstance(value, (int, float)):
+        return Scalar("number")
+    return Scalar("string") if isinstance(value, str) else Unknown()
+
+
+def leaves(root: Node) -> Iterator[FieldInfo]:
+    """List the scalar leaves of a tree, times as one leaf; see :class:`~pdhef_logtool.logs.drive_log.FieldInfo`."""
+    yield from _leaves(root, "")
+
+
+def _leaves(node: Node, path: str) -> Iterator[FieldInfo]:
+    if isinstance(node, Struct):
+        if path and node.time:
+            yield FieldInfo(path, "time")
+            return
+        for name, member in node.members.items():
+            yield from _leaves(member, f"{path}.{name}" if path else name)
+    elif isinstance(node, Array):
+        if node.length is not None and node.length <= LISTED_ELEMENTS:
+            for i in range(node.length):
+                yield from _leaves(node.item, f"{path}[{i}]")
+        else:
+            yield from _leaves(node.item, f"{path}[]")
+    elif isinstance(node, Scalar):
+        yield FieldInfo(path, node.kind)
+
+
+_PART = re.compile(r"([^.\[\]]+)|\[(\d*)\]|\.")
+
+
+def parse_path(path: str) -> tuple[Step, ...]:
+    """Split ``a.b[3].c`` into its steps; ``[]`` at the end names the whole array and is dropped.
+
+    Raises
+    ------
+    MappingError : the text is no path.
+    """
+    steps: list[Step] = []
+    at, after_dot = 0, True
+    text = path.removesuffix("[]")
+    while at < len(text):
+        found = _PART.match(text, at)
+        valid = found is not None and (found[0] != "." or not after_dot) and (not found[1] or after_dot)
+        if found is None or not valid or found[2] == "" or (found[2] is not None and after_dot):
+            raise MappingError(
+                expected="a dotted path such as twist.linear.x or data[0]", got=repr(path), where="field path"
+            )
+        if found[1]:
+            steps.append(found[1])
+        elif found[2]:
+            steps.append(int(found[2]))
+        after_dot = found[0] == "."
+        at = found.end()
+    if after_dot:
+        raise MappingError(
+            expected="a dotted path such as twist.linear.x or data[0]", got=repr(path), where="field path"
+        )
+    return tuple(steps)
+
+
+def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
+    """Resolve a path against a schema.
+
+    Raises
+    ------
+    MappingError : the type has no such path, or it names what is no number; the nearest paths are named.
+    """
+    steps = parse_path(path)
+    node: Node = schema.root
+    for step in steps:
+        if isinstance(node, Unknown):
+            return Selection(path, "dynamic", (steps,))
+        if isinstance(step, str) and isinstance(node, Struct) and step in node.members:
+            node = node.members[step]
+        elif isinstance(step, int) and isinstance(node, Array) and (node.length is None or step < node.length):
+            node = node.item
+        else:
+            raise _no_such_path(schema, topic, path)
+    if isinstance(node, Unknown):
+        return Selection(path, "dynamic", (steps,))
+    if isinstance(node, Scalar):
+        if node.kind == "string":
+            raise _no_number(schema, topic, path, "a text")
+        return Selection(path, "scalar", (steps,))
+    if isinstance(node, Array):
+        if isinstance(node.item, Unknown):
+            return Selection(path, "dynamic", (steps,))
+        if not isinstance(node.item, Scalar) or node.item.kind == "string":
+            raise _no_number(schema, topic, path, "an array of structs or texts")
+        return Selection(path, "array", (steps,), node.length)
+    if node.time:
+        return Selection(path, "time", tuple((*steps, part) for part in node.time))
+    if node.vector:
+        return Selection(path, "vector", tuple((*steps, part) for part in node.vector))
+    raise _no_number(schema, topic, path, "a struct")
+
+
+def _no_such_path(schema: MessageSchema, topic: str, path: str) -> MappingError:
+    known = [leaf.path for leaf in leaves(schema.root)]
+    near = difflib.get_close_matches(path, known, n=3, cutoff=0.4)
+    if not near:
+        last = path.rsplit(".", 1)[-1]
+        near = [p for p in known if p.rsplit(".", 1)[-1] == last][:3] or known[:3]
+    return MappingError(
+        expected=f"a field of {schema.type_name or 'the message'}",
+        got=repr(path),
+        where=topic,
+        remedy=f"nearest: {', '.join(near)}" if near else "the type has no fields",
+    )
+
+
+def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> MappingError:
+    below = [leaf.path for leaf in leaves(schema.root) if leaf.path.startswith(path) and leaf.kind != "string"][:3]
+    return MappingError(
+        expected="a number, a time, a vector or an array of numbers",
+        got=f"{path!r}, which is {what}",
+        where=topic,
+        remedy=f"nearest: {', '.join(below)}" if below else "",
+    )
+
+
+def value_at(message: object, steps: Sequence[Step]) -> object:
+    """Follow steps through attributes, mappings and sequences; None where the message has no such place."""
+    value: Any = message
+    for step in steps:
+        if value is None:
+            return None
+        if isinstance(step, int):
+            try:
+                value = value[step]
+            except (IndexError, KeyError, TypeError):
+                return None
+        elif isinstance(value, dict):
+            value = value.get(step)
+        else:
+            value = getattr(value, step, None)
+    return value

@@ -1,0 +1,309 @@
+"""The one way in: open any supported log by its content."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.errors import LogError
+from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.container import (
+    Attachment,
+    Block,
+    ChannelRecord,
+    Container,
+    MetadataRecord,
+    Span,
+    SpanDamageError,
+)
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.signals import Loss
+
+_MCAP = b"\x89MCAP0\r\n"
+_ROSBAG1 = b"#ROSBAG V2.0\n"
+_SQLITE = b"SQLite format 3\0"
+_ZSTD = b"\x28\xb5\x2f\xfd"
+_MAGIC_BYTES = 16
+_WHAT_IS_A_LOG = "an MCAP file, a ROS 1 bag, a rosbag2 database or a rosbag2 folder"
+_REMEDY = "give the recording itself"
+
+
+def open_log(path: Path | str) -> DriveLog:
+    """Open a log, detected by its content.
+
+    MCAP, ROS 1 bag (2.0), rosbag2 SQLite database, each also as a zstd-compressed file; a rosbag2 folder with its
+    ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file.
+
+    Raises
+    ------
+    LogError : the path is missing or is no log.
+    """
+    return open_columnar_log(Path(path))
+
+
+def open_columnar_log(path: Path) -> ColumnarLog:
+    """Open a log with access to its containers; see :func:`open_log`."""
+    try:
+        if path.is_dir():
+            return _open_folder(path)
+        if not path.exists():
+            raise LogError(expected=_WHAT_IS_A_LOG, got="no such file", where=str(path), remedy="check the path")
+        container, form = _open_file(path)
+    except OSError as error:
+        raise LogError(
+            expected="a readable file",
+            got=error.strerror or str(error),
+            where=str(path),
+            remedy="check its permissions",
+        ) from error
+    kind = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[form]
+    return ColumnarLog(path, kind, [container], distro=_distro_of(container))
+
+
+def is_log_folder(path: Path) -> bool:
+    """Tell whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
+    return path.is_dir() and (path / "metadata.yaml").is_file()
+
+
+def looks_like_log(path: Path) -> bool:
+    """Tell by the first bytes whether a file can be a log, without opening it further."""
+    if not path.is_file():
+        return is_log_folder(path)
+    with path.open("rb") as file:
+        head = file.read(_MAGIC_BYTES)
+    if head.startswith(_ZSTD):
+        return path.name.endswith((".mcap.zstd", ".db3.zstd", ".bag.zstd", ".mcap.zst", ".db3.zst", ".bag.zst"))
+    return head.startswith((_MCAP, _ROSBAG1, _SQLITE))
+
+
+def _distro_of(container: Container) -> str:
+    return str(getattr(container, "distro", ""))
+
+
+def _open_file(path: Path) -> tuple[Container, str]:
+    """Open one storage file; returns it and its format."""
+    with path.open("rb") as file:
+        head = file.read(_MAGIC_BYTES)
+    if head.startswith(_ZSTD):
+        return _open_compressed(path)
+    return _open_plain(path, path, head)
+
+
+def _open_plain(path: Path, shown_path: Path, head: bytes) -> tuple[Container, str]:
+    if head.startswith(_MCAP):
+        from pdhef_logtool.logs.mcap_log import McapContainer
+
+        return McapContainer(path, shown_path), "mcap"
+    if head.startswith(_ROSBAG1):
+        from pdhef_logtool.logs.rosbag1_log import Rosbag1Container
+
+        return Rosbag1Container(path, shown_path), "rosbag1"
+    if head.startswith(_SQLITE):
+        from pdhef_logtool.logs.rosbag2_sqlite_log import SqliteContainer
+
+        return SqliteContainer(path, shown_path), "sqlite3"
+    got = "an empty file" if not head else "a file that is none of these"
+    raise LogError(expected=_WHAT_IS_A_LOG, got=got, where=str(shown_path), remedy=_REMEDY)
+
+
+def _open_compressed(path: Path) -> tuple[Container, str]:
+    """Decompress a file to a temporary one and open that."""
+    import zstandard
+
+    folder = tempfile.TemporaryDirectory(prefix="pdhef-")
+    try:
+        copy = Path(folder.name) / path.stem
+        cut: Loss | None = None
+        with path.open("rb") as source, copy.open("wb") as target:
+            try:
+                zstandard.ZstdDecompressor().copy_stream(source, target)
+            except zstandard.ZstdError as error:
+                cut = Loss("truncated", f"the compressed file is damaged: {error}", str(path))
+        with copy.open("rb") as file:
+            head = file.read(_MAGIC_BYTES)
+        container, form = _open_plain(copy, path, head)
+        return _TemporaryContainer(container, folder, cut), form
+    except BaseException:
+        folder.cleanup()
+        raise
+
+
+def _open_folder(path: Path) -> ColumnarLog:
+    if (path / "metadata.yaml").is_file():
+        return _open_rosbag2_folder(path)
+    logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
+    if len(logs) != 1:
+        got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
+        raise LogError(
+            expected=_WHAT_IS_A_LOG, got=got, where=str(path), remedy="name one recording" if logs else _REMEDY
+        )
+    container, form = _open_file(logs[0])
+    kind = {"mcap": "rosbag2-mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[form]
+    return ColumnarLog(path, kind, [container], distro=_distro_of(container))
+
+
+def _read_metadata(path: Path) -> Mapping[str, Any]:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    where = str(path / "metadata.yaml")
+    try:
+        document = YAML(typ="safe").load((path / "metadata.yaml").read_text(encoding="utf-8"))
+        information = document["rosbag2_bagfile_information"]
+        files = information["relative_file_paths"]
+    except (YAMLError, KeyError, TypeError, ValueError) as error:
+        raise LogError(
+            expected="rosbag2_bagfile_information with relative_file_paths",
+            got=f"a file without ({type(error).__name__})",
+            where=where,
+            remedy="re-index the folder with ros2 bag reindex, or give the storage file itself",
+        ) from error
+    if not isinstance(files, list) or not isinstance(information, dict):
+        raise LogError(expected="a list of relative_file_paths", got=repr(files), where=where, remedy=_REMEDY)
+    return information
+
+
+def _open_rosbag2_folder(path: Path) -> ColumnarLog:
+    information = _read_metadata(path)
+    per_message = str(information.get("compression_mode") or "").lower() == "message"
+    encodings = _declared_encodings(information)
+    containers: list[Container] = []
+    forms: set[str] = set()
+    lost: list[Loss] = []
+    try:
+        for name in information["relative_file_paths"]:
+            file = _storage_file(path, str(name))
+            if file is None:
+                lost.append(Loss("missing-file", f"{name} is named in metadata.yaml and absent", str(path)))
+                continue
+            try:
+                container, form = _open_file(file)
+            except LogError as error:
+                lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
+                continue
+            forms.add(form)
+            containers.append(_Rosbag2Container(container, per_message, encodings))
+    except BaseException:
+        for opened in containers:
+            opened.close()
+        raise
+    if not containers:
+        remedy = lost[0].what if lost else "metadata.yaml names no file"
+        raise LogError(expected=_WHAT_IS_A_LOG, got="no readable storage file", where=str(path), remedy=remedy)
+    distro = str(information.get("ros_distro") or "")
+    kind = "rosbag2-sqlite3" if forms == {"sqlite3"} else "rosbag2-mcap"
+    return ColumnarLog(path, kind, containers, lost, distro or _distro_of(containers[0]))
+
+
+def _storage_file(folder: Path, name: str) -> Path | None:
+    """Find a file that metadata.yaml names: as given, by its last part, or with the suffix of file compression."""
+    for candidate in (folder / name, folder / Path(name).name):
+        for file in (candidate, candidate.with_name(candidate.name + ".zstd")):
+            if file.is_file():
+                return file
+    return None
+
+
+def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
+    """Return the serialization format that metadata.yaml declares for each topic."""
+    found: dict[str, str] = {}
+    for entry in information.get("topics_with_message_count") or ():
+        topic = entry.get("topic_metadata") if isinstance(entry, dict) else None
+        if isinstance(topic, dict) and topic.get("serialization_format"):
+            found[str(topic.get("name"))] = str(topic["serialization_format"])
+    return found
+
+
+class _Wrapped:
+    """Passes everything to another container."""
+
+    def __init__(self, container: Container) -> None:
+        self.container = container
+        self.distro = _distro_of(container)
+
+    @property
+    def path(self) -> Path:
+        return self.container.path
+
+    @property
+    def channels(self) -> Mapping[int, ChannelRecord]:
+        return self.container.channels
+
+    @property
+    def spans(self) -> Sequence[Span]:
+        return self.container.spans
+
+    @property
+    def lost(self) -> Sequence[Loss]:
+        return self.container.lost
+
+    @property
+    def selective(self) -> bool:
+        return self.container.selective
+
+    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+        return self.container.load(span, want)
+
+    def attachments(self) -> Iterator[Attachment]:
+        return self.container.attachments()
+
+    def metadata_records(self) -> Iterator[MetadataRecord]:
+        return self.container.metadata_records()
+
+    def close(self) -> None:
+        self.container.close()
+
+
+class _TemporaryContainer(_Wrapped):
+    """A container in a temporary folder that goes with it."""
+
+    def __init__(self, container: Container, folder: tempfile.TemporaryDirectory[str], cut: Loss | None) -> None:
+        super().__init__(container)
+        self._folder = folder
+        self._cut = cut
+
+    @property
+    def lost(self) -> Sequence[Loss]:
+        return [*([self._cut] if self._cut else []), *self.container.lost]
+
+    def close(self) -> None:
+        super().close()
+        self._folder.cleanup()
+
+
+class _Rosbag2Container(_Wrapped):
+    """A file of a rosbag2 folder, read as the folder's metadata.yaml says: encodings, compression by message."""
+
+    def __init__(self, container: Container, per_message: bool, encodings: Mapping[str, str]) -> None:
+        super().__init__(container)
+        self._per_message = per_message
+        # A topics table may say cdr by default where the recorder used another format: do not decode it as CDR.
+        self._channels = {
+            id_: replace(c, encoding=encodings.get(c.topic, c.encoding)) for id_, c in container.channels.items()
+        }
+
+    @property
+    def channels(self) -> Mapping[int, ChannelRecord]:
+        return self._channels
+
+    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+        block = self.container.load(span, want)
+        if not self._per_message:
+            return block
+        import zstandard
+
+        decompressor = zstandard.ZstdDecompressor()
+        payloads: list[bytes] = []
+        try:
+            for at, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
+                payloads.append(decompressor.decompress(bytes(block.buffer[at : at + n])))
+        except zstandard.ZstdError as error:
+            raise SpanDamageError(f"a compressed message is damaged: {error}") from error
+        length = np.array([len(p) for p in payloads], dtype=np.int64)
+        offset = np.cumsum(length) - length
+        return replace(block, buffer=b"".join(payloads), offset=offset, length=length)

@@ -1,0 +1,296 @@
+"""ROS 1 bags (format 2.0) as a container: one walk over the record headers, chunks decoded one at a time.
+
+Bags without an index are walked like any other, so that an unindexed bag gives every message of its complete chunks.
+"""
+
+from __future__ import annotations
+
+import bz2
+import contextlib
+import mmap
+import struct
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pdhef_logtool.errors import LogError
+from pdhef_logtool.logs.container import (
+    Attachment,
+    Block,
+    ChannelRecord,
+    MetadataRecord,
+    Span,
+    SpanDamageError,
+    block_from_lists,
+)
+from pdhef_logtool.logs.type_names import ros2_type_name
+from pdhef_logtool.signals import Loss
+
+MAGIC = b"#ROSBAG V2.0\n"
+_OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CONNECTION = 2, 3, 4, 5, 7
+_U32 = struct.Struct("<I")
+_TIME = struct.Struct("<II")
+
+
+class Rosbag1Container:
+    """One bag; see :class:`~pdhef_logtool.logs.container.Container`.
+
+    Raises
+    ------
+    LogError : no ROS 1 bag of format 2.0.
+    """
+
+    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
+        self.path = shown_path or path
+        self._lost: list[Loss] = []
+        self._channels: dict[int, ChannelRecord] = {}
+        self._spans: list[Span] = []
+        self._chunks: list[tuple[str, int, int, int]] = []  # compression, uncompressed size, start, end
+        with path.open("rb") as file:
+            if file.read(len(MAGIC)) != MAGIC:
+                raise self._no_bag("'#ROSBAG V2.0' at its start", "other content")
+            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        try:
+            self._walk()
+        except BaseException:
+            self._data.close()
+            raise
+
+    @property
+    def channels(self) -> Mapping[int, ChannelRecord]:
+        """Connections by id."""
+        return self._channels
+
+    @property
+    def spans(self) -> Sequence[Span]:
+        """Chunks in file order."""
+        return self._spans
+
+    @property
+    def selective(self) -> bool:
+        """A chunk is decompressed as a whole."""
+        return False
+
+    @property
+    def lost(self) -> Sequence[Loss]:
+        """Damage found by the walk."""
+        return self._lost
+
+    def _no_bag(self, expected: str, got: str) -> LogError:
+        return LogError(expected=expected, got=got, where=str(self.path), remedy="is it a ROS 1 bag?")
+
+    def _walk(self) -> None:
+        data, size = self._data, len(self._data)
+        at, indexed = len(MAGIC), True
+        pending: list[tuple[str, int, int, int]] = []  # the chunk whose index records are being read
+        times: list[int] = []
+        counts: Counter[int] = Counter()
+        header_seen = False
+
+        def close_chunk() -> None:
+            if pending:
+                self._add_chunk(pending.pop(), times, counts)
+            times.clear()
+            counts.clear()
+
+        while at < size:
+            record = _record_at(data, at, size)
+            if record is None:
+                if not any(data[at:size]):
+                    break  # zero padding behind the last record
+                if not header_seen:
+                    raise self._no_bag("a complete bag header record", "a cut or malformed one")
+                close_chunk()
+                what = f"the file ends inside a record at byte {at} of {size}; what follows is gone"
+                after = self._spans[-1].end_ns if self._spans else None
+                self._lost.append(Loss("truncated", what, str(self.path), start_ns=after))
+                break
+            fields, start, end = record
+            op = fields.get("op", b"\0")[0]
+            try:
+                if op == _OP_BAG_HEADER:
+                    header_seen = True
+                    indexed = int.from_bytes(fields["index_pos"], "little") != 0
+                elif op == _OP_CHUNK:
+                    close_chunk()
+                    pending.append((fields["compression"].decode(), _U32.unpack(fields["size"])[0], start, end))
+                elif op == _OP_INDEX and pending:
+                    connection, stamps = _index_record(fields, data[start:end])
+                    counts[connection] += len(stamps)
+                    times.extend(stamps)
+                elif op == _OP_CONNECTION:
+                    self._add_connection(fields, data[start:end])
+            except (KeyError, struct.error, ValueError, IndexError) as error:
+                what = f"the record at byte {at} is malformed: {error}"
+                self._lost.append(Loss("bad-record", what, str(self.path)))
+            at = end
+        close_chunk()
+        self._declare_from_chunks()
+        if not indexed and not self._lost:
+            what = "the bag has no index (it was not closed); its complete chunks were read by a scan"
+            after = self._spans[-1].end_ns if self._spans else None
+            self._lost.append(Loss("unindexed", what, str(self.path), start_ns=after))
+        self._drop_undeclared()
+
+    def _declare_from_chunks(self) -> None:
+        """Find connections that only the chunks declare, as in a bag without its index section."""
+        for span in self._spans:
+            if not set(span.counts) <= set(self._channels):
+                with contextlib.suppress(SpanDamageError):  # a read of the span reports the damage
+                    self._decode(self._chunks[span.index], declare=True)
+
+    def _drop_undeclared(self) -> None:
+        for i, span in enumerate(self._spans):
+            known = {c: n for c, n in span.counts.items() if c in self._channels}
+            if len(known) < len(span.counts):
+                count = sum(span.counts.values()) - sum(known.values())
+                what = f"{count} messages on connections that no readable record declares"
+                self._lost.append(Loss("unknown-channel", what, str(self.path), span.start_ns, span.end_ns, count))
+                self._spans[i] = Span(span.index, span.start_ns, span.end_ns, known)
+
+    def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
+        inner = _header_fields(payload)
+        id_ = _U32.unpack(fields["conn"])[0]
+        type_name = inner["type"].decode()
+        metadata: dict[str, str] = {
+            name: inner[name].decode("utf-8", errors="replace")
+            for name in ("callerid", "latching", "md5sum")
+            if name in inner
+        }
+        self._channels.setdefault(
+            id_,
+            ChannelRecord(
+                id=id_,
+                topic=fields["topic"].decode(),
+                type_name=ros2_type_name(type_name),
+                encoding="ros1",
+                schema_name=type_name,
+                schema_encoding="ros1msg",
+                schema_data=inner.get("message_definition", b""),
+                metadata=metadata,
+            ),
+        )
+
+    def _add_chunk(self, chunk: tuple[str, int, int, int], times: Sequence[int], counts: Mapping[int, int]) -> None:
+        index = len(self._spans)
+        self._chunks.append(chunk)
+        if times:
+            self._spans.append(Span(index, min(times), max(times) + 1, dict(counts)))
+            return
+        try:
+            block = self._decode(chunk, declare=True)
+        except SpanDamageError as error:
+            self._chunks.pop()
+            what = f"a chunk without index lost: {error}"
+            self._lost.append(Loss("bad-chunk", what, str(self.path), self._spans[-1].end_ns if self._spans else None))
+            return
+        if not len(block):
+            self._chunks.pop()
+            return
+        channels, per_channel = np.unique(block.channel, return_counts=True)
+        by_channel = dict(zip(channels.tolist(), per_channel.tolist(), strict=True))
+        self._spans.append(Span(index, int(block.log_time_ns.min()), int(block.log_time_ns.max()) + 1, by_channel))
+
+    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+        """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
+        del want
+        return self._decode(self._chunks[span.index], declare=False)
+
+    def _decode(self, chunk: tuple[str, int, int, int], declare: bool) -> Block:
+        compression, size, start, end = chunk
+        content = _decompress(compression, self._data[start:end])
+        if len(content) != size:
+            raise SpanDamageError(f"decompressed to {len(content)} bytes instead of {size}")
+        channels: list[int] = []
+        stamps: list[int] = []
+        offsets: list[int] = []
+        lengths: list[int] = []
+        at = 0
+        while at < size:
+            record = _record_at(content, at, size)
+            if record is None:
+                raise SpanDamageError("its last record is cut")
+            fields, begin, at = record
+            op = fields.get("op", b"\0")[0]
+            try:
+                if op == _OP_MESSAGE:
+                    channels.append(_U32.unpack(fields["conn"])[0])
+                    stamps.append(_time_ns(fields["time"]))
+                    offsets.append(begin)
+                    lengths.append(at - begin)
+                elif op == _OP_CONNECTION and declare:
+                    self._add_connection(fields, content[begin:at])
+            except (KeyError, struct.error, ValueError) as error:
+                raise SpanDamageError(f"a record is malformed: {error}") from error
+        return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
+
+    def attachments(self) -> Iterator[Attachment]:
+        """Yield nothing: bags hold no attachments."""
+        yield from ()
+
+    def metadata_records(self) -> Iterator[MetadataRecord]:
+        """Yield nothing: bags hold no metadata records."""
+        yield from ()
+
+    def close(self) -> None:
+        """Release the file."""
+        self._data.close()
+
+
+def _record_at(data: bytes | mmap.mmap, at: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
+    """Return header fields and data extent of the record at a byte; None if it is cut or no record."""
+    if at + 8 > size:
+        return None
+    (header,) = _U32.unpack_from(data, at)
+    if header == 0 or at + 8 + header > size:
+        return None
+    start = at + 8 + header
+    (length,) = _U32.unpack_from(data, start - 4)
+    if start + length > size:
+        return None
+    try:
+        return _header_fields(data[at + 4 : at + 4 + header]), start, start + length
+    except (struct.error, ValueError):
+        return None
+
+
+def _header_fields(text: bytes) -> dict[str, bytes]:
+    fields: dict[str, bytes] = {}
+    at = 0
+    while at < len(text):
+        (length,) = _U32.unpack_from(text, at)
+        name, sign, value = text[at + 4 : at + 4 + length].partition(b"=")
+        if not sign or at + 4 + length > len(text):
+            raise ValueError("a header field without '='")
+        fields[name.decode("ascii", errors="replace")] = value
+        at += 4 + length
+    return fields
+
+
+def _time_ns(value: bytes) -> int:
+    seconds, nanoseconds = _TIME.unpack(value)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def _index_record(fields: Mapping[str, bytes], payload: bytes) -> tuple[int, list[int]]:
+    """Return the connection and the log times that an index record lists."""
+    count = _U32.unpack(fields["count"])[0]
+    words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
+    return _U32.unpack(fields["conn"])[0], (words[:, 0] * 1_000_000_000 + words[:, 1]).tolist()
+
+
+def _decompress(compression: str, stored: bytes) -> bytes:
+    try:
+        if compression == "none":
+            return stored
+        if compression == "bz2":
+            return bz2.decompress(stored)
+        if compression == "lz4":
+            import lz4.frame
+
+            return bytes(lz4.frame.decompress(stored))
+    except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as error:
+        raise SpanDamageError(str(error)) from error
+    raise SpanDamageError(f"unknown compression {compression!r}")

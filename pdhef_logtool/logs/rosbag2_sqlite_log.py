@@ -1,0 +1,199 @@
+"""rosbag2 SQLite databases as a container: opened immutable, pages of rows as spans, nothing written beside."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from pdhef_logtool.errors import LogError
+from pdhef_logtool.logs.container import (
+    Attachment,
+    Block,
+    ChannelRecord,
+    MetadataRecord,
+    Span,
+    SpanDamageError,
+    block_from_lists,
+)
+from pdhef_logtool.logs.type_names import ros2_type_name
+from pdhef_logtool.signals import Loss
+
+MAGIC = b"SQLite format 3\0"
+_PAGE_ROWS = 8192
+_PAGE_BYTES = 4 << 20
+
+
+class SqliteContainer:
+    """One rosbag2 database; see :class:`~pdhef_logtool.logs.container.Container`.
+
+    A database with a write-ahead log beside it is copied to a temporary folder first, as SQLite would write to it.
+
+    Raises
+    ------
+    LogError : no SQLite file, or one without rosbag2's tables.
+    """
+
+    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
+        self.path = shown_path or path
+        self.distro = ""
+        self._lost: list[Loss] = []
+        self._channels: dict[int, ChannelRecord] = {}
+        self._spans: list[Span] = []
+        self._pages: list[tuple[int, int]] = []  # first and last row id
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._db = self._connect(path)
+        try:
+            self._read_topics()
+            self._read_pages()
+        except sqlite3.Error as error:
+            self.close()
+            raise self._no_log("a readable rosbag2 database", str(error)) from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _connect(self, path: Path) -> sqlite3.Connection:
+        wal = path.with_name(path.name + "-wal")
+        if wal.is_file() and wal.stat().st_size > 0:
+            self._folder = tempfile.TemporaryDirectory(prefix="pdhef-")
+            copy = Path(self._folder.name) / path.name
+            shutil.copyfile(path, copy)
+            shutil.copyfile(wal, copy.with_name(wal.name))
+            return sqlite3.connect(f"file:{quote(str(copy))}", uri=True, check_same_thread=False)
+        uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+        return sqlite3.connect(uri, uri=True, check_same_thread=False)
+
+    def _no_log(self, expected: str, got: str) -> LogError:
+        return LogError(expected=expected, got=got, where=str(self.path), remedy="is it a rosbag2 recording?")
+
+    @property
+    def channels(self) -> Mapping[int, ChannelRecord]:
+        """Topics by id."""
+        return self._channels
+
+    @property
+    def spans(self) -> Sequence[Span]:
+        """Pages of rows in order of their ids."""
+        return self._spans
+
+    @property
+    def selective(self) -> bool:
+        """Rows of other topics are not read."""
+        return True
+
+    @property
+    def lost(self) -> Sequence[Loss]:
+        """Damage found while the row ids were read."""
+        return self._lost
+
+    def _columns_of(self, table: str) -> set[str]:
+        return {str(row[0]) for row in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))}
+
+    def _read_topics(self) -> None:
+        topic_columns = self._columns_of("topics")
+        needed = {"id", "name", "type", "serialization_format"}
+        if not needed <= topic_columns or not {"id", "topic_id", "timestamp", "data"} <= self._columns_of("messages"):
+            raise self._no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
+        if "ros_distro" in self._columns_of("schema"):
+            row = self._db.execute("SELECT ros_distro FROM schema").fetchone()
+            self.distro = str(row[0]) if row and row[0] else ""
+        definitions: dict[str, tuple[str, str]] = {}
+        if {"topic_type", "encoding", "encoded_message_definition"} <= self._columns_of("message_definitions"):
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            definitions = {str(t): (str(e), str(d)) for t, e, d in self._db.execute(query)}
+        extra = [c for c in ("offered_qos_profiles", "type_description_hash") if c in topic_columns]
+        query = f"SELECT {', '.join(['id', 'name', 'type', 'serialization_format', *extra])} FROM topics ORDER BY id"  # noqa: S608
+        for id_, name, type_name, encoding, *rest in self._db.execute(query):
+            schema_encoding, text = definitions.get(type_name, ("", ""))
+            self._channels[int(id_)] = ChannelRecord(
+                id=int(id_),
+                topic=str(name),
+                type_name=ros2_type_name(str(type_name)),
+                encoding=str(encoding),
+                schema_name=str(type_name),
+                schema_encoding=schema_encoding if text else "",
+                schema_data=text.encode(),
+                metadata={key: str(value) for key, value in zip(extra, rest, strict=True) if value},
+            )
+
+    def _read_pages(self) -> None:
+        rows = self._db.execute("SELECT id, topic_id, timestamp, length(data) FROM messages ORDER BY id")
+        first = last = size = 0
+        times: list[int] = []
+        counts: Counter[int] = Counter()
+        unknown = 0
+
+        def close_page() -> None:
+            if times:
+                self._spans.append(Span(len(self._spans), min(times), max(times) + 1, dict(counts)))
+                self._pages.append((first, last))
+            times.clear()
+            counts.clear()
+
+        try:
+            for id_, topic, timestamp, length in rows:
+                if topic not in self._channels:
+                    unknown += 1
+                    continue
+                if not times:
+                    first, size = id_, 0
+                last = id_
+                times.append(timestamp)
+                counts[topic] += 1
+                size += length or 0
+                if len(times) >= _PAGE_ROWS or size >= _PAGE_BYTES:
+                    close_page()
+        except sqlite3.DatabaseError as error:
+            what = f"the rows after id {last} cannot be read: {error}"
+            self._lost.append(Loss("truncated", what, str(self.path), start_ns=max(times) + 1 if times else None))
+        close_page()
+        if unknown:
+            what = f"{unknown} messages of topics that the database does not name"
+            self._lost.append(Loss("unknown-channel", what, str(self.path), count=unknown))
+
+    def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
+        """Read one page; see :class:`~pdhef_logtool.logs.container.Container`."""
+        first, last = self._pages[span.index]
+        wanted = set(self._channels) if want is None else want & set(self._channels)
+        marks = ",".join("?" * len(wanted))
+        query = (
+            "SELECT topic_id, timestamp, data FROM messages "  # noqa: S608
+            f"WHERE id BETWEEN ? AND ? AND topic_id IN ({marks}) ORDER BY id"
+        )
+        channels: list[int] = []
+        stamps: list[int] = []
+        payloads: list[bytes] = []
+        try:
+            for topic, timestamp, data in self._db.execute(query, (first, last, *sorted(wanted))):
+                channels.append(topic)
+                stamps.append(timestamp)
+                payloads.append(bytes(data) if data is not None else b"")
+        except sqlite3.Error as error:
+            raise SpanDamageError(str(error)) from error
+        offsets: list[int] = []
+        at = 0
+        for payload in payloads:
+            offsets.append(at)
+            at += len(payload)
+        lengths = [len(p) for p in payloads]
+        return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
+
+    def attachments(self) -> Iterator[Attachment]:
+        """Yield nothing: these databases hold no attachments."""
+        yield from ()
+
+    def metadata_records(self) -> Iterator[MetadataRecord]:
+        """Yield nothing: these databases hold no metadata records."""
+        yield from ()
+
+    def close(self) -> None:
+        """Release the file and the temporary copy."""
+        self._db.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
