@@ -83,7 +83,7 @@ class Rosbag1Container:
 
     def _walk(self) -> None:
         data, size = self._data, len(self._data)
-        at, indexed = len(MAGIC), True
+        at, index_at = len(MAGIC), 0
         pending: list[tuple[str, int, int, int]] = []  # the chunk whose index records are being read
         times: list[int] = []
         counts: Counter[int] = Counter()
@@ -98,8 +98,10 @@ class Rosbag1Container:
         while at < size:
             record = _record_at(data, at, size)
             if record is None:
-                if not any(data[at:size]):
-                    break  # zero padding behind the last record
+                padded_to = index_at if at < index_at <= size else size
+                if not any(data[at:padded_to]):
+                    at = padded_to  # some writers pad with zeros behind the last chunk or the last record
+                    continue
                 if not header_seen:
                     raise self._no_bag("a complete bag header record", "a cut or malformed one")
                 close_chunk()
@@ -112,7 +114,7 @@ class Rosbag1Container:
             try:
                 if op == _OP_BAG_HEADER:
                     header_seen = True
-                    indexed = int.from_bytes(fields["index_pos"], "little") != 0
+                    index_at = int.from_bytes(fields["index_pos"], "little")
                 elif op == _OP_CHUNK:
                     close_chunk()
                     pending.append((fields["compression"].decode(), _U32.unpack(fields["size"])[0], start, end))
@@ -128,7 +130,7 @@ class Rosbag1Container:
             at = end
         close_chunk()
         self._declare_from_chunks()
-        if not indexed and not self._lost:
+        if not index_at and not self._lost:
             what = "the bag has no index (it was not closed); its complete chunks were read by a scan"
             after = self._spans[-1].end_ns if self._spans else None
             self._lost.append(Loss("unindexed", what, str(self.path), start_ns=after))
