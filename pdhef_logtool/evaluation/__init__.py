@@ -1,0 +1,1 @@
+"""Truth, metrics, segments and consistency; sees state tracks, never an estimator."""
