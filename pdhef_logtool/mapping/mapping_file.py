@@ -258,7 +258,8 @@ def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = No
     for note in mapping.notes:
         lines += _comment(note)
     for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):
-        for name, source in sources.items():
+        for name in (n for n in units if n in sources):
+            source = sources[name]
             lines.append("")
             lines += _comment(notes.get(name, ""))
             lines.append(f"[{section}.{name}]{' ' * max(1, 30 - len(section) - len(name))}# {units[name]}")

@@ -1,0 +1,121 @@
+"""The recorded drives through their mappings, against what their description states."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.geometry import rotation_from_quat
+from pdhef_logtool.logs.drive_log import windows
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import (
+    MappedChannels,
+    Mapping,
+    SignalSource,
+    apply_clock,
+    check_mapping,
+    clock_key,
+    fit_clocks,
+    join_channels,
+    load_mapping,
+    read_signals,
+)
+
+MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
+
+
+def read_drive(path: Path, mapping: Mapping) -> MappedChannels:
+    log = open_log(path)
+    check_mapping(mapping, log)
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    got = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    log.close()
+    return got
+
+
+def test_race_car_in_windows(shared_dir: Path) -> None:
+    path = shared_dir / "data" / "drives" / "revs_250lm_a.mcap"
+    mapping = load_mapping(MAPPINGS / "revs_250lm.toml")
+    whole = read_drive(path, mapping)
+    assert {n: len(c) for n, c in {**whole.signals, **whole.truth}.items()} == dict.fromkeys(
+        [*mapping.signals, *mapping.truth], 30_000
+    )
+    assert whole.losses == ()
+    assert set(np.unique(whole.signals["steer_rad"].arrival_ns - whole.signals["steer_rad"].stamps_ns)) == {6_000_000}
+    vy, vx = whole.truth["vy_m_s"].values, whole.truth["vx_m_s"].values
+    assert np.rad2deg([np.arctan2(vy, vx).min(), np.arctan2(vy, vx).max()]) == pytest.approx([-5.3, 3.5], abs=0.05)
+    log = open_log(path)
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    parts = [read_signals(log, mapping, clocks, s, e) for s, e in windows(log.start_ns, log.end_ns, 77_777_777_777)]
+    for name, channel in whole.signals.items():
+        joined = join_channels([p.signals[name] for p in parts])
+        np.testing.assert_array_equal(joined.stamps_ns, channel.stamps_ns)
+        np.testing.assert_array_equal(joined.values, channel.values)
+    log.close()
+
+
+def test_damaged_drive_is_counted_exactly(shared_dir: Path) -> None:
+    got = read_drive(
+        shared_dir / "data" / "drives" / "faulty" / "revs_250lm_a_disorder.mcap",
+        load_mapping(MAPPINGS / "revs_250lm.toml"),
+    )
+    counts = {(x.kind, x.where.split(" ")[0]): x.count for x in got.losses}
+    assert counts == {
+        ("nan", "ay_m_s2"): 2,
+        ("nan", "yaw_rate_rad_s"): 1,
+        ("nan", "steer_rad"): 2,
+        ("duplicate-stamp", "/imu/data"): 20,
+    }
+    good = read_drive(shared_dir / "data" / "drives" / "revs_250lm_a.mcap", load_mapping(MAPPINGS / "revs_250lm.toml"))
+    for name in ("ax_m_s2", "steer_rad", "speed_m_s"):
+        mine, theirs = got.signals[name], good.signals[name]
+        at = np.searchsorted(theirs.stamps_ns, mine.stamps_ns)
+        np.testing.assert_array_equal(theirs.stamps_ns[at], mine.stamps_ns)
+        np.testing.assert_array_equal(theirs.values[at], mine.values)
+
+
+def test_model_car_wheel_speed_has_no_stamp(shared_dir: Path) -> None:
+    got = read_drive(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag", load_mapping(MAPPINGS / "f1tenth.toml"))
+    speed, vx = got.signals["speed_m_s"], got.truth["vx_m_s"]
+    np.testing.assert_array_equal(speed.stamps_ns, vx.stamps_ns)
+    assert 1.02 < np.median(speed.values / vx.values) < 1.05
+
+
+def test_phone_clock_is_found_from_log_times(shared_dir: Path) -> None:
+    path = shared_dir / "data" / "drives" / "comma2k19_segment.mcap"
+    log = open_log(path)
+    source = SignalSource(
+        "yaw_rate_rad_s", "/imu", "gyro[2]", stamp="t", stamp_unit="s", clock="device", latency_s=0.002
+    )
+    clock = fit_clocks(log, Mapping(signals={source.name: source}), log.start_ns, log.end_ns)[clock_key(source)]
+    columns = log.read({"/imu": ["t"]})["/imu"]
+    found = apply_clock(np.rint(columns.fields["t"] * 1e9).astype(np.int64), clock) - 2_000_000
+    # The publish time is the sample's time in UTC, which the fit has not seen.
+    assert np.abs(found - columns.publish_time_ns).max() < 200_000
+    log.close()
+
+
+def test_phone_pose_moves_forward(shared_dir: Path) -> None:
+    got = read_drive(
+        shared_dir / "data" / "drives" / "comma2k19_segment.mcap", load_mapping(MAPPINGS / "comma2k19.toml")
+    )
+    rotation = rotation_from_quat(got.truth["quat_wxyz"].values)
+    body = np.einsum("nij,ni->nj", rotation, got.truth["ecef_velocity_m_s"].values)
+    # Stated in the phone's axes, forward, right, down, as (16.83, 0.24, -1.11).
+    assert body.mean(axis=0) == pytest.approx([16.83, -0.24, 1.11], abs=0.01)
+
+
+def test_instrument_units_and_invalid_steering(shared_dir: Path) -> None:
+    got = read_drive(shared_dir / "data" / "drives" / "lunda_v40", load_mapping(MAPPINGS / "lunda_v40.toml"))
+    steering = got.signals["steering_wheel_rad"]
+    assert [(x.kind, x.count) for x in got.losses] == [("out-of-range", 4)]
+    assert np.rad2deg([steering.values.min(), steering.values.max()]) == pytest.approx([-109, 117], abs=1)
+    vx, vy = got.truth["vx_m_s"].values, got.truth["vy_m_s"].values
+    assert [vx.min(), vx.max()] == pytest.approx([8.1, 23.2], abs=0.1)
+    # Course − heading is the sideslip; the course over 0.2 s, since positions are quantised.
+    lat, lon = np.deg2rad(got.truth["lat_deg"].values[:2394]), np.deg2rad(got.truth["lon_deg"].values[:2394])
+    course = np.arctan2(lat[20:] - lat[:-20], (lon[20:] - lon[:-20]) * np.cos(lat[:-20]))
+    slip = np.angle(np.exp(1j * (course - got.truth["yaw_rad"].values[10:2384])))
+    assert np.corrcoef(slip, np.arctan2(vy, vx)[10:2384])[0, 1] > 0.85

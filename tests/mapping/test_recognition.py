@@ -1,0 +1,263 @@
+"""Recognising well-known types: what is mapped, what is told as ambiguous, and what is never taken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import AutoMapping, auto_map, load_mapping
+
+N = 400
+T = 1_700_000_000_000_000_000 + np.arange(N, dtype=np.int64) * 20_000_000
+S = np.arange(N) * 0.02
+
+
+def topic(type_name: str, stamp: str = "header.stamp", **fields: np.ndarray) -> FakeTopic:
+    named = {k.replace("__", "."): np.asarray(v, dtype=np.float64) for k, v in fields.items()}
+    return FakeTopic(type_name, T + 2_000_000, ({stamp: T} if stamp else {}) | named)
+
+
+def imu(**extra: np.ndarray) -> FakeTopic:
+    out = topic("sensor_msgs/msg/Imu", linear_acceleration__x=S, linear_acceleration__y=S, angular_velocity__z=S)
+    out.fields |= extra
+    return out
+
+
+def twist(type_name: str, base: str, forward: np.ndarray, left: np.ndarray, stamp: str = "header.stamp") -> FakeTopic:
+    out = topic(type_name, stamp)
+    prefix = f"{base}." if base else ""
+    out.fields |= {
+        f"{prefix}linear.x": forward,
+        f"{prefix}linear.y": left,
+        f"{prefix}linear.z": np.zeros(N),
+        f"{prefix}angular.z": np.sin(S),
+    }
+    return out
+
+
+FORWARD, LEFT = 10.0 + np.sin(S), 0.1 * np.sin(S)
+
+
+def odometry(forward: np.ndarray = FORWARD, left: np.ndarray = LEFT, pose: bool = True) -> FakeTopic:
+    out = twist("nav_msgs/msg/Odometry", "twist.twist", forward, left)
+    value = S if pose else np.full(N, np.nan)
+    out.fields |= {"pose.pose.position.x": value, "pose.pose.position.y": value}
+    out.fields |= {f"pose.pose.orientation.{a}": np.zeros(N) for a in "xyz"} | {"pose.pose.orientation.w": np.ones(N)}
+    out.fields |= {"pose.covariance": np.zeros((N, 36)), "twist.covariance": np.zeros((N, 36))}
+    return out
+
+
+def fix(status: float = 0.0) -> FakeTopic:
+    return topic(
+        "sensor_msgs/msg/NavSatFix",
+        latitude=48.0 + S * 1e-5,
+        longitude=11.0 + S * 1e-5,
+        altitude=S,
+        status__status=np.full(N, status),
+    )
+
+
+def found(contents: dict[str, FakeTopic]) -> AutoMapping:
+    return auto_map(FakeLog(contents))
+
+
+def fields_of(auto: AutoMapping) -> dict[str, tuple[str, object, str]]:
+    both = {**auto.mapping.signals, **{f"truth.{n}": s for n, s in auto.mapping.truth.items()}}
+    return {n: (s.topic, s.field, s.stamp) for n, s in both.items()}
+
+
+def test_autoware_types() -> None:
+    auto = found(
+        {
+            "/imu": imu(),
+            "/steer": topic("autoware_vehicle_msgs/msg/SteeringReport", "stamp", steering_tire_angle=S),
+            "/speed": topic("autoware_auto_vehicle_msgs/msg/VelocityReport", longitudinal_velocity=S),
+        }
+    )
+    assert fields_of(auto) == {
+        "ax_m_s2": ("/imu", "linear_acceleration.x", "header.stamp"),
+        "ay_m_s2": ("/imu", "linear_acceleration.y", "header.stamp"),
+        "yaw_rate_rad_s": ("/imu", "angular_velocity.z", "header.stamp"),
+        "steer_rad": ("/steer", "steering_tire_angle", "stamp"),
+        "speed_m_s": ("/speed", "longitudinal_velocity", "header.stamp"),
+    }
+    assert auto.ambiguities == ()
+    assert auto.missing == ()
+    assert auto.mapping.origin == "auto"
+
+
+def test_wheel_speeds_and_perfect_truth_of_the_simulator() -> None:
+    wheels = topic("truthsim_msgs/msg/WheelSpeeds", fl_m_s=S, fr_m_s=S, rl_m_s=S, rr_m_s=S)
+    contents = {
+        "/imu": imu(),
+        "/wheels": wheels,
+        "/truth/perfect/odometry": odometry(),
+        "/rtk/odometry": odometry(),
+        "/rtk/fix": fix(2.0),
+    }
+    auto = found(contents)
+    assert {n for n in auto.mapping.signals if n.startswith("wheel")} == {
+        f"wheel_speed_{w}_m_s" for w in ("fl", "fr", "rl", "rr")
+    }
+    assert {s.topic for s in auto.mapping.truth.values()} == {"/truth/perfect/odometry"}
+    assert set(auto.mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m", "quat_wxyz"}
+    assert auto.mapping.truth["quat_wxyz"].paths == tuple(f"pose.pose.orientation.{a}" for a in "wxyz")
+    assert auto.missing == ("steer_rad",)
+    assert any("perfect truth taken; /rtk/fix, /rtk/odometry not used" in n for n in auto.mapping.notes)
+    other = auto_map(FakeLog(contents), prefer_truth="rtk").mapping.truth
+    assert {s.topic for s in other.values()} == {"/rtk/odometry"}
+    # With only one of them that one is taken, whatever is preferred.
+    del contents["/truth/perfect/odometry"]
+    assert {s.topic for s in auto_map(FakeLog(contents)).mapping.truth.values()} == {"/rtk/odometry"}
+
+
+def test_our_own_outputs_are_never_read_back() -> None:
+    auto = found(
+        {
+            "/pdhef/phy_ukf/odometry": odometry(),
+            "/vehicle/state": topic("pdhef_msgs/msg/VehicleStateEstimate", vx_m_s=S),
+        }
+    )
+    assert fields_of(auto) == {}
+    assert auto.ambiguities == ()
+
+
+def test_two_imus_are_said() -> None:
+    auto = found({"/camera/imu": imu(), "/imu/data": imu()})
+    (ambiguity,) = auto.ambiguities
+    assert ambiguity.subject == "imu"
+    assert set(ambiguity.candidates) == {"/camera/imu", "/imu/data"}
+    assert ambiguity.chosen == "/imu/data"
+    assert "mapping" in str(ambiguity)
+
+
+def test_two_truths_are_said_and_the_one_with_a_pose_is_taken() -> None:
+    auto = found({"/ins/a": odometry(pose=False), "/ins/longer_name": odometry()})
+    assert [a.subject for a in auto.ambiguities] == ["truth velocity"]
+    assert {s.topic for s in auto.mapping.truth.values()} == {"/ins/longer_name"}
+
+
+@pytest.mark.parametrize(
+    ("name", "role"),
+    [
+        ("/wheel/odometry", "speed"),
+        ("/vehicle/odom", "speed"),
+        ("/can/odom", "speed"),
+        ("/oxts/odometry", "truth"),
+        ("/ground_truth/state", "truth"),
+        ("/vicon/car", "truth"),
+        ("/odometry/filtered", "neither"),
+        ("/localization/kinematic_state", "neither"),
+        ("/something", "neither"),
+    ],
+)
+def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
+    auto = found({name: odometry()})
+    assert ("speed_m_s" in auto.mapping.signals) == (role == "speed")
+    assert ("vy_m_s" in auto.mapping.truth) == (role == "truth")
+    # What is not taken is told.
+    assert [a.chosen for a in auto.ambiguities] == ([None] if role == "neither" else [])
+
+
+def test_commands_are_no_sensors() -> None:
+    auto = found(
+        {
+            "/cmd_vel": twist("geometry_msgs/msg/Twist", "", S, S, stamp=""),
+            "/vehicle/cmd_twist": twist("geometry_msgs/msg/TwistStamped", "twist", S, S),
+            "/drive": topic("ackermann_msgs/msg/AckermannDriveStamped", drive__steering_angle=S),
+        }
+    )
+    assert fields_of(auto) == {"steer_rad": ("/drive", "drive.steering_angle", "header.stamp")}
+    assert any("command" in n for n in auto.mapping.notes)
+
+
+def test_a_measured_steering_angle_goes_before_a_command() -> None:
+    auto = found(
+        {
+            "/drive": topic("ackermann_msgs/msg/AckermannDrive", "", steering_angle=S),
+            "/report": topic("autoware_vehicle_msgs/msg/SteeringReport", "stamp", steering_tire_angle=S),
+        }
+    )
+    assert auto.mapping.signals["steer_rad"].topic == "/report"
+    assert auto.ambiguities == ()
+
+
+def test_an_unstamped_twist_is_taken_at_log_time() -> None:
+    auto = found({"/vehicle/twist": twist("geometry_msgs/msg/Twist", "", 5 + S, 0 * S, stamp="")})
+    assert fields_of(auto) == {"speed_m_s": ("/vehicle/twist", "linear.x", "log_time")}
+
+
+def test_what_a_message_disowns_is_not_mapped() -> None:
+    minus = np.full((N, 9), -1.0)
+    auto = found({"/imu": imu(angular_velocity_covariance=minus)})
+    assert set(auto.mapping.signals) == {"ax_m_s2", "ay_m_s2"}
+    assert "yaw_rate_rad_s" in auto.missing
+    hidden_pose = odometry(pose=True)
+    hidden_pose.fields["pose.covariance"] = np.full((N, 36), -1.0)
+    auto = found({"/ins/odometry": hidden_pose})
+    assert set(auto.mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
+
+
+def test_a_receivers_velocity_is_recognised_as_east_north_up() -> None:
+    heading = 0.5 * S
+    auto = found(
+        {"/gps/vel": twist("geometry_msgs/msg/TwistStamped", "twist", 10 * np.cos(heading), 10 * np.sin(heading))}
+    )
+    assert set(auto.mapping.truth) == {"enu_velocity_m_s"}
+    assert auto.mapping.truth["enu_velocity_m_s"].paths == ("twist.linear.x", "twist.linear.y", "twist.linear.z")
+    assert [a.subject for a in auto.ambiguities] == ["truth velocity frame"]
+
+
+def test_a_velocity_frame_that_cannot_be_told_is_not_guessed() -> None:
+    auto = found({"/gps/vel": twist("geometry_msgs/msg/TwistStamped", "twist", 0 * S, 0 * S)})
+    assert auto.mapping.truth == {}
+    assert [a.chosen for a in auto.ambiguities] == [None]
+
+
+def test_a_fix_alone_is_the_truth_with_a_gate() -> None:
+    auto = found({"/rtk/fix": fix(2.0)})
+    assert set(auto.mapping.truth) == {"lat_deg", "lon_deg", "alt_m"}
+    assert auto.mapping.quality is not None
+    assert auto.mapping.quality.minimum == 2.0
+    assert auto.mapping.quality.field == "status.status"
+
+
+def test_a_fix_beside_a_velocity_gives_the_position() -> None:
+    auto = found({"/ins/twist": twist("geometry_msgs/msg/TwistStamped", "twist", 9 + S, 0.1 * S), "/fix": fix()})
+    assert {"vx_m_s", "vy_m_s", "lat_deg", "lon_deg"} <= set(auto.mapping.truth)
+    assert auto.mapping.quality is None
+
+
+def test_a_zero_twist_beside_a_moving_pose_is_a_filler() -> None:
+    auto = found({"/gps/odom": odometry(forward=0 * S, left=0 * S)})
+    assert set(auto.mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
+
+
+def test_an_empty_log_maps_to_nothing() -> None:
+    auto = found({})
+    assert fields_of(auto) == {}
+    assert auto.missing == ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+
+
+@pytest.mark.parametrize(
+    ("drive", "reference", "unmapped"),
+    [
+        ("revs_250lm_a.mcap", "revs_250lm", set()),
+        ("f1tenth_hoons_run2.bag", "f1tenth", {"speed_m_s"}),  # A bare array has no type to recognise.
+    ],
+)
+def test_real_drives_map_as_by_hand(shared_dir: Path, drive: str, reference: str, unmapped: set[str]) -> None:
+    log = open_log(shared_dir / "data" / "drives" / drive)
+    auto = auto_map(log)
+    by_hand = load_mapping(Path(__file__).parents[1] / "reference" / "mappings" / f"{reference}.toml")
+    assert set(auto.missing) == unmapped
+    assert auto.ambiguities == ()
+    for mine, theirs in ((auto.mapping.signals, by_hand.signals), (auto.mapping.truth, by_hand.truth)):
+        assert {n: (s.topic, s.field, s.stamp) for n, s in mine.items()} == {
+            n: (s.topic, s.field, s.stamp) for n, s in theirs.items() if n not in unmapped
+        }
+    log.close()
