@@ -1,0 +1,184 @@
+"""Columns to ROS 2 CDR messages: one byte matrix a batch, no loop over messages."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.message_schema import (
+    MessageSchema,
+    Node,
+    Scalar,
+    SchemaError,
+    Selection,
+    Step,
+    Struct,
+    parse_path,
+    resolve,
+    ros_schema,
+)
+from pdhef_logtool.logs.wire_layout import Leaf, NoLayoutError, Steps, WireLayout, build_layout
+
+
+class CdrEncoder:
+    """Encodes the messages of one topic.
+
+    Parameters
+    ----------
+    topic, type_name : topic and ROS 2 type.
+    definition : ros2msg text with all contained types.
+    constants : what every message holds, by path: a text, a number, or an array's values. Unset texts and sequences
+        are empty, unset numbers are zero.
+
+    Raises
+    ------
+    MappingError : the definition does not parse, or a constant's path or value does not fit it.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        type_name: str,
+        definition: str,
+        constants: Mapping[str, str | float | Sequence[float]],
+    ) -> None:
+        self.topic = topic
+        try:
+            self.schema: MessageSchema = ros_schema(type_name, "ros2msg", definition, "cdr")
+        except SchemaError as error:
+            raise MappingError(expected=f"a definition of {type_name}", got=str(error), where=topic) from error
+        self._texts: dict[Steps, bytes] = {}
+        self._numbers: dict[str, NDArray[np.float64]] = {}
+        self._selections: dict[str, Selection] = {}
+        for path, value in constants.items():
+            if isinstance(value, str):
+                self._texts[self._text_steps(path)] = value.encode()
+            else:
+                self._numbers[path] = np.asarray(value, dtype=np.float64)
+                self._select(path)
+        self._layouts: dict[tuple[tuple[Steps, int], ...], tuple[WireLayout, bytes]] = {}
+        self._layout({path: value.size for path, value in self._numbers.items()})
+
+    def encode(self, n: int, fields: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+        """Return N messages as uint8 [N, size].
+
+        Parameters
+        ----------
+        n : number of messages.
+        fields : columns by path: [N] for a number, a bool or a time (int64 nanoseconds); [N, k] for an array or a
+            vector struct (x, y, z; for a quaternion w, x, y, z).
+
+        Raises
+        ------
+        MappingError : a path is not in the type, or a column does not fit it.
+        """
+        columns = {path: np.asarray(values) for path, values in fields.items()}
+        for path, values in columns.items():
+            if values.shape[:1] != (n,) or values.ndim > 2:
+                raise self._misfit(path, f"{n} rows", f"shape {values.shape}")
+            self._select(path)
+        widths = {path: value.size for path, value in self._numbers.items()}
+        widths.update({path: v.shape[1] for path, v in columns.items() if v.ndim == 2})
+        layout, template = self._layout(widths)
+        rows = np.empty((n, layout.size), dtype=np.uint8)
+        rows[:] = np.frombuffer(template, dtype=np.uint8)
+        for path, values in columns.items():
+            self._put(layout, rows, path, values)
+        return rows
+
+    def _select(self, path: str) -> Selection:
+        if path not in self._selections:
+            self._selections[path] = resolve(self.schema, self.topic, path)
+        return self._selections[path]
+
+    def _text_steps(self, path: str) -> Steps:
+        steps = parse_path(path)
+        node: Node | object = self.schema.root
+        for step in steps:
+            node = node.members.get(str(step)) if isinstance(node, Struct) else None
+        if not (isinstance(node, Scalar) and node.kind == "string"):
+            raise self._misfit(path, "a text field", "another or no field")
+        return steps
+
+    def _misfit(self, path: str, expected: str, got: str) -> MappingError:
+        return MappingError(expected=expected, got=got, where=f"{self.topic}.{path}")
+
+    def _layout(self, widths: Mapping[str, int]) -> tuple[WireLayout, bytes]:
+        """Return the layout for these array widths and the message that holds just the constants."""
+        lengths: dict[Steps, int] = {}
+        for path, width in widths.items():
+            selection = self._selections[path]
+            if selection.shape == "array" and selection.length is None:
+                lengths[selection.components[0]] = width
+        key = tuple(sorted(lengths.items(), key=repr))
+        if key not in self._layouts:
+
+            def length_of(steps: Sequence[Step], offset: int, is_text: bool) -> int:
+                del offset
+                at = tuple(steps)
+                return len(self._texts.get(at, b"")) + 1 if is_text else lengths.get(at, 0)
+
+            try:
+                layout = build_layout(self.schema.root, "cdr", length_of)
+            except NoLayoutError as error:
+                raise MappingError(expected="a type with a fixed layout", got=str(error), where=self.topic) from error
+            self._layouts[key] = (layout, self._template(layout))
+        return self._layouts[key]
+
+    def _template(self, layout: WireLayout) -> bytes:
+        message = bytearray(layout.size)
+        message[1] = 1  # little-endian CDR
+        for offset, length in layout.guards:
+            struct.pack_into("<I", message, offset, length)
+        for steps, (offset, _) in layout.texts.items():
+            text = self._texts.get(steps, b"")
+            message[offset : offset + len(text)] = text
+        row = np.frombuffer(bytes(message), dtype=np.uint8).reshape(1, -1).copy()
+        for path, value in self._numbers.items():
+            column = value.reshape(1) if value.ndim == 0 else value.reshape(1, -1)
+            self._put(layout, row, path, column)
+        return row.tobytes()
+
+    def _put(self, layout: WireLayout, rows: NDArray[np.uint8], path: str, values: NDArray[Any]) -> None:
+        selection = self._select(path)
+        if selection.shape == "time":
+            if values.dtype.kind not in "iu" or values.ndim != 1:
+                raise self._misfit(path, "int64 nanoseconds [N]", f"{values.dtype} {values.shape}")
+            seconds, nanoseconds = np.divmod(values.astype(np.int64), 1_000_000_000)
+            self._put_leaf(layout, rows, selection.components[0], seconds, path)
+            self._put_leaf(layout, rows, selection.components[1], nanoseconds, path)
+        elif selection.shape == "vector":
+            if values.ndim != 2 or values.shape[1] != len(selection.components):
+                raise self._misfit(path, f"[N, {len(selection.components)}]", f"shape {values.shape}")
+            for i, steps in enumerate(selection.components):
+                self._put_leaf(layout, rows, steps, values[:, i], path)
+        else:
+            self._put_leaf(layout, rows, selection.components[0], values, path)
+
+    def _put_leaf(
+        self, layout: WireLayout, rows: NDArray[np.uint8], steps: Steps, values: NDArray[Any], path: str
+    ) -> None:
+        leaf = layout.leaves.get(steps)
+        if leaf is None and isinstance(steps[-1], int):
+            whole = layout.leaves.get(steps[:-1])
+            if whole is not None and whole.count is not None and steps[-1] < whole.count:
+                leaf = Leaf(whole.offset + steps[-1] * whole.dtype.itemsize, whole.dtype, None)
+        if leaf is None:
+            raise self._misfit(path, "an element that the message holds", "an index outside its sequence")
+        if values.ndim != (1 if leaf.count is None else 2) or (
+            leaf.count is not None and values.shape[1] != leaf.count
+        ):
+            expected = "[N]" if leaf.count is None else f"[N, {leaf.count}]"
+            raise self._misfit(path, expected, f"shape {values.shape}")
+        if leaf.dtype.kind in "iu" and values.dtype.kind == "f":
+            if not np.all(np.isfinite(values)):
+                raise self._misfit(path, "finite values for an integer field", "NaN or infinity")
+            values = np.rint(values)
+        stored = np.ascontiguousarray(values.astype(leaf.dtype))
+        width = leaf.dtype.itemsize * (1 if leaf.count is None else leaf.count)
+        rows[:, leaf.offset : leaf.offset + width] = stored.view(np.uint8).reshape(len(values), width)

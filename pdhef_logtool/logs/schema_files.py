@@ -1,0 +1,47 @@
+"""The files of ``schemas/``: message definitions and JSON documents that are shipped with the package."""
+
+from __future__ import annotations
+
+from functools import cache
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+_MESSAGE_SEPARATOR = "=" * 80
+
+
+def schema_file(name: str) -> Traversable:
+    """Return a file of ``schemas/`` by its relative name, in an installed package or in a source tree."""
+    shipped = files("pdhef_logtool").joinpath("schemas", name)
+    return shipped if shipped.is_file() else Path(__file__).parents[2] / "schemas" / name
+
+
+@cache
+def message_definition(type_name: str) -> str:
+    """Return the ros2msg text of a message type with all types it contains.
+
+    Own types (``pdhef_msgs``) come from ``schemas/``, common ROS 2 types from the latest distribution.
+
+    Parameters
+    ----------
+    type_name : in ROS 2 form, for example ``sensor_msgs/msg/Imu``.
+
+    Raises
+    ------
+    KeyError : the type is in neither.
+    """
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    own = schema_file(f"{type_name}.msg")
+    if own.is_file():
+        text = own.read_text(encoding="utf-8")
+        types = get_types_from_msg(text, type_name)
+        store.register(types)
+        generated = store.generate_msgdef(type_name, ros_version=2)[0]
+        # Keep the comments of the own text: units stand there.
+        _, separator, rest = generated.partition(_MESSAGE_SEPARATOR)
+        return text.rstrip("\n") + "\n" + separator + rest
+    if type_name not in store.fielddefs:
+        raise KeyError(type_name)
+    return store.generate_msgdef(type_name, ros_version=2)[0]

@@ -1,0 +1,499 @@
+"""MCAP writing: ROS 2 topics from columns, other messages as ready bytes, merged by log time.
+
+Every file has zstd chunks, message indexes, statistics, a summary and CRCs: other readers need them. Channels and
+schemas stand before the first chunk that uses them and again in the summary.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Literal
+
+import numpy as np
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from numpy.typing import NDArray
+
+from pdhef_logtool import __version__
+from pdhef_logtool.errors import MappingError, OutputError
+from pdhef_logtool.logs.encoding import CdrEncoder
+from pdhef_logtool.logs.schema_files import message_definition
+from pdhef_logtool.signals import IntArray
+
+LIBRARY = f"pdhef-logtool {__version__}"
+_MAGIC = b"\x89MCAP0\r\n"
+_CHUNK_BYTES = 1 << 20
+_HEAD = np.dtype(
+    {
+        "names": ["op", "size", "channel", "sequence", "log", "publish"],
+        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
+        "offsets": [0, 1, 9, 11, 15, 23],
+        "itemsize": 31,
+    }
+)
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TopicBatch:
+    """Messages of one topic as columns.
+
+    Attributes
+    ----------
+    log_time_ns, publish_time_ns : int64 [N]; log times ascend.
+    fields : by dotted path, [N] or [N, k]; a time path such as ``header.stamp`` takes int64 nanoseconds, a
+        quaternion struct the columns w, x, y, z.
+    """
+
+    topic: str
+    log_time_ns: IntArray
+    publish_time_ns: IntArray
+    fields: Mapping[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class RawMessage:
+    """A message as ready bytes on a channel of :meth:`McapLogWriter.add_raw_channel`."""
+
+    channel: int
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Records:
+    """Complete message records of one channel: equal sizes as a matrix [N, size]."""
+
+    channel: int
+    log_time_ns: IntArray
+    rows: NDArray[np.uint8]
+
+
+class McapLogWriter:
+    """Writes one MCAP file under a temporary name and renames it on :meth:`close`; leaves nothing on an error.
+
+    Parameters
+    ----------
+    path : file to write; its folder must exist.
+    profile : MCAP profile.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+
+    def __init__(self, path: Path, *, profile: str = "ros2") -> None:
+        self._path = path
+        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+        self._schemas: list[Schema] = []
+        self._schema_ids: dict[tuple[str, str, bytes], int] = {}
+        self._channels: list[Channel] = []
+        self._encoders: dict[str, tuple[int, CdrEncoder]] = {}
+        self._sequences: Counter[int] = Counter()
+        self._counts: Counter[int] = Counter()
+        self._chunk_indexes: list[ChunkIndex] = []
+        self._attachment_indexes: list[AttachmentIndex] = []
+        self._metadata_indexes: list[MetadataIndex] = []
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._crc = 0
+        self._at = 0
+        try:
+            self._file: IO[bytes] = self._temporary.open("wb")
+        except OSError as error:
+            raise self._failed(error) from error
+        self._emit(_MAGIC)
+        self._emit_record(Header(profile=profile, library=LIBRARY))
+
+    def __enter__(self) -> McapLogWriter:
+        """Return the writer."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> Literal[False]:
+        """Close the file, or remove it if an exception passes."""
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+        return False
+
+    def _failed(self, error: OSError) -> OutputError:
+        return OutputError(
+            expected="a writable file",
+            got=error.strerror or str(error),
+            where=str(self._path),
+            remedy="check the folder, its permissions and the space left",
+        )
+
+    def add_topic(
+        self,
+        topic: str,
+        type_name: str,
+        *,
+        constants: Mapping[str, str | float | Sequence[float]] | None = None,
+        definition: str | None = None,
+    ) -> None:
+        """Add a ROS 2 CDR topic for :class:`TopicBatch`.
+
+        Parameters
+        ----------
+        topic : topic name.
+        type_name : ROS 2 type, ``pkg/msg/Type``.
+        constants : what every message holds, by path (texts, numbers, arrays such as covariances).
+        definition : ros2msg text; the type's own from ``schemas/`` or the common ROS 2 packages when absent.
+
+        Raises
+        ------
+        MappingError : the type is unknown, a constant does not fit it, or the topic was added before.
+        """
+        if topic in self._encoders:
+            raise MappingError(expected="a new topic", got="one that was added before", where=topic)
+        if definition is None:
+            try:
+                definition = message_definition(type_name)
+            except KeyError as error:
+                raise MappingError(
+                    expected="a common ROS 2 type or one of our own",
+                    got=type_name,
+                    where=topic,
+                    remedy="give its definition",
+                ) from error
+        encoder = CdrEncoder(topic, type_name, definition, constants or {})
+        channel = self.add_raw_channel(
+            topic,
+            schema_name=type_name,
+            schema_encoding="ros2msg",
+            schema_data=definition.encode(),
+            message_encoding="cdr",
+            metadata={},
+        )
+        self._encoders[topic] = (channel, encoder)
+
+    def add_raw_channel(
+        self,
+        topic: str,
+        *,
+        schema_name: str,
+        schema_encoding: str,
+        schema_data: bytes,
+        message_encoding: str,
+        metadata: Mapping[str, str],
+    ) -> int:
+        """Add a channel for :class:`RawMessage` and return its id; without name and encoding it has no schema."""
+        if len(self._channels) >= 0xFFFF:
+            raise OutputError(expected="at most 65535 channels", got="more", where=str(self._path))
+        schema_id = 0
+        if schema_name or schema_encoding:
+            key = (schema_name, schema_encoding, schema_data)
+            schema_id = self._schema_ids.get(key, 0)
+            if not schema_id:
+                schema_id = len(self._schemas) + 1
+                self._schema_ids[key] = schema_id
+                schema = Schema(id=schema_id, data=schema_data, encoding=schema_encoding, name=schema_name)
+                self._schemas.append(schema)
+                self._emit_record(schema)
+        channel = Channel(
+            id=len(self._channels) + 1,
+            topic=topic,
+            message_encoding=message_encoding,
+            metadata=dict(metadata),
+            schema_id=schema_id,
+        )
+        self._channels.append(channel)
+        self._emit_record(channel)
+        return channel.id
+
+    def write(self, batches: Sequence[TopicBatch], raws: Iterable[RawMessage] = ()) -> None:
+        """Write messages merged by log time; on equal times raw messages come first, then batches in their order.
+
+        Raw messages are consumed as they come (in ascending log time) and not held.
+        """
+        records = [self._encode(batch) for batch in batches if len(batch.log_time_ns)]
+        for record in records:
+            if np.any(np.diff(record.log_time_ns) < 0):
+                topic = self._channels[record.channel - 1].topic
+                raise MappingError(expected="ascending log times", got="a step back", where=topic)
+        done = [0] * len(records)
+        group: list[RawMessage] = []
+        size = 0
+        for raw in raws:
+            group.append(raw)
+            size += len(raw.data) + _HEAD.itemsize
+            if size >= _CHUNK_BYTES:
+                self._write_group(records, done, group, until_ns=raw.log_time_ns)
+                group, size = [], 0
+        self._write_group(records, done, group, until_ns=None)
+
+    def _encode(self, batch: TopicBatch) -> _Records:
+        if batch.topic not in self._encoders:
+            raise MappingError(expected="a topic of this file", got="an unknown one", where=batch.topic)
+        channel, encoder = self._encoders[batch.topic]
+        n = len(batch.log_time_ns)
+        payload = encoder.encode(n, batch.fields)
+        head = np.zeros(n, dtype=_HEAD)
+        head["op"] = Opcode.MESSAGE
+        head["size"] = 22 + payload.shape[1]
+        head["channel"] = channel
+        head["sequence"] = self._sequences[channel] + np.arange(n)
+        head["log"] = batch.log_time_ns
+        head["publish"] = batch.publish_time_ns
+        self._sequences[channel] += n
+        rows = np.empty((n, _HEAD.itemsize + payload.shape[1]), dtype=np.uint8)
+        rows[:, : _HEAD.itemsize] = head.view(np.uint8).reshape(n, _HEAD.itemsize)
+        rows[:, _HEAD.itemsize :] = payload
+        return _Records(channel, batch.log_time_ns.astype(np.int64), rows)
+
+    def _write_group(
+        self, records: Sequence[_Records], done: list[int], group: Sequence[RawMessage], until_ns: int | None
+    ) -> None:
+        """Write raw messages and the batch rows that belong before ``until_ns`` (all that are left when None)."""
+        parts: list[_Records] = []
+        for i, record in enumerate(records):
+            end = (
+                len(record.log_time_ns)
+                if until_ns is None
+                else max(done[i], int(np.searchsorted(record.log_time_ns, until_ns, side="left")))
+            )
+            if end > done[i]:
+                parts.append(_Records(record.channel, record.log_time_ns[done[i] : end], record.rows[done[i] : end]))
+                done[i] = end
+        self._write_merged(group, parts)
+
+    def _write_merged(self, raws: Sequence[RawMessage], parts: Sequence[_Records]) -> None:
+        """Merge by log time and cut into chunks."""
+        if not raws and not parts:
+            return
+        raw_bytes = [
+            _MESSAGE_HEAD.pack(
+                Opcode.MESSAGE, 22 + len(r.data), r.channel, r.sequence, r.log_time_ns, r.publish_time_ns
+            )
+            + r.data
+            for r in raws
+        ]
+        log_time = np.concatenate(
+            [np.array([r.log_time_ns for r in raws], dtype=np.int64), *[p.log_time_ns for p in parts]]
+        )
+        channel = np.concatenate(
+            [np.array([r.channel for r in raws], dtype=np.int64), *[np.full(len(p.rows), p.channel) for p in parts]]
+        )
+        length = np.concatenate(
+            [np.array([len(b) for b in raw_bytes], dtype=np.int64)]
+            + [np.full(len(p.rows), p.rows.shape[1], dtype=np.int64) for p in parts]
+        )
+        source = np.concatenate(
+            [np.zeros(len(raws), dtype=np.int64)] + [np.full(len(p.rows), i + 1) for i, p in enumerate(parts)]
+        )
+        order = np.argsort(log_time, kind="stable")
+        log_time, channel, length, source = log_time[order], channel[order], length[order], source[order]
+        row_of = _row_numbers(order, len(raws), parts)
+        ends = np.cumsum(length)
+        first = 0
+        while first < len(order):
+            base = int(ends[first - 1]) if first else 0
+            last = max(int(np.searchsorted(ends, base + _CHUNK_BYTES, side="right")), first + 1)
+            at = ends[first:last] - length[first:last] - base
+            content = np.empty(int(ends[last - 1]) - base, dtype=np.uint8)
+            part_source, part_row = source[first:last], row_of[first:last]
+            for i in np.unique(part_source).tolist():
+                mine = part_source == i
+                _scatter(content, at[mine], part_row[mine], raw_bytes if i == 0 else parts[i - 1].rows)
+            self._emit_chunk(content.tobytes(), channel[first:last], log_time[first:last], at)
+            first = last
+
+    def _emit_chunk(self, content: bytes, channel: IntArray, log_time: IntArray, offset: IntArray) -> None:
+        import zstandard
+
+        stored = zstandard.ZstdCompressor(level=3).compress(content)
+        start_ns, end_ns = int(log_time.min()), int(log_time.max())
+        compression = b"zstd"
+        body = (
+            struct.pack("<QQQI", start_ns, end_ns, len(content), zlib.crc32(content))
+            + struct.pack("<I", len(compression))
+            + compression
+            + struct.pack("<Q", len(stored))
+        )
+        chunk_at = self._at
+        self._emit(struct.pack("<BQ", Opcode.CHUNK, len(body) + len(stored)) + body)
+        self._emit(stored)
+        chunk_length = self._at - chunk_at
+        index_at = self._at
+        offsets: dict[int, int] = {}
+        for id_ in np.unique(channel).tolist():
+            mine = channel == id_
+            pairs = np.empty((int(mine.sum()), 2), dtype="<u8")
+            pairs[:, 0], pairs[:, 1] = log_time[mine], offset[mine]
+            offsets[id_] = self._at
+            data = pairs.tobytes()
+            self._emit(struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(data), id_, len(data)) + data)
+            self._counts[id_] += len(pairs)
+        self._chunk_indexes.append(
+            ChunkIndex(
+                chunk_start_offset=chunk_at,
+                chunk_length=chunk_length,
+                message_start_time=start_ns,
+                message_end_time=end_ns,
+                message_index_offsets=offsets,
+                message_index_length=self._at - index_at,
+                compression="zstd",
+                compressed_size=len(stored),
+                uncompressed_size=len(content),
+            )
+        )
+        self._first_ns = start_ns if self._first_ns is None else min(self._first_ns, start_ns)
+        self._last_ns = max(self._last_ns, end_ns)
+
+    def attachment(self, name: str, media_type: str, data: bytes, log_time_ns: int, create_time_ns: int) -> None:
+        """Add a file."""
+        record = Attachment(
+            create_time=create_time_ns, log_time=log_time_ns, name=name, media_type=media_type, data=data
+        )
+        at, length = self._emit_record(record)
+        self._attachment_indexes.append(
+            AttachmentIndex(
+                offset=at,
+                length=length,
+                create_time=create_time_ns,
+                log_time=log_time_ns,
+                data_size=len(data),
+                name=name,
+                media_type=media_type,
+            )
+        )
+
+    def metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a record of key-value pairs."""
+        at, length = self._emit_record(Metadata(name=name, metadata=dict(values)))
+        self._metadata_indexes.append(MetadataIndex(offset=at, length=length, name=name))
+
+    def close(self) -> None:
+        """Write the summary and give the file its name."""
+        if self._file.closed:
+            return
+        try:
+            self._emit_record(DataEnd(data_section_crc=self._crc))
+            self._emit_summary()
+            self._file.close()
+            self._temporary.replace(self._path)
+        except OSError as error:
+            self.abort()
+            raise self._failed(error) from error
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        self._file.close()
+        self._temporary.unlink(missing_ok=True)
+
+    def _emit_summary(self) -> None:
+        start = self._at
+        builder = RecordBuilder()
+        offsets: list[SummaryOffset] = []
+        statistics = Statistics(
+            attachment_count=len(self._attachment_indexes),
+            channel_count=len(self._channels),
+            channel_message_counts=dict(sorted(self._counts.items())),
+            chunk_count=len(self._chunk_indexes),
+            message_count=self._counts.total(),
+            message_end_time=self._last_ns,
+            message_start_time=self._first_ns or 0,
+            metadata_count=len(self._metadata_indexes),
+            schema_count=len(self._schemas),
+        )
+        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+            (Opcode.SCHEMA, self._schemas),
+            (Opcode.CHANNEL, self._channels),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, self._chunk_indexes),
+            (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
+            (Opcode.METADATA_INDEX, self._metadata_indexes),
+        ]
+        for opcode, records in groups:
+            group_start = builder.count
+            for record in records:
+                record.write(builder)
+            if records:
+                offsets.append(
+                    SummaryOffset(
+                        group_opcode=opcode,
+                        group_start=start + group_start,
+                        group_length=builder.count - group_start,
+                    )
+                )
+        offset_start = start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        summary: bytes = builder.end()  # type: ignore[no-untyped-call]
+        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
+        self._emit(summary)
+        self._emit_record(
+            Footer(
+                summary_start=start,
+                summary_offset_start=offset_start,
+                summary_crc=zlib.crc32(head, zlib.crc32(summary)),
+            )
+        )
+        self._emit(_MAGIC)
+
+    def _emit(self, data: bytes) -> None:
+        try:
+            self._file.write(data)
+        except OSError as error:
+            self.abort()
+            raise self._failed(error) from error
+        self._crc = zlib.crc32(data, self._crc)
+        self._at += len(data)
+
+    def _emit_record(self, record: McapRecord) -> tuple[int, int]:
+        builder = RecordBuilder()
+        record.write(builder)
+        data: bytes = builder.end()  # type: ignore[no-untyped-call]
+        at = self._at
+        self._emit(data)
+        return at, len(data)
+
+
+def _row_numbers(order: IntArray, raws: int, parts: Sequence[_Records]) -> IntArray:
+    """Return each merged message's row in its own source."""
+    rows = np.concatenate([np.arange(raws), *[np.arange(len(p.rows)) for p in parts]])
+    return rows[order].astype(np.int64)
+
+
+def _scatter(
+    content: NDArray[np.uint8], at: IntArray, row: IntArray, source: NDArray[np.uint8] | Sequence[bytes]
+) -> None:
+    """Copy records to their places in a chunk."""
+    if isinstance(source, np.ndarray):
+        size = source.shape[1]
+        record = np.dtype((np.void, size))
+        # A view of a record at every byte: one indexed assignment copies them all.
+        places = np.ndarray((len(content) - size + 1,), dtype=record, buffer=content.data, strides=(1,))
+        places[at] = source[row].view(record)[:, 0]
+        return
+    for to, i in zip(at.tolist(), row.tolist(), strict=True):
+        data = source[i]
+        content[to : to + len(data)] = np.frombuffer(data, dtype=np.uint8)
