@@ -1,0 +1,173 @@
+"""From a log to aligned signals and truth, window by window, with everything decided once a log beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.alignment import SURVEY_S, AlignmentPlan, align, plan_alignment
+from pdhef_logtool.evaluation.truth import (
+    LatencyEstimate,
+    TruthPlan,
+    dependent_signals,
+    derive_truth,
+    estimate_truth_latency,
+    plan_truth,
+    truth_at,
+)
+from pdhef_logtool.logs.drive_log import DriveLog, windows
+from pdhef_logtool.mapping import ClockModel, Mapping, fit_clocks, join_channels, merge_losses, read_signals
+from pdhef_logtool.signals import Channel, Loss, Signals
+from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.vehicle import VehicleParameters
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivePlan:
+    """What is decided from the first ten minutes of a log and holds for all of its windows.
+
+    Attributes
+    ----------
+    survey_signals, survey_truth : the channels that it was decided on.
+    latency : of the truth against the sensors; None without truth yaw rate or gyro.
+    dependent : truth quantities that are an input of the estimators, with the reason.
+    derivation : by truth quantity, how it is derived.
+    """
+
+    mapping: Mapping
+    clocks: dict[str, ClockModel]
+    alignment: AlignmentPlan
+    truth: TruthPlan | None
+    latency: LatencyEstimate | None
+    dependent: dict[str, str]
+    derivation: dict[str, str]
+    survey_signals: dict[str, Channel]
+    survey_truth: dict[str, Channel]
+    start_ns: int
+    end_ns: int
+
+    @property
+    def truth_latency_s(self) -> float:
+        """Latency that all estimators' comparison with truth uses."""
+        return 0.0 if self.latency is None else self.latency.latency_s
+
+    @property
+    def margin_ns(self) -> int:
+        """How much of the channels a window needs on both sides."""
+        truth_margin = 0 if self.truth is None else self.truth.margin_ns
+        return max(self.alignment.margin_ns, truth_margin)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveWindow:
+    """One window: what the estimators see, and the truth at the same stamps (None if the log has none)."""
+
+    signals: Signals
+    truth: StateTrack | None
+    share_done: float
+
+
+def plan_drive(log: DriveLog, mapping: Mapping, vehicle: VehicleParameters, start_ns: int, end_ns: int) -> DrivePlan:
+    """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and truth.
+
+    Raises
+    ------
+    MappingError
+        The log lacks what is mapped, or there is no IMU to set the stamps.
+    """
+    clocks = fit_clocks(log, mapping, start_ns, end_ns)
+    survey = read_signals(log, mapping, clocks, start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    alignment = plan_alignment(
+        survey.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
+    )
+    truth = plan_truth(survey.truth, truth_position_m=vehicle.truth_position_m) if survey.truth else None
+    latency = None
+    derivation: dict[str, str] = {}
+    if truth is not None:
+        derived = derive_truth(survey.truth, plan=truth)
+        derivation = dict(derived.derivation)
+        gyro = survey.signals.get("yaw_rate_rad_s")
+        rate = survey.truth.get("yaw_rate_rad_s")
+        if rate is None and np.isfinite(derived.track.yaw_rate_rad_s).any():
+            known = np.isfinite(derived.track.yaw_rate_rad_s)
+            stamps = derived.track.stamps_ns[known]
+            rate = Channel("yaw_rate_rad_s", "rad/s", "derived", stamps, stamps, derived.track.yaw_rate_rad_s[known])
+        if gyro is not None and rate is not None and len(gyro) and len(rate):
+            latency = estimate_truth_latency(gyro, rate)
+    return DrivePlan(
+        mapping=mapping,
+        clocks=clocks,
+        alignment=alignment,
+        truth=truth,
+        latency=latency,
+        dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
+        derivation=derivation,
+        survey_signals=survey.signals,
+        survey_truth=survey.truth,
+        start_ns=start_ns,
+        end_ns=end_ns,
+    )
+
+
+@dataclass(slots=True)
+class DriveReader:
+    """Reads a planned drive once from start to end; ``losses`` and ``samples`` grow while it does."""
+
+    log: DriveLog
+    plan: DrivePlan
+    window_s: float
+    losses: tuple[Loss, ...] = ()
+    samples: dict[str, int] | None = None
+
+    def windows(self) -> Iterator[DriveWindow]:
+        """Yield the drive's windows in order; joined, they are bit-identical to one window over all."""
+        plan = self.plan
+        margin = plan.margin_ns
+        signals: dict[str, Channel] = {}
+        truth: dict[str, Channel] = {}
+        counts: dict[str, int] = {}
+        done_ns: int | None = None
+        for a, b in windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9)):
+            part = read_signals(self.log, plan.mapping, plan.clocks, a, b)
+            self.losses = merge_losses([self.losses, part.losses])
+            for store, new in ((signals, part.signals), (truth, part.truth)):
+                for name, channel in new.items():
+                    counts[channel.source] = counts.get(channel.source, 0) + len(channel)
+                    store[name] = join_channels([store[name], channel]) if name in store else channel
+            self.samples = counts
+            last = b >= plan.end_ns
+            stamps = [c.stamps_ns for c in signals.values() if len(c)]
+            if not stamps:
+                continue
+            if done_ns is None:
+                done_ns = min(int(s[0]) for s in stamps)
+            newest = max(int(s[-1]) for s in stamps) + 1
+            until = newest if last else min(newest, b) - margin
+            if until <= done_ns:
+                continue
+            yield self._window(signals, truth, done_ns, until, (b - plan.start_ns) / (plan.end_ns - plan.start_ns))
+            done_ns = until
+            signals = {n: _since(c, until - margin) for n, c in signals.items()}
+            truth = {n: _since(c, until - margin) for n, c in truth.items()}
+
+    def _window(
+        self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int, share: float
+    ) -> DriveWindow:
+        plan = self.plan
+        aligned = align(signals, plan.alignment, start_ns, end_ns)
+        at_stamps = None
+        if plan.truth is not None:
+            at_stamps = truth_at(derive_truth(truth, plan=plan.truth), aligned.stamps_ns, plan.truth_latency_s)
+        return DriveWindow(aligned, at_stamps, share)
+
+
+def _since(channel: Channel, stamp_ns: int) -> Channel:
+    first = int(np.searchsorted(channel.stamps_ns, stamp_ns))
+    return replace(
+        channel,
+        stamps_ns=channel.stamps_ns[first:],
+        arrival_ns=channel.arrival_ns[first:],
+        values=channel.values[first:],
+    )

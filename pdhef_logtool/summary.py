@@ -1,0 +1,118 @@
+"""What a run prints on the terminal: one table a log, then what to do next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.pipeline import LogResult, RunResult
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+_DEG = math.degrees(1.0)
+#: Column head, signal, metric, factor to the shown unit, digits.
+_COLUMNS: tuple[tuple[str, str, str, float, int], ...] = (
+    ("sideslip\nRMSE °", "sideslip_rad", "rmse", _DEG, 3),
+    ("\np95 °", "sideslip_rad", "p95_abs", _DEG, 3),
+    ("\nmax °", "sideslip_rad", "max_abs", _DEG, 2),
+    ("\nlag ms", "sideslip_rad", "lag_s", 1e3, 0),
+    ("\n95 % cover", "sideslip_rad", "coverage95", 1.0, 2),
+    ("v_y\nRMSE m/s", "vy_m_s", "rmse", 1.0, 3),
+    ("v_x\nRMSE m/s", "vx_m_s", "rmse", 1.0, 3),
+    ("yaw rate\nRMSE °/s", "yaw_rate_rad_s", "rmse", _DEG, 3),
+    ("a_y\nRMSE m/s²", "ay_m_s2", "rmse", 1.0, 3),
+    ("1 s lateral\nRMSE m", "lateral_1s_m", "rmse", 1.0, 3),
+)
+_SEGMENTS = ("linear", "nonlinear")
+
+
+def render_run(result: RunResult, console: Console) -> None:
+    """Print one table a log and where the outputs are."""
+    for one in result.results:
+        _render_log(one, console)
+    failed = [r for r in result.results if r.report is None]
+    lost = [r for r in result.results if r.outcome.lost]
+    if len(result.results) > 1 or failed:
+        console.print(
+            f"{len(result.results)} logs: {len(result.results) - len(failed)} done, {len(failed)} failed, "
+            f"{len(lost)} with input lost",
+            highlight=False,
+        )
+    console.print(f"outputs in {result.output}", highlight=False, soft_wrap=True)
+
+
+def _render_log(one: LogResult, console: Console) -> None:
+    report = one.report
+    if report is None:
+        console.print(f"[bold]{one.outcome.log}[/bold]  {one.outcome.outcome}", highlight=False)
+        console.print()
+        return
+    seconds = report["log"]["duration_s"]
+    console.print(
+        f"[bold]{one.outcome.log}[/bold]  {report['log']['kind']}, {seconds:.1f} s, "
+        f"vehicle {report['vehicle']['name']}",
+        highlight=False,
+    )
+    for loss in report["losses"]:
+        word = "lost" if loss["severity"] == "lost" else "note"
+        count = "" if loss["count"] is None else f"{loss['count']} × "
+        span = ""
+        if loss["start_ns"] is not None and loss["end_ns"] is not None:
+            start = report["log"]["start_ns"]
+            span = f", {(loss['start_ns'] - start) / 1e9:.2f} to {(loss['end_ns'] - start) / 1e9:.2f} s"
+        console.print(f"  {word}: {count}{loss['what']} ({loss['where']}{span})", highlight=False)
+    console.print(_table(report))
+    if not report["truth"]["available"]:
+        console.print("  no truth in this log: estimates, NIS and disagreement only", highlight=False)
+    if report["truth"]["not_independent"]:
+        console.print("  † the truth channel is an input of the estimators: no independent check", highlight=False)
+    for estimator in report["estimators"]:
+        if estimator["outcome"] == "skipped":
+            console.print(f"  {estimator['name']} skipped: {estimator['reason']}", highlight=False)
+    console.print()
+
+
+def _table(report: Mapping[str, Any]) -> Table:
+    from rich.table import Table
+
+    values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
+    present = {(m["signal"], m["metric"]) for m in report["metrics"] if m["segment"] == "all"}
+    shown = [c for c in _COLUMNS if (c[1], c[2]) in present]
+    table = Table(box=None, header_style="bold", pad_edge=True)
+    table.add_column("\nestimator")
+    dependent = report["truth"]["not_independent"]
+    for head, signal, *_ in shown:
+        table.add_column(head + (" †" if signal in dependent else ""), justify="right")
+    by_segment = [
+        s for s in _SEGMENTS if any(m["segment"] == s and m["signal"] == "sideslip_rad" for m in report["metrics"])
+    ]
+    for segment in by_segment:
+        table.add_column(f"{segment}\nRMSE °", justify="right")
+    nis = any(m["metric"] == "nis" for m in report["metrics"])
+    if nis:
+        table.add_column("\nNIS/dof", justify="right")
+    for estimator in report["estimators"]:
+        if estimator["outcome"] != "ran":
+            continue
+        name = estimator["name"]
+        cells = [name + ("" if estimator["causal"] else " (not causal)")]
+        cells += [_cell(values.get((name, signal, "all", metric)), f, d) for _, signal, metric, f, d in shown]
+        cells += [_cell(values.get((name, "sideslip_rad", s, "rmse")), _DEG, 3) for s in by_segment]
+        if nis:
+            cells.append(_cell(_first(values, name, "nis"), 1.0, 2))
+        table.add_row(*cells)
+    return table
+
+
+def _first(values: Mapping[tuple[str, str, str, str], float | None], name: str, metric: str) -> float | None:
+    found: Sequence[float | None] = [
+        v for (e, _, s, m), v in values.items() if e == name and s == "all" and m == metric
+    ]
+    return found[0] if found else None
+
+
+def _cell(value: float | None, factor: float, digits: int) -> str:
+    return "-" if value is None else f"{value * factor:.{digits}f}"
