@@ -14,12 +14,14 @@ All of it is local: windows derived with ``TruthPlan.margin_ns`` on both sides j
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.correlation import find_shift, on_common_grid
+from pdhef_logtool.evaluation.interpolation import Bracket
 from pdhef_logtool.geometry import (
     ecef_from_geodetic,
     enu_from_ecef_rotation,
@@ -28,7 +30,7 @@ from pdhef_logtool.geometry import (
     shift_velocity_to_cg,
     wrap_angle,
 )
-from pdhef_logtool.signals import BoolArray, Channel, FloatArray, IntArray
+from pdhef_logtool.signals import Channel, FloatArray, IntArray
 from pdhef_logtool.tracks import StateTrack, make_track
 
 #: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
@@ -244,7 +246,7 @@ def truth_at(truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0) -> 
     ``truth.max_gap_s``. Sideslip is recomputed from the interpolated velocities where both are known.
     """
     track = truth.track
-    bracket = _Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
+    bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
     vx, vy = bracket.linear(track.vx_m_s), bracket.linear(track.vy_m_s)
     beta = bracket.angle(track.sideslip_rad)
     known = np.isfinite(vx) & np.isfinite(vy)
@@ -281,40 +283,30 @@ def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) ->
     if _same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
         return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the truth's yaw rate is the gyro's channel")
 
-    def refuse(reason: str, correlation: float = 0.0, error: float = np.inf) -> LatencyEstimate:
+    def refuse(reason: str, correlation: float = 0.0, error: float = float("inf")) -> LatencyEstimate:
         return LatencyEstimate(0.0, correlation, error, False, False, reason)
 
     if min(len(sensor_yaw_rate), len(truth_yaw_rate)) < 2:
         return refuse("too few samples")
-    step_ns, a, b = _on_common_grid(sensor_yaw_rate, truth_yaw_rate)
-    reach = round(MAX_LATENCY_S * 1e9 / step_ns)
-    both = int(np.count_nonzero(np.isfinite(a) & np.isfinite(b)))
-    if both < 4 * reach:
+    grid = on_common_grid(
+        sensor_yaw_rate.stamps_ns, sensor_yaw_rate.values, truth_yaw_rate.stamps_ns, truth_yaw_rate.values
+    )
+    if grid.both * grid.step_s < 4.0 * MAX_LATENCY_S:
         return refuse("less than two seconds in common")
-    a, b = _detrend(a), _detrend(b)
-    correlation = np.array([_correlation(a, b, k) for k in range(-reach, reach + 1)])
-    if not np.isfinite(correlation).any():
+    shift = find_shift(grid, MAX_LATENCY_S)
+    if not np.isfinite(shift.correlation):
         return refuse("no yaw motion")
-    best = int(np.nanargmax(correlation))
-    peak = float(correlation[best])
-    motion = float(np.sqrt(np.nanmean(np.gradient(b, step_ns * 1e-9) ** 2)))
-    residual = float(np.nanstd(b)) * np.sqrt(max(1.0 - peak**2, 0.0))
-    count = max(1.0, both * min(step_ns * 1e-9 * 10.0, 1.0))
-    error = residual / (motion * np.sqrt(count)) if motion > 0 else np.inf
-    if best in (0, 2 * reach):
-        return refuse("no peak within the range searched", peak, error)
-    if peak < 0.8:
-        return refuse("gyro and truth yaw rate correlate too little", peak, error)
+    motion = float(np.sqrt(np.nanmean(np.gradient(grid.b, grid.step_s) ** 2)))
+    residual = float(np.nanstd(grid.b)) * float(np.sqrt(max(1.0 - shift.correlation**2, 0.0)))
+    count = max(1.0, grid.both * min(grid.step_s * 10.0, 1.0))
+    error = residual / (motion * float(np.sqrt(count))) if motion > 0 else float("inf")
+    if not shift.inside:
+        return refuse("no peak within the range searched", shift.correlation, error)
+    if shift.correlation < 0.8:
+        return refuse("gyro and truth yaw rate correlate too little", shift.correlation, error)
     if error > 0.005:
-        return refuse("too little yaw motion", peak, error)
-    latency = (best - reach + parabolic_peak(*correlation[best - 1 : best + 2])) * step_ns * 1e-9
-    return LatencyEstimate(float(latency), peak, error, True, False, "gyro against truth yaw rate")
-
-
-def parabolic_peak(before: float, at: float, after: float) -> float:
-    """Return the place of the vertex of the parabola through values at −1, 0, 1; 0 when they lie on a line."""
-    curvature = before - 2.0 * at + after
-    return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
+        return refuse("too little yaw motion", shift.correlation, error)
+    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against truth yaw rate")
 
 
 def dependent_signals(signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel]) -> dict[str, str]:
@@ -439,45 +431,6 @@ def _median(values: FloatArray) -> float:
 # ---- columns on the truth's clock ----
 
 
-class _Bracket:
-    """Linear interpolation between the two samples around each stamp, not across gaps."""
-
-    def __init__(self, stamps_ns: IntArray, at_ns: IntArray, max_gap_ns: int) -> None:
-        n = int(stamps_ns.shape[0])
-        if n == 0:
-            self.inside: BoolArray = np.zeros(at_ns.shape[0], dtype=np.bool_)
-            self._left = self._right = np.zeros(at_ns.shape[0], dtype=np.int64)
-            self._share = np.zeros(at_ns.shape[0])
-            return
-        right = np.searchsorted(stamps_ns, at_ns, side="left")
-        hit = stamps_ns[np.minimum(right, n - 1)] == at_ns
-        left = np.where(hit, right, right - 1)
-        bracketed = (left >= 0) & (right < n)
-        self._left, self._right = np.clip(left, 0, n - 1), np.minimum(right, n - 1)
-        step = stamps_ns[self._right] - stamps_ns[self._left]
-        self.inside = bracketed & (step <= max_gap_ns)
-        self._share = np.where(self.inside, (at_ns - stamps_ns[self._left]) / np.maximum(step, 1), 0.0)
-
-    def linear(self, values: FloatArray) -> FloatArray:
-        """Return [N] or [N, k]; NaN outside."""
-        return self._between(values, lambda a, b: b - a)
-
-    def angle(self, values: FloatArray) -> FloatArray:
-        """Return [N] in [−π, π), the shorter way round; NaN outside."""
-        return wrap_angle(self._between(values, lambda a, b: wrap_angle(b - a)))
-
-    def quaternion(self, values: FloatArray) -> FloatArray:
-        """Return [N, 4], not normalised; q and −q are the same attitude."""
-        return self._between(values, lambda a, b: np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b) - a)
-
-    def _between(self, values: FloatArray, difference: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
-        out = np.full((self.inside.shape[0], *values.shape[1:]), np.nan)
-        a, b = values[self._left[self.inside]], values[self._right[self.inside]]
-        share = self._share[self.inside].reshape(-1, *([1] * (values.ndim - 1)))
-        out[self.inside] = a + share * difference(a, b)
-        return out
-
-
 class _Source:
     """The truth channels of a window, as columns on the base channel's stamps."""
 
@@ -500,7 +453,7 @@ class _Source:
         if channel is None:
             width = {"quat_wxyz": (4,), "ecef_position_m": (3,), "ecef_velocity_m_s": (3,), "enu_velocity_m_s": (3,)}
             return np.full((self.stamps_ns.shape[0], *width.get(name, ())), np.nan)
-        bracket = _Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * 1e9))
+        bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * 1e9))
         if name in _ANGLES:
             return bracket.angle(channel.values)
         if name == "quat_wxyz":
@@ -729,39 +682,6 @@ def _lateral_acceleration(
 
 
 # ---- latency and dependence ----
-
-
-def _on_common_grid(sensor: Channel, truth: Channel) -> tuple[int, FloatArray, FloatArray]:
-    periods = [float(np.median(np.diff(c.stamps_ns))) for c in (sensor, truth)]
-    step = int(np.clip(min(periods), 5e6, 5e7))
-    start = max(int(sensor.stamps_ns[0]), int(truth.stamps_ns[0]))
-    end = min(int(sensor.stamps_ns[-1]), int(truth.stamps_ns[-1]))
-    grid = np.arange(start, end + 1, step, dtype=np.int64)
-    a, b = (
-        _Bracket(c.stamps_ns, grid, round(GAP_PERIODS * p)).linear(c.values)
-        for c, p in zip((sensor, truth), periods, strict=True)
-    )
-    return step, a, b
-
-
-def _detrend(values: FloatArray) -> FloatArray:
-    known = np.flatnonzero(np.isfinite(values))
-    slope, offset = np.polyfit(known / values.shape[0], values[known], 1)
-    return np.asarray(values - offset - slope * (np.arange(values.shape[0]) / values.shape[0]), dtype=np.float64)
-
-
-def _correlation(a: FloatArray, b: FloatArray, shift: int) -> float:
-    """Pearson correlation of a[i] with b[i + shift] over the samples that both have; NaN without variation."""
-    n = a.shape[0]
-    x = a[max(0, -shift) : n - max(0, shift)]
-    y = b[max(0, shift) : n - max(0, -shift)]
-    both = np.isfinite(x) & np.isfinite(y)
-    x, y = x[both], y[both]
-    if x.size < 2:
-        return float("nan")
-    x, y = x - x.mean(), y - y.mean()
-    power = float((x * x).sum() * (y * y).sum())
-    return float((x * y).sum()) / power**0.5 if power > 0 else float("nan")
 
 
 def _same_share(a: Channel, b: Channel) -> float:

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy.signal import savgol_filter
 from scipy.spatial.transform import Rotation
 
+from pdhef_logtool.evaluation.correlation import parabolic_peak
 from pdhef_logtool.evaluation.truth import (
     dependent_signals,
     derive_truth,
     differentiate,
     estimate_truth_latency,
-    parabolic_peak,
     plan_truth,
     truth_at,
 )
