@@ -1,0 +1,13 @@
+"""Ships the folder ``schemas/`` inside the package; everything else stands in pyproject.toml."""
+
+from setuptools import find_packages, setup
+
+setup(
+    packages=[*find_packages(include=["pdhef_logtool*", "truthsim*"]), "pdhef_logtool.schemas"],
+    package_dir={"pdhef_logtool.schemas": "schemas"},
+    package_data={
+        "pdhef_logtool": ["py.typed"],
+        "truthsim": ["py.typed"],
+        "pdhef_logtool.schemas": ["*.json", "*/msg/*.msg"],
+    },
+)
