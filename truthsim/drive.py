@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool import __version__
 from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.logs.drive_log import windows
+from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.signals import FloatArray
 from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Manoeuvre, Plan, Request
 from truthsim.motion import Motion, simulate_motion
+from truthsim.recording import topics_of
 from truthsim.sensors import IMU_PERIOD_S, STEER_PHASE_S, WHEEL_PHASE_S, SensorChannel, SensorNoise, sense
 from truthsim.vehicle import OBSERVED, Vehicle
 
@@ -67,6 +71,18 @@ class Drive:
         default = MANOEUVRES[self.manoeuvre].default_duration_s(self.speed_km_h / 3.6)
         return text if self.duration_s == default else f"{text} --duration {self.duration_s:g}"
 
+    def facts(self) -> dict[str, float | int | str | bool | list[str]]:
+        """What to tell who asked for the drive."""
+        return {
+            "command": self.command,
+            "duration_s": self.duration_s,
+            "scale": self.scale,
+            "peak_ay_m_s2": self.peak_ay_m_s2,
+            "peak_sideslip_deg": math.degrees(self.peak_sideslip_rad),
+            "spun": self.spun,
+            "notes": list(self.notes),
+        }
+
     def metadata(self) -> dict[str, str]:
         """What the log's metadata record ``truthsim`` holds."""
         import json
@@ -100,7 +116,7 @@ def simulate_drive(
     duration_s: float | None = None,
     vehicle: Vehicle | None = None,
     noise: SensorNoise | None = None,
-    rtk_rate_hz: int = 100,
+    rtk_rate_hz: int | None = None,
 ) -> Drive:
     """Simulate a manoeuvre of ``truthsim.manoeuvres.MANOEUVRES``; what is None takes the manoeuvre's default.
 
@@ -119,6 +135,7 @@ def simulate_drive(
         )
     speed_km_h = chosen.speed_km_h if speed_km_h is None else float(speed_km_h)
     friction = chosen.friction if friction is None else float(friction)
+    rtk_rate_hz = chosen.rtk_rate_hz if rtk_rate_hz is None else rtk_rate_hz
     _check(speed_km_h, friction, seed, duration_s, rtk_rate_hz)
     speed_m_s = speed_km_h / 3.6
     duration_s = chosen.default_duration_s(speed_m_s) if duration_s is None else float(duration_s)
@@ -231,3 +248,36 @@ def _search_scale(chosen: Manoeuvre, request: Request, vehicle: Vehicle, notes: 
             f"|a_y| reaches only {best_peak / unit:.2f} mu g of the {chosen.peak_share:.2f} that {chosen.name} asks for"
         )
     return best_scale
+
+
+#: Length of the pieces that a log is written in, so that the messages of a long drive never stand in memory at once.
+_WRITE_NS = 60_000_000_000
+
+
+def write_drive(drive: Drive, path: Path) -> None:
+    """Write a drive as ROS 2 MCAP: sensors, RTK truth, perfect truth, and how it was made as metadata ``truthsim``.
+
+    ``header.stamp`` and publish time are the measurement time, log time is the arrival.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    topics = list(
+        topics_of(
+            drive.channels,
+            drive.times_s,
+            drive.truth,
+            friction=drive.friction,
+            noise=drive.noise,
+            rtk_rate_hz=drive.rtk_rate_hz,
+            start_ns=drive.start_ns,
+        )
+    )
+    with McapLogWriter(path) as writer:
+        for topic in topics:
+            writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=topic.definition)
+        writer.metadata("truthsim", drive.metadata())
+        end_ns = 1 + max(int(topic.arrival_ns[-1]) for topic in topics)
+        for start, end in windows(drive.start_ns, end_ns, _WRITE_NS):
+            writer.write([topic.between(start, end) for topic in topics])

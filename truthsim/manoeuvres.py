@@ -59,6 +59,7 @@ class Manoeuvre:
     Attributes
     ----------
     default_duration_s : duration in s by speed in m/s.
+    rtk_rate_hz : default rate of the truth; long drives take less.
     peak_share : peak |a_y| over μ g that the scale is searched for; None where nothing is scaled.
     least_share : peak |a_y| over μ g below which the manoeuvre has failed its purpose.
     """
@@ -71,6 +72,12 @@ class Manoeuvre:
     least_share: float
     default_duration_s: Callable[[float], float]
     plan: Callable[[Request], Plan]
+    rtk_rate_hz: int = 100
+
+    @property
+    def duration_s(self) -> float:
+        """Duration at the default speed."""
+        return self.default_duration_s(self.speed_km_h / 3.6)
 
 
 def _steer_for(a_y_m_s2: float, speed_m_s: float) -> float:
@@ -286,6 +293,7 @@ _CATALOGUE = (
         least_share=0.0,
         default_duration_s=lambda _: 300.0,
         plan=_road,
+        rtk_rate_hz=50,
     ),
 )
 

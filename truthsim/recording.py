@@ -1,0 +1,226 @@
+"""Turn the columns of a drive into the topics of its log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.logs.writer import TopicBatch
+from pdhef_logtool.signals import WHEELS, FloatArray, IntArray
+from truthsim.sensors import IMU_PERIOD_S, SensorChannel, SensorNoise
+
+#: Steering has no header there, only a stamp.
+STEERING_REPORT = """builtin_interfaces/Time stamp
+float32 steering_tire_angle
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+#: What is written is rounded to this, far below the noise (16 µm) or any use (60 nm): digits without meaning do not
+#: compress.
+RTK_STEP = 2.0**-16
+PERFECT_STEP = 2.0**-24
+
+_EXACT = (
+    "vx_m_s",
+    "vy_m_s",
+    "yaw_rate_rad_s",
+    "sideslip_rad",
+    "ax_m_s2",
+    "ay_m_s2",
+    "roll_rad",
+    "roll_rate_rad_s",
+    "pitch_rad",
+    "steer_rad",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topic:
+    """One topic of the log: what stands in every message, and the columns.
+
+    ``definition`` is given for a type that ROS 2 itself and our own ``schemas/`` lack.
+    """
+
+    name: str
+    type_name: str
+    constants: Mapping[str, str | float | Sequence[float]]
+    stamps_ns: IntArray
+    arrival_ns: IntArray
+    fields: Mapping[str, NDArray[Any]]
+    definition: str | None = None
+
+    def between(self, start_ns: int, end_ns: int) -> TopicBatch:
+        """Return the messages that arrive in [start, end)."""
+        rows = slice(*np.searchsorted(self.arrival_ns, [start_ns, end_ns], side="left").tolist())
+        return TopicBatch(
+            topic=self.name,
+            log_time_ns=self.arrival_ns[rows],
+            publish_time_ns=self.stamps_ns[rows],
+            fields={path: column[rows] for path, column in self.fields.items()},
+        )
+
+
+def quaternion(roll_rad: FloatArray, pitch_rad: FloatArray, yaw_rad: FloatArray) -> FloatArray:
+    """Hamilton quaternions [N, 4] (w, x, y, z) of yaw, then pitch, then roll: they turn the body into ENU."""
+    cr, sr = np.cos(roll_rad / 2), np.sin(roll_rad / 2)
+    cp, sp = np.cos(pitch_rad / 2), np.sin(pitch_rad / 2)
+    cy, sy = np.cos(yaw_rad / 2), np.sin(yaw_rad / 2)
+    return np.stack(
+        [
+            cy * cp * cr + sy * sp * sr,
+            cy * cp * sr - sy * sp * cr,
+            cy * sp * cr + sy * cp * sr,
+            sy * cp * cr - cy * sp * sr,
+        ],
+        axis=1,
+    )
+
+
+def topics_of(
+    channels: Mapping[str, SensorChannel],
+    times_s: FloatArray,
+    truth: Mapping[str, FloatArray],
+    *,
+    friction: float,
+    noise: SensorNoise,
+    rtk_rate_hz: int,
+    start_ns: int,
+) -> Iterator[Topic]:
+    """Yield the topics of a log: sensors, RTK truth, perfect truth."""
+    imu, steering, wheels = (channels[k] for k in ("imu", "steering", "wheels"))
+
+    def topic(
+        name: str,
+        type_name: str,
+        channel: SensorChannel,
+        *,
+        constants: Mapping[str, str | float | Sequence[float]],
+        fields: Mapping[str, NDArray[Any]],
+    ) -> Topic:
+        stamps, arrival = channel.stamps_ns(start_ns), channel.arrival_ns(start_ns)
+        return Topic(name, type_name, constants, stamps, arrival, {"header.stamp": stamps, **fields})
+
+    acceleration, rate = noise.acceleration_m_s2**2, noise.yaw_rate_rad_s**2
+    yield topic(
+        "/imu/data",
+        "sensor_msgs/msg/Imu",
+        imu,
+        constants={
+            "header.frame_id": "base_link",
+            "orientation_covariance": [-1.0] + [0.0] * 8,
+            "angular_velocity_covariance": _diagonal(rate, rate, rate),
+            "linear_acceleration_covariance": _diagonal(acceleration, acceleration, acceleration),
+        },
+        fields={
+            "linear_acceleration.x": imu.fields["ax_m_s2"],
+            "linear_acceleration.y": imu.fields["ay_m_s2"],
+            "linear_acceleration.z": imu.fields["az_m_s2"],
+            "angular_velocity.x": imu.fields["roll_rate_rad_s"],
+            "angular_velocity.y": imu.fields["pitch_rate_rad_s"],
+            "angular_velocity.z": imu.fields["yaw_rate_rad_s"],
+        },
+    )
+    stamps = steering.stamps_ns(start_ns)
+    yield Topic(
+        "/vehicle/status/steering_status",
+        "autoware_vehicle_msgs/msg/SteeringReport",
+        {},
+        stamps,
+        steering.arrival_ns(start_ns),
+        {"stamp": stamps, "steering_tire_angle": steering.fields["steer_rad"]},
+        definition=STEERING_REPORT,
+    )
+    yield topic(
+        "/vehicle/wheel_speeds",
+        "truthsim_msgs/msg/WheelSpeeds",
+        wheels,
+        constants={"header.frame_id": "base_link"},
+        fields={f"{w}_m_s": wheels.fields[f"{w}_m_s"] for w in WHEELS},
+    )
+
+    rtk, fix = channels["rtk"], channels["fix"]
+    place, tilt = noise.rtk_position_m**2, noise.rtk_tilt_rad**2
+    # A body velocity also carries the heading's error across the speed; 0.015 m/s is that of 30 m/s.
+    speed = noise.rtk_velocity_m_s**2 + (30.0 * noise.rtk_heading_rad) ** 2
+    yield topic(
+        "/rtk/odometry",
+        "nav_msgs/msg/Odometry",
+        rtk,
+        constants={
+            "header.frame_id": "map",
+            "child_frame_id": "base_link",
+            "pose.covariance": _diagonal(place, place, 4.0 * place, tilt, tilt, noise.rtk_heading_rad**2),
+            "twist.covariance": _diagonal(speed, speed, speed, rate, rate, noise.rtk_yaw_rate_rad_s**2),
+        },
+        fields=_rounded(_odometry(rtk.fields), RTK_STEP),
+    )
+    yield topic(
+        "/rtk/fix",
+        "sensor_msgs/msg/NavSatFix",
+        fix,
+        constants={
+            "header.frame_id": "base_link",
+            "status.status": 2.0,
+            "status.service": 1.0,
+            "position_covariance": _diagonal(place, place, 4.0 * place),
+            "position_covariance_type": 2.0,
+        },
+        fields={
+            "latitude": fix.fields["lat_deg"],
+            "longitude": fix.fields["lon_deg"],
+            "altitude": fix.fields["alt_m"],
+        },
+    )
+
+    every = max(1, round(1.0 / (rtk_rate_hz * IMU_PERIOD_S)))
+    exact = {name: column[::every] for name, column in truth.items()}
+    perfect = SensorChannel(times_s[::every], times_s[::every], exact)
+    zero = np.zeros(perfect.times_s.shape[0])
+    yield topic(
+        "/truth/perfect/odometry",
+        "nav_msgs/msg/Odometry",
+        perfect,
+        constants={"header.frame_id": "map", "child_frame_id": "base_link"},
+        fields=_rounded(_odometry({**exact, "z_m": zero}), PERFECT_STEP),
+    )
+    yield topic(
+        "/truth/perfect/state",
+        "truthsim_msgs/msg/VehicleTruth",
+        perfect,
+        constants={"header.frame_id": "base_link", "friction": friction},
+        fields={
+            **_rounded({name: exact[name] for name in _EXACT}, PERFECT_STEP),
+            "longitudinal_force_n": np.stack([exact[f"fx_{w}_n"] for w in WHEELS], axis=1),
+            "lateral_force_n": np.stack([exact[f"fy_{w}_n"] for w in WHEELS], axis=1),
+            "vertical_force_n": np.stack([exact[f"fz_{w}_n"] for w in WHEELS], axis=1),
+            "slip_angle_rad": np.stack([exact[f"slip_angle_{w}_rad"] for w in WHEELS], axis=1),
+        },
+    )
+
+
+def _diagonal(*values: float) -> list[float]:
+    return np.diag(np.array(values)).ravel().tolist()
+
+
+def _rounded(fields: Mapping[str, FloatArray], step: float) -> dict[str, FloatArray]:
+    return {path: np.asarray(np.round(column / step) * step) for path, column in fields.items()}
+
+
+def _odometry(state: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    return {
+        "pose.pose.position.x": state["x_m"],
+        "pose.pose.position.y": state["y_m"],
+        "pose.pose.position.z": state["z_m"],
+        "pose.pose.orientation": quaternion(state["roll_rad"], state["pitch_rad"], state["yaw_rad"]),
+        "twist.twist.linear.x": state["vx_m_s"],
+        "twist.twist.linear.y": state["vy_m_s"],
+        "twist.twist.angular.z": state["yaw_rate_rad_s"],
+    }
