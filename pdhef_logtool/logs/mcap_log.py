@@ -354,7 +354,7 @@ class _Walk:
         self.last_ns = max(times)
         self.run, self.run_times, self.run_counts = None, [], Counter()
 
-    def _end_chunk(self) -> None:
+    def _end_chunk(self, index_complete: bool = True) -> None:
         """Close a chunk; open it now if only its content tells its channels or its messages."""
         if self.chunk is None:
             return
@@ -364,7 +364,7 @@ class _Walk:
         extent, known = self.index_extent, set(of._raw_channels)
         self.chunk, self.index_extent, self.index_counts = None, (0, 0), Counter()
         index = len(of._spans)
-        if not counts or not set(counts) <= known:
+        if not index_complete or not counts or not set(counts) <= known:
             try:
                 content = of.chunk_content(start, end)
                 block = _scan_messages(content, of)
@@ -384,7 +384,7 @@ class _Walk:
 
     def cut(self, at: int) -> None:
         """Note that the file ends inside a record."""
-        self._end_chunk()
+        self._end_chunk(index_complete=False)
         self._end_run()
         where = str(self.of.path)
         what = f"the file ends inside a record at byte {at} of {len(self.of._data)}; what follows is gone"
@@ -392,7 +392,7 @@ class _Walk:
 
     def skipped(self, at: int, resume: int) -> None:
         """Note that a damaged stretch was stepped over."""
-        self._end_chunk()
+        self._end_chunk(index_complete=False)
         self._end_run()
         what = f"bytes {at} to {resume} hold no readable record; reading resumes at the next chunk"
         self.of._lost.append(Loss("bad-record", what, str(self.of.path), start_ns=self._after_last()))

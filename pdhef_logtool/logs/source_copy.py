@@ -1,0 +1,274 @@
+"""Lossless copies of a log's messages into an MCAP: ready bytes in log-time order, a few spans in memory at a time.
+
+MCAP sources keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and metadata
+records come along. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2 CDR.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.errors import LogError
+from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, MetadataRecord
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.message_schema import SchemaError, ros_schema
+from pdhef_logtool.logs.schema_files import message_definition
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+from pdhef_logtool.signals import Loss
+
+_HEADER = "std_msgs/msg/Header"
+
+#: Number of a channel in the log: file of the log, and channel id in that file.
+_Key = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class SourceChannels:
+    """Where the channels of a log went in the copy.
+
+    Attributes
+    ----------
+    ids : channel of the copy by file and channel of the source.
+    converters : turns a payload into what the copy holds; absent where bytes are kept.
+    numbered : ROS 1 channels whose messages begin with a header: its sequence number, which a ROS 2 header has not,
+        becomes the message's.
+    lost : channels and messages that cannot be copied.
+    """
+
+    ids: Mapping[_Key, int]
+    converters: Mapping[_Key, Callable[[bytes], bytes | None]]
+    numbered: frozenset[_Key]
+    lost: tuple[Loss, ...]
+
+
+def source_profile(log: DriveLog) -> str:
+    """Return the MCAP profile that a full copy should carry: the source's own, or ``ros2`` for bags."""
+    columnar = _columnar(log)
+    profiles = [getattr(c, "profile", "ros2") for c in columnar.containers]
+    return str(profiles[0]) if profiles else "ros2"
+
+
+def register_channels(writer: McapLogWriter, log: DriveLog) -> SourceChannels:
+    """Add every channel of a log to a writer.
+
+    Channels that only repeat over split files become one. A ROS 1 channel whose definition does not parse cannot be
+    converted and is left out with a loss.
+    """
+    columnar = _columnar(log)
+    ids: dict[_Key, int] = {}
+    converters: dict[_Key, Callable[[bytes], bytes | None]] = {}
+    numbered: set[_Key] = set()
+    lost: list[Loss] = []
+    known: dict[tuple[object, ...], int] = {}
+    for c, container in enumerate(columnar.containers):
+        same_file: set[int] = set()
+        for channel in container.channels.values():
+            target = channel
+            if channel.encoding == "ros1" and columnar.kind == "rosbag1":
+                try:
+                    target, converters[(c, channel.id)], has_number = _as_ros2(channel)
+                    if has_number:
+                        numbered.add((c, channel.id))
+                except SchemaError as error:
+                    lost.append(Loss("not-converted", f"cannot become ROS 2: {error}", channel.topic))
+                    continue
+            elif channel.encoding == "cdr" and not channel.schema_data:
+                target = _with_definition(channel)
+            identity = (
+                target.topic,
+                target.schema_name,
+                target.schema_encoding,
+                target.schema_data,
+                target.encoding,
+                tuple(sorted(target.metadata.items())),
+            )
+            id_ = known.get(identity)
+            if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
+                id_ = writer.add_raw_channel(
+                    target.topic,
+                    schema_name=target.schema_name,
+                    schema_encoding=target.schema_encoding,
+                    schema_data=target.schema_data,
+                    message_encoding=target.encoding,
+                    metadata=target.metadata,
+                )
+                known[identity] = id_
+            same_file.add(id_)
+            ids[(c, channel.id)] = id_
+    return SourceChannels(ids, converters, frozenset(numbered), tuple(lost))
+
+
+def iterate_raw(
+    log: DriveLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[RawMessage]:
+    """Yield the messages of a log with log time in [start, end) in log-time order, with the copy's channel ids.
+
+    Messages of equal log time come in file order. Spans that overlap in time are merged; no more of them are held
+    than overlap. Damaged spans are left out and reported by ``log.lost``.
+    """
+    columnar = _columnar(log)
+    spans = [
+        (span.start_ns, c, span)
+        for c, container in enumerate(columnar.containers)
+        for span in container.spans
+        if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
+    ]
+    spans.sort(key=lambda item: (item[0], item[1], item[2].index))
+    open_spans: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
+    at = 0
+    while at < len(spans) or open_spans:
+        while at < len(spans) and (not open_spans or spans[at][0] <= open_spans[0][0]):
+            _, c, span = spans[at]
+            at += 1
+            block = columnar.load(c, span)
+            if block is not None:
+                cursor = _Cursor(block, start_ns, end_ns)
+                if cursor.rows:
+                    heapq.heappush(open_spans, (cursor.time, c, span.index, 0, cursor))
+        if not open_spans:
+            continue
+        _, c, index, _, cursor = heapq.heappop(open_spans)
+        # Run on in this span for as long as no other one can come first.
+        limit = min(
+            open_spans[0][0] if open_spans else np.iinfo(np.int64).max,
+            spans[at][0] if at < len(spans) else np.iinfo(np.int64).max,
+        )
+        while True:
+            message = cursor.take(c, channels)
+            if message is not None:
+                yield message
+            if not cursor.rows:
+                break
+            if cursor.time >= limit:
+                heapq.heappush(open_spans, (cursor.time, c, index, cursor.taken, cursor))
+                break
+
+
+def iterate_attachments(log: DriveLog) -> Iterator[Attachment]:
+    """Yield the attachments of a log."""
+    for container in _columnar(log).containers:
+        yield from container.attachments()
+
+
+def iterate_metadata(log: DriveLog) -> Iterator[MetadataRecord]:
+    """Yield the metadata records of a log."""
+    for container in _columnar(log).containers:
+        yield from container.metadata_records()
+
+
+class _Cursor:
+    """Goes through one span's messages in order of log time."""
+
+    def __init__(self, block: Block, start_ns: int | None, end_ns: int | None) -> None:
+        keep = np.ones(len(block), dtype=np.bool_)
+        if start_ns is not None:
+            keep &= block.log_time_ns >= start_ns
+        if end_ns is not None:
+            keep &= block.log_time_ns < end_ns
+        rows = np.flatnonzero(keep)
+        rows = rows[np.argsort(block.log_time_ns[rows], kind="stable")]
+        self.taken = 0
+        self._buffer = block.buffer
+        columns = (
+            block.channel,
+            block.log_time_ns,
+            block.publish_time_ns,
+            block.sequence,
+            block.offset,
+            block.length,
+        )
+        self._rows = list(zip(*(column[rows].tolist() for column in columns), strict=True))
+
+    @property
+    def rows(self) -> int:
+        """Messages that are left."""
+        return len(self._rows) - self.taken
+
+    @property
+    def time(self) -> int:
+        """Log time of the next message."""
+        return int(self._rows[self.taken][1])
+
+    def take(self, c: int, channels: SourceChannels) -> RawMessage | None:
+        """Return the next message; None if its channel or the message itself cannot be copied."""
+        channel, log_time, publish_time, sequence, offset, length = self._rows[self.taken]
+        self.taken += 1
+        key = (c, channel)
+        id_ = channels.ids.get(key)
+        if id_ is None:
+            return None
+        data: bytes | None = bytes(self._buffer[offset : offset + length])
+        convert = channels.converters.get(key)
+        if convert is not None and data is not None:
+            if key in channels.numbered:
+                sequence = int.from_bytes(data[:4], "little")
+            data = convert(data)
+        return None if data is None else RawMessage(id_, log_time, publish_time, sequence, data)
+
+
+def _columnar(log: DriveLog) -> ColumnarLog:
+    if not isinstance(log, ColumnarLog):
+        raise LogError(expected="a log opened from a file", got=type(log).__name__, where=str(log.path))
+    return log
+
+
+def _with_definition(channel: ChannelRecord) -> ChannelRecord:
+    """Give a channel of an old database the definition that its type has in the common packages, if any."""
+    try:
+        text = message_definition(channel.type_name)
+    except KeyError:
+        return channel
+    return replace(channel, schema_encoding="ros2msg", schema_data=text.encode())
+
+
+def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], bytes | None], bool]:
+    """Return the ROS 2 form of a ROS 1 channel, the converter of its payloads, and whether a header begins these.
+
+    Raises
+    ------
+    SchemaError : its definition does not parse.
+    """
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import Stores, get_typestore
+
+    text = channel.schema_data.decode("utf-8", errors="replace")
+    parsed = ros_schema(channel.type_name, "ros1msg", text, "ros1").store
+    if parsed is None:
+        raise SchemaError("no definition")
+    name = channel.type_name
+    # The conversion drops the sequence number of headers, which the ROS 2 header has not; so must the definition.
+    types = dict(parsed.fielddefs)
+    if _HEADER in types:
+        types[_HEADER] = get_typestore(Stores.LATEST).fielddefs[_HEADER]
+    source = get_typestore(Stores.EMPTY)
+    source.register(types)
+
+    def convert(data: bytes) -> bytes | None:
+        try:
+            return bytes(source.ros1_to_cdr(data, name))
+        except (SerdeError, ValueError, IndexError):
+            return None
+
+    definition = source.generate_msgdef(name, ros_version=2)[0]
+    return (
+        replace(
+            channel,
+            encoding="cdr",
+            schema_name=name,
+            schema_encoding="ros2msg",
+            schema_data=definition.encode(),
+            metadata={},
+        ),
+        convert,
+        _starts_with_header(parsed.fielddefs[name][1]),
+    )
+
+
+def _starts_with_header(members: Sequence[tuple[str, Any]]) -> bool:
+    return bool(members) and members[0][1][1] == _HEADER
