@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,6 +13,18 @@ from pdhef_logtool.tracks import StateTrack
 
 #: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
 MAX_PREDICTION_S = 0.3
+
+#: Magnitudes beyond which a reading is no motion of a ground vehicle (10 g; eight turns a second; 540 km/h; wheels
+#: across): an input has no innovation that a gate could judge, and one such value would end a filter.
+POSSIBLE_MAGNITUDE = {
+    "steer_rad": 0.5 * math.pi,
+    "ax_m_s2": 100.0,
+    "ay_m_s2": 100.0,
+    "yaw_rate_rad_s": 50.0,
+    "speed_m_s": 150.0,
+}
+#: Friction below ice or above any tyre is no friction.
+POSSIBLE_FRICTION = (0.01, 5.0)
 
 
 class Estimator(Protocol):
@@ -52,3 +66,16 @@ def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
     ``ready_ns`` [K] is non-decreasing, ``stamps_ns`` [M]; the result is int64 [M] (METHOD §1, §6 "Delay").
     """
     return np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
+
+
+def without_impossible(signals: Signals) -> Signals:
+    """Return the signals with readings that no vehicle can have as missing; the same object where there are none."""
+    bad = {c: ~(np.abs(getattr(signals, c)) <= limit) for c, limit in POSSIBLE_MAGNITUDE.items()}
+    low, high = POSSIBLE_FRICTION
+    bad["friction"] = ~((signals.friction >= low) & (signals.friction <= high))
+    changed: dict[str, Any] = {
+        c: np.where(mask, np.nan, getattr(signals, c))
+        for c, mask in bad.items()
+        if (mask & ~np.isnan(getattr(signals, c))).any()
+    }
+    return replace(signals, **changed) if changed else signals

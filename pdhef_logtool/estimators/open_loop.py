@@ -28,6 +28,9 @@ from pdhef_logtool.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import VehicleParameters
 
+#: The rate of a_y is taken along the motion over this time.
+AY_RATE_STEP_S = 0.001
+
 
 @njit(cache=True)
 def _open_loop(dt, steer, ax, speed, friction, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
@@ -54,12 +57,16 @@ def _open_loop(dt, steer, ax, speed, friction, default_friction, p, state, value
         valid[k] = ok
         if ok:
             _, vy_dot, r_dot = state_derivative(state[0], state[2], state[3], steer[k], 0.0, mu, p)
+            ay = planar_lateral_acceleration(state[0], state[2], state[3], steer[k], mu, p)
+            h = AY_RATE_STEP_S
+            soon = planar_lateral_acceleration(state[0], state[2] + h * vy_dot, state[3] + h * r_dot, steer[k], mu, p)
             values[k, VX] = state[0]
             values[k, VY] = state[2]
             values[k, YAW_RATE] = state[3]
-            values[k, AY] = planar_lateral_acceleration(state[0], state[2], state[3], steer[k], mu, p)
+            values[k, AY] = ay
             rates[k, VY] = vy_dot
             rates[k, YAW_RATE] = r_dot
+            rates[k, AY] = (soon - ay) / h
 
 
 @dataclass(frozen=True, slots=True)

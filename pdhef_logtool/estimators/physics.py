@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -38,6 +38,9 @@ VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3
 STATES = 4
 Z_AY, Z_YAW_RATE, Z_SPEED = 0, 1, 2
 MEASUREMENTS = 3
+# Inputs of a step; a_x is 0 where U_AX_KNOWN is 0.
+U_STEER, U_AX, U_FRICTION, U_AX_KNOWN = 0, 1, 2, 3
+INPUTS = 4
 
 #: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
 #: over the recorded sample drives by ``benchmarks/tune_physics_q.py`` and frozen.
@@ -58,16 +61,22 @@ GATE_INFLATION = 10.0
 STANDSTILL_SPEED_M_S = 0.05
 STANDSTILL_YAW_RATE_RAD_S = 0.05
 STANDSTILL_AFTER_S = 0.3
+#: A standstill is not believed for longer than this without a speed sample that says so.
+STANDSTILL_SILENCE_S = 1.5
 STANDSTILL_STD = (0.02, 0.01, 0.002, 0.0)
-#: Divergence: the filter's own normalised innovation stays this far above its expectation, averaged over the time.
+#: Divergence: the filter's own normalised squared innovations stay this far above 1, averaged over the time.
 DIVERGED_NIS_RATIO = 25.0
+#: Samples that the gate rejects count as well, or a gated filter could never notice; each up to this square.
+DIVERGED_NIS_CAP = 4.0 * GATE_SIGMA**2
 DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
 
 # Entries of the filter's scalar memory.
-M_INITIALISED, M_STEER, M_AX, M_FRICTION, M_STEER_AGE, M_STILL, M_NIS = range(7)
-M_REJECTED = 7  # and the two after it, one a measurement
-MEMORY = 10
+M_INITIALISED, M_STEER, M_AX, M_AX_KNOWN, M_FRICTION, M_STEER_AGE, M_STILL, M_SPEED_AGE, M_NIS = range(9)
+M_REJECTED = 9  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
+MEMORY = 12
+#: What M_REJECTED holds at the first rejected sample itself; 0 is "the last sample was accepted".
+JUST_REJECTED_S = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +92,7 @@ class FilterCarry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSteps:
-    """Filter posteriors on measurement time: [K] each, state [K, 4], covariance [K, 4, 4], inputs [K, 3]."""
+    """Filter posteriors on measurement time: [K] each, state [K, 4], covariance [K, 4, 4], inputs [K, 4]."""
 
     stamps_ns: IntArray
     ready_ns: IntArray
@@ -127,9 +136,21 @@ def _measure(chi, steer, friction, p, zeta):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _add_process_noise(P, q_std, dt):  # type: ignore[no-untyped-def]
+def _add_process_noise(P, q_std, ax_known, dt):  # type: ignore[no-untyped-def]
     for i in range(P.shape[0]):
-        P[i, i] += q_std[i] * q_std[i] * dt
+        q = q_std[i] if i != VX or ax_known else NO_AX_Q_STD
+        P[i, i] += q * q * dt
+
+
+@njit(cache=True)
+def _all_finite(x, P):  # type: ignore[no-untyped-def]
+    for i in range(x.shape[0]):
+        if not math.isfinite(x[i]):
+            return False
+        for j in range(x.shape[0]):
+            if not math.isfinite(P[i, j]):
+                return False
+    return True
 
 
 @njit(cache=True)
@@ -148,7 +169,6 @@ def _filter(  # type: ignore[no-untyped-def]
     nu = np.empty(MEASUREMENTS)
     z = np.empty(MEASUREMENTS)
     use = np.empty(MEASUREMENTS, dtype=np.bool_)
-    q = q_std.copy()
     for k in range(dt.shape[0]):
         restart = not dt[k] <= RESTART_GAP_S
         if restart:
@@ -192,76 +212,89 @@ def _filter(  # type: ignore[no-untyped-def]
             draw_sigma_points(x, P, scale, L, chi)
             _propagate(chi, memory[M_STEER], memory[M_AX], memory[M_FRICTION], dt[k], p)
             mean_and_covariance(chi, wm, wc, x, P)
-            q[VX] = q_std[VX] if has_ax else NO_AX_Q_STD
-            _add_process_noise(P, q, dt[k])
-            draw_sigma_points(x, P, scale, L, chi)
-            _measure(chi, steer_k, mu_k, p, zeta)
-            innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-            opens = False
-            for i in range(MEASUREMENTS):
-                S[i, i] += r_std[i] * r_std[i]
-                nu[i] = z[i] - z_hat[i]
-                use[i] = math.isfinite(nu[i]) and (i != Z_AY or steer_ok)
-                if use[i]:
-                    out_nu[k, i] = nu[i]
-                    if nu[i] * nu[i] <= GATE_SIGMA**2 * S[i, i]:
-                        memory[M_REJECTED + i] = 0.0
-                    else:
-                        memory[M_REJECTED + i] += dt[k]
-                        use[i] = memory[M_REJECTED + i] > GATE_OPENS_AFTER_S
-                        opens = opens or use[i]
-            if opens:
-                for i in range(n):
-                    for j in range(n):
-                        P[i, j] *= GATE_INFLATION
+            _add_process_noise(P, q_std, memory[M_AX_KNOWN] > 0.0, dt[k])
+            alive = _all_finite(x, P)
+            if alive:
                 draw_sigma_points(x, P, scale, L, chi)
                 _measure(chi, steer_k, mu_k, p, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
+                opens = False
+                seen = 0
+                squares = 0.0
                 for i in range(MEASUREMENTS):
                     S[i, i] += r_std[i] * r_std[i]
                     nu[i] = z[i] - z_hat[i]
-                    memory[M_REJECTED + i] = 0.0
-            nis, dof, log_likelihood = kalman_update(x, P, nu, S, Pxz, use)
-            if dof > 0:
-                out_nis[k] = nis
-                out_dof[k] = dof
-                out_ll[k] = log_likelihood
-                memory[M_NIS] += min(1.0, dt[k] / DIVERGED_AVERAGE_S) * (nis / dof - memory[M_NIS])
-            # Standstill: the speed sensor reads zero and nothing turns, for a while.
-            if math.isfinite(z[Z_SPEED]):
-                still = abs(z[Z_SPEED]) < STANDSTILL_SPEED_M_S and not abs(z[Z_YAW_RATE]) > STANDSTILL_YAW_RATE_RAD_S
-                memory[M_STILL] = memory[M_STILL] + dt[k] if still else 0.0
-            elif memory[M_STILL] > 0.0:
-                memory[M_STILL] += dt[k]
-            if memory[M_STILL] >= STANDSTILL_AFTER_S:
-                for i in range(AX_BIAS):
-                    x[i] = 0.0
-                    for j in range(n):
-                        P[i, j] = 0.0
-                        P[j, i] = 0.0
-                    P[i, i] = STANDSTILL_STD[i] ** 2
-            out_valid[k] = steer_ok
-            sideslip = math.atan2(x[VY], x[VX])
-            out_diverged[k] = memory[M_NIS] > DIVERGED_NIS_RATIO or (
-                x[VX] > p.blend_high_m_s and abs(sideslip) > DIVERGED_SIDESLIP_RAD
-            )
-            finite = True
-            for i in range(n):
-                finite = finite and math.isfinite(x[i]) and math.isfinite(P[i, i])
-            if not finite:
+                    use[i] = math.isfinite(nu[i]) and (i != Z_AY or steer_ok)
+                    if memory[M_REJECTED + i] > 0.0:
+                        memory[M_REJECTED + i] += dt[k]
+                    if use[i]:
+                        out_nu[k, i] = nu[i]
+                        square = nu[i] * nu[i] / S[i, i]
+                        seen += 1
+                        squares += min(square, DIVERGED_NIS_CAP)
+                        if square <= GATE_SIGMA**2:
+                            memory[M_REJECTED + i] = 0.0
+                        else:
+                            memory[M_REJECTED + i] = max(memory[M_REJECTED + i], JUST_REJECTED_S)
+                            use[i] = memory[M_REJECTED + i] > GATE_OPENS_AFTER_S
+                            opens = opens or use[i]
+                if opens:
+                    for i in range(n):
+                        for j in range(n):
+                            P[i, j] *= GATE_INFLATION
+                    draw_sigma_points(x, P, scale, L, chi)
+                    _measure(chi, steer_k, mu_k, p, zeta)
+                    innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
+                    for i in range(MEASUREMENTS):
+                        S[i, i] += r_std[i] * r_std[i]
+                        nu[i] = z[i] - z_hat[i]
+                        if use[i]:
+                            memory[M_REJECTED + i] = 0.0
+                nis, dof, log_likelihood = kalman_update(x, P, nu, S, Pxz, use)
+                if dof > 0:
+                    out_nis[k] = nis
+                    out_dof[k] = dof
+                    out_ll[k] = log_likelihood
+                if seen > 0:
+                    memory[M_NIS] += min(1.0, dt[k] / DIVERGED_AVERAGE_S) * (squares / seen - memory[M_NIS])
+                # Standstill: the speed sensor reads zero and nothing turns, for a while.
+                turns = abs(z[Z_YAW_RATE]) > STANDSTILL_YAW_RATE_RAD_S
+                if math.isfinite(z[Z_SPEED]):
+                    memory[M_SPEED_AGE] = 0.0
+                    still = abs(z[Z_SPEED]) < STANDSTILL_SPEED_M_S and not turns
+                    memory[M_STILL] = memory[M_STILL] + dt[k] if still else 0.0
+                elif memory[M_STILL] > 0.0:
+                    memory[M_SPEED_AGE] += dt[k]
+                    still = memory[M_SPEED_AGE] <= STANDSTILL_SILENCE_S and not turns
+                    memory[M_STILL] = memory[M_STILL] + dt[k] if still else 0.0
+                if memory[M_STILL] >= STANDSTILL_AFTER_S:
+                    for i in range(AX_BIAS):
+                        x[i] = 0.0
+                        for j in range(n):
+                            P[i, j] = 0.0
+                            P[j, i] = 0.0
+                        P[i, i] = STANDSTILL_STD[i] ** 2
+                alive = _all_finite(x, P)
+            if alive:
+                out_valid[k] = steer_ok
+                out_diverged[k] = memory[M_NIS] > DIVERGED_NIS_RATIO or (
+                    x[VX] > p.blend_high_m_s and abs(math.atan2(x[VY], x[VX])) > DIVERGED_SIDESLIP_RAD
+                )
+            else:
                 memory[M_INITIALISED] = 0.0
-                out_valid[k] = False
                 out_diverged[k] = True
         memory[M_STEER] = steer_k
         memory[M_AX] = ax_k
+        memory[M_AX_KNOWN] = 1.0 if has_ax else 0.0
         memory[M_FRICTION] = mu_k
         for i in range(n):
             out_x[k, i] = x[i]
             for j in range(n):
                 out_P[k, i, j] = P[i, j]
-        out_u[k, 0] = steer_k
-        out_u[k, 1] = ax_k
-        out_u[k, 2] = mu_k
+        out_u[k, U_STEER] = steer_k
+        out_u[k, U_AX] = ax_k
+        out_u[k, U_FRICTION] = mu_k
+        out_u[k, U_AX_KNOWN] = memory[M_AX_KNOWN]
 
 
 @njit(cache=True)
@@ -283,12 +316,17 @@ def _predict_outputs(step, horizon_s, x, P, inputs, p, q_std, wm, wc, scale, out
         Pm[:, :] = P[k]
         if horizon_s[m] > 0.0:
             draw_sigma_points(xm, Pm, scale, L, chi)
-            _propagate(chi, inputs[k, 0], inputs[k, 1], inputs[k, 2], horizon_s[m], p)
+            _propagate(chi, inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_FRICTION], horizon_s[m], p)
             mean_and_covariance(chi, wm, wc, xm, Pm)
-            _add_process_noise(Pm, q_std, horizon_s[m])
+            _add_process_noise(Pm, q_std, inputs[k, U_AX_KNOWN] > 0.0, horizon_s[m])
+            if not _all_finite(xm, Pm):
+                xm[:] = math.nan
+                Pm[:, :] = math.nan
         out_x[m] = xm
         out_P[m] = Pm
-        out_ay[m] = planar_lateral_acceleration(xm[VX], xm[VY], xm[YAW_RATE], inputs[k, 0], inputs[k, 2], p)
+        out_ay[m] = planar_lateral_acceleration(
+            xm[VX], xm[VY], xm[YAW_RATE], inputs[k, U_STEER], inputs[k, U_FRICTION], p
+        )
 
 
 def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -335,6 +373,7 @@ class PhysicsUkf:
 
     def filter_steps(self, signals: Signals, carry: FilterCarry | None) -> tuple[PosteriorSteps, FilterCarry]:
         """Run the filter on measurement time only; the steps and the carry with no pending steps in it."""
+        signals = without_impossible(signals)
         count = len(signals)
         if carry is None:
             x, P, memory = np.zeros(STATES), np.eye(STATES), np.zeros(MEMORY)
@@ -351,7 +390,7 @@ class PhysicsUkf:
             ready_ns=signals.ready_ns,
             x=np.empty((count, STATES)),
             P=np.empty((count, STATES, STATES)),
-            inputs=np.empty((count, 3)),
+            inputs=np.empty((count, INPUTS)),
             nis=np.empty(count),
             nis_dof=np.empty(count),
             log_likelihood=np.empty(count),
@@ -387,6 +426,7 @@ class PhysicsUkf:
             chosen, horizon, steps.x, steps.P, steps.inputs, self._parameters, np.array(self.q_std), wm, wc, scale[0],
             x, P, ay,
         )  # fmt: skip
+        usable &= np.isfinite(x[:, VX])
         at = np.maximum(chosen, 0)
         nan = np.full(count, np.nan)
         covariance = P[:, :3, :3]
@@ -407,7 +447,7 @@ class PhysicsUkf:
             r_scale=np.ones(count),
             nis=np.where(usable, steps.nis[at], np.nan) if len(steps.nis) else nan,
             nis_dof=np.where(usable, steps.nis_dof[at], 0.0) if len(steps.nis) else np.zeros(count),
-            friction=np.where(usable, steps.inputs[at, 2], np.nan) if len(steps.nis) else nan,
+            friction=np.where(usable, steps.inputs[at, U_FRICTION], np.nan) if len(steps.nis) else nan,
             valid=usable,
             diverged=np.where(usable, steps.diverged[at], False) if len(steps.nis) else usable,
         )

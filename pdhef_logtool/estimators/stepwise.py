@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
 from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack, make_track
 
@@ -61,6 +61,7 @@ def run_stepwise(
 
     ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log.
     """
+    signals = without_impossible(signals)
     count = len(signals)
     state = np.full(state_size, np.nan) if carry is None else carry.state.copy()
     dt = np.empty(count)

@@ -1,0 +1,416 @@
+"""What every estimator must do: join windows, see no future, mirror, predict by the delay, survive bad signals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import cut, drive, keep, make_signals, rolling_drive, slalom, tanh_tyre, with_noise
+
+from pdhef_logtool.errors import UsageError
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
+from pdhef_logtool.estimators.registry import DESCRIPTIONS, check_names, make_estimator, runnable
+from pdhef_logtool.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
+from pdhef_logtool.tracks import StateTrack, concatenate
+from pdhef_logtool.vehicle import AxleTyre, Tyres, default_vehicle
+
+VEHICLE = default_vehicle()
+NAMES = tuple(DESCRIPTIONS)
+#: Those that claim a lateral velocity by a model or by integration.
+CLAIMING = ("kinematic", "open-loop", "phy-ukf")
+STIFFNESS_VEHICLE = VEHICLE.model_copy(
+    update={
+        "tyres": Tyres(
+            front=AxleTyre(cornering_stiffness_n_per_rad=105_000.0),
+            rear=AxleTyre(cornering_stiffness_n_per_rad=96_000.0),
+        )
+    }
+)
+SIGNS = {"steer_rad": -1, "ay_m_s2": -1, "yaw_rate_rad_s": -1}
+MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
+
+
+def run(name: str, signals: Signals, **options) -> StateTrack:
+    return make_estimator(name, VEHICLE, **options).run(signals, None)[0]
+
+
+def same_bits(a: StateTrack, b: StateTrack, upto: int | None = None) -> None:
+    for f in fields(StateTrack):
+        if f.name != "name":
+            left, right = getattr(a, f.name)[:upto], getattr(b, f.name)[:upto]
+            np.testing.assert_array_equal(left, right, err_msg=f.name, strict=True)
+
+
+def worst(error: np.ndarray, mask: np.ndarray) -> float:
+    assert mask.any()
+    return float(np.abs(error[mask]).max())
+
+
+@pytest.fixture(scope="module")
+def rough() -> Signals:
+    """Noisy, on irregular stamps, with missing samples, a gap of 0.8 s and messages that arrive late and bunched."""
+    rng = np.random.default_rng(11)
+    dt = rng.uniform(0.004, 0.022, 500)
+    s = with_noise(drive(slalom(0.035, 0.5), speed=22.0, step_s=dt).signals, seed=5)
+    for column in (s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s):
+        column[rng.random(len(s)) < 0.05] = np.nan
+    s.friction[100:350] = 0.8
+    ready = np.maximum.accumulate(s.stamps_ns + rng.integers(0, 45_000_000, len(s)))
+    t = (s.stamps_ns - s.stamps_ns[0]) * 1e-9
+    return keep(replace(s, ready_ns=ready), (t < 3.0) | (t > 3.8))
+
+
+# --- windows, causality, symmetry ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(derandomize=True, deadline=None, max_examples=25)
+@given(data=st.data())
+def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
+    inner = data.draw(st.lists(st.integers(0, len(rough)), max_size=12))
+    estimator = make_estimator(name, VEHICLE)
+    whole, _ = estimator.run(rough, None)
+    edges = [0, *sorted(inner), len(rough)]
+    parts, carry = [], None
+    for first, end in pairwise(edges):
+        track, carry = estimator.run(cut(rough, first, end), carry)
+        assert len(track) == end - first
+        parts.append(track)
+    same_bits(concatenate(parts), whole)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_carry_can_be_used_twice(name, rough):
+    """An estimator is immutable: what it handed out is not changed by running on."""
+    estimator = make_estimator(name, VEHICLE)
+    _, carry = estimator.run(cut(rough, 0, 100), None)
+    first, _ = estimator.run(cut(rough, 100, 300), carry)
+    again, _ = estimator.run(cut(rough, 100, 300), carry)
+    same_bits(first, again)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(derandomize=True, deadline=None, max_examples=25)
+@given(j=st.integers(1, 400), seed=st.integers(0, 2**32 - 1), missing=st.booleans())
+def test_nothing_that_arrives_later_changes_an_output(name, rough, j, seed, missing):
+    rng = np.random.default_rng(seed)
+    changed = {}
+    for column in ALIGNED_SIGNALS:
+        values = getattr(rough, column).copy()
+        values[j:] = np.nan if missing else rng.normal(0, 5, len(rough) - j) + 10.0
+        changed[column] = values
+    other = replace(rough, **changed)
+    before = int(np.searchsorted(rough.stamps_ns, rough.ready_ns[j], side="left"))  # stamps before sample j arrived
+    assert before >= j
+    same_bits(run(name, rough), run(name, other), before)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_arrived_sample_is_used(name, rough):
+    """The counterpart of the causality test: from its arrival on, a sample does change the output."""
+    j = 150
+    columns = {c: getattr(rough, c).copy() for c in ("steer_rad", "yaw_rate_rad_s", "ay_m_s2")}
+    for values in columns.values():
+        values[j : j + 5] = 0.02
+    at = int(np.searchsorted(rough.stamps_ns, rough.ready_ns[j], side="left"))
+    a, b = run(name, rough), run(name, replace(rough, **columns))
+    assert not np.array_equal(a.yaw_rate_rad_s[at : at + 5], b.yaw_rate_rad_s[at : at + 5])
+
+
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(st.lists(st.integers(0, 30), max_size=30), st.lists(st.integers(0, 40), max_size=30))
+def test_released_steps_is_the_newest_arrived(ready, stamps):
+    ready, stamps = np.sort(np.array(ready, dtype=np.int64)), np.sort(np.array(stamps, dtype=np.int64))
+    want = [max((k for k in range(len(ready)) if ready[k] <= t), default=-1) for t in stamps]
+    got = released_steps(ready, stamps)
+    assert got.tolist() == want
+    assert got.dtype == np.int64
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_left_and_right_are_mirrored(name, rough):
+    mirrored = replace(rough, **{c: sign * getattr(rough, c) for c, sign in SIGNS.items()})
+    left, right = run(name, rough), run(name, mirrored)
+    for column in ("vx_m_s", "vy_std_m_s", "sideslip_std_rad", "nis", "valid", "diverged"):
+        np.testing.assert_allclose(getattr(right, column), getattr(left, column), rtol=1e-6, atol=1e-9, err_msg=column)
+    for column in MIRRORED:
+        np.testing.assert_allclose(getattr(right, column), -getattr(left, column), rtol=1e-6, atol=1e-9, err_msg=column)
+
+
+# --- delay -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["open-loop", "phy-ukf"])
+def test_output_is_predicted_by_the_whole_delay_and_only_once(name):
+    """Inputs are held from stamp to stamp and arrive one stamp late: the prediction can be, and must be, exact."""
+    undelayed = drive(slalom(0.03, 0.6), 6.0)
+    late = replace(undelayed.signals, ready_ns=undelayed.signals.stamps_ns + 10_000_000)
+    track = run(name, late)
+    settled = undelayed.time_s > 1.0
+    stale = worst(np.diff(undelayed.sideslip), settled[1:])
+    assert stale > math.radians(0.03)
+    assert worst(track.sideslip_rad - undelayed.sideslip, settled) < 0.1 * stale
+    stale = worst(np.diff(undelayed.r), settled[1:])
+    assert worst(track.yaw_rate_rad_s - undelayed.r, settled) < 0.1 * stale
+
+
+@pytest.mark.parametrize("name", ["open-loop", "phy-ukf"])
+def test_lateral_acceleration_is_predicted_too(name):
+    """While the steering is held after a step, a_y at the scored stamp follows from the predicted state."""
+    made = drive(lambda t: 0.02 if t >= 2.0 else 0.0, 4.0)
+    track = run(name, replace(made.signals, ready_ns=made.signals.stamps_ns + 20_000_000))
+    rising = (made.time_s > 2.035) & (made.time_s < 2.3)
+    stale = worst(made.ay[2:] - made.ay[:-2], rising[2:])
+    assert stale > 0.1
+    assert worst(track.ay_m_s2 - made.ay, rising) < 0.3 * stale
+
+
+def test_kinematic_is_predicted_to_first_order():
+    made = drive(slalom(0.03, 0.6), 6.0)
+    on_time, late = (
+        run("kinematic", replace(made.signals, ready_ns=made.signals.stamps_ns + delay)) for delay in (0, 10_000_000)
+    )
+    settled = made.time_s > 1.0
+    stale = worst(np.diff(on_time.vy_m_s), settled[1:])
+    assert worst(late.vy_m_s - on_time.vy_m_s, settled) < 0.05 * stale
+
+
+def test_speed_is_predicted_by_the_delay():
+    made = drive(lambda _: 0.0, 5.0, speed=15.0, acceleration=lambda _: 3.0)
+    track = run("phy-ukf", replace(made.signals, ready_ns=made.signals.stamps_ns + 50_000_000))
+    settled = made.time_s > 1.0
+    assert worst(track.vx_m_s - made.vx, settled) < 0.005  # 0.15 m/s without prediction
+
+
+@pytest.mark.parametrize("name", ["zero", "gyro"])
+def test_pass_through_shows_the_newest_arrived_sample(name):
+    made = drive(slalom(), 3.0)
+    track = run(name, replace(made.signals, ready_ns=made.signals.stamps_ns + 25_000_000))
+    np.testing.assert_array_equal(track.yaw_rate_rad_s[3:], made.r[:-3])
+    np.testing.assert_array_equal(track.ay_m_s2[3:], made.ay[:-3])
+    assert not track.valid[:3].any()
+    assert track.valid[3:].all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_too_late_is_not_predicted(name):
+    made = drive(slalom(), 3.0)
+    for delay_s, valid in ((MAX_PREDICTION_S - 0.02, True), (MAX_PREDICTION_S + 0.02, False)):
+        track = run(name, replace(made.signals, ready_ns=made.signals.stamps_ns + round(delay_s * 1e9)))
+        assert track.valid[100:].all() == valid
+        assert track.valid.any() == valid
+        assert np.isfinite(track.yaw_rate_rad_s).any() == valid
+
+
+def test_uncertainty_grows_with_the_prediction():
+    made = drive(slalom(), 4.0)
+    stds = [
+        run("phy-ukf", replace(made.signals, ready_ns=made.signals.stamps_ns + delay)).vy_std_m_s[-1]
+        for delay in (0, 50_000_000, 200_000_000)
+    ]
+    assert stds[0] < stds[1] < stds[2]
+
+
+# --- bad signals -----------------------------------------------------------------------------------------------------
+
+
+def _replaced(column: str, mask_of_time, value):
+    def fault(s: Signals) -> Signals:
+        t = (s.stamps_ns - s.stamps_ns[0]) * 1e-9
+        values = getattr(s, column)
+        return replace(s, **{column: np.where(mask_of_time(t), value(values, t), values)})
+
+    return fault
+
+
+def _between(a: float, b: float):
+    return lambda t: (t >= a) & (t < b)
+
+
+def _spikes(t: np.ndarray) -> np.ndarray:
+    return np.arange(len(t)) % 97 == 50
+
+
+MAPPED = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+FAULTS = {
+    **{f"nan {c}": _replaced(c, _between(2, 4), lambda v, _: np.nan) for c in (*MAPPED, "friction")},
+    **{f"infinite {c}": _replaced(c, _between(2, 2.5), lambda v, _: np.inf) for c in (*MAPPED, "friction")},
+    **{f"spikes of 1e6 in {c}": _replaced(c, _spikes, lambda v, _: 1e6) for c in (*MAPPED, "friction")},
+    **{f"1e300 in {c}": _replaced(c, _between(2, 3), lambda v, _: 1e300) for c in (*MAPPED, "friction")},
+    **{f"{c} turned around": _replaced(c, _between(2, 6), lambda v, _: -v) for c in MAPPED},
+    **{f"{c} stuck": _replaced(c, _between(2, 6), lambda v, t: v[np.searchsorted(t, 2.0) // 2 * 2]) for c in MAPPED},
+    "no friction at all": _replaced("friction", _between(2, 3), lambda v, _: 0.0),
+    "negative friction": _replaced("friction", _between(2, 3), lambda v, _: -0.5),
+    "everything missing": lambda s: replace(
+        s,
+        **{
+            c: np.where((s.stamps_ns - s.stamps_ns[0] > 2e9) & (s.stamps_ns - s.stamps_ns[0] < 3e9), np.nan, v)
+            for c in MAPPED
+            for v in [getattr(s, c)]
+        },
+    ),
+    "noise x20": lambda s: with_noise(s, 3, 20.0),
+    "gap of 0.4 s": lambda s: keep(s, ~_between(2, 2.4)((s.stamps_ns - s.stamps_ns[0]) * 1e-9)),
+    "gap of 1.5 s": lambda s: keep(s, ~_between(2, 3.5)((s.stamps_ns - s.stamps_ns[0]) * 1e-9)),
+    "one stamp": lambda s: cut(s, 0, 1),
+    "nothing": lambda s: cut(s, 0, 0),
+}
+
+
+def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
+    ok = track.valid
+    columns = ["vx_m_s", "yaw_rate_rad_s"]
+    if name != "gyro":
+        columns += ["vy_m_s", "sideslip_rad"]
+    if name in CLAIMING:
+        columns += ["ay_m_s2"]
+    for column in columns:
+        assert np.isfinite(getattr(track, column)[ok]).all(), column
+        assert np.isnan(getattr(track, column)[~ok]).all(), f"{column} claims something where it is not valid"
+    if name == "phy-ukf":
+        P = track.covariance[ok]
+        np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
+        assert (np.linalg.eigvalsh(P) > 0).all()
+        assert np.isfinite(track.sideslip_std_rad[ok]).all()
+        steps, _ = make_estimator(name, VEHICLE).filter_steps(signals, None)
+        full = steps.P[steps.valid]
+        np.testing.assert_array_equal(full, np.swapaxes(full, 1, 2))
+        # scaled to correlations, so that 1e6 m/s beside 1 mrad/s is no matter of rounding
+        std = np.sqrt(np.einsum("kii->ki", full))
+        assert (std > 0).all()
+        assert (np.linalg.eigvalsh(full / std[:, :, None] / std[:, None, :]) > 0).all()
+
+
+@pytest.fixture(scope="module")
+def plain() -> Signals:
+    s = with_noise(drive(slalom(0.035, 0.5), 8.0, speed=22.0).signals, seed=9)
+    s.friction[:] = 0.85
+    return replace(s, ready_ns=s.stamps_ns + 10_000_000)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.filterwarnings("error")
+def test_no_fault_breaks_an_estimator(name, fault, plain):
+    faulty = FAULTS[fault](plain)
+    for vehicle in (VEHICLE, STIFFNESS_VEHICLE):
+        track, _ = make_estimator(name, vehicle).run(faulty, None)
+        assert len(track) == len(faulty)
+        check_sane(track, name, faulty)
+    if len(faulty) > 1:
+        assert track.valid[-50:].all(), "it must run again after the fault"
+
+
+#: Faults that end by 6 s at the latest.
+PASSING = [f for f in FAULTS if f not in ("one stamp", "nothing", "noise x20") and "spikes" not in f]
+
+
+@pytest.mark.parametrize("fault", PASSING)
+def test_the_filter_recovers_from_every_fault(fault, plain):
+    """Two seconds after the last bad sample it is back at what it says without the fault."""
+    faulty = FAULTS[fault](plain)
+    reference, track = run("phy-ukf", plain), run("phy-ukf", faulty)
+    at = np.searchsorted(plain.stamps_ns, faulty.stamps_ns)
+    late = faulty.stamps_ns - plain.stamps_ns[0] > 7.9e9
+    assert worst(track.sideslip_rad - reference.sideslip_rad[at], late) < math.radians(0.1)
+
+
+@pytest.mark.parametrize("fault", [f for f in FAULTS if "spikes" in f])
+def test_spikes_do_no_harm(fault, plain):
+    reference, track = run("phy-ukf", plain), run("phy-ukf", FAULTS[fault](plain))
+    settled = plain.stamps_ns - plain.stamps_ns[0] > 1e9
+    assert worst(track.sideslip_rad - reference.sideslip_rad, settled) < math.radians(0.2)
+    assert worst(track.vx_m_s - reference.vx_m_s, settled) < 0.3
+
+
+@pytest.mark.parametrize("limit", ["steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"])
+def test_only_what_no_vehicle_can_do_is_dropped(limit, plain):
+    hard = {"steer_rad": 0.6, "ax_m_s2": 60.0, "ay_m_s2": 45.0, "yaw_rate_rad_s": 8.0, "speed_m_s": 110.0}[limit]
+    column = getattr(plain, limit).copy()
+    column[[10, 20, 30, 40]] = hard, -hard, 1e4, -np.inf
+    before = column.copy()
+    signals = replace(plain, **{limit: column})
+    kept = getattr(without_impossible(signals), limit)
+    np.testing.assert_array_equal(kept[[10, 20]], [hard, -hard])
+    assert np.isnan(kept[[30, 40]]).all()
+    np.testing.assert_array_equal(column, before)  # the caller's arrays stay as they are
+    others = np.delete(np.arange(len(column)), [10, 20, 30, 40])
+    np.testing.assert_array_equal(kept[others], getattr(plain, limit)[others])
+    assert without_impossible(plain) is plain
+
+
+@settings(derandomize=True, deadline=None, max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1), log_low=st.floats(-4, -1), speed=st.floats(4.0, 50.0))
+def test_covariance_is_definite_on_any_clock(seed, log_low, speed):
+    """Steps from 0.1 ms to 0.3 s, in any order."""
+    rng = np.random.default_rng(seed)
+    dt = 10 ** rng.uniform(log_low, math.log10(0.3), 120)
+    made = drive(slalom(min(0.3, 8.0 / speed**2), 0.5), speed=speed, step_s=dt)
+    signals = with_noise(made.signals, seed % 1000)
+    check_sane(run("phy-ukf", signals), "phy-ukf", signals)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_reverse_and_manoeuvring_are_finite_and_signed(name):
+    made = rolling_drive(lambda t: -2.0 * np.sin(0.8 * t), lambda t: 0.3 * np.cos(0.5 * t), 12.0)
+    signals = with_noise(made.signals, 2)
+    track = run(name, signals)
+    check_sane(track, name, signals)
+    moving = made.time_s > 1.0
+    assert worst(track.vx_m_s - made.vx, moving) < 0.5
+    assert worst(track.yaw_rate_rad_s - made.r, moving) < 0.15
+    if name in ("open-loop", "phy-ukf"):
+        assert worst(track.vy_m_s - made.vy, moving & (np.abs(made.vx) < 1.4)) < 0.3
+
+
+# --- the registry ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
+    estimator = make_estimator(name, VEHICLE)
+    assert estimator.name == name
+    assert estimator.causal
+    dt = np.diff(plain.stamps_ns) * 1e-9
+    bare = make_signals(dt, **{c: getattr(plain, c) for c in estimator.needs})
+    track, _ = estimator.run(bare, None)
+    assert track.valid[5:].all()
+    assert np.isfinite(track.vx_m_s[5:]).all()
+    assert np.isfinite(track.yaw_rate_rad_s[5:]).all()
+
+
+def test_what_cannot_run_is_skipped_with_the_reason():
+    estimators, skipped = runnable(NAMES, VEHICLE, frozenset({"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"}))
+    assert [e.name for e in estimators] == ["zero", "gyro", "kinematic"]
+    assert [s.name for s in skipped] == ["open-loop", "phy-ukf"]
+    assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
+    assert runnable(NAMES, VEHICLE, frozenset(ALIGNED_SIGNALS))[1] == []
+
+
+@pytest.mark.parametrize("names", [(), ("zero", "zero"), ("phy-ufk",)])
+def test_wrong_names_are_named(names):
+    with pytest.raises(UsageError, match="--estimators") as caught:
+        check_names(names)
+    assert all(n in str(caught.value) for n in names)
+    assert "\n" not in str(caught.value)
+
+
+def test_signals_hold_no_truth():
+    sensor_fields = {f.name for f in fields(Signals)}
+    only_truth = set(TRUTH_UNITS) - set(ALIGNED_SIGNALS)
+    assert not sensor_fields & only_truth
+
+
+def test_baselines_claim_what_they_say(plain):
+    made = drive(slalom(0.03, 0.6), 6.0, tyre=tanh_tyre)
+    assert (run("zero", plain).vy_m_s[run("zero", plain).valid] == 0).all()
+    assert np.isnan(run("gyro", plain).vy_m_s).all()
+    error = {n: worst(run(n, made.signals).sideslip_rad - made.sideslip, made.time_s > 1) for n in (*CLAIMING, "zero")}
+    assert error["phy-ukf"] < error["zero"] / 4
+    assert error["open-loop"] < error["zero"]
+    assert error["kinematic"] < error["zero"]

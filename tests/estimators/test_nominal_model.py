@@ -1,0 +1,213 @@
+"""The compiled single-track model against plain Python, linear theory and convergence order."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M, YAW_INERTIA, derivative, forces
+from scipy.integrate import solve_ivp
+
+from pdhef_logtool import nominal_model
+from pdhef_logtool.nominal_model import model_parameters
+from pdhef_logtool.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+
+SEDAN = default_vehicle()
+P = model_parameters(SEDAN)
+BLEND_HIGH, BLEND_LOW = 3.0, 1.5
+STIFFNESS = (105_000.0, 96_000.0)
+STIFFNESS_CAR = SEDAN.model_copy(
+    update={
+        "tyres": Tyres(
+            front=AxleTyre(cornering_stiffness_n_per_rad=STIFFNESS[0]),
+            rear=AxleTyre(cornering_stiffness_n_per_rad=STIFFNESS[1]),
+        )
+    }
+)
+
+speeds = st.floats(BLEND_HIGH, 70.0)
+lateral = st.floats(-10.0, 10.0)
+yaw_rates = st.floats(-3.0, 3.0)
+steering = st.floats(-0.6, 0.6)
+friction = st.floats(0.05, 1.5)
+exact = settings(derandomize=True, deadline=None, max_examples=150)
+
+
+@exact
+@given(speeds, lateral, yaw_rates, steering, st.floats(-10, 10), friction)
+def test_derivative_is_the_published_model(vx, vy, r, steer, ax, mu):
+    got = nominal_model.state_derivative(vx, vy, r, steer, ax, mu, P)
+    want = derivative(np.array([vx, vy, r]), steer, ax, mu)
+    np.testing.assert_allclose(got, want, rtol=1e-11, atol=1e-11)
+    ay, _ = forces(vx, vy, r, steer, mu)
+    assert nominal_model.planar_lateral_acceleration(vx, vy, r, steer, mu, P) == pytest.approx(ay, rel=1e-11, abs=1e-11)
+    assert nominal_model.measured_lateral_acceleration(vx, vy, r, steer, mu, P) == pytest.approx(
+        ay, rel=1e-11, abs=1e-11
+    )
+
+
+@exact
+@given(st.floats(0.0, 70.0), lateral, yaw_rates, steering, friction)
+def test_left_and_right_are_mirrored(vx, vy, r, steer, mu):
+    for car in (SEDAN, STIFFNESS_CAR):
+        p = model_parameters(car)
+        left = nominal_model.state_derivative(vx, vy, r, steer, 0.0, mu, p)
+        right = nominal_model.state_derivative(vx, -vy, -r, -steer, 0.0, mu, p)
+        assert left == (right[0], -right[1], -right[2])
+        assert nominal_model.measured_lateral_acceleration(vx, vy, r, steer, mu, p) == (
+            -nominal_model.measured_lateral_acceleration(vx, -vy, -r, -steer, mu, p)
+        )
+
+
+@exact
+@given(lateral, yaw_rates, steering, friction)
+def test_blend_has_no_step_in_speed(vy, r, steer, mu):
+    # Across both ends of the blend, and in it, a speed change of 1e-9 m/s moves nothing by more than its slope can.
+    for vx in (BLEND_LOW, 2.0, BLEND_HIGH):
+        below = nominal_model.state_derivative(vx - 1e-9, vy, r, steer, 0.0, mu, P)
+        above = nominal_model.state_derivative(vx + 1e-9, vy, r, steer, 0.0, mu, P)
+        np.testing.assert_allclose(below, above, rtol=0, atol=1e-5)
+        outputs = [nominal_model.measured_lateral_acceleration(v, vy, r, steer, mu, P) for v in (vx - 1e-9, vx + 1e-9)]
+        assert outputs[0] == pytest.approx(outputs[1], abs=1e-6)
+
+
+@pytest.mark.parametrize("vx", [-5.0, -1.0, 0.0, 0.5, 1.4])
+@pytest.mark.parametrize("steer", [-0.5, 0.0, 0.2])
+def test_wheels_roll_without_slip_below_the_blend(vx, steer):
+    vy, r = 0.3, -0.2
+    for _ in range(300):
+        ax = -vy * r  # hold the speed
+        _, vy, r = nominal_model.rk4_step(vx, vy, r, steer, ax, FRICTION, 0.01, 1, P)
+    assert r == pytest.approx(vx * math.tan(steer) / WHEELBASE_M, abs=1e-9)
+    assert vy == pytest.approx(REAR_M * vx * math.tan(steer) / WHEELBASE_M, abs=1e-9)
+    assert nominal_model.planar_lateral_acceleration(vx, vy, r, steer, FRICTION, P) == pytest.approx(vx * r, abs=1e-12)
+
+
+@pytest.mark.parametrize("car", [SEDAN, STIFFNESS_CAR], ids=["magic", "stiffness"])
+@pytest.mark.parametrize("vx", [5.0, 15.0, 30.0, 45.0])
+def test_steady_state_gains_are_those_of_the_linear_single_track_model(car, vx):
+    p, steer = model_parameters(car), 1e-4
+    if car is SEDAN:
+        cf, cr = 12.3 * 1.41 * 7600 * FRICTION, 15.4 * 1.17 * 6110 * FRICTION
+    else:
+        cf, cr = STIFFNESS
+    gradient = MASS_KG / WHEELBASE_M * (REAR_M / cf - FRONT_M / cr)
+    vy = r = 0.0
+    for _ in range(2000):
+        _, vy, r = nominal_model.rk4_step(vx, vy, r, steer, 0.0, FRICTION, 0.01, 2, p)
+    yaw_gain = vx / (WHEELBASE_M + gradient * vx**2)
+    assert r / steer == pytest.approx(yaw_gain, rel=1e-5)
+    # sideslip gain: (l_r - m l_f v^2 / (L C_r)) / (L + K v^2)
+    sideslip_gain = (REAR_M - MASS_KG * FRONT_M * vx**2 / (WHEELBASE_M * cr)) / (WHEELBASE_M + gradient * vx**2)
+    assert vy / vx / steer == pytest.approx(sideslip_gain, rel=1e-5, abs=1e-5)
+    assert car.understeer_gradient_rad_per_m_s2(FRICTION) == pytest.approx(gradient, rel=1e-12)
+
+
+def test_runge_kutta_is_of_fourth_order():
+    start, steer, dt = (25.0, -0.4, 0.3), 0.08, 0.2
+
+    def f(_t: float, s: np.ndarray) -> np.ndarray:
+        return derivative(s, steer, 0.5, FRICTION)
+
+    truth = solve_ivp(f, (0.0, dt), start, method="DOP853", rtol=1e-13, atol=1e-13).y[:, -1]
+    errors = [
+        np.abs(np.array(nominal_model.rk4_step(*start, steer, 0.5, FRICTION, dt, n, P)) - truth).max()
+        for n in (8, 16, 32)
+    ]
+    assert errors[-1] < 1e-8
+    for coarse, fine in pairwise(errors):
+        assert math.log2(coarse / fine) == pytest.approx(4.0, abs=0.3)
+
+
+@exact
+@given(st.floats(0.0, 60.0), st.floats(1e-4, 0.3), st.floats(0.1, 1.5), st.floats(-0.3, 0.3))
+def test_steps_are_divided_until_they_are_stable(vx, dt, mu, steer):
+    """From a wild state the lateral motion stays bounded, as RK4 does only inside its region of stability."""
+    n = nominal_model.substeps(vx, dt, mu, P)
+    assert 1 <= n <= nominal_model.MAX_SUBSTEPS
+    state = (vx, 0.5, -0.5)
+    for _ in range(20):
+        state = nominal_model.rk4_step(vx, *state[1:], steer, 0.0, mu, dt, n, P)
+    assert abs(state[1]) < 50 and abs(state[2]) < 10
+
+
+def test_one_millisecond_needs_no_division_on_the_road():
+    assert nominal_model.substeps(25.0, 0.001, FRICTION, P) == 1
+    assert nominal_model.substeps(25.0, 0.3, FRICTION, P) > 1
+
+
+@exact
+@given(st.floats(0.05, 2.0), st.booleans())
+def test_tyre_known_by_its_stiffness(mu, front):
+    """The slope is the given one at any friction, the force never exceeds friction times the load and gets near it."""
+    p = model_parameters(STIFFNESS_CAR)
+    tyre = (
+        (p.front_B, p.front_C, p.front_D_n, p.front_E, p.front_fixed_stiffness)
+        if front
+        else (p.rear_B, p.rear_C, p.rear_D_n, p.rear_E, p.rear_fixed_stiffness)
+    )
+    stiffness = STIFFNESS[0] if front else STIFFNESS[1]
+    load = MASS_KG * 9.80665 * (REAR_M if front else FRONT_M) / WHEELBASE_M
+    h = 1e-7
+    slope = nominal_model.magic_formula_force(h, *tyre, mu) / h
+    assert slope == pytest.approx(stiffness, rel=1e-6)
+    sweep = [nominal_model.magic_formula_force(a, *tyre, mu) for a in np.linspace(0, 1.5, 400)]
+    assert max(sweep) <= mu * load * (1 + 1e-12)
+    assert max(sweep) > 0.99 * mu * load or mu > 1.5  # the stiffest road needs more slip than the sweep has
+    assert STIFFNESS_CAR.cornering_stiffness_n_per_rad(front, mu) == pytest.approx(stiffness, rel=1e-12)
+
+
+def test_magic_formula_stiffness_is_proportional_to_friction():
+    tyre = (P.front_B, P.front_C, P.front_D_n, P.front_E, P.front_fixed_stiffness)
+    slopes = [nominal_model.magic_formula_force(1e-7, *tyre, mu) / 1e-7 for mu in (0.3, 0.6)]
+    assert slopes == pytest.approx([12.3 * 1.41 * 7600 * 0.3, 12.3 * 1.41 * 7600 * 0.6], rel=1e-6)
+
+
+@exact
+@given(speeds, lateral, yaw_rates, steering, st.floats(-8, 8), st.floats(-2, 2), st.floats(-1, 1))
+def test_accelerometer_away_from_the_centre_of_gravity(vx, vy, r, steer, ax, x, y):
+    """Rigid body: a_imu = a_cg + w' x p + w x (w x p), computed with 3-vectors."""
+    car = SEDAN.model_copy(update={"imu_position_m": (x, y, 0.3)})
+    p = model_parameters(car)
+    ay, r_dot = forces(vx, vy, r, steer, FRICTION)
+    w, w_dot, at = np.array([0, 0, r]), np.array([0, 0, r_dot]), np.array([x, y, 0.0])
+    moved = np.cross(w_dot, at) + np.cross(w, np.cross(w, at))
+    measured = nominal_model.measured_lateral_acceleration(vx, vy, r, steer, FRICTION, p)
+    assert measured == pytest.approx(ay + moved[1], rel=1e-10, abs=1e-10)
+    # a_x,imu is an input: the model must take the lever arm off again
+    vx_dot, _, _ = nominal_model.state_derivative(vx, vy, r, steer, ax + moved[0], FRICTION, p)
+    assert vx_dot == pytest.approx(ax + vy * r, rel=1e-10, abs=1e-9)
+    planar = nominal_model.planar_lateral_acceleration(vx, vy, r, steer, FRICTION, p)
+    assert planar == pytest.approx(ay, rel=1e-10, abs=1e-10)
+
+
+def test_roll_correction_adds_the_gravity_of_a_leaning_body():
+    corrected = model_parameters(SEDAN, roll_correction=True)
+    state = (25.0, -0.3, 0.3, 0.04, FRICTION)
+    planar = nominal_model.planar_lateral_acceleration(*state, P)
+    roll = SEDAN.roll_gradient_rad_per_m_s2 * planar
+    assert nominal_model.measured_lateral_acceleration(*state, corrected) == pytest.approx(planar + 9.80665 * roll)
+    assert nominal_model.measured_lateral_acceleration(*state, P) == pytest.approx(planar)
+
+
+@exact
+@given(speeds, lateral, yaw_rates, steering)
+def test_a_car_of_other_size_keeps_its_own_blend(vx, vy, r, steer):
+    """A 1:10 car with its blend at 0.3 m/s drives by the dynamic model at 1 m/s."""
+    small = VehicleParameters(
+        mass_kg=MASS_KG,
+        yaw_inertia_kg_m2=YAW_INERTIA,
+        cg_to_front_axle_m=FRONT_M,
+        cg_to_rear_axle_m=REAR_M,
+        low_speed_blend_m_s=0.3,
+        tyres=SEDAN.tyres,
+    )
+    vx = vx / 70.0 + 0.3
+    assume(vx > 0.3)
+    got = nominal_model.state_derivative(vx, vy, r, steer, 0.0, FRICTION, model_parameters(small))
+    want = derivative(np.array([vx, vy, r]), steer, 0.0, FRICTION)
+    np.testing.assert_allclose(got, want, rtol=1e-11, atol=1e-11)
