@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool.errors import UsageError
+from pdhef_logtool.logs.discovery import find_logs
+
+
+def _touch(root: Path, *names: str) -> None:
+    for name in names:
+        path = root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+
+def test_folder_is_searched_and_rosbag2_folders_count_once(tmp_path: Path) -> None:
+    _touch(
+        tmp_path, "a.mcap", "day1/b.bag", "day1/bag2/metadata.yaml", "day1/bag2/x_0.mcap", "notes.txt", "c.mcap.zstd"
+    )
+    found = find_logs([str(tmp_path)])
+    assert [(f.path.relative_to(tmp_path).as_posix(), f.stem) for f in found] == [
+        ("a.mcap", "a"),
+        ("c.mcap.zstd", "c"),
+        ("day1/b.bag", "day1__b"),
+        ("day1/bag2", "day1__bag2"),
+    ]
+
+
+def test_own_outputs_and_hidden_folders_are_no_input(tmp_path: Path) -> None:
+    _touch(tmp_path, "a.mcap", "out/run.json", "out/logs/a/annotated.mcap", ".cache/b.mcap")
+    assert [f.stem for f in find_logs([str(tmp_path)])] == ["a"]
+
+
+def test_same_stem_gets_hash_digits_that_depend_on_the_path_only(tmp_path: Path) -> None:
+    _touch(tmp_path, "x/a.mcap", "x/a.bag", "x/b.mcap")
+    stems = {f.path.name: f.stem for f in find_logs([str(tmp_path / "x")])}
+    assert stems["b.mcap"] == "b"
+    assert stems["a.mcap"] != stems["a.bag"]
+    assert all(len(stems[n]) == len("a-") + 8 and stems[n].startswith("a-") for n in ("a.mcap", "a.bag"))
+    assert {f.path.name: f.stem for f in find_logs([str(tmp_path / "x" / "*")])} == stems
+
+
+def test_stems_are_relative_to_the_common_root(tmp_path: Path) -> None:
+    _touch(tmp_path, "car1/d.mcap", "car2/d.mcap")
+    assert [f.stem for f in find_logs([str(tmp_path / "car1" / "d.mcap"), str(tmp_path / "car2")])] == [
+        "car1__d",
+        "car2__d",
+    ]
+
+
+def test_each_log_once_whatever_names_it(tmp_path: Path) -> None:
+    _touch(tmp_path, "a.mcap")
+    (tmp_path / "link.mcap").symlink_to(tmp_path / "a.mcap")
+    assert len(find_logs([str(tmp_path), str(tmp_path / "a.mcap"), str(tmp_path / "*.mcap")])) == 1
+
+
+def test_named_file_is_taken_whatever_it_is_called_or_whether_it_exists(tmp_path: Path) -> None:
+    _touch(tmp_path, "drive.dat")
+    assert find_logs([str(tmp_path / "drive.dat")])[0].stem == "drive.dat"
+    assert find_logs([str(tmp_path / "none.mcap")])[0].path.name == "none.mcap"
+
+
+@pytest.mark.parametrize("argument", ["empty", "*.mcap"])
+def test_nothing_found_is_a_usage_error_that_names_the_argument(tmp_path: Path, argument: str) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UsageError, match=r"empty|mcap"):
+        find_logs([str(tmp_path / argument)])
