@@ -1,0 +1,155 @@
+"""Fit the nominal axle tyres to a slow ramp steer of the truth vehicle, and write the vehicle files of the sample logs.
+
+    python benchmarks/fit_nominal_tyres.py [sample_logs]
+
+The nominal model (METHOD section 2) knows one slip angle an axle, from the mean steering angle and the motion of the
+CG. So load transfer, compliance and both wheels of an axle go into its magic formula. Forces follow from Newton and
+Euler as they would from measured accelerations: F_f = (l_r m a_y + I_z dr/dt) / (L cos d), F_r = m a_y - F_f cos d.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from pdhef_logtool.signals import FloatArray
+from truthsim.drive import Drive, simulate_drive
+from truthsim.manoeuvres import GRAVITY_M_S2
+
+FRICTION = 0.85
+#: Below this the ramp is the linear range, in which roll is proportional to lateral acceleration.
+LINEAR_A_Y_M_S2 = 4.0
+
+
+@dataclass(frozen=True)
+class AxleFit:
+    """Magic formula of an axle at friction 1, and how well it fits."""
+
+    B: float
+    C: float
+    D_n: float
+    E: float
+    rms_n: float
+    peak_n: float
+
+
+def axle_curves(drive: Drive) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return slip angle (rad) and lateral force (N) of both axles over the drive."""
+    car, truth = drive.vehicle, drive.truth
+    lf, lr = car.cg_to_front_axle_m, car.cg_to_rear_axle_m
+    v_x, v_y, r, steer = (truth[k] for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad"))
+    force = car.mass_kg * truth["ay_m_s2"]
+    front = (lr * force + car.yaw_inertia_kg_m2 * truth["yaw_acceleration_rad_s2"]) / (lf + lr)
+    return {
+        "front": (steer - np.arctan2(v_y + lf * r, v_x), front / np.cos(steer)),
+        "rear": (-np.arctan2(v_y - lr * r, v_x), force - front),
+    }
+
+
+def magic_formula(alpha: FloatArray, b: float, c: float, d: float, e: float) -> FloatArray:
+    """F = D sin(C atan(B a - E (B a - atan(B a)))); E = 1 - exp(e) keeps E below 1."""
+    x = b * alpha
+    curvature = 1.0 - np.exp(e)
+    return np.asarray(d * np.sin(c * np.arctan(x - curvature * (x - np.arctan(x)))))
+
+
+def fit_axle(alpha: FloatArray, force: FloatArray, friction: float, load_n: float) -> AxleFit:
+    """Fit B, C, D, E by least squares.
+
+    The rear axle of an understeering car never reaches its peak in a ramp: friction times static load bounds it.
+    """
+    top = float(force.max())
+    start = [10.0, 1.3, 1.01 * top, 0.0]
+    bounds = ([3.0, 1.05, 1.0 * top, -2.0], [40.0, 1.7, max(friction * load_n, 1.02 * top), 1.1])
+    found = least_squares(
+        lambda p: (magic_formula(alpha, *p) - force) / top, start, bounds=bounds, x_scale=[10.0, 1.0, top, 1.0]
+    )
+    b, c, d, e = found.x
+    error = magic_formula(alpha, b, c, d, e) - force
+    return AxleFit(b, c, d / friction, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
+
+
+def fit_axles(drive: Drive) -> dict[str, AxleFit]:
+    """Fit both axles to a drive at ``FRICTION``."""
+    car = drive.vehicle
+    wheelbase = car.cg_to_front_axle_m + car.cg_to_rear_axle_m
+    arms = {"front": car.cg_to_rear_axle_m, "rear": car.cg_to_front_axle_m}
+    return {
+        axle: fit_axle(*curve, FRICTION, car.mass_kg * GRAVITY_M_S2 * arms[axle] / wheelbase)
+        for axle, curve in axle_curves(drive).items()
+    }
+
+
+def roll_gradient_rad_per_m_s2(drive: Drive) -> float:
+    """Return the roll angle per planar lateral acceleration in the linear range."""
+    a_y, roll = drive.truth["ay_m_s2"], drive.truth["roll_rad"]
+    small = np.abs(a_y) < LINEAR_A_Y_M_S2
+    return float(np.polyfit(a_y[small], roll[small], 1)[0])
+
+
+def ramp() -> Drive:
+    """Return the slow ramp steer that everything is fitted to."""
+    return simulate_drive("ramp-steer", friction=FRICTION)
+
+
+def vehicle_text(drive: Drive, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
+    """Return a vehicle file."""
+    car, noise = drive.vehicle, drive.noise
+    tyres = "\n".join(
+        f"[tyres.{axle}]\nB = {fit.B:.3f}\nC = {fit.C:.4f}\nD_n = {fit.D_n:.1f}\nE = {fit.E:.4f}"
+        for axle, fit in fits.items()
+    )
+    return f"""# Nominal vehicle of the simulated sample logs, made by benchmarks/fit_nominal_tyres.py:
+# mass and geometry of the paper's Table 3; axle tyres and roll gradient fitted to
+# `{drive.command}`.
+# The formula scales stiffness with friction, which real (and these simulated) tyres hardly do.
+name = "{name}"
+mass_kg = {car.mass_kg}
+yaw_inertia_kg_m2 = {car.yaw_inertia_kg_m2}
+cg_to_front_axle_m = {car.cg_to_front_axle_m}
+cg_to_rear_axle_m = {car.cg_to_rear_axle_m}
+track_m = {car.track_m}
+cg_height_m = {car.cg_height_m}
+wheel_radius_m = {car.wheel_radius_m}
+steering_ratio = 16.0
+roll_gradient_rad_per_m_s2 = {roll_gradient_rad_per_m_s2(drive):.5f}
+friction = {friction}
+imu_position_m = [0.0, 0.0, 0.0]
+truth_position_m = [0.0, 0.0, 0.0]
+low_speed_blend_m_s = 3.0
+
+[sensors]
+ax_std_m_s2 = {noise.acceleration_m_s2}
+ay_std_m_s2 = {noise.acceleration_m_s2}
+yaw_rate_std_rad_s = {noise.yaw_rate_rad_s}
+speed_std_m_s = {noise.wheel_speed_m_s}
+steer_std_rad = {noise.steer_rad}
+
+{tyres}
+"""
+
+
+def main(folder: Path) -> None:
+    """Fit, print how well, and write both vehicle files."""
+    drive = ramp()
+    fits = fit_axles(drive)
+    print("axle      B      C     D_n       E   BCD at mu 0.85   rms N   largest N")
+    for axle, fit in fits.items():
+        stiffness = fit.B * fit.C * fit.D_n * FRICTION
+        print(
+            f"{axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {stiffness:16.0f}"
+            f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
+        )
+    for file, name, friction in (
+        ("vehicle.toml", "truthsim saloon", FRICTION),
+        ("vehicle_mu03.toml", "truthsim saloon on a road of friction 0.3", 0.3),
+    ):
+        (folder / file).write_text(vehicle_text(drive, fits, name=name, friction=friction), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "sample_logs"))
