@@ -1,0 +1,410 @@
+"""Metrics: figures by hand, known lags, calibrated Gaussians, closed-form positions, and what must not be counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference, block_bootstrap_interval
+from pdhef_logtool.evaluation.metrics import (
+    lag_s,
+    lateral_errors_after_one_second,
+    nees,
+    position_error,
+    score_track,
+    state_rows,
+    summarise_errors,
+)
+from pdhef_logtool.tracks import StateTrack, make_track
+
+T0 = 1_700_000_000_000_000_000
+
+
+def stamps_of(n, rate=100):
+    return T0 + np.arange(n, dtype=np.int64) * (1_000_000_000 // rate)
+
+
+def track(name="x", n=4, **columns) -> StateTrack:
+    stamps = columns.pop("stamps_ns", stamps_of(n))
+    return make_track(
+        name, stamps, **{k: np.asarray(v, dtype=bool if k == "valid" else float) for k, v in columns.items()}
+    )
+
+
+def score(estimate, truth, masks=None, low=3.0, **kwargs):
+    rows = score_track(estimate, truth, masks or {}, log="drive", low_speed_m_s=low, **kwargs)
+    keys = [(r.signal, r.segment, r.metric) for r in rows]
+    assert len(set(keys)) == len(keys)
+    return dict(zip(keys, rows, strict=True))
+
+
+def test_figures_by_hand():
+    truth = track(vx_m_s=[10, 10, 10, 10], vy_m_s=[0, 0, 0, 0])
+    estimate = track("ukf", vx_m_s=[11, 7, 10, 12], vy_m_s=[0, 0, 0, 0])
+    rows = score(estimate, truth)
+
+    def value(metric):
+        return rows["vx_m_s", "all", metric].value
+
+    assert value("rmse") == pytest.approx(np.sqrt((1 + 9 + 0 + 4) / 4))
+    assert value("mae") == pytest.approx(1.5)
+    assert value("bias") == pytest.approx(0.0)
+    assert value("max_abs") == 3.0
+    assert value("p95_abs") == pytest.approx(2.85)  # sorted 0 1 2 3, linear at 0.95 · 3
+    assert value("rmse_relative") == pytest.approx(np.sqrt(3.5) / 10)
+    assert value("availability") == 1.0
+    row = rows["vx_m_s", "all", "rmse"]
+    assert (row.log, row.estimator, row.unit, row.n, row.independent) == ("drive", "ukf", "m/s", 4, True)
+    assert ("vx_m_s", "all", "coverage95") not in rows  # no covariance, no claim
+    assert ("position_m", "all", "rmse") not in rows  # no truth pose
+    assert ("yaw_rate_rad_s", "all", "rmse") not in rows  # no truth yaw rate
+
+
+def test_only_valid_finite_scored_stamps_count():
+    truth = track(n=6, vx_m_s=[10, 10, 10, 2, 10, np.nan], vy_m_s=np.zeros(6), valid=[1, 1, 0, 1, 1, 1])
+    estimate = track(
+        "e", n=6, vx_m_s=10 * np.ones(6), sideslip_rad=[0.1, np.nan, 9, 9, 0.3, 9], valid=[1, 1, 1, 1, 1, 1]
+    )
+    rows = score(estimate, truth)
+    # Stamps 0 and 4 remain: 1 is not finite, 2 has no truth, 3 is too slow, 5 has no truth speed.
+    assert rows["sideslip_rad", "all", "rmse"].n == 2
+    assert rows["sideslip_rad", "all", "mae"].value == pytest.approx(0.2)
+    assert rows["sideslip_rad", "all", "availability"].value == pytest.approx(2 / 3)
+    assert rows["sideslip_rad", "all", "availability"].n == 3
+    invalid = track("e", n=6, vx_m_s=11 * np.ones(6), valid=[1, 0, 1, 1, 1, 1])
+    rows = score(invalid, truth)
+    assert rows["vx_m_s", "all", "rmse"].n == 3
+    assert rows["vx_m_s", "all", "availability"].value == pytest.approx(3 / 4)
+
+
+def test_an_estimator_that_never_answers_has_availability_zero_and_no_figures():
+    truth = track(vx_m_s=[10, 10, 10, 10], vy_m_s=[1, 1, 1, 1])
+    rows = score(track("dead", vx_m_s=[10] * 4), truth)
+    assert rows["vy_m_s", "all", "availability"].value == 0.0
+    assert ("vy_m_s", "all", "rmse") not in rows
+
+
+def test_segments_select_and_wrong_shapes_are_refused():
+    truth = track(vx_m_s=[10, 10, 10, 10])
+    estimate = track(vx_m_s=[11, 10, 10, 13])
+    rows = score(estimate, truth, {"linear": np.array([True, False, False, False]), "nonlinear": np.zeros(4, bool)})
+    assert rows["vx_m_s", "linear", "rmse"].value == 1.0
+    assert rows["vx_m_s", "all", "max_abs"].value == 3.0
+    assert not [k for k in rows if k[1] == "nonlinear"]
+    with pytest.raises(ValueError, match="same stamps"):
+        score(track(stamps_ns=stamps_of(4) + 1, vx_m_s=[1] * 4), truth)
+    with pytest.raises(ValueError, match="mask m"):
+        score(estimate, truth, {"m": np.ones(3, bool)})
+
+
+def test_sideslip_errors_wrap():
+    truth = track(vx_m_s=[-10] * 4, vy_m_s=[0.1] * 4)
+    estimate = track(vx_m_s=[-10] * 4, vy_m_s=[-0.1] * 4)
+    assert score(estimate, truth)["sideslip_rad", "all", "max_abs"].value == pytest.approx(2 * np.arctan(0.01))
+
+
+def test_dependent_truth_is_marked_in_rows_and_in_the_file():
+    truth = track(vx_m_s=[10] * 4, yaw_rate_rad_s=[0.1] * 4)
+    estimate = track(vx_m_s=[10] * 4, yaw_rate_rad_s=[0.2] * 4)
+    rows = score(estimate, truth, not_independent={"yaw_rate_rad_s": "same channel", "x_m": "not scored"})
+    assert rows["yaw_rate_rad_s", "all", "not_independent"].value == 1.0
+    assert not any(r.independent for k, r in rows.items() if k[0] == "yaw_rate_rad_s")
+    assert all(r.independent for k, r in rows.items() if k[0] != "yaw_rate_rad_s")
+    assert [k for k in rows if k[2] == "not_independent"] == [("yaw_rate_rad_s", "all", "not_independent")]
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(st.lists(st.floats(-100, 100), min_size=1, max_size=50), st.integers(0, 10**6))
+def test_summary_properties(errors, seed):
+    e = np.array(errors)
+    s = summarise_errors(e)
+    slack = 1e-9 * (1 + s["max_abs"])
+    assert s["mae"] <= s["rmse"] + slack
+    assert s["rmse"] <= s["max_abs"] + slack
+    assert abs(s["bias"]) <= s["mae"] + slack
+    assert s["p95_abs"] <= s["max_abs"] + slack
+    mirrored = summarise_errors(-e)
+    assert mirrored["bias"] == -s["bias"]
+    assert {k: v for k, v in mirrored.items() if k != "bias"} == {k: v for k, v in s.items() if k != "bias"}
+    shuffled = summarise_errors(np.random.default_rng(seed).permutation(e))
+    for k, v in s.items():
+        assert shuffled[k] == pytest.approx(v, abs=slack)
+
+
+# ---- lag ----
+
+
+def motion(t):
+    return np.sin(2.1 * t) + 0.5 * np.sin(5.3 * t + 1) + 0.3 * np.sin(9.1 * t)
+
+
+@settings(derandomize=True, max_examples=20, deadline=None)
+@given(lag=st.floats(-0.25, 0.25), seed=st.integers(0, 1000))
+def test_a_known_lag_is_found_with_its_sign(lag, seed):
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, 30, 0.01)
+    stamps = T0 + np.round((t + rng.uniform(-2e-3, 2e-3, t.size)) * 1e9).astype(np.int64)
+    at = (stamps - T0) * 1e-9
+    estimate = 1.3 * motion(at - lag) + 0.2 + rng.normal(0, 0.01, t.size)
+    assert lag_s(stamps, estimate, motion(at)) == pytest.approx(lag, abs=1e-3)
+
+
+def test_no_lag_is_claimed_without_likeness():
+    t = np.arange(0, 30, 0.01)
+    stamps = T0 + np.round(t * 1e9).astype(np.int64)
+    assert np.isnan(lag_s(stamps, np.zeros(t.size), motion(t)))
+    assert np.isnan(lag_s(stamps, np.random.default_rng(0).normal(size=t.size), motion(t)))
+    assert np.isnan(lag_s(stamps, motion(t - 0.4), motion(t)))
+    assert np.isnan(lag_s(stamps, np.full(t.size, np.nan), motion(t)))
+
+
+# ---- uncertainty ----
+
+
+def gaussian_case(n=20000, scale=1.0, seed=0):
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(3, 3))
+    p = a @ a.T * 0.01 + 0.001 * np.eye(3)
+    e = rng.multivariate_normal(np.zeros(3), p, size=n)
+    zeros = np.zeros(n)
+    truth = track(n=n, vx_m_s=zeros + 20, vy_m_s=zeros, yaw_rate_rad_s=zeros)
+    estimate = make_track(
+        "e",
+        truth.stamps_ns,
+        vx_m_s=20 + e[:, 0],
+        vy_m_s=e[:, 1],
+        yaw_rate_rad_s=e[:, 2],
+        covariance=np.tile(p * scale, (n, 1, 1)),
+    )
+    return estimate, truth
+
+
+def test_coverage_and_nees_of_a_calibrated_gaussian():
+    rows = score(*gaussian_case())
+    for signal in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s"):
+        assert rows[signal, "all", "coverage95"].value == pytest.approx(0.95, abs=0.006)
+    assert rows["state", "all", "nees"].value == pytest.approx(3.0, abs=0.07)
+    overconfident = score(*gaussian_case(scale=0.25))
+    assert overconfident["vy_m_s", "all", "coverage95"].value == pytest.approx(0.673, abs=0.01)  # P(|z| < 0.98)
+    assert overconfident["state", "all", "nees"].value == pytest.approx(12.0, abs=0.3)
+
+
+def test_truth_covariance_counts_too():
+    estimate, truth = gaussian_case(scale=0.5)
+    p = estimate.covariance
+    truth = make_track(
+        "truth",
+        truth.stamps_ns,
+        vx_m_s=truth.vx_m_s,
+        vy_m_s=truth.vy_m_s,
+        yaw_rate_rad_s=truth.yaw_rate_rad_s,
+        covariance=p,
+    )
+    rows = score(estimate, truth)
+    assert rows["state", "all", "nees"].value == pytest.approx(3.0, abs=0.07)
+    assert rows["vx_m_s", "all", "coverage95"].value == pytest.approx(0.95, abs=0.006)
+
+
+def test_nees_by_hand_and_a_broken_covariance_does_not_count():
+    e = np.array([[1.0, 2.0], [1.0, 2.0], [np.nan, 0.0], [1.0, 2.0]])
+    p = np.array([np.diag([1.0, 4.0]), np.diag([1.0, -4.0]), np.eye(2), np.full((2, 2), np.nan)])
+    np.testing.assert_allclose(nees(e, p), [2.0, np.nan, np.nan, np.nan])
+
+
+def test_nis_is_given_with_its_degrees_of_freedom_without_truth():
+    rows = state_rows(track("e", nis=[1, 3, np.nan, 5], nis_dof=[1, 3, 0, 2]), {"all": np.ones(4, bool)}, log="drive")
+    values = {r.metric: (r.value, r.n) for r in rows}
+    assert values == {"nis": (3.0, 3), "nis_dof": (2.0, 3), "diverged": (0.0, 4)}
+    assert "nis" not in {r.metric for r in state_rows(track("zero"), {"all": np.ones(4, bool)}, log="drive")}
+
+
+# ---- position ----
+
+
+def circle(n=3001, rate=100, speed=20.0, r=0.2, yaw0=0.7):
+    """Closed form of a circle with v_y = 0."""
+    stamps = stamps_of(n, rate)
+    t = (stamps - T0) * 1e-9
+    yaw = yaw0 + r * t
+    x = 100 + speed / r * (np.sin(yaw) - np.sin(yaw0))
+    y = -50 - speed / r * (np.cos(yaw) - np.cos(yaw0))
+    ones = np.ones(n)
+    return make_track(
+        "truth",
+        stamps,
+        vx_m_s=speed * ones,
+        vy_m_s=0 * ones,
+        yaw_rate_rad_s=r * ones,
+        x_m=x,
+        y_m=y,
+        yaw_rad=np.angle(np.exp(1j * yaw)),
+    )
+
+
+def test_a_perfect_estimate_stays_on_the_circle():
+    truth = circle()
+    rows = score(truth, truth)
+    assert rows["position_m", "all", "max_abs"].value < 1e-3
+    assert rows["lateral_1s_m", "all", "max_abs"].value < 1e-4
+    assert rows["lateral_1s_m", "all", "rmse"].n == 30
+    assert ("position_m", "all", "bias") not in rows
+
+
+def test_a_sideways_velocity_error_becomes_its_distance():
+    """On a straight, v_y wrong by 0.1 m/s is 0.1 m after one second and 0.1 · t after t."""
+    n = 1001
+    stamps = stamps_of(n)
+    t = (stamps - T0) * 1e-9
+    z = np.zeros(n)
+    truth = make_track(
+        "truth", stamps, vx_m_s=z + 10, vy_m_s=z, yaw_rate_rad_s=z, x_m=z, y_m=10 * t, yaw_rad=z + np.pi / 2
+    )
+    estimate = make_track("e", stamps, vx_m_s=z + 10, vy_m_s=z + 0.1, yaw_rate_rad_s=z)
+    np.testing.assert_allclose(position_error(estimate, truth), 0.1 * t, atol=1e-9)
+    np.testing.assert_allclose(lateral_errors_after_one_second(estimate, truth), 0.1, atol=1e-9)
+    faster = make_track("e", stamps, vx_m_s=z + 11, vy_m_s=z, yaw_rate_rad_s=z)
+    np.testing.assert_allclose(lateral_errors_after_one_second(faster, truth), 0.0, atol=1e-9)
+
+
+def test_lateral_seconds_agree_with_a_plain_restart_every_second():
+    truth = circle(n=1001, yaw0=-2.0)
+    rng = np.random.default_rng(0)
+    estimate = make_track(
+        "e",
+        truth.stamps_ns,
+        vx_m_s=truth.vx_m_s + rng.normal(0, 0.3, 1001),
+        vy_m_s=rng.normal(0, 0.3, 1001).cumsum() * 0.05,
+        yaw_rate_rad_s=truth.yaw_rate_rad_s + 0.02,
+    )
+    expected = []
+    for k in range(10):
+        x, y, yaw = truth.x_m[100 * k], truth.y_m[100 * k], truth.yaw_rad[100 * k]
+        for i in range(100 * k, 100 * k + 100):
+            vx, vy, r = ((a[i] + a[i + 1]) / 2 for a in (estimate.vx_m_s, estimate.vy_m_s, estimate.yaw_rate_rad_s))
+            heading = yaw + r * 0.005
+            x += 0.01 * (vx * np.cos(heading) - vy * np.sin(heading))
+            y += 0.01 * (vx * np.sin(heading) + vy * np.cos(heading))
+            yaw += r * 0.01
+        j = 100 * k + 100
+        left = np.array([-np.sin(truth.yaw_rad[j]), np.cos(truth.yaw_rad[j])])
+        expected.append(left @ [x - truth.x_m[j], y - truth.y_m[j]])
+    np.testing.assert_allclose(lateral_errors_after_one_second(estimate, truth), expected, atol=1e-9)
+
+
+def test_seconds_with_holes_do_not_count():
+    truth = circle(n=1001)
+    valid = np.ones(1001, bool)
+    valid[250] = False
+    x = truth.x_m.copy()
+    x[500] = np.nan  # end of the fifth second and start of the sixth
+    holed = make_track(
+        "truth",
+        truth.stamps_ns,
+        vx_m_s=truth.vx_m_s,
+        x_m=x,
+        y_m=truth.y_m,
+        yaw_rad=truth.yaw_rad,
+    )
+    estimate = make_track(
+        "e", truth.stamps_ns, vx_m_s=truth.vx_m_s, vy_m_s=truth.vy_m_s, yaw_rate_rad_s=truth.yaw_rate_rad_s, valid=valid
+    )
+    assert lateral_errors_after_one_second(estimate, holed).size == 10 - 1 - 2
+    keep = np.ones(1001, bool)
+    keep[720:760] = False  # a gap of 0.41 s in the stamps
+
+    def thin(t):
+        return make_track(
+            t.name,
+            t.stamps_ns[keep],
+            **{
+                c: getattr(t, c)[keep] for c in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m", "yaw_rad", "valid")
+            },
+        )
+
+    assert lateral_errors_after_one_second(thin(estimate), thin(holed)).size == 10 - 1 - 2 - 1
+
+
+@settings(derandomize=True, max_examples=20, deadline=None)
+@given(turn=st.floats(-3, 3), dx=st.floats(-1e4, 1e4), dy=st.floats(-1e4, 1e4), shift=st.integers(-(10**15), 10**15))
+def test_position_figures_do_not_depend_on_place_heading_or_time(turn, dx, dy, shift):
+    truth = circle(n=801)
+    c, s = np.cos(turn), np.sin(turn)
+    moved = make_track(
+        "truth",
+        truth.stamps_ns + shift,
+        vx_m_s=truth.vx_m_s,
+        vy_m_s=truth.vy_m_s,
+        yaw_rate_rad_s=truth.yaw_rate_rad_s,
+        x_m=c * truth.x_m - s * truth.y_m + dx,
+        y_m=s * truth.x_m + c * truth.y_m + dy,
+        yaw_rad=truth.yaw_rad + turn,
+    )
+
+    def wrong(t):
+        return make_track(
+            "e", t.stamps_ns, vx_m_s=t.vx_m_s + 0.1, vy_m_s=t.vy_m_s + 0.2, yaw_rate_rad_s=t.yaw_rate_rad_s
+        )
+
+    np.testing.assert_allclose(position_error(wrong(moved), moved), position_error(wrong(truth), truth), atol=1e-7)
+    np.testing.assert_allclose(
+        lateral_errors_after_one_second(wrong(moved), moved),
+        lateral_errors_after_one_second(wrong(truth), truth),
+        atol=1e-7,
+    )
+
+
+# ---- bootstrap ----
+
+
+def test_bootstrap_value_and_determinism():
+    rng = np.random.default_rng(0)
+    stamps = stamps_of(30000)
+    e = rng.normal(0, 2.0, 30000)
+    e[100] = np.nan
+    a = block_bootstrap_interval(e, stamps, seed=3)
+    assert a == block_bootstrap_interval(e, stamps, seed=3)
+    assert a.blocks == 30
+    assert a.value == pytest.approx(np.sqrt(np.nanmean(e**2)))
+    assert a.low < a.value < a.high
+    # White noise: the standard error of an RMSE is σ/√(2N).
+    assert (a.high - a.low) / (2 * 1.96) == pytest.approx(2.0 / np.sqrt(60000), rel=0.35)
+
+
+def test_blocks_see_the_correlation_that_samples_hide():
+    rng = np.random.default_rng(1)
+    e = np.repeat(rng.normal(0, 1.0, 60), 500)  # the error is constant for 5 s
+    wide = block_bootstrap_interval(e, stamps_of(30000))
+    narrow = block_bootstrap_interval(rng.permutation(e), stamps_of(30000))
+    assert wide.high - wide.low > 5 * (narrow.high - narrow.low)
+
+
+def test_interval_covers_the_truth_as_often_as_it_says():
+    hits = 0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        e = rng.normal(0, 1.0, 4000)
+        i = block_bootstrap_interval(e, stamps_of(4000, rate=10), n=300, seed=seed)
+        hits += i.low <= 1.0 <= i.high
+    assert 0.86 <= hits / 200 <= 0.99
+
+
+def test_a_paired_difference_is_sharper_than_the_intervals_of_its_parts():
+    rng = np.random.default_rng(2)
+    common = np.repeat(rng.normal(0, 1.0, 30), 1000)
+    stamps = stamps_of(30000)
+    a, b = common + rng.normal(0, 0.1, 30000), 1.05 * common + rng.normal(0, 0.1, 30000)
+    d = block_bootstrap_difference(a, b, stamps)
+    assert d.high < 0.0
+    assert d.value == pytest.approx(np.sqrt(np.mean(a**2)) - np.sqrt(np.mean(b**2)))
+    swapped = block_bootstrap_difference(b, a, stamps)
+    assert (swapped.low, swapped.high) == pytest.approx((-d.high, -d.low))
+    assert block_bootstrap_interval(a, stamps).high > block_bootstrap_interval(b, stamps).low
+
+
+def test_too_short_for_an_interval():
+    one = block_bootstrap_interval(np.ones(100), stamps_of(100))
+    assert (one.value, one.blocks) == (1.0, 1)
+    assert np.isnan(one.low)
+    assert np.isnan(block_bootstrap_interval(np.full(5, np.nan), stamps_of(5)).value)

@@ -1,0 +1,163 @@
+"""Segments: a drive staged from known manoeuvres, mirror symmetry, gaps, and intervals that give the masks back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.evaluation.segments import find_intervals, segment_masks, smooth
+from pdhef_logtool.signals import Signals
+from pdhef_logtool.tracks import make_track
+from pdhef_logtool.vehicle import default_vehicle
+
+T0 = 1_700_000_000_000_000_000
+VEHICLE = default_vehicle()  # friction 0.85, blend 3 m/s
+
+
+def staged():
+    """0–10 stand, 10–15 accelerate, 15–25 straight, 25–30 left, 35–40 right, 45–51 slalom, 55–58 brake, to 65."""
+    t = np.arange(0, 65, 0.01)
+    speed = np.interp(t, [0, 10, 15, 55, 58, 65], [0, 0, 20, 20, 8, 8])
+    ax = np.select([(t >= 10) & (t < 15), (t >= 55) & (t < 58)], [4.0, -4.0], 0.0)
+    ay = np.select([(t >= 25) & (t < 30), (t >= 35) & (t < 40)], [3.0, -6.0], 0.0)
+    ay = np.where((t >= 45) & (t < 51), 3.0 * np.sin(2 * np.pi * 0.5 * (t - 45)), ay)
+    return t, speed, ax, ay
+
+
+def signals(t, speed, ax, ay, noise=0.0, friction=np.nan):
+    rng = np.random.default_rng(0)
+    n = t.size
+    measured = np.where(np.arange(n) % 5 == 0, speed, np.nan)  # a measurement every 50 ms
+    rate = np.where(speed > 1, ay / np.maximum(speed, 1), 0.0)
+    return Signals(
+        stamps_ns=T0 + np.round(t * 1e9).astype(np.int64),
+        ready_ns=T0 + np.round(t * 1e9).astype(np.int64),
+        steer_rad=np.zeros(n),
+        ax_m_s2=ax + rng.normal(0, noise, n),
+        ay_m_s2=ay + rng.normal(0, noise, n),
+        yaw_rate_rad_s=rate,
+        speed_m_s=measured,
+        friction=np.full(n, friction),
+        wheel_speed_m_s=np.full((n, 4), np.nan),
+    )
+
+
+def spans(masks, stamps, name):
+    return [((s.start_ns - T0) * 1e-9, (s.end_ns - T0) * 1e-9) for s in find_intervals(stamps, {name: masks[name]})]
+
+
+EXPECTED = {
+    "standstill": [(0, 10)],
+    "accelerating": [(10, 15)],
+    "cornering-left": [(25, 30)],
+    "cornering-right": [(35, 40)],
+    "slalom": [(45, 51)],
+    "braking": [(55, 58)],
+    "straight": [(11, 25), (30, 35), (40, 45), (51, 65)],
+}
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_staged_manoeuvres_are_found_where_they_are(noise):
+    s = signals(*staged(), noise=noise)
+    masks = segment_masks(s, None, VEHICLE)
+    assert masks["all"].all()
+    for name, expected in EXPECTED.items():
+        found = spans(masks, s.stamps_ns, name)
+        assert len(found) == len(expected), (name, found)
+        np.testing.assert_allclose(found, expected, atol=0.35, err_msg=name)
+
+
+def test_mirror():
+    t, speed, ax, ay = staged()
+    a = segment_masks(signals(t, speed, ax, ay), None, VEHICLE)
+    b = segment_masks(signals(t, speed, ax, -ay), None, VEHICLE)
+    swap = {"cornering-left": "cornering-right", "cornering-right": "cornering-left"}
+    for name, mask in a.items():
+        np.testing.assert_array_equal(mask, b[swap.get(name, name)], err_msg=name)
+
+
+def test_grip_use_follows_friction():
+    s = signals(*staged())
+    t = (s.stamps_ns - T0) * 1e-9
+    left, right = (t > 26) & (t < 29), (t > 36) & (t < 39)
+    masks = segment_masks(s, None, VEHICLE)  # 3 m/s² is 0.36 of 0.85 g, 6 m/s² is 0.72 of it
+    assert not masks["linear"][left].any()
+    assert not masks["nonlinear"][left].any()
+    assert masks["nonlinear"][right].all()
+    slippery = segment_masks(signals(*staged(), friction=0.5), None, VEHICLE)  # 3 m/s² is 0.61 of 0.5 g
+    assert slippery["nonlinear"][left].all()
+    unknown = segment_masks(s, None, VEHICLE.model_copy(update={"friction": None}))  # 3 m/s² is 0.31 of g
+    assert not unknown["linear"][left].any()
+    assert not (masks["linear"] & masks["nonlinear"]).any()
+
+
+def test_the_truth_is_preferred_and_its_gaps_are_in_no_segment():
+    t, speed, ax, ay = staged()
+    s = signals(t, speed, ax, 0 * ay)
+    hole = (t > 27) & (t < 27.3)
+    truth = make_track(
+        "truth",
+        s.stamps_ns,
+        vx_m_s=speed,
+        yaw_rate_rad_s=s.yaw_rate_rad_s,
+        ay_m_s2=np.where(hole, np.nan, ay),
+    )
+    masks = segment_masks(s, truth, VEHICLE)
+    assert not masks["straight"][(t > 26) & (t < 29)].any()
+    for name in ("linear", "nonlinear", "cornering-left"):
+        assert not masks[name][hole].any()
+    assert masks["cornering-left"][(t > 25.3) & (t < 27)].all()
+
+
+def test_a_gap_in_the_stamps_ends_an_interval_and_is_not_smoothed_across():
+    t, speed, ax, ay = staged()
+    keep = (t < 27) | (t > 28)
+    s = signals(t[keep], speed[keep], ax[keep], ay[keep])
+    found = spans(segment_masks(s, None, VEHICLE), s.stamps_ns, "cornering-left")
+    np.testing.assert_allclose(found, [(25, 27), (28, 30)], atol=0.1)
+    step = np.where(t[keep] < 27.5, 0.0, 5.0)
+    np.testing.assert_allclose(smooth(s.stamps_ns, step, 1.0), step, atol=1e-12)
+
+
+def test_smoothing_has_the_stated_gain_and_no_phase():
+    t = np.arange(0, 20, 0.01)
+    stamps = T0 + np.round(t * 1e9).astype(np.int64)
+    wave = np.sin(2 * np.pi * 2.0 * t)
+    inner = slice(200, -200)
+    np.testing.assert_allclose(smooth(stamps, wave, 2.0)[inner], wave[inner] / np.sqrt(2), atol=2e-3)
+    holed = np.where(np.arange(t.size) % 7 == 0, np.nan, 3.0)
+    out = smooth(stamps, holed, 2.0)
+    np.testing.assert_array_equal(np.isnan(out), np.isnan(holed))
+    np.testing.assert_allclose(out[np.isfinite(out)], 3.0)
+
+
+def test_intervals_give_the_masks_back():
+    s = signals(*staged(), noise=0.3)
+    masks = segment_masks(s, None, VEHICLE)
+    rebuilt = {name: np.zeros(len(s), bool) for name in masks}
+    found = find_intervals(s.stamps_ns, masks)
+    for i in found:
+        rebuilt[i.name] |= (s.stamps_ns >= i.start_ns) & (s.stamps_ns < i.end_ns)
+    for name in masks:
+        np.testing.assert_array_equal(rebuilt[name], masks[name])
+    assert [i.start_ns for i in found] == sorted(i.start_ns for i in found)
+
+
+def test_nothing_known_is_only_the_whole():
+    t, speed, ax, ay = staged()
+    s = signals(t, speed, ax, ay)
+    nan = np.full(t.size, np.nan)
+    blind = replace(s, ax_m_s2=nan, ay_m_s2=nan, yaw_rate_rad_s=nan, speed_m_s=nan)
+    masks = segment_masks(blind, None, VEHICLE)
+    assert [name for name, mask in masks.items() if mask.any()] == ["all"]
+    empty = replace(
+        s,
+        **{
+            f: getattr(s, f)[:0]
+            for f in ("stamps_ns", "ready_ns", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
+        },
+    )
+    assert all(mask.size == 0 for mask in segment_masks(empty, None, VEHICLE).values())
