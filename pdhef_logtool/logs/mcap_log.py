@@ -10,17 +10,16 @@ import mmap
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
-from mcap.records import Channel, ChunkIndex, Metadata, Schema
+from mcap.records import Channel, Metadata, Schema
 
 from pdhef_logtool.errors import LogError
 from pdhef_logtool.logs.container import (
@@ -42,7 +41,7 @@ _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
-_HIGHEST_OPCODE = 0x0F
+_LARGEST_CHUNK_BYTES = 4 << 30  # a larger claim is damage, not a chunk
 _MESSAGE_HEAD = np.dtype(
     {
         "names": ["op", "size", "channel", "sequence", "log", "publish"],
@@ -169,8 +168,8 @@ class McapContainer:
         found: list[int] = []
         while after < at < foot and at + 9 <= foot:
             opcode, length = _RECORD.unpack_from(data, at)
-            if opcode == Opcode.CHUNK_INDEX and at + 9 + length <= foot:
-                offset = ChunkIndex.read(ReadDataStream(BytesIO(data[at + 9 : at + 9 + length]))).chunk_start_offset
+            if opcode == Opcode.CHUNK_INDEX and length >= 24 and at + 9 + length <= foot:
+                (offset,) = struct.unpack_from("<Q", data, at + 9 + 16)
                 if after < offset < foot and data[offset] == Opcode.CHUNK:
                     found.append(offset)
             at += 9 + length
@@ -227,8 +226,9 @@ class McapContainer:
         at = start + 40 + n
         if at + stored > end:
             raise SpanDamageError("the chunk's records run past its end")
-        with memoryview(data) as view:
-            content = _decompress(compression, view[at : at + stored], size)
+        if size > _LARGEST_CHUNK_BYTES:
+            raise SpanDamageError(f"it claims {size} bytes")
+        content = _decompress(compression, data[at : at + stored], size)
         if len(content) != size:
             raise SpanDamageError(f"decompressed to {len(content)} bytes instead of {size}")
         if crc and zlib.crc32(content) != crc:
@@ -427,30 +427,34 @@ class _Walk:
                 of._spans[i] = Span(span.index, span.start_ns, span.end_ns, counts)
 
 
-def _decompress(compression: str, stored: memoryview, size: int) -> bytes:
+def _decompress(compression: str, stored: bytes, size: int) -> bytes:
     """Undo a chunk's compression; every library's own error becomes one."""
-    decode: Callable[[], Any]
     if compression == "":
-        return bytes(stored)
+        return stored
     if compression == "zstd":
-        import zstandard
+        return _decompress_zstd(stored, size)
+    if compression == "lz4":
+        return _decompress_lz4(stored)
+    raise SpanDamageError(f"unknown compression {compression!r}")
 
-        def decode() -> Any:
-            return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-    elif compression == "lz4":
-        import lz4.frame
 
-        def decode() -> Any:
-            return lz4.frame.decompress(stored)
-    else:
-        raise SpanDamageError(f"unknown compression {compression!r}")
+def _decompress_zstd(stored: bytes, size: int) -> bytes:
+    import zstandard
+
     try:
-        return bytes(decode())
-    except (zlib.error, RuntimeError, EOFError, ValueError, MemoryError) as error:
+        if zstandard.frame_content_size(stored) not in (-1, size):
+            raise SpanDamageError("its compressed content has another size")
+        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    except (zstandard.ZstdError, OverflowError, MemoryError) as error:
         raise SpanDamageError(str(error)) from error
-    except Exception as error:
-        if type(error).__module__.split(".")[0] not in ("zstandard", "zstd"):
-            raise
+
+
+def _decompress_lz4(stored: bytes) -> bytes:
+    import lz4.frame
+
+    try:
+        return bytes(lz4.frame.decompress(stored))
+    except (RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
         raise SpanDamageError(str(error)) from error
 
 

@@ -47,10 +47,11 @@ class SqliteContainer:
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._db = self._connect(path)
+        self._db.text_factory = _text
         try:
             self._read_topics()
             self._read_pages()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
             self.close()
             raise self._no_log("a readable rosbag2 database", str(error)) from error
         except BaseException:
@@ -137,7 +138,7 @@ class SqliteContainer:
 
         try:
             for id_, topic, timestamp, length in rows:
-                if topic not in self._channels:
+                if topic not in self._channels or not isinstance(timestamp, int):
                     unknown += 1
                     continue
                 if not times:
@@ -153,7 +154,7 @@ class SqliteContainer:
             self._lost.append(Loss("truncated", what, str(self.path), start_ns=max(times) + 1 if times else None))
         close_page()
         if unknown:
-            what = f"{unknown} messages of topics that the database does not name"
+            what = f"{unknown} messages of topics that the database does not name, or without a time"
             self._lost.append(Loss("unknown-channel", what, str(self.path), count=unknown))
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
@@ -170,9 +171,11 @@ class SqliteContainer:
         payloads: list[bytes] = []
         try:
             for topic, timestamp, data in self._db.execute(query, (first, last, *sorted(wanted))):
+                if not isinstance(timestamp, int) or not isinstance(data, bytes):
+                    continue
                 channels.append(topic)
                 stamps.append(timestamp)
-                payloads.append(bytes(data) if data is not None else b"")
+                payloads.append(data)
         except sqlite3.Error as error:
             raise SpanDamageError(str(error)) from error
         offsets: list[int] = []
@@ -197,3 +200,8 @@ class SqliteContainer:
         if self._folder is not None:
             self._folder.cleanup()
             self._folder = None
+
+
+def _text(stored: bytes) -> str:
+    """Decode a text column even where it is damaged."""
+    return stored.decode("utf-8", errors="replace")
