@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -74,7 +75,8 @@ def inspect(
 ) -> None:
     """Show topics, rates, gaps, clock jitter, what maps to what, and what is missing."""
     from pdhef_logtool.config import load_config
-    from pdhef_logtool.inspection import inspect_log, render_inspection, write_mapping_file
+    from pdhef_logtool.inspection import inspect_log, render_inspection
+    from pdhef_logtool.inspection import write_mapping as write_mapping_file
     from pdhef_logtool.mapping import load_mapping
 
     config = load_config(None, {"mapping": mapping, "prefer_truth": prefer_truth})
@@ -306,5 +308,10 @@ def main() -> NoReturn:
     except BrokenPipeError:
         # The reader of our stdout has gone (for example ``| head``): no error of ours.
         sys.stderr.close()
+        sys.exit(EXIT_FAILURE)
+    except Exception as error:
+        if os.environ.get("PDHEF_TRACEBACK"):
+            raise
+        _say(f"pdhef: internal error, {type(error).__name__}: {error}; PDHEF_TRACEBACK=1 shows where, please report it")
         sys.exit(EXIT_FAILURE)
     sys.exit(0)

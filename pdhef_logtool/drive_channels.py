@@ -54,6 +54,11 @@ class DrivePlan:
         return 0.0 if self.latency is None else self.latency.latency_s
 
     @property
+    def has_truth_pose(self) -> bool:
+        """Whether the truth has position and heading."""
+        return {"position_m", "yaw_rad"} <= self.derivation.keys()
+
+    @property
     def margin_ns(self) -> int:
         """How much of the channels a window needs on both sides."""
         truth_margin = 0 if self.truth is None else self.truth.margin_ns

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -127,3 +128,11 @@ class Signals:
     def __len__(self) -> int:
         """Return the number of stamps."""
         return int(self.stamps_ns.shape[0])
+
+
+def join_signals(windows: Sequence[Signals]) -> Signals:
+    """Join consecutive windows of one drive in time order."""
+    columns = {
+        f.name: np.concatenate([getattr(w, f.name) for w in windows]) for f in fields(Signals) if f.name != "available"
+    }
+    return Signals(**columns, available=windows[0].available)

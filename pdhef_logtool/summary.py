@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.pipeline import LogResult, RunResult
@@ -102,16 +102,14 @@ def _table(report: Mapping[str, Any]) -> Table:
         cells += [_cell(values.get((name, signal, "all", metric)), f, d) for _, signal, metric, f, d in shown]
         cells += [_cell(values.get((name, "sideslip_rad", s, "rmse")), _DEG, 3) for s in by_segment]
         if nis:
-            cells.append(_cell(_first(values, name, "nis"), 1.0, 2))
+            cells.append(_cell(_nis_ratio(values, name), 1.0, 2))
         table.add_row(*cells)
     return table
 
 
-def _first(values: Mapping[tuple[str, str, str, str], float | None], name: str, metric: str) -> float | None:
-    found: Sequence[float | None] = [
-        v for (e, _, s, m), v in values.items() if e == name and s == "all" and m == metric
-    ]
-    return found[0] if found else None
+def _nis_ratio(values: Mapping[tuple[str, str, str, str], float | None], name: str) -> float | None:
+    nis, dof = values.get((name, "state", "all", "nis")), values.get((name, "state", "all", "nis_dof"))
+    return None if nis is None or not dof else nis / dof
 
 
 def _cell(value: float | None, factor: float, digits: int) -> str:

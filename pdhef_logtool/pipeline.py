@@ -1,0 +1,515 @@
+"""One log from start to end, and several of them in turn: read, estimate, compare, write."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdhef_logtool.config import RunConfig, time_slice
+from pdhef_logtool.drive_channels import DrivePlan, DriveReader, plan_drive
+from pdhef_logtool.errors import (
+    EXIT_FAILURE,
+    EXIT_OK,
+    EXIT_PARTIAL,
+    EstimatorError,
+    MappingError,
+    OutputError,
+    PdhefError,
+)
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.registry import Skipped, runnable
+from pdhef_logtool.geometry import dead_reckon
+from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping, auto_map, check_mapping, load_mapping, merge_losses
+from pdhef_logtool.signals import ALIGNED_SIGNALS, SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Loss, Signals, join_signals
+from pdhef_logtool.sinks.base import TRUTH, Event, Sink
+from pdhef_logtool.sinks.report import (
+    EstimatorFacts,
+    LogFacts,
+    LogOutcome,
+    ReportFacts,
+    SourceFacts,
+    TopicFacts,
+    TruthFacts,
+    build_report,
+    build_run,
+    tool_versions,
+    write_json,
+)
+from pdhef_logtool.track_store import TrackStore
+from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.metrics import MetricRow
+
+#: ``update(text, share)`` with share in [0, 1].
+Progress = Callable[[str, float], None]
+
+#: Units of truth quantities that have no channel of their own name.
+_DERIVED_UNITS = {"position_m": "m"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogResult:
+    """What came out of one log; ``report`` is the document of report.json, None if the log failed."""
+
+    outcome: LogOutcome
+    output: Path | None
+    report: dict[str, Any] | None
+    rows: tuple[MetricRow, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """What came out of a run."""
+
+    output: Path
+    results: tuple[LogResult, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all is well, 3 if some input was lost or some logs failed, 1 if all failed."""
+        if all(r.report is None for r in self.results):
+            return EXIT_FAILURE
+        return EXIT_OK if all(r.outcome.outcome == "ok" for r in self.results) else EXIT_PARTIAL
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {
+            "output": str(self.output),
+            "exit_code": self.exit_code,
+            "logs": [
+                {
+                    "log": r.outcome.log,
+                    "outcome": r.outcome.outcome,
+                    "output": None if r.output is None else str(r.output),
+                    "report": r.report,
+                }
+                for r in self.results
+            ],
+        }
+
+
+def run_logs(
+    arguments: Sequence[str],
+    output: Path,
+    config: RunConfig,
+    *,
+    progress: Progress = lambda _text, _share: None,
+    warn: Callable[[str], None] = lambda _text: None,
+) -> RunResult:
+    """Run the configured estimators on logs and write everything of DESIGN §6 to ``output``.
+
+    A log that fails is reported and never stops the others.
+
+    Parameters
+    ----------
+    arguments : logs, folders, glob patterns. progress, warn : called with lines for people.
+
+    Raises
+    ------
+    UsageError, VehicleError, MappingError
+        What holds for all logs is wrong: arguments, vehicle or mapping file.
+    OutputError
+        The output folder cannot be written.
+    """
+    inputs = find_logs(arguments)
+    vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
+    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    if config.vehicle is None:
+        warn(f"no --vehicle: the default {vehicle.name} is assumed, so the model-based estimates are of another car")
+    _make_folder(output)
+    results = []
+    for number, log_input in enumerate(inputs):
+
+        def of_all(text: str, share: float, number: int = number) -> None:
+            progress(text, (number + share) / len(inputs))
+
+        try:
+            result = run_log(log_input, output, config, vehicle, mapping, progress=of_all, warn=warn)
+        except Exception as error:  # one bad log never stops the others, whatever is wrong with it
+            if len(inputs) == 1:
+                raise
+            reason = str(error) if isinstance(error, PdhefError) else f"internal error, {type(error).__name__}: {error}"
+            warn(reason)
+            outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
+            result = LogResult(outcome, None, None, ())
+        results.append(result)
+    _write_run(output, config, results)
+    return RunResult(output, tuple(results))
+
+
+def run_log(
+    log_input: LogInput,
+    output: Path,
+    config: RunConfig,
+    vehicle: VehicleParameters,
+    mapping: Mapping | None,
+    *,
+    progress: Progress = lambda _text, _share: None,
+    warn: Callable[[str], None] = lambda _text: None,
+) -> LogResult:
+    """Run one log and write its folder ``output/logs/<stem>``.
+
+    Raises
+    ------
+    PdhefError
+        Nothing of the log can be used; nothing is then left under a final name.
+    """
+    progress(log_input.stem, 0.0)
+    log = open_log(log_input.path)
+    try:
+        return _run_open_log(log, log_input, output, config, vehicle, mapping, progress, warn)
+    finally:
+        log.close()
+
+
+def _run_open_log(
+    log: DriveLog,
+    log_input: LogInput,
+    output: Path,
+    config: RunConfig,
+    vehicle: VehicleParameters,
+    mapping: Mapping | None,
+    progress: Progress,
+    warn: Callable[[str], None],
+) -> LogResult:
+    from pdhef_logtool.inspection import plausibility_warnings
+
+    warnings: list[str] = []
+
+    def tell(text: str) -> None:
+        warnings.append(text)
+        warn(f"{log_input.stem}: {text}")
+
+    mapping, missing = _choose_mapping(log, mapping, config, tell)
+    start_ns, end_ns = time_slice(config, log.start_ns, log.end_ns)
+    plan = plan_drive(log, mapping, vehicle, start_ns, end_ns)
+    for warning in plausibility_warnings(plan.survey_signals):
+        tell(warning.message)
+    for name, reason in plan.alignment.unused:
+        tell(f"{name} is not used: {reason}")
+    estimators, skipped = runnable(
+        config.estimators, vehicle, plan.alignment.available, use_speed=config.sensors == "full"
+    )
+    for skip in skipped:
+        tell(f"{skip.name} is skipped: {skip.reason}")
+    if not estimators:
+        raise EstimatorError(
+            expected="at least one estimator that can run",
+            got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
+            where=str(log_input.path),
+            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
+        )
+    sha256 = hash_log(log_input.path)
+    folder = output / "logs" / log_input.stem
+    reader = DriveReader(log, plan, config.window_s)
+    sinks = _open_sinks(folder, log, log_input.stem, config, vehicle, plan, sha256)
+    try:
+        with TrackStore(folder) as store:
+            context = _estimate(reader, estimators, sinks, store, lambda share: progress(log_input.stem, 0.8 * share))
+            progress(log_input.stem, 0.8)
+            rows, events = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
+        losses = merge_losses([log.lost, reader.losses])
+        report = build_report(
+            _facts(
+                log, log_input, sha256, plan, missing, vehicle, estimators, skipped, rows, events, losses, warnings,
+                reader.samples or {},
+            )
+        )  # fmt: skip
+        from pdhef_logtool.sinks.parquet import write_metrics
+
+        for sink in sinks:
+            sink.finish(report, events)
+        write_metrics(folder / "metrics.parquet", rows)
+        write_json(folder / "report.json", report)
+    except BaseException:
+        for sink in sinks:
+            sink.abort()
+        with suppress(OSError):
+            folder.rmdir()
+        raise
+    lost = tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
+    outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=sha256, lost=lost)
+    progress(log_input.stem, 1.0)
+    return LogResult(outcome, folder, report, tuple(rows))
+
+
+def _choose_mapping(
+    log: DriveLog, mapping: Mapping | None, config: RunConfig, tell: Callable[[str], None]
+) -> tuple[Mapping, tuple[str, ...]]:
+    """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently."""
+    if mapping is not None:
+        check_mapping(mapping, log)
+        for note in mapping.notes:
+            tell(note)
+        return mapping, tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
+    found = auto_map(log, prefer_truth=config.prefer_truth)
+    for ambiguity in found.ambiguities:
+        tell(str(ambiguity))
+    for note in found.mapping.notes:
+        tell(note)
+    if not found.mapping.signals:
+        raise MappingError(
+            expected="topics of well-known message types",
+            got=", ".join(sorted({t.type_name for t in log.topics})) or "no topics",
+            where=str(log.path),
+            remedy="write a mapping.toml (pdhef inspect LOG --write-mapping mapping.toml) and give it with --mapping",
+        )
+    return found.mapping, found.missing
+
+
+def _open_sinks(
+    folder: Path,
+    log: DriveLog,
+    stem: str,
+    config: RunConfig,
+    vehicle: VehicleParameters,
+    plan: DrivePlan,
+    input_hash: str,
+) -> list[Sink]:
+    from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
+    from pdhef_logtool.sinks.parquet import EstimatesSink
+    from pdhef_logtool.sinks.rerun import RerunSink
+
+    sinks: list[Sink] = []
+    try:
+        sinks.append(EstimatesSink(folder / "estimates.parquet"))
+        if config.annotate != "none":
+            sinks.append(AnnotatedMcapSink(folder / "annotated.mcap", log if config.annotate == "full" else None))
+        sinks.append(
+            RerunSink(
+                folder / "recording.rrd",
+                log_name=stem,
+                input_hash=input_hash,
+                start_ns=plan.start_ns,
+                min_speed_m_s=vehicle.low_speed_blend_m_s,
+            )
+        )
+    except BaseException:
+        for sink in sinks:
+            sink.abort()
+        raise
+    return sinks
+
+
+class _Pose:
+    """Dead-reckons one track from window to window, from the true pose at the start where there is one."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, float, float, float] | None = None
+        self._pose: tuple[float, float, float] | None = None
+
+    def add(self, track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
+        if len(track) == 0:
+            return track
+        stamps, vx, vy, rate = track.stamps_ns, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
+        if not np.isfinite(vy).any():
+            vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
+        if self._last is not None:
+            stamps = np.concatenate([[self._last[0]], stamps])
+            vx, vy, rate = (np.concatenate([[v], c]) for v, c in zip(self._last[1:], (vx, vy, rate), strict=True))
+        x, y, yaw = dead_reckon(stamps, vx, vy, rate, self._pose or start)
+        self._last = (int(stamps[-1]), float(vx[-1]), float(vy[-1]), float(rate[-1]))
+        self._pose = (float(x[-1]), float(y[-1]), float(yaw[-1]))
+        skip = len(x) - len(track)
+        return track.with_pose(x[skip:], y[skip:], yaw[skip:])
+
+
+def _first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
+    if truth is not None:
+        known = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))
+        if known.size:
+            i = int(known[0])
+            return float(truth.x_m[i]), float(truth.y_m[i]), float(truth.yaw_rad[i])
+    return 0.0, 0.0, 0.0
+
+
+def _estimate(
+    reader: DriveReader,
+    estimators: Sequence[Estimator],
+    sinks: Sequence[Sink],
+    store: TrackStore,
+    progress: Callable[[float], None],
+) -> Signals:
+    """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
+    carries: dict[str, Any] = {}
+    poses = {e.name: _Pose() for e in estimators} | {TRUTH: _Pose()}
+    seen: list[Signals] = []
+    start: tuple[float, float, float] | None = None
+    for window in reader.windows():
+        if len(window.signals) == 0:
+            continue
+        seen.append(window.signals)
+        if start is None:
+            start = _first_pose(window.truth)
+        for sink in sinks:
+            sink.append_signals(window.signals)
+        if window.truth is not None:
+            store.append(window.truth)
+            drawn = window.truth
+            if not reader.plan.has_truth_pose:
+                drawn = poses[TRUTH].add(drawn, start)
+            for sink in sinks:
+                sink.append(drawn)
+        for estimator in estimators:
+            track, carries[estimator.name] = estimator.run(window.signals, carries.get(estimator.name))
+            track = poses[estimator.name].add(track, start)
+            store.append(track)
+            for sink in sinks:
+                sink.append(track)
+        progress(window.share_done)
+    if not seen:
+        raise EstimatorError(
+            expected="IMU samples in the chosen slice",
+            got="none that can be used",
+            where=str(reader.log.path),
+            remedy="pdhef inspect LOG shows what the log holds and what was dropped",
+        )
+    return join_signals(seen)
+
+
+def _evaluate(
+    stem: str,
+    store: TrackStore,
+    estimators: Sequence[Estimator],
+    signals: Signals,
+    plan: DrivePlan,
+    vehicle: VehicleParameters,
+) -> tuple[list[MetricRow], list[Event]]:
+    """Score the stored tracks, one whole track in memory at a time besides the truth."""
+    from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
+    from pdhef_logtool.evaluation.metrics import score_track, state_rows
+    from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
+
+    truth = store.read(TRUTH)
+    masks = segment_masks(signals, truth, vehicle)
+    slow = vehicle.low_speed_blend_m_s
+    rows: list[MetricRow] = []
+    events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(signals.stamps_ns, _without_whole(masks))]
+    for estimator in estimators:
+        track = store.read(estimator.name)
+        assert track is not None
+        if truth is not None:
+            rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=plan.dependent)
+        else:
+            rows += state_rows(track, masks, log=stem)
+        rows += whiteness_rows(track, masks, log=stem)
+        events += [
+            Event(f"{estimator.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
+            for s in find_intervals(track.stamps_ns, {"diverged": track.diverged})
+        ]
+    if truth is None:
+        for a, b in combinations([e.name for e in estimators], 2):
+            pair = [t for t in (store.read(a), store.read(b)) if t is not None]
+            rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
+    rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
+    return rows, sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
+
+
+def _without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
+    return {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
+
+
+def _facts(
+    log: DriveLog,
+    log_input: LogInput,
+    sha256: str,
+    plan: DrivePlan,
+    missing: Sequence[str],
+    vehicle: VehicleParameters,
+    estimators: Sequence[Estimator],
+    skipped: Sequence[Skipped],
+    rows: Sequence[MetricRow],
+    events: Sequence[Event],
+    losses: Sequence[Loss],
+    warnings: Sequence[str],
+    samples: dict[str, int],
+) -> ReportFacts:
+    mapping = plan.mapping
+    mapped = set(mapping.topics)
+    notes = [] if plan.latency is None else [f"latency: {plan.latency.reason}"]
+    notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
+    if "cg" in plan.derivation:
+        notes.append(plan.derivation["cg"])
+    if plan.truth is not None and not plan.has_truth_pose:
+        notes.append("no true position: the drawn truth trajectory is its velocity dead-reckoned")
+    return ReportFacts(
+        log=LogFacts(
+            name=log_input.stem,
+            file=log_input.path.name,
+            kind=log.kind,
+            sha256=sha256,
+            start_ns=plan.start_ns,
+            end_ns=plan.end_ns,
+            topics=[
+                TopicFacts(t.name, t.type_name, t.encoding, t.messages, mapped=t.name in mapped) for t in log.topics
+            ],
+        ),
+        signals=[SourceFacts(n, s.label, SIGNAL_UNITS[n], samples.get(s.label, 0)) for n, s in mapping.signals.items()],
+        missing_signals=list(missing),
+        vehicle_name=vehicle.name,
+        vehicle_sha256=hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest(),
+        estimators=[EstimatorFacts(e.name, causal=e.causal) for e in estimators]
+        + [EstimatorFacts(s.name, causal=True, skipped=s.reason) for s in skipped],
+        truth=TruthFacts(
+            quantities=[
+                _truth_quantity(name, how, mapping, samples) for name, how in plan.derivation.items() if name != "cg"
+            ],
+            latency_s=None if plan.latency is None else plan.latency.latency_s,
+            not_independent=sorted(plan.dependent),
+            notes=notes,
+        ),
+        metrics=rows,
+        segments=events,
+        losses=losses,
+        warnings=warnings,
+        versions=tool_versions(),
+    )
+
+
+def _truth_quantity(name: str, how: str, mapping: Mapping, samples: dict[str, int]) -> SourceFacts:
+    source = mapping.truth.get(name)
+    if source is None:
+        return SourceFacts(name, "derived", _DERIVED_UNITS.get(name) or TRUTH_UNITS[name], 0, derivation=how)
+    derivation = "" if how == source.label else how
+    return SourceFacts(name, source.label, TRUTH_UNITS[name], samples.get(source.label, 0), derivation=derivation)
+
+
+def hash_log(path: Path) -> str:
+    """Return the sha256 of a log file, or of the names and contents of a log folder's files in order."""
+    if path.is_file():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    total = hashlib.sha256()
+    for file_path in sorted(p for p in path.rglob("*") if p.is_file()):
+        total.update(file_path.relative_to(path).as_posix().encode() + b"\0")
+        with file_path.open("rb") as file:
+            total.update(hashlib.file_digest(file, "sha256").digest())
+    return total.hexdigest()
+
+
+def _make_folder(output: Path) -> None:
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            expected="a folder to write to", got=error.strerror or str(error), where=str(output)
+        ) from None
+
+
+def _write_run(output: Path, config: RunConfig, results: Sequence[LogResult]) -> None:
+    from pdhef_logtool.sinks.parquet import write_metrics
+
+    write_metrics(output / "metrics.parquet", [row for r in results for row in r.rows])
+    write_json(output / "run.json", build_run(tool_versions(), config.to_dict(), None, [r.outcome for r in results]))
