@@ -54,8 +54,10 @@ def source_profile(log: DriveLog) -> str:
     return str(profiles[0]) if profiles else "ros2"
 
 
-def register_channels(writer: McapLogWriter, log: DriveLog) -> SourceChannels:
-    """Add every channel of a log to a writer.
+def register_channels(
+    writer: McapLogWriter, log: DriveLog, *, leave_out: Callable[[str], bool] = lambda _topic: False
+) -> SourceChannels:
+    """Add every channel of a log to a writer but those whose topic is to be left out.
 
     Channels that only repeat over split files become one. A ROS 1 channel whose definition does not parse cannot be
     converted and is left out with a loss.
@@ -69,6 +71,8 @@ def register_channels(writer: McapLogWriter, log: DriveLog) -> SourceChannels:
     for c, container in enumerate(columnar.containers):
         same_file: set[int] = set()
         for channel in container.channels.values():
+            if leave_out(channel.topic):
+                continue
             target = channel
             if channel.encoding == "ros1" and columnar.kind == "rosbag1":
                 try:

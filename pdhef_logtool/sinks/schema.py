@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.logs.schema_files import schema_file
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
 
 def load_schema(name: str) -> dict[str, Any]:
     """Return one of the JSON documents of ``schemas/`` by file name."""
-    document: dict[str, Any] = json.loads((Path(__file__).parents[2] / "schemas" / name).read_text(encoding="utf-8"))
+    document: dict[str, Any] = json.loads(schema_file(name).read_text(encoding="utf-8"))
     return document
 
 

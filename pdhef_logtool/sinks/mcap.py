@@ -1,0 +1,249 @@
+"""annotated.mcap: the source log with our topics merged in by log time, or our topics alone (sidecar)."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.errors import OutputError
+from pdhef_logtool.geometry import quat_from_yaw
+from pdhef_logtool.logs.container import Attachment
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.source_copy import (
+    iterate_attachments,
+    iterate_metadata,
+    iterate_raw,
+    register_channels,
+    source_profile,
+)
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.signals import BoolArray, FloatArray, Loss, Signals
+from pdhef_logtool.sinks.base import Event
+from pdhef_logtool.sinks.report import json_bytes
+from pdhef_logtool.tracks import StateTrack
+
+#: Everything below this name in a source log is ours and is replaced.
+NAMESPACE = "/pdhef/"
+STATE_TYPE = "pdhef_msgs/msg/VehicleStateEstimate"
+ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+MAP_FRAME = "map"
+BODY_FRAME = "base_link"
+METRICS_RECORD = "pdhef.metrics"
+REPORT_ATTACHMENT = "report.json"
+_REPORT_MEDIA_TYPE = "application/json"
+
+_STATE_FIELDS = (
+    "vx_m_s",
+    "vy_m_s",
+    "yaw_rate_rad_s",
+    "sideslip_rad",
+    "ay_m_s2",
+    "sideslip_std_rad",
+    "network_trust",
+    "r_scale",
+    "nis",
+    "friction",
+    "valid",
+    "diverged",
+)
+#: Places of v_x, v_y and yaw rate among x, y, z and the rotations about x, y, z.
+_PLANAR = np.array([0, 1, 5])
+
+
+def topic_of(estimator: str, what: str) -> str:
+    """Return the topic of a track as a legal ROS 2 name: ``/pdhef/phy_ukf/state`` of ``phy-ukf`` and ``state``."""
+    token = re.sub(r"[^A-Za-z0-9_]", "_", estimator)
+    return f"{NAMESPACE}{'_' if token[:1].isdigit() else ''}{token}/{what}"
+
+
+class AnnotatedMcapSink:
+    """Writes the annotated log window by window; messages of the source pass through one at a time.
+
+    Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp) and ``odometry`` (``nav_msgs/msg/Odometry``, the
+    stamps that are valid and have a pose, as the message can say neither). Log and publish time are the scored stamp.
+    Everything that an earlier annotation left in the source is replaced.
+
+    Parameters
+    ----------
+    path : where the finished file stands.
+    source : the log to copy in full; None for a sidecar that holds our topics alone.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+
+    def __init__(self, path: Path, source: DriveLog | None) -> None:
+        self._source = source
+        self._topics: dict[str, str] = {}
+        self._window: dict[str, list[TopicBatch]] = {}
+        self._lost: tuple[Loss, ...] = ()
+        self._raws: Iterator[RawMessage] = iter(())
+        self._next: RawMessage | None = None
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                expected="a place to write to", got=error.strerror or str(error), where=str(path)
+            ) from error
+        self._writer = McapLogWriter(path, profile="ros2" if source is None else source_profile(source))
+        if source is None:
+            return
+        try:
+            channels = register_channels(self._writer, source, leave_out=_is_ours)
+        except BaseException:
+            self._writer.abort()
+            raise
+        self._lost = channels.lost
+        self._raws = iterate_raw(source, channels)
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """What of the source cannot be copied."""
+        return self._lost
+
+    def append_signals(self, signals: Signals) -> None:
+        """Take nothing: the inputs are in the source."""
+
+    def append(self, track: StateTrack) -> None:
+        """Take one track of this window."""
+        if track.name in self._window:
+            self._write_window()
+        if track.name not in self._topics:
+            self._add_topics(track.name)
+        self._window[track.name] = [_state_batch(track), _odometry_batch(track)]
+
+    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
+        """Write what is left of the source, the metrics record and report.json, and give the file its name."""
+        try:
+            self._write_window()
+            self._writer.write([], raws=self._raws_before(None))
+            if self._source is not None:
+                for attachment in iterate_attachments(self._source):
+                    if not _is_our_report(attachment):
+                        self._attach(attachment)
+                for record in iterate_metadata(self._source):
+                    if record.name != METRICS_RECORD:
+                        self._writer.metadata(record.name, record.values)
+            self._writer.metadata(METRICS_RECORD, metrics_record(report))
+            end_ns = int(report["log"]["end_ns"])
+            self._attach(Attachment(REPORT_ATTACHMENT, _REPORT_MEDIA_TYPE, json_bytes(report), end_ns, end_ns))
+            self._writer.close()
+        except BaseException:
+            self.abort()
+            raise
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        self._writer.abort()
+
+    def _add_topics(self, estimator: str) -> None:
+        state, odometry = topic_of(estimator, "state"), topic_of(estimator, "odometry")
+        if state in self._topics.values():
+            raise OutputError(expected="estimators with different topics", got=estimator, where=state)
+        self._writer.add_topic(state, STATE_TYPE, constants={"header.frame_id": BODY_FRAME})
+        frames = {"header.frame_id": MAP_FRAME, "child_frame_id": BODY_FRAME}
+        self._writer.add_topic(odometry, ODOMETRY_TYPE, constants=frames)
+        self._topics[estimator] = state
+
+    def _write_window(self) -> None:
+        batches = [batch for pair in self._window.values() for batch in pair]
+        self._window.clear()
+        ends = [int(b.log_time_ns[-1]) + 1 for b in batches if len(b.log_time_ns)]
+        if ends:
+            self._writer.write(batches, raws=self._raws_before(max(ends)))
+
+    def _raws_before(self, end_ns: int | None) -> Iterator[RawMessage]:
+        while True:
+            message = self._next if self._next is not None else next(self._raws, None)
+            self._next = None
+            if message is None:
+                return
+            if end_ns is not None and message.log_time_ns >= end_ns:
+                self._next = message
+                return
+            yield message
+
+    def _attach(self, attachment: Attachment) -> None:
+        self._writer.attachment(
+            attachment.name,
+            attachment.media_type,
+            attachment.data,
+            log_time_ns=attachment.log_time_ns,
+            create_time_ns=attachment.create_time_ns,
+        )
+
+
+def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
+    """Return the figures as ``estimator/signal/segment/metric`` → ``value unit n=samples`` (``null``: not computable).
+
+    ``log`` and ``truth`` (``available`` or ``no truth``) stand beside them.
+    """
+    record = {
+        "log": str(report["log"]["name"]),
+        "truth": "available" if report["truth"]["available"] else "no truth",
+    }
+    for m in report["metrics"]:
+        value = "null" if m["value"] is None else repr(float(m["value"]))
+        record[f"{m['estimator']}/{m['signal']}/{m['segment']}/{m['metric']}"] = f"{value} {m['unit']} n={m['n']}"
+    return record
+
+
+def _is_ours(topic: str) -> bool:
+    return topic.startswith(NAMESPACE)
+
+
+def _is_our_report(attachment: Attachment) -> bool:
+    """Tell our report.json from somebody else's attachment of the same name."""
+    if attachment.name != REPORT_ATTACHMENT:
+        return False
+    try:
+        document = json.loads(attachment.data)
+    except ValueError:
+        return False
+    return isinstance(document, dict) and document.get("format") == "pdhef.report"
+
+
+def _state_batch(track: StateTrack) -> TopicBatch:
+    n = len(track)
+    known = track.covariance.shape[0] == n
+    covariance = track.covariance.reshape(n, 9) if known else np.full((n, 9), np.nan)
+    fields = {name: np.asarray(getattr(track, name)) for name in _STATE_FIELDS}
+    return TopicBatch(
+        topic_of(track.name, "state"),
+        track.stamps_ns,
+        track.stamps_ns,
+        {"header.stamp": track.stamps_ns, "covariance": covariance, **fields},
+    )
+
+
+def _odometry_batch(track: StateTrack) -> TopicBatch:
+    use = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+    stamps_ns = track.stamps_ns[use]
+    n = len(stamps_ns)
+    zero = np.zeros(n)
+    covariance = track.covariance[use] if track.covariance.shape[0] == len(track) else np.empty((0, 3, 3))
+    fields = {
+        "header.stamp": stamps_ns,
+        "pose.pose.position": np.stack([track.x_m[use], track.y_m[use], zero], axis=1),
+        "pose.pose.orientation": quat_from_yaw(track.yaw_rad[use]),
+        "twist.twist.linear": np.stack([track.vx_m_s[use], track.vy_m_s[use], zero], axis=1),
+        "twist.twist.angular": np.stack([zero, zero, track.yaw_rate_rad_s[use]], axis=1),
+        "twist.covariance": _twist_covariance(covariance, n),
+    }
+    return TopicBatch(topic_of(track.name, "odometry"), stamps_ns, stamps_ns, fields)
+
+
+def _twist_covariance(covariance: FloatArray, n: int) -> FloatArray:
+    """Place [N, 3, 3] over v_x, v_y, r into [N, 36]; all zero, ROS's sign for unknown, where it is not known."""
+    full = np.zeros((n, 6, 6))
+    if covariance.shape[0]:
+        known: BoolArray = np.all(np.isfinite(covariance), axis=(1, 2))
+        full[:, _PLANAR[:, None], _PLANAR] = np.where(known[:, None, None], covariance, 0.0)
+    return full.reshape(n, 36)
