@@ -267,6 +267,20 @@ def truth_at(truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0) -> 
     )
 
 
+def yaw_rate_channel(truth: TruthTrack) -> Channel:
+    """Return the truth's yaw rate, mapped or derived, as a channel without NaN, for :func:`estimate_truth_latency`."""
+    known = np.isfinite(truth.track.yaw_rate_rad_s)
+    stamps = truth.track.stamps_ns[known]
+    return Channel(
+        name="yaw_rate_rad_s",
+        unit="rad/s",
+        source=truth.derivation.get("yaw_rate_rad_s", "none"),
+        stamps_ns=stamps,
+        arrival_ns=stamps,
+        values=truth.track.yaw_rate_rad_s[known],
+    )
+
+
 def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) -> LatencyEstimate:
     """Estimate the truth's latency against the gyro by cross-correlation of detrended yaw rates.
 

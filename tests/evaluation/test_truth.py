@@ -20,6 +20,7 @@ from pdhef_logtool.evaluation.truth import (
     estimate_truth_latency,
     plan_truth,
     truth_at,
+    yaw_rate_channel,
 )
 from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
 from pdhef_logtool.tracks import StateTrack
@@ -419,6 +420,18 @@ def test_parabola_vertex():
     f = lambda x: 3.0 - 2.0 * (x - 0.3) ** 2  # noqa: E731
     assert parabolic_peak(f(-1), f(0), f(1)) == pytest.approx(0.3)
     assert parabolic_peak(1.0, 1.0, 1.0) == 0.0
+
+
+def test_latency_of_a_truth_whose_yaw_rate_is_derived():
+    stamps, d = drive(60.0, rate=20)
+    channels = {n: channel(n, stamps, v) for n, v in sources(stamps, d)["position, yaw"].items()}
+    derived = yaw_rate_channel(derive_truth(channels))
+    assert np.isfinite(derived.values).all()
+    t = np.arange(0, 60, 0.01)
+    gyro = channel("yaw_rate_rad_s", T0 + np.round((t - 0.05) * 1e9), Drive(t).r, SIGNAL_UNITS, "/imu")
+    estimate = estimate_truth_latency(gyro, derived)
+    assert estimate.reliable, estimate.reason
+    assert abs(estimate.latency_s - 0.05) < 1e-3
 
 
 # ---- dependence ----

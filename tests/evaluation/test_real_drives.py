@@ -1,0 +1,126 @@
+"""Recorded drives: alignment and truth reproduce the figures that the data's description gives for them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.alignment import align, plan_alignment
+from pdhef_logtool.evaluation.segments import smooth
+from pdhef_logtool.evaluation.truth import (
+    Attitude,
+    dependent_signals,
+    derive_truth,
+    estimate_truth_latency,
+    plan_truth,
+    truth_at,
+    yaw_rate_channel,
+)
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import fit_clocks, load_mapping, read_signals
+from pdhef_logtool.vehicle import load_vehicle
+
+REFERENCE = Path(__file__).resolve().parents[1] / "reference"
+DRIVES = {
+    "revs_250lm_a.mcap": ("revs_250lm", "revs_250lm"),
+    "f1tenth_hoons_run2.bag": ("f1tenth", "f1tenth"),
+    "f1tenth_xray_run24.bag": ("f1tenth", "f1tenth"),
+    "comma2k19_segment.mcap": ("comma2k19", "comma2k19_rav4"),
+    "lunda_v40": ("lunda_v40", "lunda_v40"),
+}
+
+
+@pytest.fixture(scope="module")
+def drive(shared_dir):
+    done = {}
+
+    def read(name):
+        if name not in done:
+            mapping_name, vehicle_name = DRIVES[name]
+            log = open_log(shared_dir / "data" / "drives" / name)
+            mapping = load_mapping(REFERENCE / "mappings" / f"{mapping_name}.toml")
+            clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+            channels = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+            log.close()
+            done[name] = channels, load_vehicle(REFERENCE / "vehicles" / f"{vehicle_name}.toml")
+        return done[name]
+
+    return read
+
+
+def aligned(channels, vehicle):
+    plan = plan_alignment(
+        channels.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
+    )
+    starts = [int(c.stamps_ns[0]) for c in channels.signals.values()]
+    ends = [int(c.stamps_ns[-1]) for c in channels.signals.values()]
+    return align(channels.signals, plan, min(starts), max(ends) + 1)
+
+
+@pytest.mark.parametrize(
+    ("name", "bias", "rms"),
+    [
+        ("revs_250lm_a.mcap", 0.03, 0.28),
+        ("f1tenth_hoons_run2.bag", -0.18, 0.62),
+        ("f1tenth_xray_run24.bag", -0.14, 0.43),
+    ],
+)
+def test_measured_against_derived_lateral_acceleration(drive, name, bias, rms):
+    channels, vehicle = drive(name)
+    signals = aligned(channels, vehicle)
+    truth = truth_at(derive_truth(channels.truth), signals.stamps_ns)
+    t = signals.stamps_ns
+    residual = smooth(t, signals.ay_m_s2, 4.0) - smooth(t, truth.ay_m_s2, 4.0)
+    residual = residual[np.isfinite(residual)]
+    assert residual.mean() == pytest.approx(bias, abs=0.03)
+    assert np.sqrt(np.mean(residual**2)) == pytest.approx(rms, rel=0.25)
+
+
+def test_the_250_lm_knows_its_speed_and_yaw_rate(drive):
+    channels, vehicle = drive("revs_250lm_a.mcap")
+    assert set(dependent_signals(channels.signals, channels.truth)) == {"vx_m_s", "yaw_rate_rad_s"}
+    latency = estimate_truth_latency(channels.signals["yaw_rate_rad_s"], yaw_rate_channel(derive_truth(channels.truth)))
+    assert latency.identical
+    assert latency.latency_s == 0.0
+    signals = aligned(channels, vehicle)
+    assert len(signals) == 30000
+    assert np.isfinite(signals.speed_m_s).all()
+    truth = truth_at(derive_truth(channels.truth), signals.stamps_ns)
+    assert np.rad2deg([np.nanmin(truth.sideslip_rad), np.nanmax(truth.sideslip_rad)]) == pytest.approx(
+        [-5.3, 3.5], abs=0.05
+    )
+
+
+@pytest.mark.parametrize("name", ["f1tenth_hoons_run2.bag", "comma2k19_segment.mcap", "lunda_v40"])
+def test_other_truths_are_independent(drive, name):
+    channels, _ = drive(name)
+    assert dependent_signals(channels.signals, channels.truth) == {}
+
+
+def test_the_phones_velocity_is_turned_into_the_car(drive):
+    channels, vehicle = drive("comma2k19_segment.mcap")
+    plan = plan_truth(channels.truth)
+    assert plan.attitude == Attitude("ECEF", "FLU")
+    signals = aligned(channels, vehicle)
+    truth = truth_at(derive_truth(channels.truth, plan=plan), signals.stamps_ns)
+    assert np.nanmean(truth.vx_m_s) == pytest.approx(16.83, abs=0.1)
+    assert np.nanmean(truth.vy_m_s) == pytest.approx(-0.24, abs=0.02)
+    both = np.isfinite(truth.vx_m_s) & np.isfinite(signals.speed_m_s)
+    speed = np.hypot(truth.vx_m_s[both], truth.vy_m_s[both])
+    assert np.sqrt(np.mean((speed - signals.speed_m_s[both]) ** 2)) < 0.25
+
+
+def test_the_v40s_velocities_are_moved_by_the_stated_lever_arm(drive):
+    channels, vehicle = drive("lunda_v40")
+    truth = derive_truth(channels.truth, truth_position_m=vehicle.truth_position_m)
+    track = truth.track
+    known = np.isfinite(track.vy_m_s)
+    assert known.sum() > 2000
+    moved = np.interp(track.stamps_ns, channels.truth["vy_m_s"].stamps_ns, channels.truth["vy_m_s"].values)
+    np.testing.assert_allclose(track.vy_m_s[known], (moved + 0.32 * track.yaw_rate_rad_s)[known], atol=1e-9)
+    gap = np.diff(track.stamps_ns) > 2e9
+    assert gap.sum() == 1
+    inside = truth_at(truth, track.stamps_ns[:-1][gap] + 1_000_000_000)
+    assert not inside.valid.any()
