@@ -27,50 +27,6 @@ class Event:
     text: str
 
 
-class MetricRowLike(Protocol):
-    """One figure, as :class:`pdhef_logtool.evaluation.metrics.MetricRow` holds it; NaN when not computable."""
-
-    @property
-    def log(self) -> str:
-        """Stem of the log."""
-        ...
-
-    @property
-    def estimator(self) -> str:
-        """Name of the estimator."""
-        ...
-
-    @property
-    def signal(self) -> str:
-        """Scored signal."""
-        ...
-
-    @property
-    def segment(self) -> str:
-        """Part of the drive."""
-        ...
-
-    @property
-    def metric(self) -> str:
-        """Name of the figure."""
-        ...
-
-    @property
-    def value(self) -> float:
-        """The figure in ``unit``."""
-        ...
-
-    @property
-    def unit(self) -> str:
-        """Unit of the figure."""
-        ...
-
-    @property
-    def n(self) -> int:
-        """Number of samples behind it."""
-        ...
-
-
 class Sink(Protocol):
     """One output of one log, fed window by window.
 

@@ -12,8 +12,9 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from pdhef_logtool.errors import OutputError
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.signals import FloatArray, Signals
-from pdhef_logtool.sinks.base import Event, MetricRowLike, PendingFile
+from pdhef_logtool.sinks.base import Event, PendingFile
 from pdhef_logtool.sinks.schema import arrow_schema
 from pdhef_logtool.tracks import TRACK_COLUMNS, StateTrack, make_track
 
@@ -212,7 +213,7 @@ def _open(path: Path) -> pq.ParquetFile:
         ) from error
 
 
-def write_metrics(path: Path, rows: Sequence[MetricRowLike]) -> None:
+def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
     arrays = [pa.array([getattr(r, f.name) for r in rows], type=f.type, from_pandas=True) for f in schema]
@@ -221,6 +222,29 @@ def write_metrics(path: Path, rows: Sequence[MetricRowLike]) -> None:
             pq.write_table(pa.Table.from_arrays(arrays, schema=schema), pending.path, compression="zstd")
         except OSError as error:
             raise _cannot_write(path, error) from error
+
+
+def read_metrics(path: Path) -> list[MetricRow]:
+    """Read a metrics.parquet; null becomes NaN, rows marked ``not_independent`` are so again; raises OutputError."""
+    schema = arrow_schema("metrics.parquet.json")
+    with _open(path) as file:
+        absent = set(schema.names) - set(file.schema_arrow.names)
+        if absent:
+            raise OutputError(
+                expected="a metrics.parquet",
+                got=f"a Parquet file without {', '.join(sorted(absent))}",
+                where=str(path),
+                remedy="run the logs again",
+            )
+        records = file.read(columns=schema.names).to_pylist()
+    dependent = {(r["log"], r["estimator"], r["signal"]) for r in records if r["metric"] == "not_independent"}
+    return [
+        MetricRow(
+            **{**r, "value": float("nan") if r["value"] is None else r["value"]},
+            independent=(r["log"], r["estimator"], r["signal"]) not in dependent,
+        )
+        for r in records
+    ]
 
 
 def _cannot_write(target: Path, error: OSError) -> OutputError:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.signals import Loss
-from pdhef_logtool.sinks.base import Event, MetricRowLike, write_bytes
+from pdhef_logtool.sinks.base import Event, write_bytes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,7 +94,7 @@ class ReportFacts:
     vehicle_sha256: str
     estimators: Sequence[EstimatorFacts]
     truth: TruthFacts
-    metrics: Sequence[MetricRowLike] = ()
+    metrics: Sequence[MetricRow] = ()
     segments: Sequence[Event] = ()
     losses: Sequence[Loss] = ()
     warnings: Sequence[str] = ()

@@ -352,7 +352,8 @@ class _Trajectory:
 
 
 def _event_text(event: Event) -> str:
-    return f"{event.name}, {(event.end_ns - event.start_ns) * 1e-9:.2f} s: {event.text}"
+    head = f"{event.name}, {(event.end_ns - event.start_ns) * 1e-9:.2f} s"
+    return f"{head}: {event.text}" if event.text else head
 
 
 def _blueprint() -> rrb.Blueprint:

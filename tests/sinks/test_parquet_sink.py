@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,9 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from pdhef_logtool.errors import OutputError
-from pdhef_logtool.sinks.parquet import EstimatesSink, list_estimators, read_track, write_metrics
-from pdhef_logtool.tracks import concatenate
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.sinks.parquet import EstimatesSink, list_estimators, read_metrics, read_track, write_metrics
+from pdhef_logtool.tracks import concatenate, make_track
 
 ESTIMATE_COLUMNS = {
     "stamp_ns": pl.Int64,
@@ -253,21 +254,9 @@ def test_empty_log_gives_an_empty_table(tmp_path):
     assert pl.read_parquet(path).schema.names() == list(ESTIMATE_COLUMNS)
 
 
-@dataclass(frozen=True)
-class Row:
-    log: str
-    estimator: str
-    signal: str
-    segment: str
-    metric: str
-    value: float
-    unit: str
-    n: int
-
-
 ROWS = [
-    Row("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600),
-    Row("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
+    MetricRow("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600),
+    MetricRow("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
 ]
 
 
@@ -281,3 +270,21 @@ def test_polars_reads_the_metrics(tmp_path):
         ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0),
     ]
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.parquet"]
+
+
+def test_metrics_come_back(tmp_path):
+    path = tmp_path / "metrics.parquet"
+    marked = [
+        MetricRow("drive", "phy-ukf", "vx_m_s", "all", "rmse", 0.1, "m/s", 600, independent=False),
+        MetricRow("drive", "phy-ukf", "vx_m_s", "all", "not_independent", 1.0, "1", 600, independent=False),
+    ]
+    write_metrics(path, ROWS + marked)
+    rows = read_metrics(path)
+    assert np.isnan(rows[1].value)
+    assert [replace(r, value=0.0) for r in rows] == [replace(r, value=0.0) for r in ROWS + marked]
+    assert [r.value for r in rows if r.n] == [0.0123, 0.1, 1.0]
+    write_metrics(path, [])
+    assert read_metrics(path) == []
+    with pytest.raises(OutputError, match=r"expected a metrics\.parquet"):
+        write(tmp_path / "estimates.parquet", lambda *a: make_track("zero", np.arange(2)))
+        read_metrics(tmp_path / "estimates.parquet")

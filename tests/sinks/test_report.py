@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 import jsonschema
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.errors import OutputError
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.signals import Loss
 from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.report import (
@@ -29,18 +29,6 @@ from pdhef_logtool.sinks.report import (
 from pdhef_logtool.sinks.schema import load_schema
 
 SHA = "ab" * 32
-
-
-@dataclass(frozen=True)
-class Row:
-    log: str
-    estimator: str
-    signal: str
-    segment: str
-    metric: str
-    value: float
-    unit: str
-    n: int
 
 
 def facts(**changes) -> ReportFacts:
@@ -68,8 +56,8 @@ def facts(**changes) -> ReportFacts:
             not_independent=["yaw_rate_rad_s"],
         ),
         "metrics": [
-            Row("drive", "phy-ukf", "sideslip_rad", "all", "rmse", np.deg2rad(0.5), "rad", 990),
-            Row("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
+            MetricRow("drive", "phy-ukf", "sideslip_rad", "all", "rmse", np.deg2rad(0.5), "rad", 990),
+            MetricRow("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
         ],
         "segments": [Event("nonlinear", 1, 2, "|ay| above 0.5 g")],
         "losses": [Loss(kind="gap", what="0.4 s without samples", where="/imu", start_ns=5, end_ns=6, count=1)],

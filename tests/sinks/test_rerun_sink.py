@@ -34,7 +34,7 @@ REPORT = {
 }
 EVENTS = (
     Event("nonlinear", START_NS + 10**9, START_NS + 3 * 10**9, "|ay| above 0.5 g"),
-    Event("start", START_NS, START_NS + 1, "first stamp"),
+    Event("start", START_NS, START_NS + 1, ""),
 )
 
 #: Every entity of the recording of two windows of 300 stamps of phy-ukf, zero and truth, with its number of rows.
@@ -225,7 +225,7 @@ def test_events_and_report_are_text(recording):
     timed, static = tables(recording)
     order = np.argsort(timed["/events"]["time"].to_numpy())
     texts = [timed["/events"]["TextLog:text"].to_pylist()[i][0] for i in order]
-    assert texts == ["start, 0.00 s: first stamp", "nonlinear, 2.00 s: |ay| above 0.5 g"]
+    assert texts == ["start, 0.00 s", "nonlinear, 2.00 s: |ay| above 0.5 g"]
     (batch,) = static["/report"]
     assert batch["TextDocument:media_type"].to_pylist() == [["text/markdown"]]
     assert batch["TextDocument:text"].to_pylist()[0][0].startswith("# drive\n")
