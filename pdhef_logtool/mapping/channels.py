@@ -18,14 +18,14 @@ GATE_HOLD_PERIODS = 2.0
 #: How much earlier or later than the truth a gate message with the same stamp may be recorded.
 GATE_MARGIN_NS = 2_000_000_000
 
-#: What a loss of each kind says; counts and spans stand beside it.
+#: What one loss of each kind says; how many there are, and when, stands beside it.
 LOSS_TEXTS = {
-    "bad-stamp": "messages without a usable stamp (zero, negative or not a number) were dropped",
-    "nan": "samples that are not a number were dropped",
-    "out-of-range": "samples outside valid_min and valid_max were dropped",
-    "duplicate-stamp": "messages that repeat the stamp of another were dropped, the first to arrive was kept",
-    "out-of-order": "messages were recorded after later ones and sorted back by stamp",
-    "truth-quality": "truth samples that the quality gate rejects were dropped",
+    "bad-stamp": "message without a usable stamp (zero, negative or not a number) dropped",
+    "nan": "sample that is not a number dropped",
+    "out-of-range": "sample outside valid_min and valid_max dropped",
+    "duplicate-stamp": "message that repeats the stamp of another dropped, the first to arrive kept",
+    "out-of-order": "message recorded after a later one, sorted back by stamp",
+    "truth-quality": "truth sample that the quality gate rejects dropped",
     "delay-unknown": "log time is not 0 to 1 s after the stamps: the delay is unknown, arrival is taken as the stamp",
 }
 LOST_KINDS = frozenset({"nan", "bad-stamp"})

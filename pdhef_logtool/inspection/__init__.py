@@ -1,0 +1,30 @@
+"""What a log holds, how it maps to signals, and whether that makes sense."""
+
+from __future__ import annotations
+
+from pdhef_logtool.inspection.plausibility import PlausibilityWarning, plausibility_warnings
+from pdhef_logtool.inspection.rendering import render_inspection
+from pdhef_logtool.inspection.report import (
+    ClockReport,
+    Inspection,
+    SignalReport,
+    TopicReport,
+    inspect_drive_log,
+    inspect_log,
+    mapping_comments,
+    write_mapping,
+)
+
+__all__ = [
+    "ClockReport",
+    "Inspection",
+    "PlausibilityWarning",
+    "SignalReport",
+    "TopicReport",
+    "inspect_drive_log",
+    "inspect_log",
+    "mapping_comments",
+    "plausibility_warnings",
+    "render_inspection",
+    "write_mapping",
+]

@@ -1,0 +1,143 @@
+"""An inspection as tables for a terminal of 80 columns or more."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from pdhef_logtool.inspection.report import Inspection, SignalReport, TopicReport
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def render_inspection(inspection: Inspection, console: Console) -> None:
+    """Print an inspection: topics, signals and truth, what is missing, and everything to look at."""
+    start = datetime.fromtimestamp(inspection.start_ns * 1e-9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    messages = sum(t.messages for t in inspection.topics)
+    console.print(f"[bold]{escape(inspection.path)}[/]", soft_wrap=True)
+    console.print(
+        f"{inspection.kind}, {inspection.duration_s:.1f} s from {start}, {messages} messages on "
+        f"{len(inspection.topics)} topics"
+    )
+    if inspection.topics:
+        console.print(_topics_table(inspection.topics))
+    if inspection.signals or inspection.truth:
+        console.print(_sources_table(inspection))
+        console.print(_statistics_table(inspection))
+    for head, style, text in _findings(inspection):
+        line = Table.grid(padding=(0, 1))
+        line.add_column(width=9)
+        line.add_column(overflow="fold")
+        line.add_row(f"[{style}]{head}[/]", escape(text))
+        console.print(line)
+
+
+def _table(title: str, *headings: str, words: int) -> Table:
+    """Return an empty table whose first ``words`` columns hold text and the others numbers."""
+    table = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        padding=(0, 1, 0, 0),
+    )
+    for i, heading in enumerate(headings):
+        if i < words:
+            table.add_column(heading, overflow="fold")
+        else:
+            table.add_column(heading, justify="right", no_wrap=True)
+    return table
+
+
+def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
+    encodings = sorted({t.encoding for t in topics})
+    headings = ("topic\n[dim]type[/]", "count", "Hz", "jitter\nms", "longest gap\ns @ s", "delay\nms")
+    table = _table(f"Topics ({escape(', '.join(encodings))})", *headings, words=1)
+    for topic in topics:
+        gap = "-"
+        if math.isfinite(topic.largest_gap_s):
+            gap = f"{_text(topic.largest_gap_s)} @ {topic.largest_gap_at_s:.1f}"
+        delay, late = _text(topic.delay_median_s * 1e3), _text(topic.delay_p95_s * 1e3)
+        kind = topic.type.replace("/msg/", "/") + (f" ({topic.encoding})" if len(encodings) > 1 else "")
+        table.add_row(
+            f"{escape(topic.name)}\n[dim]{escape(kind)}[/]",
+            str(topic.messages),
+            _text(topic.rate_hz),
+            _text(topic.jitter_p95_s * 1e3),
+            gap,
+            delay if delay == late else f"{delay} to {late}",
+        )
+    return table
+
+
+def _sources_table(inspection: Inspection) -> Table:
+    origin = "recognised types" if inspection.mapping.origin == "auto" else "mapping file"
+    table = _table(f"Mapping ({origin})", "signal", "topic", "field", words=3)
+    for section in (inspection.signals, inspection.truth):
+        for report in section.values():
+            table.add_row(report.name, escape(report.topic), escape(report.field))
+        if section is inspection.signals and inspection.truth:
+            table.add_row("[bold]truth[/]", "", "")
+    return table
+
+
+def _statistics_table(inspection: Inspection) -> Table:
+    headings = ("signal", "Hz", "delay\nms", "min", "mean", "max", "std", "gaps", "drop")
+    table = _table("Values in SI units", *headings, words=1)
+    for section in (inspection.signals, inspection.truth):
+        for report in section.values():
+            table.add_row(*_statistics_row(report))
+        if section is inspection.signals and inspection.truth:
+            table.add_row("[bold]truth[/]", *[""] * 8)
+    return table
+
+
+def _statistics_row(report: SignalReport) -> tuple[str, ...]:
+    return (
+        report.name,
+        _text(report.rate_hz),
+        _text(report.latency_s * 1e3),
+        _text(report.minimum),
+        _text(report.mean),
+        _text(report.maximum),
+        _text(report.std),
+        str(report.gaps) if report.gaps else "-",
+        str(sum(report.dropped.values())) if any(report.dropped.values()) else "-",
+    )
+
+
+def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
+    """Return what to look at: a heading, its style and the text."""
+    found: list[tuple[str, str, str]] = []
+    if inspection.missing:
+        found.append(("missing", "yellow", ", ".join(inspection.missing)))
+    if not inspection.truth:
+        found.append(("missing", "yellow", "truth: nothing to score an estimate against"))
+    found += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
+    found += [("warning", "red", str(w)) for w in inspection.warnings]
+    for loss in inspection.lost:
+        facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
+        if loss.start_ns is not None:
+            until = "" if loss.end_ns is None else f" to {(loss.end_ns - inspection.start_ns) * 1e-9:.2f} s"
+            facts.append(f"from {(loss.start_ns - inspection.start_ns) * 1e-9:.2f} s{until}")
+        head, style = ("lost", "red") if loss.severity == "lost" else ("note", "cyan")
+        found.append((head, style, f"{loss.where}: {loss.what}{' (' + ', '.join(facts) + ')' if facts else ''}"))
+    found += [("note", "cyan", n) for n in inspection.notes]
+    if inspection.mapping.quality is not None:
+        found.append(("note", "cyan", f"truth is used where {inspection.mapping.quality.describe()}"))
+    return found
+
+
+def _text(value: float) -> str:
+    if not math.isfinite(value):
+        return "-"
+    if value == 0.0:
+        return "0"
+    return f"{value:.3g}" if 1e-4 <= abs(value) < 1e4 else f"{value:.1e}"

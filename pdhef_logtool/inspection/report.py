@@ -1,0 +1,428 @@
+"""Look a log through: topics, rates, gaps, clocks, what maps to which signal, what is missing, what is implausible."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.errors import OutputError
+from pdhef_logtool.inspection.plausibility import GRID_S, PlausibilityWarning, plausibility_warnings
+from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import (
+    Ambiguity,
+    ClockModel,
+    MappedChannels,
+    Mapping,
+    QualityGate,
+    SignalSource,
+    auto_map,
+    check_mapping,
+    clock_key,
+    fit_clocks,
+    mapping_to_toml,
+    merge_losses,
+    read_signals,
+    resolve_mapping,
+)
+from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
+
+WINDOW_NS = 600_000_000_000
+#: Kinds of loss that are counted by topic and concern all its signals.
+TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
+#: Topics with more number fields than this are listed in part.
+MAX_LISTED_FIELDS = 40
+#: A device clock whose envelope leaves the fitted line by more has stepped or bent.
+CLOCK_RESIDUAL_S = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class TopicReport:
+    """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be said.
+
+    ``delay_*`` are of log time − publish time, which equals zero where a recorder knows one time only.
+    """
+
+    name: str
+    type: str
+    encoding: str
+    messages: int
+    rate_hz: float
+    jitter_p95_s: float
+    largest_gap_s: float
+    largest_gap_at_s: float
+    delay_median_s: float
+    delay_p95_s: float
+    delay_drift_ppm: float
+    delay_negative_share: float
+    fields: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockReport:
+    """The stamps that mapped signals use, against log time."""
+
+    topic: str
+    stamp: str
+    clock: str
+    delay_median_s: float
+    delay_p95_s: float
+    delay_min_s: float
+    drift_ppm: float
+    residual_s: float
+    delay_known: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SignalReport:
+    """One mapped signal in SI units, cleaned. Vectors have NaN statistics.
+
+    ``gaps`` counts steps of more than 5 median steps and 0.1 s; ``dropped`` samples by kind.
+    """
+
+    name: str
+    unit: str
+    topic: str
+    field: str
+    samples: int
+    rate_hz: float
+    latency_s: float
+    mean: float
+    std: float
+    minimum: float
+    maximum: float
+    gaps: int
+    largest_gap_s: float
+    largest_gap_at_s: float
+    dropped: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Inspection:
+    """All that :func:`inspect_log` found.
+
+    Attributes
+    ----------
+    kind : of log. start_ns, end_ns : log time, [start, end).
+    signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
+    ambiguities, notes : of the mapping. warnings : contradictions with physics. lost : every loss and note of reading.
+    """
+
+    path: str
+    kind: str
+    start_ns: int
+    end_ns: int
+    topics: tuple[TopicReport, ...]
+    clocks: tuple[ClockReport, ...]
+    mapping: Mapping
+    signals: dict[str, SignalReport]
+    truth: dict[str, SignalReport]
+    missing: tuple[str, ...]
+    ambiguities: tuple[Ambiguity, ...]
+    notes: tuple[str, ...]
+    warnings: tuple[PlausibilityWarning, ...]
+    lost: tuple[Loss, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the log."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def is_partial(self) -> bool:
+        """Return whether data that the log should have held is gone (exit code 3)."""
+        return any(loss.severity == "lost" for loss in self.lost)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``pdhef inspect --json`` prints; NaN and infinities become None."""
+        document = {
+            "path": self.path,
+            "kind": self.kind,
+            "start_ns": self.start_ns,
+            "end_ns": self.end_ns,
+            "duration_s": self.duration_s,
+            "topics": [asdict(t) for t in self.topics],
+            "clocks": [asdict(c) for c in self.clocks],
+            "mapping_origin": self.mapping.origin,
+            "signals": {n: asdict(s) for n, s in self.signals.items()},
+            "truth": {n: asdict(s) for n, s in self.truth.items()},
+            "truth_quality": None if self.mapping.quality is None else self.mapping.quality.describe(),
+            "missing": list(self.missing),
+            "ambiguities": [asdict(a) for a in self.ambiguities],
+            "notes": list(self.notes),
+            "warnings": [asdict(w) for w in self.warnings],
+            "lost": [asdict(loss) for loss in self.lost],
+        }
+        return {key: _json_value(value) for key, value in document.items()}
+
+
+def inspect_log(path: Path, mapping: Mapping | None = None) -> Inspection:
+    """Read a log once through and report on it; without a mapping the well-known types are recognised.
+
+    Memory is bounded by windows of ten minutes, whatever the log's length.
+
+    Raises
+    ------
+    LogError
+        The file is no log.
+    MappingError
+        The mapping names what the log does not hold.
+    """
+    log = open_log(path)
+    try:
+        return inspect_drive_log(log, mapping)
+    finally:
+        log.close()
+
+
+def inspect_drive_log(log: DriveLog, given: Mapping | None = None) -> Inspection:
+    """Do what :func:`inspect_log` does with a log that is open already."""
+    ambiguities: tuple[Ambiguity, ...] = ()
+    if given is None:
+        auto = auto_map(log)
+        mapping, ambiguities = auto.mapping, auto.ambiguities
+    else:
+        check_mapping(given, log)
+        mapping = given
+    mapping = resolve_mapping(log, mapping)
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    steps = {t.name: StepStatistics() for t in log.topics}
+    delays = {t.name: DelayStatistics() for t in log.topics}
+    gathered: dict[tuple[str, str], _Gathered] = {}
+    thinned: dict[str, list[Channel]] = {name: [] for name in mapping.signals}
+    losses: list[tuple[Loss, ...]] = []
+    for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS):
+        for name, columns in log.read_stamps(start, end).items():
+            steps[name].add(columns.log_time_ns)
+            delays[name].add(columns.log_time_ns, columns.publish_time_ns)
+        channels = read_signals(log, mapping, clocks, start, end)
+        losses.append(channels.losses)
+        _gather(channels, gathered)
+        for name, channel in channels.signals.items():
+            thinned[name].append(_thin(channel))
+    reading = merge_losses(losses)
+    signals = {
+        n: _signal_report(s, "signals", gathered, clocks, reading, log, None) for n, s in mapping.signals.items()
+    }
+    truth = {
+        n: _signal_report(s, "truth", gathered, clocks, reading, log, mapping.quality) for n, s in mapping.truth.items()
+    }
+    return Inspection(
+        path=str(log.path),
+        kind=log.kind,
+        start_ns=log.start_ns,
+        end_ns=log.end_ns,
+        topics=tuple(_topic_report(t, steps[t.name], delays[t.name], log) for t in log.topics),
+        clocks=tuple(_clock_report(s, clocks[clock_key(s)]) for s in _one_per_clock(mapping.sources())),
+        mapping=mapping,
+        signals=signals,
+        truth=truth,
+        missing=missing_signals(mapping),
+        ambiguities=ambiguities,
+        notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
+        warnings=plausibility_warnings({n: _joined(parts) for n, parts in thinned.items() if parts}),
+        # Last, since a log knows all its losses only after it was read through.
+        lost=merge_losses([log.lost, reading]),
+    )
+
+
+# ---------------------------------------------------------------------------------------------- gathering
+
+
+@dataclass(slots=True)
+class _Gathered:
+    steps: StepStatistics
+    values: ValueStatistics
+
+
+def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]) -> None:
+    for section, found in (("signals", channels.signals), ("truth", channels.truth)):
+        for name, channel in found.items():
+            entry = gathered.setdefault((section, name), _Gathered(StepStatistics(), ValueStatistics()))
+            stamps = channel.stamps_ns
+            if entry.steps.last_ns is not None:
+                # Stamps at the seam of two windows may be out of order by the jitter of their delays.
+                stamps = stamps[stamps > entry.steps.last_ns]
+            entry.steps.add(stamps)
+            if channel.values.ndim == 1:
+                entry.values.add(channel.values)
+
+
+def _thin(channel: Channel) -> Channel:
+    """Average a channel within the cells of the plausibility checks' grid, so that hours of it fit into memory."""
+    cell_ns = int(GRID_S * 1e9)
+    cells, first, count = np.unique(channel.stamps_ns // cell_ns, return_index=True, return_counts=True)
+    total = np.add.reduceat(channel.values, first, axis=0) if first.shape[0] else channel.values
+    stamps = cells * cell_ns + cell_ns // 2
+    return replace(channel, stamps_ns=stamps, arrival_ns=stamps, values=total / count if count.shape[0] else total)
+
+
+def _joined(parts: list[Channel]) -> Channel:
+    """Join thinned windows; the cell at a seam may come twice and is averaged later."""
+    stamps = np.concatenate([p.stamps_ns for p in parts])
+    values = np.concatenate([p.values for p in parts])
+    return replace(parts[0], stamps_ns=stamps, arrival_ns=stamps, values=values)
+
+
+# ------------------------------------------------------------------------------------------------ reports
+
+
+def _topic_report(topic: TopicInfo, steps: StepStatistics, delays: DelayStatistics, log: DriveLog) -> TopicReport:
+    largest = steps.largest
+    numbers = tuple(f.path for f in log.fields(topic.name) if f.kind in ("number", "bool"))
+    return TopicReport(
+        name=topic.name,
+        type=topic.type_name,
+        encoding=topic.encoding,
+        messages=topic.messages,
+        rate_hz=_inverse(steps.median_s),
+        jitter_p95_s=steps.jitter_p95_s,
+        largest_gap_s=largest[0] if largest else float("nan"),
+        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),
+        delay_median_s=delays.quantile(0.5),
+        delay_p95_s=delays.quantile(0.95),
+        delay_drift_ppm=delays.drift_ppm,
+        delay_negative_share=delays.negative / delays.count if delays.count else float("nan"),
+        fields=numbers[:MAX_LISTED_FIELDS],
+    )
+
+
+def _signal_report(
+    source: SignalSource,
+    section: str,
+    gathered: dict[tuple[str, str], _Gathered],
+    clocks: dict[str, ClockModel],
+    losses: Iterable[Loss],
+    log: DriveLog,
+    quality: QualityGate | None,
+) -> SignalReport:
+    entry = gathered.get((section, source.name), _Gathered(StepStatistics(), ValueStatistics()))
+    gaps = entry.steps.gaps()
+    largest = max(gaps, key=lambda g: g[0]) if gaps else None
+    known = entry.values.count > 0
+    own = {f"{source.name} ({source.label})"}
+    if section == "truth" and quality is not None:
+        own.add(f"{source.name} ({quality.describe()})")
+    dropped = {x.kind: x.count or 0 for x in losses if x.where in own}
+    # Messages that were sorted back are used.
+    dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.topic and x.kind in TOPIC_DROPS}
+    clock = clocks[clock_key(source)]
+    return SignalReport(
+        name=source.name,
+        unit=(SIGNAL_UNITS if section == "signals" else TRUTH_UNITS)[source.name],
+        topic=source.topic,
+        field=source.field if isinstance(source.field, str) else ", ".join(source.field),
+        samples=entry.steps.count,
+        rate_hz=_inverse(entry.steps.median_s),
+        latency_s=clock.median_delay_s + source.latency_s,
+        mean=entry.values.mean if known else float("nan"),
+        std=entry.values.std,
+        minimum=entry.values.low if known else float("nan"),
+        maximum=entry.values.high if known else float("nan"),
+        gaps=len(gaps),
+        largest_gap_s=largest[0] if largest else float("nan"),
+        largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),
+        dropped=dropped,
+    )
+
+
+def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
+    return ClockReport(
+        topic=source.topic,
+        stamp=source.stamp,
+        clock=source.clock,
+        delay_median_s=clock.median_delay_s,
+        delay_p95_s=clock.p95_delay_s,
+        delay_min_s=clock.min_delay_s,
+        drift_ppm=clock.drift * 1e6,
+        residual_s=clock.residual_s,
+        delay_known=clock.delay_known,
+    )
+
+
+def _one_per_clock(sources: Iterable[SignalSource]) -> list[SignalSource]:
+    found: dict[str, SignalSource] = {}
+    for source in sources:
+        found.setdefault(clock_key(source), source)
+    return list(found.values())
+
+
+def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
+    notes = []
+    for source in _one_per_clock(mapping.sources()):
+        clock = clocks[clock_key(source)]
+        if source.clock == "device" and clock.residual_s > CLOCK_RESIDUAL_S:
+            notes.append(
+                f"the clock of {clock_key(source)} leaves its fitted line by {clock.residual_s * 1e3:.0f} ms: "
+                "it stepped, or its drift changed"
+            )
+    return notes
+
+
+def _inverse(seconds: float) -> float:
+    return 1.0 / seconds if math.isfinite(seconds) and seconds > 0.0 else float("nan")
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _json_value(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_json_value(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+# ------------------------------------------------------------------------------------------------ mapping
+
+
+def mapping_comments(inspection: Inspection) -> dict[str, str]:
+    """Return comments for :func:`pdhef_logtool.mapping.mapping_to_toml` that help to edit the mapping."""
+    types = {t.name: t.type for t in inspection.topics}
+    comments: dict[str, str] = {}
+    for name, report in {**inspection.truth, **inspection.signals}.items():
+        text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
+        if math.isfinite(report.minimum):
+            text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
+        warned = [w.message for w in inspection.warnings if name in (w.suspects or w.signals)]
+        comments[name] = "\n".join([text, *(f"WARNING: {w}" for w in warned)])
+    head = [f"Written from {Path(inspection.path).name}."]
+    head += [f"Ambiguous: {a}" for a in inspection.ambiguities]
+    mapped = set(inspection.mapping.topics)
+    unmapped = [t for t in inspection.topics if t.name not in mapped and t.fields and t.messages]
+    if unmapped and (inspection.missing or not inspection.truth):
+        head.append("Topics with numbers that no signal uses:")
+        head += [f"  {t.name} ({t.type}): {', '.join(t.fields[:12])}" for t in unmapped[:50]]
+    comments[""] = "\n".join(head)
+    return comments
+
+
+def write_mapping(inspection: Inspection, path: Path) -> None:
+    """Write the inspection's mapping as a TOML file that is ready to edit.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    text = mapping_to_toml(inspection.mapping, comments=mapping_comments(inspection))
+    unfinished = path.with_name(f".{path.name}.part")
+    try:
+        unfinished.write_text(text, encoding="utf-8", newline="\n")
+        unfinished.replace(path)
+    except OSError as error:
+        unfinished.unlink(missing_ok=True)
+        raise OutputError(
+            expected="a mapping file that can be written", got=error.strerror or str(error), where=str(path)
+        ) from None
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "?"

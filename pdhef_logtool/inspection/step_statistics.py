@@ -1,0 +1,141 @@
+"""Rates, gaps, jitter and delays of a stream of times, gathered window by window in bounded memory."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pdhef_logtool.signals import FloatArray, IntArray
+
+#: Each window adds at most this many values to the quantiles; counts, extremes and gaps see all of them.
+KEPT_PER_WINDOW = 20_000
+#: A gap is more than this many median steps, and more than ``MIN_GAP_S``.
+GAP_PERIODS = 5.0
+MIN_GAP_S = 0.1
+
+
+@dataclass(slots=True)
+class StepStatistics:
+    """Steps of one stream of ascending times.
+
+    Attributes
+    ----------
+    count : times seen. steps_s : a thinned sample of the steps. long_steps : the longest steps with their starts.
+    """
+
+    count: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+    steps_s: list[FloatArray] = field(default_factory=list)
+    long_steps: list[tuple[float, int]] = field(default_factory=list)
+
+    def add(self, times_ns: IntArray) -> None:
+        """Add the next window's times, int64 [N], ascending."""
+        if times_ns.shape[0] == 0:
+            return
+        self.count += int(times_ns.shape[0])
+        self.first_ns = int(times_ns[0]) if self.first_ns is None else self.first_ns
+        joined = times_ns if self.last_ns is None else np.concatenate([[np.int64(self.last_ns)], times_ns])
+        self.last_ns = int(times_ns[-1])
+        steps = np.diff(joined) * 1e-9
+        if steps.shape[0] == 0:
+            return
+        self.steps_s.append(thin(steps))
+        # All steps that can count as gaps once the median is known, the longest first, within bounds.
+        longest = np.argsort(-steps, kind="stable")[:1000]
+        longest = longest[steps[longest] > MIN_GAP_S]
+        self.long_steps += [(float(steps[i]), int(joined[i])) for i in longest]
+
+    @property
+    def median_s(self) -> float:
+        """Median step; NaN with fewer than two times."""
+        steps = self._steps()
+        return float(np.median(steps)) if steps.shape[0] else float("nan")
+
+    @property
+    def jitter_p95_s(self) -> float:
+        """95th percentile of |step − median|; NaN with fewer than two times."""
+        steps = self._steps()
+        return float(np.quantile(np.abs(steps - np.median(steps)), 0.95)) if steps.shape[0] else float("nan")
+
+    @property
+    def largest(self) -> tuple[float, int] | None:
+        """Longest step above ``MIN_GAP_S`` and where it starts."""
+        return max(self.long_steps, key=lambda s: s[0]) if self.long_steps else None
+
+    def gaps(self) -> list[tuple[float, int]]:
+        """Return the steps that are gaps: their length in s and start in ns, in time order."""
+        limit = max(MIN_GAP_S, GAP_PERIODS * self.median_s)
+        return sorted((s for s in self.long_steps if s[0] > limit), key=lambda s: s[1])
+
+    def _steps(self) -> FloatArray:
+        return np.concatenate(self.steps_s) if self.steps_s else np.empty(0)
+
+
+@dataclass(slots=True)
+class DelayStatistics:
+    """Delays of messages: log time less another time of theirs."""
+
+    times_s: list[FloatArray] = field(default_factory=list)
+    delays_s: list[FloatArray] = field(default_factory=list)
+    count: int = 0
+    negative: int = 0
+
+    def add(self, log_time_ns: IntArray, other_ns: IntArray) -> None:
+        """Add a window's messages, int64 [N] each."""
+        delays = (log_time_ns - other_ns).astype(np.float64) * 1e-9
+        self.count += int(delays.shape[0])
+        self.negative += int(np.count_nonzero(delays < 0.0))
+        self.times_s.append(thin(log_time_ns.astype(np.float64) * 1e-9))
+        self.delays_s.append(thin(delays))
+
+    def quantile(self, q: float) -> float:
+        """Return a quantile of the delays in s; NaN without messages."""
+        delays = np.concatenate(self.delays_s) if self.delays_s else np.empty(0)
+        return float(np.quantile(delays, q)) if delays.shape[0] else float("nan")
+
+    @property
+    def drift_ppm(self) -> float:
+        """Slope of the delay over time by least squares, in parts per million; NaN without a span."""
+        if not self.delays_s:
+            return float("nan")
+        times, delays = np.concatenate(self.times_s), np.concatenate(self.delays_s)
+        times = times - times.mean() if times.shape[0] else times
+        spread = float(np.dot(times, times))
+        return float(np.dot(times, delays - delays.mean()) / spread * 1e6) if spread > 0.0 else float("nan")
+
+
+@dataclass(slots=True)
+class ValueStatistics:
+    """Mean, spread and extremes of the values of a channel, by Chan's pairwise update."""
+
+    count: int = 0
+    mean: float = 0.0
+    squares: float = 0.0
+    low: float = float("inf")
+    high: float = float("-inf")
+
+    def add(self, values: FloatArray) -> None:
+        """Add a window's values, float64 [N]."""
+        n = int(values.shape[0])
+        if n == 0:
+            return
+        mean = float(values.mean())
+        squares = float(np.square(values - mean).sum())
+        total = self.count + n
+        self.squares += squares + (mean - self.mean) ** 2 * self.count * n / total
+        self.mean += (mean - self.mean) * n / total
+        self.count = total
+        self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
+
+    @property
+    def std(self) -> float:
+        """Standard deviation; NaN without values."""
+        return float(np.sqrt(self.squares / self.count)) if self.count else float("nan")
+
+
+def thin(values: FloatArray) -> FloatArray:
+    """Keep evenly spread values, at most ``KEPT_PER_WINDOW``."""
+    stride = -(-values.shape[0] // KEPT_PER_WINDOW) if values.shape[0] else 1
+    return np.asarray(values[::stride], dtype=np.float64)
