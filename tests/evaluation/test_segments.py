@@ -161,3 +161,19 @@ def test_nothing_known_is_only_the_whole():
         },
     )
     assert all(mask.size == 0 for mask in segment_masks(empty, None, VEHICLE).values())
+
+
+def test_a_slow_slalom_is_no_string_of_corners():
+    t = np.arange(0, 20, 0.01)
+    ay = np.where((t > 2) & (t < 18), 4.0 * np.sin(2 * np.pi * 0.25 * (t - 2)), 0.0)  # swings of 2 s
+    masks = segment_masks(signals(t, 0 * t + 20, 0 * t, ay), None, VEHICLE)
+    assert masks["slalom"][(t > 2.2) & (t < 17.8)].all()
+    assert not masks["cornering-left"].any()
+    assert not masks["cornering-right"].any()
+
+
+def test_swings_to_one_side_are_no_slalom():
+    t = np.arange(0, 20, 0.01)
+    ay = np.where((t > 2) & (t < 18), 4.0 * np.maximum(np.sin(2 * np.pi * 0.5 * (t - 2)), 0.0), 0.0)
+    masks = segment_masks(signals(t, 0 * t + 20, 0 * t, ay), None, VEHICLE)
+    assert not masks["slalom"].any()

@@ -158,6 +158,18 @@ def test_every_source_gives_the_same_body_velocity(kind):
         np.testing.assert_allclose(track.y_m[known] - offset[1], d.y[known], atol=0.02)
 
 
+def test_a_quaternion_on_its_own_clock_is_interpolated_whatever_its_sign():
+    stamps, d = drive()
+    other, e = stamps + 4_000_000, Drive(d.t + 0.004)
+    channels = {
+        "enu_velocity_m_s": channel("enu_velocity_m_s", stamps, d.velocity),
+        "quat_wxyz": channel("quat_wxyz", other, quat(body_to_enu(e)), source="/attitude"),
+    }
+    track = derive_truth(channels).track
+    assert np.isfinite(track.vy_m_s[1:]).all()
+    np.testing.assert_allclose(track.vy_m_s[1:], d.vy[1:], atol=2e-4)
+
+
 @pytest.mark.parametrize("kind", ["body", "enu velocity, yaw", "position, yaw"])
 def test_lever_arm_is_taken_back_to_the_cg(kind):
     stamps, d = drive()
