@@ -17,10 +17,17 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from pdhef_logtool.signals import FloatArray
-from truthsim.drive import Drive, simulate_drive
-from truthsim.manoeuvres import GRAVITY_M_S2
+from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Request
+from truthsim.motion import Motion, simulate_motion
+from truthsim.sensors import SensorNoise
+from truthsim.vehicle import Vehicle
 
+CAR = Vehicle()
+NOISE = SensorNoise()
 FRICTION = 0.85
+SPEED_KM_H = 80.0
+#: Steering goes to this multiple of what the plain ramp manoeuvre guesses, well into the plateau of the front axle.
+SCALE = 2.5
 #: Below this the ramp is the linear range, in which roll is proportional to lateral acceleration.
 LINEAR_A_Y_M_S2 = 4.0
 
@@ -37,13 +44,12 @@ class AxleFit:
     peak_n: float
 
 
-def axle_curves(drive: Drive) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Return slip angle (rad) and lateral force (N) of both axles over the drive."""
-    car, truth = drive.vehicle, drive.truth
-    lf, lr = car.cg_to_front_axle_m, car.cg_to_rear_axle_m
-    v_x, v_y, r, steer = (truth[k] for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad"))
-    force = car.mass_kg * truth["ay_m_s2"]
-    front = (lr * force + car.yaw_inertia_kg_m2 * truth["yaw_acceleration_rad_s2"]) / (lf + lr)
+def axle_curves(motion: Motion) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return slip angle (rad) and lateral force (N) of both axles over a motion."""
+    lf, lr = CAR.cg_to_front_axle_m, CAR.cg_to_rear_axle_m
+    v_x, v_y, r, steer = (motion.column(k) for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad"))
+    force = CAR.mass_kg * motion.column("ay_m_s2")
+    front = (lr * force + CAR.yaw_inertia_kg_m2 * motion.column("yaw_acceleration_rad_s2")) / (lf + lr)
     return {
         "front": (steer - np.arctan2(v_y + lf * r, v_x), front / np.cos(steer)),
         "rear": (-np.arctan2(v_y - lr * r, v_x), force - front),
@@ -73,61 +79,62 @@ def fit_axle(alpha: FloatArray, force: FloatArray, friction: float, load_n: floa
     return AxleFit(b, c, d / friction, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
 
 
-def fit_axles(drive: Drive) -> dict[str, AxleFit]:
-    """Fit both axles to a drive at ``FRICTION``."""
-    car = drive.vehicle
-    wheelbase = car.cg_to_front_axle_m + car.cg_to_rear_axle_m
-    arms = {"front": car.cg_to_rear_axle_m, "rear": car.cg_to_front_axle_m}
+def fit_axles(motion: Motion) -> dict[str, AxleFit]:
+    """Fit both axles to a motion at ``FRICTION``."""
+    wheelbase = CAR.cg_to_front_axle_m + CAR.cg_to_rear_axle_m
+    arms = {"front": CAR.cg_to_rear_axle_m, "rear": CAR.cg_to_front_axle_m}
     return {
-        axle: fit_axle(*curve, FRICTION, car.mass_kg * GRAVITY_M_S2 * arms[axle] / wheelbase)
-        for axle, curve in axle_curves(drive).items()
+        axle: fit_axle(*curve, FRICTION, CAR.mass_kg * GRAVITY_M_S2 * arms[axle] / wheelbase)
+        for axle, curve in axle_curves(motion).items()
     }
 
 
-def roll_gradient_rad_per_m_s2(drive: Drive) -> float:
+def roll_gradient_rad_per_m_s2(motion: Motion) -> float:
     """Return the roll angle per planar lateral acceleration in the linear range."""
-    a_y, roll = drive.truth["ay_m_s2"], drive.truth["roll_rad"]
+    a_y, roll = motion.column("ay_m_s2"), motion.column("roll_rad")
     small = np.abs(a_y) < LINEAR_A_Y_M_S2
     return float(np.polyfit(a_y[small], roll[small], 1)[0])
 
 
-def ramp() -> Drive:
+def ramp() -> Motion:
     """Return the slow ramp steer that everything is fitted to."""
-    return simulate_drive("ramp-steer", friction=FRICTION)
+    manoeuvre = MANOEUVRES["ramp-steer"]
+    duration_s = manoeuvre.default_duration_s(SPEED_KM_H / 3.6)
+    request = Request(SPEED_KM_H / 3.6, FRICTION, seed=0, duration_s=duration_s, scale=SCALE)
+    return simulate_motion(manoeuvre.plan(request), FRICTION, vehicle=CAR)
 
 
-def vehicle_text(drive: Drive, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
+def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
     """Return a vehicle file."""
-    car, noise = drive.vehicle, drive.noise
     tyres = "\n".join(
         f"[tyres.{axle}]\nB = {fit.B:.3f}\nC = {fit.C:.4f}\nD_n = {fit.D_n:.1f}\nE = {fit.E:.4f}"
         for axle, fit in fits.items()
     )
     return f"""# Nominal vehicle of the simulated sample logs, made by benchmarks/fit_nominal_tyres.py:
 # mass and geometry of the paper's Table 3; axle tyres and roll gradient fitted to
-# `{drive.command}`.
+# a ramp steer at {SPEED_KM_H:g} km/h and friction {FRICTION:g} into the plateau of the front axle.
 # The formula scales stiffness with friction, which real (and these simulated) tyres hardly do.
 name = "{name}"
-mass_kg = {car.mass_kg}
-yaw_inertia_kg_m2 = {car.yaw_inertia_kg_m2}
-cg_to_front_axle_m = {car.cg_to_front_axle_m}
-cg_to_rear_axle_m = {car.cg_to_rear_axle_m}
-track_m = {car.track_m}
-cg_height_m = {car.cg_height_m}
-wheel_radius_m = {car.wheel_radius_m}
+mass_kg = {CAR.mass_kg}
+yaw_inertia_kg_m2 = {CAR.yaw_inertia_kg_m2}
+cg_to_front_axle_m = {CAR.cg_to_front_axle_m}
+cg_to_rear_axle_m = {CAR.cg_to_rear_axle_m}
+track_m = {CAR.track_m}
+cg_height_m = {CAR.cg_height_m}
+wheel_radius_m = {CAR.wheel_radius_m}
 steering_ratio = 16.0
-roll_gradient_rad_per_m_s2 = {roll_gradient_rad_per_m_s2(drive):.5f}
+roll_gradient_rad_per_m_s2 = {roll_gradient_rad_per_m_s2(motion):.5f}
 friction = {friction}
 imu_position_m = [0.0, 0.0, 0.0]
 truth_position_m = [0.0, 0.0, 0.0]
 low_speed_blend_m_s = 3.0
 
 [sensors]
-ax_std_m_s2 = {noise.acceleration_m_s2}
-ay_std_m_s2 = {noise.acceleration_m_s2}
-yaw_rate_std_rad_s = {noise.yaw_rate_rad_s}
-speed_std_m_s = {noise.wheel_speed_m_s}
-steer_std_rad = {noise.steer_rad}
+ax_std_m_s2 = {NOISE.acceleration_m_s2}
+ay_std_m_s2 = {NOISE.acceleration_m_s2}
+yaw_rate_std_rad_s = {NOISE.yaw_rate_rad_s}
+speed_std_m_s = {NOISE.wheel_speed_m_s}
+steer_std_rad = {NOISE.steer_rad}
 
 {tyres}
 """
@@ -135,8 +142,8 @@ steer_std_rad = {noise.steer_rad}
 
 def main(folder: Path) -> None:
     """Fit, print how well, and write both vehicle files."""
-    drive = ramp()
-    fits = fit_axles(drive)
+    motion = ramp()
+    fits = fit_axles(motion)
     print("axle      B      C     D_n       E   BCD at mu 0.85   rms N   largest N")
     for axle, fit in fits.items():
         stiffness = fit.B * fit.C * fit.D_n * FRICTION
@@ -148,7 +155,7 @@ def main(folder: Path) -> None:
         ("vehicle.toml", "truthsim saloon", FRICTION),
         ("vehicle_mu03.toml", "truthsim saloon on a road of friction 0.3", 0.3),
     ):
-        (folder / file).write_text(vehicle_text(drive, fits, name=name, friction=friction), encoding="utf-8")
+        (folder / file).write_text(vehicle_text(motion, fits, name=name, friction=friction), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,243 @@
+"""The written log, read back by other libraries; and the sample logs of the repository."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+import sys
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from pdhef_logtool.errors import OutputError
+from pdhef_logtool.vehicle import load_vehicle
+from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
+from truthsim.samples import SAMPLES, write_samples
+
+ROOT = Path(__file__).resolve().parents[2]
+TYPES = {
+    "/imu/data": "sensor_msgs/msg/Imu",
+    "/vehicle/status/steering_status": "autoware_vehicle_msgs/msg/SteeringReport",
+    "/vehicle/wheel_speeds": "truthsim_msgs/msg/WheelSpeeds",
+    "/rtk/odometry": "nav_msgs/msg/Odometry",
+    "/rtk/fix": "sensor_msgs/msg/NavSatFix",
+    "/truth/perfect/odometry": "nav_msgs/msg/Odometry",
+    "/truth/perfect/state": "truthsim_msgs/msg/VehicleTruth",
+}
+
+
+def read_with_other_libraries(path: Path) -> tuple[dict[str, list], dict[str, str], dict[str, str]]:
+    """Messages by topic as (log time, publish time, message), types, and the metadata record; mcap and rosbags."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    messages: dict[str, list] = {}
+    types: dict[str, str] = {}
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None and schema.encoding == "ros2msg" and channel.message_encoding == "cdr"
+            if channel.topic not in types:
+                store.register(get_types_from_msg(schema.data.decode(), schema.name))
+            types[channel.topic] = schema.name
+            decoded = store.deserialize_cdr(message.data, schema.name)
+            messages.setdefault(channel.topic, []).append((message.log_time, message.publish_time, decoded))
+        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+    return messages, types, metadata["truthsim"]
+
+
+def nanoseconds(stamp) -> int:
+    return stamp.sec * 1_000_000_000 + stamp.nanosec
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    return simulate_drive("step-steer", seed=2)
+
+
+@pytest.fixture(scope="module")
+def read_back(drive: Drive, tmp_path_factory: pytest.TempPathFactory):
+    path = tmp_path_factory.mktemp("log") / "step.mcap"
+    write_drive(drive, path)
+    return read_with_other_libraries(path)
+
+
+def test_other_libraries_find_every_topic_with_its_type(read_back, drive: Drive) -> None:
+    messages, types, _ = read_back
+    assert types == TYPES
+    n = drive.times_s.shape[0]
+    assert {t: len(m) for t, m in messages.items()} == {t: (61 if t == "/rtk/fix" else n) for t in TYPES}
+
+
+def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
+    messages, _, _ = read_back
+    for topic, delay_ns in (
+        ("/imu/data", 10_000_000),
+        ("/vehicle/status/steering_status", 10_000_000),
+        ("/vehicle/wheel_speeds", 10_000_000),
+        ("/rtk/odometry", 20_000_000),
+        ("/rtk/fix", 20_000_000),
+        ("/truth/perfect/odometry", 0),
+        ("/truth/perfect/state", 0),
+    ):
+        for log_time, publish_time, message in messages[topic]:
+            stamp = nanoseconds(message.stamp if topic.endswith("steering_status") else message.header.stamp)
+            assert stamp == publish_time and log_time - publish_time == delay_ns
+    assert nanoseconds(messages["/imu/data"][0][2].header.stamp) == START_NS == 1_767_225_600 * 10**9
+    steering = [p for _, p, _ in messages["/vehicle/status/steering_status"]]
+    assert steering[0] - START_NS == 3_000_000 and set(np.diff(steering)) == {10_000_000}
+
+
+def test_values_survive(read_back, drive: Drive) -> None:
+    messages, _, _ = read_back
+    imu = drive.channels["imu"].fields
+    last = messages["/imu/data"][-1][2]
+    assert (last.linear_acceleration.x, last.linear_acceleration.y) == (imu["ax_m_s2"][-1], imu["ay_m_s2"][-1])
+    assert last.angular_velocity.z == imu["yaw_rate_rad_s"][-1]
+    assert last.orientation_covariance[0] == -1.0
+    assert last.linear_acceleration_covariance[4] == pytest.approx(0.12**2)
+    steering = messages["/vehicle/status/steering_status"][-1][2].steering_tire_angle
+    assert steering == np.float32(drive.channels["steering"].fields["steer_rad"][-1])
+    wheels = messages["/vehicle/wheel_speeds"][-1][2]
+    assert [getattr(wheels, f"{w}_m_s") for w in ("fl", "fr", "rl", "rr")] == [
+        drive.channels["wheels"].fields[f"{w}_m_s"][-1] for w in ("fl", "fr", "rl", "rr")
+    ]
+    odometry = messages["/rtk/odometry"][-1][2]
+    rtk = drive.channels["rtk"].fields
+    assert odometry.twist.twist.linear.y == pytest.approx(rtk["vy_m_s"][-1], abs=1e-5)
+    assert odometry.pose.pose.position.x == pytest.approx(rtk["x_m"][-1], abs=1e-5)
+    assert odometry.pose.covariance[0] == pytest.approx(1e-4) and odometry.twist.covariance[7] > 0.0
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "base_link")
+    fix = messages["/rtk/fix"][-1][2]
+    assert fix.latitude == drive.channels["fix"].fields["lat_deg"][-1]
+    assert fix.status.status == 2 and fix.position_covariance_type == 2
+
+
+def test_perfect_truth_is_exact(read_back, drive: Drive) -> None:
+    messages, _, _ = read_back
+    q = np.array(
+        [[getattr(m.pose.pose.orientation, k) for k in "wxyz"] for _, _, m in messages["/truth/perfect/odometry"]]
+    )
+    w, x, y, z = q.T
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    truth = drive.truth
+    assert np.abs(np.unwrap(yaw) - truth["yaw_rad"]).max() < 1e-6
+    assert np.abs(roll - truth["roll_rad"]).max() < 1e-6
+    states = [m for _, _, m in messages["/truth/perfect/state"]]
+    for name in ("vx_m_s", "vy_m_s", "sideslip_rad", "ay_m_s2", "roll_rad", "steer_rad"):
+        assert np.abs(np.array([getattr(m, name) for m in states]) - truth[name]).max() < 1e-7, name
+    twist = np.array([m.twist.twist.linear.y for _, _, m in messages["/truth/perfect/odometry"]])
+    assert np.abs(twist - truth["vy_m_s"]).max() < 1e-7
+    assert states[-1].friction == 0.85
+    assert states[-1].vertical_force_n.sum() == pytest.approx(1440.0 * 9.80665, rel=1e-6)
+
+
+def test_metadata_says_how_it_was_made(read_back) -> None:
+    _, _, metadata = read_back
+    assert metadata["command"] == "pdhef simulate step-steer --speed 100 --mu 0.85 --seed 2"
+    assert (metadata["friction"], metadata["seed"], metadata["spun"]) == ("0.85", "2", "false")
+    assert json.loads(metadata["vehicle"])["mass_kg"] == 1440.0
+    assert json.loads(metadata["noise"])["acceleration_m_s2"] == 0.12
+    assert set(json.loads(metadata["versions"])) >= {"pdhef-logtool", "numpy"}
+
+
+def test_a_long_drive_is_written_in_pieces_without_a_seam(tmp_path: Path) -> None:
+    drive = simulate_drive("road", duration_s=130.0)
+    write_drive(drive, tmp_path / "road.mcap")
+    with (tmp_path / "road.mcap").open("rb") as stream:
+        log_times: dict[str, list[int]] = {}
+        for _, channel, message in make_reader(stream).iter_messages():
+            log_times.setdefault(channel.topic, []).append(message.log_time)
+    assert set(np.diff(log_times["/imu/data"])) == {10_000_000} and len(log_times["/imu/data"]) == 13_001
+    assert set(np.diff(log_times["/rtk/odometry"])) == {20_000_000}
+
+
+def test_a_folder_that_is_not_there_is_one_clear_line(drive: Drive, tmp_path: Path) -> None:
+    with pytest.raises(OutputError):
+        write_drive(drive, tmp_path / "none" / "x.mcap")
+
+
+@pytest.fixture(scope="module")
+def manifest() -> list[dict]:
+    return tomllib.loads((ROOT / "sample_logs" / "manifest.toml").read_text(encoding="utf-8"))["log"]
+
+
+def test_manifest_lists_the_sample_logs_with_their_hashes(manifest: list[dict]) -> None:
+    assert [entry["file"] for entry in manifest] == [s.file for s in SAMPLES] == ["dlc.mcap", "sweep.mcap", "road.mcap"]
+    for entry in manifest:
+        data = (ROOT / "sample_logs" / entry["file"]).read_bytes()
+        assert hashlib.sha256(data).hexdigest() == entry["sha256"] and len(data) == entry["size_bytes"]
+        assert (ROOT / "sample_logs" / entry["vehicle"]).is_file()
+        assert f"--seed {entry['seed']}" in entry["command"] and entry["command"].endswith(f"-o {entry['file']}")
+    assert sum(entry["size_bytes"] for entry in manifest) < 15_000_000
+
+
+@pytest.mark.parametrize("sample", SAMPLES[:2], ids=lambda s: s.file)
+def test_a_sample_log_is_what_the_code_makes(sample, tmp_path: Path) -> None:
+    write_drive(sample.simulate(), tmp_path / sample.file)
+    new, _, new_metadata = read_with_other_libraries(tmp_path / sample.file)
+    old, _, old_metadata = read_with_other_libraries(ROOT / "sample_logs" / sample.file)
+    assert {k: len(v) for k, v in new.items()} == {k: len(v) for k, v in old.items()}
+    assert new_metadata["command"] == old_metadata["command"]
+    for topic, path in (
+        ("/imu/data", "linear_acceleration.y"),
+        ("/vehicle/status/steering_status", "steering_tire_angle"),
+        ("/vehicle/wheel_speeds", "fl_m_s"),
+        ("/rtk/odometry", "twist.twist.linear.y"),
+        ("/truth/perfect/state", "sideslip_rad"),
+    ):
+        columns = []
+        for messages in (new, old):
+            values = [m for _, _, m in messages[topic]]
+            for part in path.split("."):
+                values = [getattr(v, part) for v in values]
+            columns.append(np.array(values, dtype=np.float64))
+        # Sensors are quantised: a last-place difference of another processor may flip one step of a few samples.
+        difference = np.abs(columns[0] - columns[1])
+        assert np.mean(difference > 1e-6) < 1e-3 and difference.max() < 5e-3, topic
+
+
+def test_write_samples_repeats_itself_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("truthsim.samples.SAMPLES", SAMPLES[:1])
+    manifests = []
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write_samples(tmp_path / name)
+        manifests.append((tmp_path / name / "manifest.toml").read_bytes())
+    assert manifests[0] == manifests[1]
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["dlc.mcap", "manifest.toml"]
+
+
+@pytest.fixture(scope="module")
+def fitting() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("fit_nominal_tyres", ROOT / "benchmarks" / "fit_nominal_tyres.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_vehicle_files_are_the_fit_to_the_truth_vehicle(fitting: ModuleType, tmp_path: Path) -> None:
+    fitting.main(tmp_path)
+    for name, friction in (("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)):
+        old, new = load_vehicle(ROOT / "sample_logs" / name), load_vehicle(tmp_path / name)
+        assert old.friction == new.friction == friction
+        for front in (True, False):
+            assert new.magic_formula(front, 0.85) == pytest.approx(old.magic_formula(front, 0.85), rel=0.01)
+        assert new.roll_gradient_rad_per_m_s2 == pytest.approx(old.roll_gradient_rad_per_m_s2, rel=0.01)
+
+
+def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(fitting: ModuleType) -> None:
+    vehicle = load_vehicle(ROOT / "sample_logs" / "vehicle.toml")
+    for axle, (alpha, force) in fitting.axle_curves(fitting.ramp()).items():
+        b, c, d, e = vehicle.magic_formula(axle == "front", 0.85)
+        x = b * alpha
+        model = d * np.sin(c * np.arctan(x - e * (x - np.arctan(x))))
+        assert np.sqrt(np.mean((model - force) ** 2)) < 0.015 * force.max(), axle
+    assert np.degrees(vehicle.understeer_gradient_rad_per_m_s2(0.85)) * 9.80665 == pytest.approx(1.93, abs=0.35)

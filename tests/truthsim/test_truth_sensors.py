@@ -1,0 +1,188 @@
+"""Sensor errors have the size, shape, delay and independence that METHOD section 9 gives them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pdhef_logtool.geometry import ecef_from_geodetic, enu_from_ecef_rotation
+from truthsim.manoeuvres import MANOEUVRES, Plan, Request
+from truthsim.motion import Motion, simulate_motion
+from truthsim.sensors import (
+    IMU_PERIOD_S,
+    NO_NOISE,
+    ORIGIN_GEODETIC,
+    STEER_PHASE_S,
+    WHEEL_PHASE_S,
+    SensorNoise,
+    sense,
+    slow_walk,
+    student_t,
+)
+from truthsim.vehicle import Vehicle
+
+G = 9.80665
+PHASES = (0.0, STEER_PHASE_S, WHEEL_PHASE_S)
+WHITE_ONLY = NO_NOISE._replace(
+    acceleration_m_s2=0.12, yaw_rate_rad_s=0.004, steer_rad=0.0008, wheel_speed_m_s=0.08, rtk_yaw_rate_rad_s=0.001
+)
+
+
+def record(plan: Plan, friction: float = 0.85) -> Motion:
+    return simulate_motion(plan, friction, period_s=IMU_PERIOD_S, phases_s=PHASES)
+
+
+@pytest.fixture(scope="module")
+def lane_change() -> Motion:
+    return record(MANOEUVRES["dlc"].plan(Request(100.0 / 3.6, 0.85, 1, 9.5, 0.76)))
+
+
+@pytest.fixture(scope="module")
+def straight() -> Motion:
+    return record(Plan(20.0, 200.0, steer_rad=np.zeros(200_001)))
+
+
+def test_noise_is_student_t_with_four_degrees_of_freedom_scaled_to_sigma() -> None:
+    noise = student_t(np.random.default_rng(1), 0.12, 400_000)
+    assert noise.std() == pytest.approx(0.12, rel=0.02)
+    scaled = noise / (0.12 / np.sqrt(2.0))
+    for p in (0.6, 0.75, 0.9, 0.975, 0.999):
+        assert np.quantile(scaled, p) == pytest.approx(stats.t(4).ppf(p), rel=0.03)
+    assert stats.kurtosis(noise) > 3.0  # a normal distribution has 0
+
+
+def test_white_noise_of_each_channel_has_the_stated_sigma(straight: Motion) -> None:
+    clean, noisy = (sense(straight, Vehicle(), n, 5, 100) for n in (NO_NOISE, WHITE_ONLY))
+    for channel, field, sigma in (
+        ("imu", "ax_m_s2", 0.12),
+        ("imu", "ay_m_s2", 0.12),
+        ("imu", "yaw_rate_rad_s", 0.004),
+        ("steering", "steer_rad", 0.0008),
+        ("wheels", "fl_m_s", 0.08),
+        ("wheels", "rr_m_s", 0.08),
+        ("rtk", "yaw_rate_rad_s", 0.001),
+    ):
+        error = noisy[channel].fields[field] - clean[channel].fields[field]
+        assert error.std() == pytest.approx(sigma, rel=0.05), field
+        assert abs(error.mean()) < 4.0 * sigma / np.sqrt(error.shape[0]), field
+        if channel != "rtk":
+            assert stats.kurtosis(error) > 2.0, field
+        assert abs(np.corrcoef(error[1:], error[:-1])[0, 1]) < 0.03, field
+    errors = [noisy["imu"].fields[k] - clean["imu"].fields[k] for k in ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")]
+    assert np.abs(np.corrcoef(errors) - np.eye(3)).max() < 0.03
+
+
+def test_biases_are_drawn_per_drive() -> None:
+    motion = record(Plan(20.0, 1.0, steer_rad=np.zeros(1001)))
+    noise = NO_NOISE._replace(
+        acceleration_bias_m_s2=0.08, yaw_rate_bias_rad_s=0.0015, steer_bias_rad=0.0008, wheel_scale=0.003
+    )
+    drives = [sense(motion, Vehicle(), noise, seed, 100) for seed in range(300)]
+    clean = sense(motion, Vehicle(), NO_NOISE, 0, 100)
+    for channel, field, sigma in (
+        ("imu", "ay_m_s2", 0.08),
+        ("imu", "yaw_rate_rad_s", 0.0015),
+        ("steering", "steer_rad", 0.0008),
+        ("wheels", "rl_m_s", 0.003 * 20.0),
+    ):
+        errors = np.array([d[channel].fields[field] - clean[channel].fields[field] for d in drives])
+        assert errors.mean(axis=1).std() == pytest.approx(sigma, rel=0.15), field
+        assert np.ptp(errors, axis=1).max() < 0.1 * sigma + 0.005, field
+
+
+def test_slow_walk_has_its_spread_and_its_time_constant() -> None:
+    walk = slow_walk(np.random.default_rng(2), 0.02, 2.0, 0.01, 400_000)
+    assert walk.std() == pytest.approx(0.02, rel=0.1)
+    for lag_s in (0.5, 2.0):
+        n = round(lag_s / 0.01)
+        assert np.corrcoef(walk[n:], walk[:-n])[0, 1] == pytest.approx(np.exp(-lag_s / 2.0), abs=0.06)
+
+
+def test_messages_arrive_late_by_the_bus_and_keep_their_order(lane_change: Motion) -> None:
+    channels = sense(lane_change, Vehicle(), SensorNoise(), 1, 100)
+    for name in ("imu", "steering", "wheels"):
+        delay = channels[name].arrival_ns(0) - channels[name].stamps_ns(0)
+        assert np.all(delay == 10_000_000), name
+    assert np.all(channels["rtk"].arrival_ns(0) - channels["rtk"].stamps_ns(0) == 20_000_000)
+    late = sense(lane_change, Vehicle(), SensorNoise(jitter_s=0.015), 1, 100)["imu"]
+    delay_s = (late.arrival_ns(0) - late.stamps_ns(0)) * 1e-9
+    assert delay_s.min() >= 0.010 and 0.020 < delay_s.max() <= 0.025
+    assert np.all(np.diff(late.arrival_ns(0)) >= 0)
+
+
+def test_imu_reads_gravity_by_the_body_s_tilt(lane_change: Motion) -> None:
+    imu = sense(lane_change, Vehicle(), NO_NOISE, 1, 100)["imu"].fields
+    a_y, roll = lane_change.column("ay_m_s2"), lane_change.column("roll_rad")
+    assert imu["ay_m_s2"] - a_y == pytest.approx(G * np.sin(roll) - a_y * (1.0 - np.cos(roll)), abs=2e-3)
+    # Leaning outward, it reads more than the car does, by g times the roll gradient: about 9 %.
+    assert np.polyfit(a_y, imu["ay_m_s2"], 1)[0] == pytest.approx(1.0 + G * 0.0088, abs=0.006)
+    a_x, pitch = lane_change.column("ax_m_s2"), lane_change.column("pitch_rad")
+    assert imu["ax_m_s2"] == pytest.approx(a_x * np.cos(pitch) - G * np.sin(pitch), abs=1e-3)
+    total = np.sqrt(sum(imu[k] ** 2 for k in ("ax_m_s2", "ay_m_s2", "az_m_s2")))
+    assert total == pytest.approx(np.sqrt(a_x**2 + a_y**2 + G**2), abs=2e-3)
+
+
+def test_sensors_sample_at_their_own_times(lane_change: Motion) -> None:
+    channels = sense(lane_change, Vehicle(), NO_NOISE, 1, 100)
+    steering = channels["steering"]
+    assert (steering.times_s - channels["imu"].times_s) == pytest.approx(0.003)
+    fine = simulate_motion(MANOEUVRES["dlc"].plan(Request(100.0 / 3.6, 0.85, 1, 9.5, 0.76)), 0.85, period_s=0.001)
+    at = np.interp(steering.times_s, fine.times_s, fine.column("steer_rad"))
+    inside = steering.times_s <= fine.times_s[-1]
+    assert np.abs(steering.fields["steer_rad"] - at)[inside].max() < 1e-9
+    wheels = channels["wheels"]
+    rim = 0.30 * np.interp(wheels.times_s, fine.times_s, fine.column("spin_fl_rad_s"))
+    inside = wheels.times_s <= fine.times_s[-1]
+    assert np.abs(wheels.fields["fl_m_s"] - rim)[inside].max() < 0.003
+
+
+def test_a_standing_wheel_reads_zero() -> None:
+    wheels = sense(record(Plan(0.0, 5.0, steer_rad=np.zeros(5001))), Vehicle(), SensorNoise(), 1, 100)["wheels"]
+    assert all(np.all(column == 0.0) for column in wheels.fields.values())
+
+
+def test_rtk_is_good_to_centimetres_and_consistent_in_itself(lane_change: Motion) -> None:
+    errors: dict[str, list[float]] = {"x_m": [], "vx_m_s": [], "vy_m_s": [], "yaw_rad": []}
+    for seed in range(40):
+        rtk = sense(lane_change, Vehicle(), SensorNoise(), seed, 100)["rtk"].fields
+        for name, spread in errors.items():
+            spread.append(float(np.sqrt(np.mean((rtk[name] - lane_change.column(name)) ** 2))))
+    rms = {name: float(np.sqrt(np.mean(np.square(spread)))) for name, spread in errors.items()}
+    assert rms["x_m"] == pytest.approx(0.010, rel=0.2)
+    assert rms["yaw_rad"] == pytest.approx(0.0005, rel=0.2)
+    assert rms["vx_m_s"] == pytest.approx(0.012, rel=0.2)
+    # A heading error turns forward speed into lateral velocity.
+    assert rms["vy_m_s"] == pytest.approx(np.hypot(0.012, 27.7 * 0.0005), rel=0.2)
+
+
+def test_rtk_rates() -> None:
+    motion = record(Plan(20.0, 10.0, steer_rad=np.zeros(10_001)))
+    for rate in (10, 20, 50, 100):
+        channels = sense(motion, Vehicle(), SensorNoise(), 1, rate)
+        assert np.diff(channels["rtk"].times_s) == pytest.approx(1.0 / rate)
+        assert np.diff(channels["fix"].times_s) == pytest.approx(0.1)
+
+
+def test_fix_is_the_position_in_geodetic_coordinates(lane_change: Motion) -> None:
+    channels = sense(lane_change, Vehicle(), SensorNoise(), 1, 100)
+    fix, rtk = channels["fix"].fields, channels["rtk"].fields
+    lat, lon, alt = (np.array([v]) for v in ORIGIN_GEODETIC)
+    turn = enu_from_ecef_rotation(float(np.deg2rad(lat[0])), float(np.deg2rad(lon[0])))
+    ecef = ecef_from_geodetic(fix["lat_deg"], fix["lon_deg"], fix["alt_m"]) - ecef_from_geodetic(lat, lon, alt)
+    enu = ecef @ turn.T
+    assert np.abs(enu[:, 0] - rtk["x_m"][::10]).max() < 1e-6
+    assert np.abs(enu[:, 1] - rtk["y_m"][::10]).max() < 1e-6
+    # East is where longitude grows: 111.3 km a degree at the equator, less by the cosine of the latitude.
+    assert np.polyfit(rtk["x_m"][::10], fix["lon_deg"], 1)[0] == pytest.approx(
+        1.0 / (111_320.0 * np.cos(np.deg2rad(48.0))), rel=5e-3
+    )
+
+
+def test_changing_one_error_leaves_the_others_alone(straight: Motion) -> None:
+    a = sense(straight, Vehicle(), SensorNoise(), 7, 100)
+    b = sense(straight, Vehicle(), SensorNoise(steer_rad=0.01), 7, 100)
+    assert not np.array_equal(a["steering"].fields["steer_rad"], b["steering"].fields["steer_rad"])
+    for channel in ("imu", "wheels", "rtk"):
+        for field, column in a[channel].fields.items():
+            assert np.array_equal(column, b[channel].fields[field]), field
