@@ -252,6 +252,23 @@ def test_slow_sideslip_is_not_drawn(tmp_path, circle):
     assert not {"/sideslip_deg/zero", "/sideslip_deg/zero/band95", "/error/sideslip_deg/zero", "/events"} & set(timed)
 
 
+def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
+    path = tmp_path / "recording.rrd"
+    track, truth = circle("zero", 0, 40), circle("truth", 5, 40)
+    track.valid[20] = False
+    truth.valid[25] = False  # stamp 30 of the track
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink.append(track)
+    sink.append(truth)
+    sink.finish(REPORT)
+    timed, _ = tables(path)
+    stamps, values = series(timed["/error/sideslip_deg/zero"])
+    shown = [int(t) for t, v in zip(stamps, values, strict=True) if v]
+    assert shown == track.stamps_ns[[i for i in range(5, 40) if i not in (20, 30)]].tolist()
+    drawn = [int(t) for t, v in zip(*series(timed["/vx_m_s/zero"]), strict=True) if v]
+    assert drawn == track.stamps_ns[[i for i in range(40) if i != 20]].tolist()
+
+
 def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
     path = tmp_path / "out" / "recording.rrd"
     sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
