@@ -279,7 +279,8 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     lines += _bullets("Warnings", report["warnings"])
     lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
     lines += _truth_lines(report["truth"])
-    for signal in dict.fromkeys(m["signal"] for m in report["metrics"]):
+    signals = dict.fromkeys(m["signal"] for m in report["metrics"])
+    for signal in sorted(signals, key=lambda s: s != "sideslip_rad"):
         lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal])
     lines += ["## Estimators", ""]
     for e in report["estimators"]:
