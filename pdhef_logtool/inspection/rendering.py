@@ -50,7 +50,8 @@ def _table(title: str, *headings: str, words: int) -> Table:
     )
     for i, heading in enumerate(headings):
         if i < words:
-            table.add_column(heading, overflow="fold")
+            # Names of signals are short and are looked up; topics and fields may be of any length.
+            table.add_column(heading, overflow="fold", no_wrap=heading == "signal")
         else:
             table.add_column(heading, justify="right", no_wrap=True)
     return table
@@ -82,7 +83,7 @@ def _sources_table(inspection: Inspection) -> Table:
     table = _table(f"Mapping ({origin})", "signal", "topic", "field", words=3)
     for section in (inspection.signals, inspection.truth):
         for report in section.values():
-            table.add_row(report.name, escape(report.topic), escape(report.field))
+            table.add_row(report.name, escape(report.topic), escape(_short(report.field)))
         if section is inspection.signals and inspection.truth:
             table.add_row("[bold]truth[/]", "", "")
     return table
@@ -135,9 +136,17 @@ def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
     return found
 
 
+def _short(field: str) -> str:
+    """Write several fields of one struct as ``struct.{w,x,y,z}``."""
+    stems, _, leaves = zip(*(path.rpartition(".") for path in field.split(", ")), strict=True)
+    return f"{stems[0]}.{{{','.join(leaves)}}}" if len(leaves) > 1 and stems[0] and len(set(stems)) == 1 else field
+
+
 def _text(value: float) -> str:
     if not math.isfinite(value):
         return "-"
     if value == 0.0:
         return "0"
+    if 100.0 <= abs(value) < 1e5:
+        return f"{value:.0f}"
     return f"{value:.3g}" if 1e-4 <= abs(value) < 1e4 else f"{value:.1e}"

@@ -387,12 +387,14 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
     """Return comments for :func:`pdhef_logtool.mapping.mapping_to_toml` that help to edit the mapping."""
     types = {t.name: t.type for t in inspection.topics}
     comments: dict[str, str] = {}
-    for name, report in {**inspection.truth, **inspection.signals}.items():
-        text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
-        if math.isfinite(report.minimum):
-            text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
-        warned = [w.message for w in inspection.warnings if name in (w.suspects or w.signals)]
-        comments[name] = "\n".join([text, *(f"WARNING: {w}" for w in warned)])
+    for section, reports in (("signals", inspection.signals), ("truth", inspection.truth)):
+        for name, report in reports.items():
+            text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
+            if math.isfinite(report.minimum):
+                text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
+            warned = [w.message for w in inspection.warnings if name in (w.suspects or w.signals)]
+            lines = [f"WARNING: {w}" for w in warned] if section == "signals" else []
+            comments[f"{section}.{name}"] = "\n".join([text, *lines])
     head = [f"Written from {Path(inspection.path).name}."]
     head += [f"Ambiguous: {a}" for a in inspection.ambiguities]
     mapped = set(inspection.mapping.topics)

@@ -244,8 +244,8 @@ def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = No
 
     Parameters
     ----------
-    comments : text by signal or truth name, by ``truth_quality``, or under ``""`` for the head of the file; it
-        stands above the entry as a comment.
+    comments : text by name (``steer_rad``) or table (``truth.yaw_rate_rad_s``), by ``truth_quality``, or under ``""``
+        for the head of the file; it stands above the entry as a comment.
 
     Signals that the mapping lacks appear as commented examples, so that they only need a topic and a field.
     """
@@ -261,7 +261,7 @@ def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = No
         for name in (n for n in units if n in sources):
             source = sources[name]
             lines.append("")
-            lines += _comment(notes.get(name, ""))
+            lines += _comment(notes.get(f"{section}.{name}", notes.get(name, "")))
             lines.append(f"[{section}.{name}]{' ' * max(1, 30 - len(section) - len(name))}# {units[name]}")
             lines += _source_lines(source)
     if mapping.quality is not None:

@@ -152,6 +152,7 @@ def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> N
     text = path.read_text()
     assert "# [signals.speed_m_s]" in text
     assert "/vendor (vendor_msgs/msg/Box): speed_kmh" in text
+    assert "# sensor_msgs/msg/Imu, 100 Hz, " in text
     assert [p.name for p in tmp_path.iterdir()] == ["m.toml"]
 
 
@@ -202,3 +203,24 @@ def test_vendor_messages_are_not_guessed(shared_dir: Path, tmp_path: Path) -> No
     assert len(found.missing) == 5
     write_mapping(found, tmp_path / "m.toml")
     assert "steer_ang_deg" in (tmp_path / "m.toml").read_text()
+
+
+@pytest.mark.parametrize("name", ["dlc", "sweep", "road"])
+def test_simulated_drives_need_no_mapping(sample_logs_dir: Path, name: str) -> None:
+    found = inspect_log(sample_logs_dir / f"{name}.mcap")
+    assert found.missing == ()
+    assert found.ambiguities == ()
+    assert found.warnings == ()
+    assert found.lost == ()
+    text = text_of(found, 80)
+    assert max(len(line) for line in text.splitlines()[1:]) <= 80
+    assert "wheel_speed_fl_m_s " in text
+    assert "pose.pose.orientation.{w,x,y,z}" in text_of(found, 110)
+
+
+def test_signal_and_truth_of_one_name_keep_their_own_comments(shared_dir: Path, tmp_path: Path) -> None:
+    write_mapping(inspect_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag"), tmp_path / "m.toml")
+    lines = (tmp_path / "m.toml").read_text().splitlines()
+    above = {line.split("]")[0]: lines[i - 1] for i, line in enumerate(lines) if line.startswith("[")}
+    assert "Imu" in above["[signals.yaw_rate_rad_s"]
+    assert "TwistStamped" in above["[truth.yaw_rate_rad_s"]
