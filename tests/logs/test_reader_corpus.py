@@ -1,0 +1,121 @@
+"""Every recording of the corpus, written by other tools, ends as its catalogue says."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from recorded import numeric_paths
+
+from pdhef_logtool.errors import LogError, MappingError
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+
+# Their test fixtures carry a definition that is not the one the payloads were written with.
+_WRONG_DEFINITIONS = {("ros2_rosbag2/rosbag2_py/test/resources/sqlite3/talker/talker.db3", "/rosout")}
+
+
+def _corpus(shared_dir: Path) -> tuple[Path, list[dict[str, object]]]:
+    root = shared_dir / "reader_corpus"
+    return root, json.loads((root / "CATALOG.json").read_text())
+
+
+def _outcome(path: Path) -> tuple[str, dict[str, int] | None]:
+    try:
+        log = open_log(path)
+    except LogError:
+        return "must-be-rejected", None
+    try:
+        counts = {topic: len(columns) for topic, columns in log.read_stamps().items()}
+        assert counts == {t.name: t.messages for t in log.topics}
+        lost = any(loss.severity == "lost" for loss in log.lost)
+    finally:
+        log.close()
+    return ("truncated" if lost else "ok"), counts
+
+
+def test_every_recording_ends_as_catalogued(shared_dir: Path) -> None:
+    root, catalogue = _corpus(shared_dir)
+    wrong = []
+    for entry in catalogue:
+        outcome, counts = _outcome(root / str(entry["file"]))
+        if outcome != entry["expected"] or (counts is not None and counts != entry["messages"]):
+            wrong.append(f"{entry['file']}: expected {entry['expected']}, got {outcome} with {counts}")
+    assert len(catalogue) > 700
+    assert not wrong, "\n".join(wrong)
+
+
+def _field_problems(log: DriveLog, file: str) -> list[str]:
+    problems = []
+    for topic in log.topics:
+        if topic.encoding not in ("cdr", "ros1", "json") or topic.name == "/bad/data":
+            continue
+        paths = numeric_paths(log, topic.name)
+        columns = log.read({topic.name: paths})[topic.name]
+        if len(columns) != topic.messages:
+            problems.append(f"{file} {topic.name}: {len(columns)} of {topic.messages}")
+    problems += [
+        f"{file}: {loss.where}: {loss.what}"
+        for loss in log.lost
+        if loss.kind == "undecodable" and (file, loss.where) not in _WRONG_DEFINITIONS
+    ]
+    return problems
+
+
+def test_every_field_of_every_readable_recording_decodes(shared_dir: Path) -> None:
+    root, catalogue = _corpus(shared_dir)
+    problems: list[str] = []
+    for entry in catalogue:
+        if entry["expected"] == "must-be-rejected":
+            continue
+        log = open_log(root / str(entry["file"]))
+        problems += _field_problems(log, str(entry["file"]))
+        log.close()
+    assert not problems, "\n".join(problems)
+
+
+@pytest.mark.parametrize(
+    ("file", "broken", "healthy"),
+    [
+        ("plotjuggler_pj-mcap-server/test_bad_schema.mcap", "/bad/data", "/good/data"),
+        ("plotjuggler_pj-mcap-server/test_unsupported_encoding.mcap", None, None),
+        ("ros2_rosbag2/rosbag2_tests/resources/mcap/wrong_rmw_test/wrong_rmw_test_0.mcap", "/test_topic", None),
+    ],
+)
+def test_a_channel_that_cannot_be_decoded_spoils_no_other(
+    shared_dir: Path, file: str, broken: str | None, healthy: str | None
+) -> None:
+    log = open_log(shared_dir / "reader_corpus" / file)
+    undecodable = [t.name for t in log.topics if not log.fields(t.name)]
+    assert undecodable
+    assert broken is None or broken in undecodable
+    for topic in undecodable:
+        with pytest.raises(MappingError, match=topic):
+            log.read({topic: ["x"]})
+    for topic in {t.name for t in log.topics} - set(undecodable):
+        assert healthy is None or topic == healthy
+        assert len(log.read({topic: numeric_paths(log, topic)})[topic]) > 0
+    log.close()
+
+
+def test_a_database_that_its_folder_declares_in_another_format_is_not_decoded_as_cdr(shared_dir: Path) -> None:
+    folder = shared_dir / "reader_corpus" / "ros2_rosbag2/rosbag2_tests/resources/sqlite3/wrong_rmw_test"
+    log = open_log(folder)
+    assert {t.encoding for t in log.topics} == {"wrong_format"}
+    with pytest.raises(MappingError, match="wrong_format"):
+        log.read({"/test_topic": ["bool_value"]})
+    log.close()
+
+
+def test_publish_time_is_kept_apart_from_log_time(shared_dir: Path) -> None:
+    from mcap.reader import make_reader
+
+    path = shared_dir / "reader_corpus" / "plotjuggler_pj-mcap-server/test_publish_vs_log_time.mcap"
+    with path.open("rb") as file:
+        expected = [(m.log_time, m.publish_time) for _, _, m in make_reader(file).iter_messages()]
+    log = open_log(path)
+    (columns,) = log.read_stamps().values()
+    assert list(zip(columns.log_time_ns.tolist(), columns.publish_time_ns.tolist(), strict=True)) == expected
+    assert any(a != b for a, b in expected)
+    log.close()
