@@ -196,3 +196,10 @@ def test_the_instrument_with_its_yaw_rate_to_the_right(shared_dir: Path) -> None
     wrong = replace(channels["yaw_rate_rad_s"], values=-channels["yaw_rate_rad_s"].values)
     warnings = plausibility_warnings({**channels, "yaw_rate_rad_s": wrong})
     assert {(w.kind, w.suspects) for w in warnings} == {("sign", ("yaw_rate_rad_s",))}
+
+
+def test_weak_excitation_is_no_evidence(shared_dir: Path) -> None:
+    channels = read_drive(shared_dir, "comma2k19_segment.mcap", "comma2k19")
+    # A highway at 0.1 m/s² of lateral acceleration: its correlation with yaw rate × speed is 0.6.
+    wrong = replace(channels["ay_m_s2"], values=-channels["ay_m_s2"].values)
+    assert plausibility_warnings({**channels, "ay_m_s2": wrong}) == ()
