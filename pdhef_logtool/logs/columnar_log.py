@@ -50,8 +50,8 @@ class ColumnarLog:
         self._opened_lost = tuple(lost)
         self._distro = distro
         self._damaged: dict[tuple[int, int], Loss] = {}
-        self._undecodable: dict[tuple[int, int], int] = {}  # messages that do not decode, by container and channel
-        self._seen_undecodable: set[tuple[int, int, int, int]] = set()
+        # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
+        self._undecodable: dict[tuple[int, int, int], IntArray] = {}
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -109,12 +109,17 @@ class ColumnarLog:
         for c, container in enumerate(self._containers):
             found.extend(container.lost)
             found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
-            for (of, channel), n in sorted(self._undecodable.items()):
-                if of == c and n:
-                    topic = container.channels[channel].topic
-                    what = f"{n} messages do not fit the type of their topic"
-                    found.append(Loss("undecodable", what, topic, count=n))
+            found.extend(self._undecodable_losses(c, container))
         return tuple(found)
+
+    def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
+        counts: Counter[int] = Counter()
+        for (of, channel, _), rows in self._undecodable.items():
+            if of == c:
+                counts[channel] += len(rows)
+        for channel, n in sorted(counts.items()):
+            what = f"{n} messages do not fit the type of their topic"
+            yield Loss("undecodable", what, container.channels[channel].topic, count=n)
 
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
@@ -280,13 +285,13 @@ class ColumnarLog:
         if decoder is None:
             fields = {s.path: missing_column(s, len(rows)) for s in plan.selections}
             return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], fields)
-        before = decoder.undecodable
         fields = decoder.columns(block, rows)
-        if decoder.undecodable > before:
-            key = (c, span.index, id_, int(rows[0]))
-            if key not in self._seen_undecodable:
-                self._seen_undecodable.add(key)
-                self._undecodable[(c, id_)] = self._undecodable.get((c, id_), 0) + decoder.undecodable - before
+        if decoder.undecodable:
+            key = (c, id_, span.index)
+            seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
+            # Count by place in the channel: which other channels a block holds depends on what was asked for.
+            places = np.searchsorted(np.flatnonzero(block.channel == id_), decoder.undecodable)
+            self._undecodable[key] = np.union1d(seen, places.astype(np.int64))
         return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], fields)
 
 

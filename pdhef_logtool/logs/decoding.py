@@ -84,17 +84,18 @@ def channel_schema(channel: ChannelRecord, distro: str = "", example: bytes | No
 class ChannelDecoder:
     """Decodes the messages of one channel for one set of paths; made by :func:`compile_decoder`.
 
-    ``undecodable`` counts the messages so far whose payload does not fit their type (their fields are NaN).
+    ``undecodable`` holds the rows of the last block whose payload does not fit their type (their fields are NaN).
     """
 
     schema: MessageSchema
     selections: tuple[Selection, ...]
-    undecodable: int = 0
+    undecodable: list[int] = field(default_factory=list)
     _layouts: list[WireLayout] = field(default_factory=list)
     _columns_of: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def columns(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
+        self.undecodable = []
         partial: list[tuple[IntArray, dict[str, NDArray[Any]]]] = []
         left = np.arange(len(rows))
         if self.schema.wire in ("cdr", "ros1"):
@@ -148,10 +149,10 @@ class ChannelDecoder:
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self._single_decoder()
         values: dict[str, list[object]] = {s.path: [] for s in self.selections}
-        for at, n in zip(block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
+        for row, at, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
             message = decode(bytes(block.buffer[at : at + n]))
             if message is None:
-                self.undecodable += 1
+                self.undecodable.append(row)
             for s in self.selections:
                 values[s.path].append(_single_value(message, s))
         return {s.path: self._single_column(s, values[s.path]) for s in self.selections}

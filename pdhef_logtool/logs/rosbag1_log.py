@@ -128,6 +128,8 @@ class Rosbag1Container:
                 what = f"the record at byte {at} is malformed: {error}"
                 self._lost.append(Loss("bad-record", what, str(self.path)))
             at = end
+        if not header_seen:
+            raise self._no_bag("a bag header record", "none")
         close_chunk()
         self._declare_from_chunks()
         if not index_at and not self._lost:

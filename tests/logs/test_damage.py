@@ -1,0 +1,186 @@
+"""Damaged files: whatever bytes change, a log opens with a loss or ends in one clear error; nothing else escapes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from recorded import numeric_paths
+
+from pdhef_logtool.errors import PdhefError
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+
+T0 = 1_700_000_000_000_000_000
+N = 400
+
+
+def _mcap(folder: Path) -> bytes:
+    path = folder / "good.mcap"
+    stamps = T0 + np.arange(N) * 10_000_000
+    with McapLogWriter(path) as writer:
+        writer.add_topic("/imu", "sensor_msgs/msg/Imu", constants={"header.frame_id": "imu"})
+        for at in range(0, N, 100):  # a chunk a call
+            cut = slice(at, at + 100)
+            writer.write(
+                [TopicBatch("/imu", stamps[cut], stamps[cut], {"angular_velocity.z": np.arange(N)[cut] * 0.5})]
+            )
+    return path.read_bytes()
+
+
+def _mcap_of_another_writer(folder: Path) -> bytes:
+    from mcap.writer import CompressionType, Writer
+
+    path = folder / "other.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000, compression=CompressionType.LZ4)
+        writer.start()
+        schema = writer.register_schema("T", "jsonschema", b'{"type": "object"}')
+        channel = writer.register_channel("/t", "json", schema)
+        for i in range(N):
+            writer.add_message(channel, T0 + i, b'{"a": %d}' % i, T0 + i, i)
+        writer.finish()
+    return path.read_bytes()
+
+
+def _bag(folder: Path) -> bytes:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    name = "geometry_msgs/msg/Vector3"
+    path = folder / "good.bag"
+    writer = Writer(path)
+    writer.set_compression(writer.CompressionFormat.LZ4)
+    with writer:
+        connection = writer.add_connection("/v", name, typestore=store)
+        for i in range(N):
+            message = store.types[name](x=float(i), y=0.0, z=0.0)
+            writer.write(connection, T0 + i, store.serialize_ros1(message, name))
+    return path.read_bytes()
+
+
+def _database(folder: Path) -> bytes:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    name = "geometry_msgs/msg/Vector3"
+    with Writer(folder / "bag", version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connection = writer.add_connection("/v", name, typestore=store)
+        for i in range(N):
+            message = store.types[name](x=float(i), y=0.0, z=0.0)
+            writer.write(connection, T0 + i, store.serialize_cdr(message, name))
+    return (folder / "bag" / "bag.db3").read_bytes()
+
+
+_SOURCES: dict[str, Callable[[Path], bytes]] = {
+    "mcap": _mcap,
+    "mcap-lz4": _mcap_of_another_writer,
+    "bag": _bag,
+    "sqlite3": _database,
+}
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return {kind: make(tmp_path_factory.mktemp(kind)) for kind, make in _SOURCES.items()}
+
+
+def _read_everything(path: Path) -> tuple[int, bool]:
+    log = open_log(path)
+    try:
+        count = sum(len(c) for c in log.read_stamps().values())
+        for topic in log.topics:
+            log.read({topic.name: numeric_paths(log, topic.name)})
+        return count, bool(log.lost)
+    finally:
+        log.close()
+
+
+@pytest.mark.parametrize("kind", sorted(_SOURCES))
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_no_damage_escapes_as_another_error(
+    good: dict[str, bytes], tmp_path: Path, kind: str, data: st.DataObject
+) -> None:
+    content = bytearray(good[kind])
+    places = st.one_of(st.integers(0, len(content) - 1), st.integers(0, 300), st.integers(1, 300).map(lambda n: -n))
+    for at, value in data.draw(st.lists(st.tuples(places, st.integers(0, 255)), max_size=4)):
+        content[at] = value
+    cut = data.draw(st.one_of(st.none(), st.integers(0, len(content))))
+    path = tmp_path / "damaged"
+    path.write_bytes(content[:cut])
+    try:
+        _read_everything(path)
+    except PdhefError as error:
+        assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("kind", ["mcap", "mcap-lz4", "bag"])
+def test_a_cut_file_never_gives_more_nor_passes_as_whole(good: dict[str, bytes], tmp_path: Path, kind: str) -> None:
+    content, counts = good[kind], []
+    path = tmp_path / "cut"
+    for cut in np.linspace(len(content) * 0.2, len(content) - 1, 60).astype(int):
+        path.write_bytes(content[:cut])
+        try:
+            count, lost = _read_everything(path)
+        except PdhefError:
+            continue
+        assert lost
+        counts.append(count)
+    assert counts == sorted(counts)
+    assert counts[-1] == N
+
+
+def test_a_byte_flipped_in_any_chunk_costs_just_that_chunk(good: dict[str, bytes], tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    (tmp_path / "good").write_bytes(good["mcap"])
+    with (tmp_path / "good").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert len(summary.chunk_indexes) == 4
+    for chunk in summary.chunk_indexes:
+        content = bytearray(good["mcap"])
+        content[chunk.chunk_start_offset + chunk.chunk_length - 20] ^= 0xFF
+        (tmp_path / "bad").write_bytes(content)
+        log = open_log(tmp_path / "bad")
+        read = log.read({"/imu": ["angular_velocity.z"]})["/imu"]
+        (loss,) = log.lost
+        assert (loss.start_ns, loss.end_ns, loss.count) == (
+            chunk.message_start_time,
+            chunk.message_end_time + 1,
+            100,
+        )
+        kept = np.setdiff1d(np.arange(N), np.round(_lost_rows(chunk.message_start_time)))
+        np.testing.assert_array_equal(read.fields["angular_velocity.z"], kept * 0.5)
+        log.close()
+
+
+def _lost_rows(first_ns: int) -> np.ndarray:
+    first = (first_ns - T0) // 10_000_000
+    return np.arange(first, first + 100)
+
+
+def test_a_damaged_record_length_costs_only_up_to_the_next_indexed_chunk(
+    good: dict[str, bytes], tmp_path: Path
+) -> None:
+    from mcap.reader import make_reader
+
+    (tmp_path / "good").write_bytes(good["mcap"])
+    with (tmp_path / "good").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    content = bytearray(good["mcap"])
+    content[summary.chunk_indexes[1].chunk_start_offset + 7] = 0xFF  # the length now points past the end
+    (tmp_path / "bad").write_bytes(content)
+    log = open_log(tmp_path / "bad")
+    values = log.read({"/imu": ["angular_velocity.z"]})["/imu"].fields["angular_velocity.z"]
+    np.testing.assert_array_equal(values, np.setdiff1d(np.arange(N), np.arange(100, 200)) * 0.5)
+    assert [loss.kind for loss in log.lost] == ["bad-record"]
+    log.close()

@@ -1,0 +1,233 @@
+"""Paths, shapes and missing values, on messages whose content is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.decoding import NO_TIME_NS
+from pdhef_logtool.logs.message_schema import parse_path
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+
+T0 = 1_700_000_000_000_000_000
+
+
+def _write_raw(
+    path: Path, payloads: Sequence[bytes], encoding: str, name: str, schema_encoding: str, text: str
+) -> None:
+    with McapLogWriter(path, profile="") as writer:
+        channel = writer.add_raw_channel(
+            "/t",
+            schema_name=name,
+            schema_encoding=schema_encoding,
+            schema_data=text.encode(),
+            message_encoding=encoding,
+            metadata={},
+        )
+        writer.write([], [RawMessage(channel, T0 + i, T0 + i, i, p) for i, p in enumerate(payloads)])
+
+
+def _read_json(path: Path, messages: Sequence[object], schema: object, fields: Sequence[str]) -> dict[str, Any]:
+    text = "" if schema is None else json.dumps(schema)
+    encoding = "" if schema is None else "jsonschema"
+    _write_raw(path, [json.dumps(m).encode() for m in messages], "json", "T", encoding, text)
+    log = open_log(path)
+    try:
+        return dict(log.read({"/t": fields})["/t"].fields)
+    finally:
+        log.close()
+
+
+def _rosbags_store() -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def test_missing_json_fields_and_short_arrays_are_nan(tmp_path: Path) -> None:
+    messages = [{"a": 1, "b": {"c": [1.5, 2.5]}, "d": True}, {"b": {"c": [3.5]}}, {"a": None, "b": {}, "d": False}]
+    number = {"type": "number"}
+    inner = {"type": "object", "properties": {"c": {"type": "array", "items": number}}}
+    schema = {"type": "object", "properties": {"a": number, "b": inner, "d": {"type": "boolean"}}}
+    read = _read_json(tmp_path / "x.mcap", messages, schema, ["a", "b.c[1]", "b.c", "d"])
+    np.testing.assert_array_equal(read["a"], [1, np.nan, np.nan])
+    np.testing.assert_array_equal(read["b.c[1]"], [2.5, np.nan, np.nan])
+    np.testing.assert_array_equal(read["b.c"], [[1.5, 2.5], [3.5, np.nan], [np.nan, np.nan]])
+    np.testing.assert_array_equal(read["d"], [1, np.nan, 0])
+
+
+def test_json_without_a_schema_takes_its_fields_from_the_first_message(tmp_path: Path) -> None:
+    messages = [{"speed": 1.0, "pos": {"x": 1, "y": 2, "z": 3}, "name": "a"}, {"speed": 2.0, "pos": None}]
+    read = _read_json(tmp_path / "x.mcap", messages, None, ["speed", "pos"])
+    np.testing.assert_array_equal(read["speed"], [1, 2])
+    np.testing.assert_array_equal(read["pos"], [[1, 2, 3], [np.nan] * 3])
+    log = open_log(tmp_path / "x.mcap")
+    kinds = {f.path: f.kind for f in log.fields("/t")}
+    assert kinds == {"speed": "number", "pos.x": "number", "pos.y": "number", "pos.z": "number", "name": "string"}
+    log.close()
+
+
+def test_json_times_are_nanoseconds_and_missing_ones_are_marked(tmp_path: Path) -> None:
+    messages = [{"stamp": {"sec": 5, "nsec": 7}}, {}]
+    read = _read_json(tmp_path / "x.mcap", messages, None, ["stamp"])
+    assert read["stamp"].dtype == np.int64
+    assert read["stamp"].tolist() == [5_000_000_007, NO_TIME_NS]
+
+
+def test_places_that_a_json_schema_leaves_open_are_found_in_the_messages(tmp_path: Path) -> None:
+    messages = [{"m": {"v": [1, 2]}}, {"m": {"v": [3, 4]}}]
+    read = _read_json(tmp_path / "x.mcap", messages, {"type": "object"}, ["m.v", "m.v[1]"])
+    np.testing.assert_array_equal(read["m.v"], [[1, 2], [3, 4]])
+    np.testing.assert_array_equal(read["m.v[1]"], [2, 4])
+
+
+def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
+    _write_raw(tmp_path / "x.mcap", [b'{"a": 1}', b"{", b'{"a": 3}'], "json", "T", "", "")
+    log = open_log(tmp_path / "x.mcap")
+    for start in (None, T0 + 1):  # a second read must not count it twice
+        read = log.read({"/t": ["a"]}, start)["/t"].fields["a"]
+        np.testing.assert_array_equal(read, [1, np.nan, 3] if start is None else [np.nan, 3])
+        (loss,) = log.lost
+        assert (loss.kind, loss.count, loss.severity) == ("undecodable", 1, "lost")
+    log.close()
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(
+    rows=st.lists(
+        st.tuples(
+            st.lists(st.text("abc", max_size=4), max_size=3), st.lists(st.floats(width=64), max_size=3), st.booleans()
+        ),
+        min_size=1,
+        max_size=25,
+    )
+)
+def test_changing_layouts_and_byte_orders_read_like_the_independent_deserialiser(
+    tmp_path_factory: pytest.TempPathFactory, rows: list[tuple[list[str], list[float], bool]]
+) -> None:
+    store = _rosbags_store()
+    types, name = store.types, "sensor_msgs/msg/JointState"
+    header = types["std_msgs/msg/Header"](stamp=types["builtin_interfaces/msg/Time"](sec=3, nanosec=4), frame_id="f")
+    payloads = [
+        bytes(
+            store.serialize_cdr(
+                types[name](
+                    header=header,
+                    name=names,
+                    position=np.array(position),
+                    velocity=np.array(position[:1]),
+                    effort=np.zeros(0),
+                ),
+                name,
+                little_endian=little,
+            )
+        )
+        for names, position, little in rows
+    ]
+    path = tmp_path_factory.mktemp("layouts") / "x.mcap"
+    _write_raw(path, payloads, "cdr", name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0])
+    log = open_log(path)
+    read = log.read({"/t": ["header.stamp", "position", "position[1]", "velocity[0]"]})["/t"].fields
+    assert log.lost == ()
+    assert read["header.stamp"].tolist() == [3_000_000_004] * len(rows)
+    width = max(len(p) for _, p, _ in rows)
+    padded = np.array([p + [np.nan] * (width - len(p)) for _, p, _ in rows]).reshape(len(rows), width)
+    np.testing.assert_array_equal(read["position"].reshape(len(rows), -1), padded)
+    np.testing.assert_array_equal(read["position[1]"], [p[1] if len(p) > 1 else np.nan for _, p, _ in rows])
+    np.testing.assert_array_equal(read["velocity[0]"], [p[0] if p else np.nan for _, p, _ in rows])
+    log.close()
+
+
+def test_a_cut_payload_costs_only_its_own_message(tmp_path: Path) -> None:
+    store = _rosbags_store()
+    name = "geometry_msgs/msg/Vector3"
+    full = [bytes(store.serialize_cdr(store.types[name](x=float(i), y=0.0, z=0.0), name)) for i in range(5)]
+    payloads = [*full[:2], full[2][:11], *full[3:]]
+    _write_raw(tmp_path / "x.mcap", payloads, "cdr", name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0])
+    log = open_log(tmp_path / "x.mcap")
+    np.testing.assert_array_equal(log.read({"/t": ["x"]})["/t"].fields["x"], [0, 1, np.nan, 3, 4])
+    assert [(loss.kind, loss.count) for loss in log.lost] == [("undecodable", 1)]
+    log.close()
+
+
+def test_listed_fields_follow_the_schema(tmp_path: Path) -> None:
+    store = _rosbags_store()
+    name = "nav_msgs/msg/Odometry"
+    _write_raw(tmp_path / "x.mcap", [], "cdr", name, "ros2msg", store.generate_msgdef(name, ros_version=2)[0])
+    log = open_log(tmp_path / "x.mcap")
+    kinds = {f.path: f.kind for f in log.fields("/t")}
+    assert kinds["header.stamp"] == "time"
+    assert kinds["header.frame_id"] == "string"
+    assert kinds["twist.twist.angular.z"] == "number"
+    assert kinds["pose.covariance[]"] == "number"  # 36 elements: more than are listed
+    assert "header.stamp.sec" not in kinds
+    log.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "problem"),
+    [
+        ("angular_velocity.zz", "angular_velocity.z"),
+        ("yaw.z", "angular_velocity.z"),
+        ("header.frame_id", "text"),
+        ("header", "struct"),
+        ("orientation_covariance[9]", "nearest"),
+        ("angular_velocity..z", "dotted path"),
+        ("angular_velocity[", "dotted path"),
+        ("", "dotted path"),
+    ],
+)
+def test_a_wrong_path_names_the_nearest(tmp_path: Path, path: str, problem: str) -> None:
+    with McapLogWriter(tmp_path / "x.mcap") as writer:
+        writer.add_topic("/imu", "sensor_msgs/msg/Imu")
+    log = open_log(tmp_path / "x.mcap")
+    with pytest.raises(MappingError, match=problem):
+        log.read({"/imu": [path]})
+    log.close()
+
+
+def test_a_wrong_topic_names_the_nearest(tmp_path: Path) -> None:
+    with McapLogWriter(tmp_path / "x.mcap") as writer:
+        writer.add_topic("/vehicle/imu", "sensor_msgs/msg/Imu")
+    log = open_log(tmp_path / "x.mcap")
+    with pytest.raises(MappingError, match="nearest: /vehicle/imu"):
+        log.read({"/vehicle/imv": ["x"]})
+    log.close()
+
+
+def test_an_empty_window_has_columns_of_the_right_shape(tmp_path: Path) -> None:
+    with McapLogWriter(tmp_path / "x.mcap") as writer:
+        writer.add_topic("/imu", "sensor_msgs/msg/Imu")
+    log = open_log(tmp_path / "x.mcap")
+    columns = log.read({"/imu": ["header.stamp", "orientation", "orientation_covariance", "angular_velocity.z"]})[
+        "/imu"
+    ]
+    assert (log.start_ns, log.end_ns, len(columns)) == (0, 0, 0)
+    assert columns.fields["header.stamp"].dtype == np.int64
+    assert columns.fields["orientation"].shape == (0, 4)
+    assert columns.fields["orientation_covariance"].shape == (0, 9)
+    assert columns.fields["angular_velocity.z"].shape == (0,)
+    log.close()
+
+
+@pytest.mark.parametrize(
+    ("path", "steps"),
+    [
+        ("a", ("a",)),
+        ("a.b.c", ("a", "b", "c")),
+        ("a[3]", ("a", 3)),
+        ("a[0][1].b", ("a", 0, 1, "b")),
+        ("data[]", ("data",)),
+    ],
+)
+def test_paths_split_into_steps(path: str, steps: tuple[object, ...]) -> None:
+    assert parse_path(path) == steps

@@ -1,0 +1,211 @@
+"""Full copies: every message, attachment and metadata record of the source, in log-time order."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import decoded_by_rosbags
+
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.source_copy import (
+    iterate_attachments,
+    iterate_metadata,
+    iterate_raw,
+    register_channels,
+    source_profile,
+)
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+
+T0 = 1_700_000_000_000_000_000
+
+
+def _copy(source: Path, target: Path) -> None:
+    log = open_log(source)
+    with McapLogWriter(target, profile=source_profile(log)) as writer:
+        channels = register_channels(writer, log)
+        assert channels.lost == ()
+        writer.write([], iterate_raw(log, channels))
+        for a in iterate_attachments(log):
+            writer.attachment(a.name, a.media_type, a.data, a.log_time_ns, a.create_time_ns)
+        for m in iterate_metadata(log):
+            writer.metadata(m.name, m.values)
+    log.close()
+
+
+def _content(path: Path) -> list[tuple[object, ...]]:
+    """Everything about every message through another reader, in log-time order."""
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        return [
+            (
+                m.log_time,
+                c.topic,
+                c.message_encoding,
+                tuple(sorted(c.metadata.items())),
+                (s.name, s.encoding, s.data) if s else None,
+                m.publish_time,
+                m.sequence,
+                m.data,
+            )
+            for s, c, m in make_reader(file, validate_crcs=True).iter_messages()
+        ]
+
+
+def _many_sided_source(path: Path) -> None:
+    """Two encodings, a channel without schema, two publishers of one topic, channel metadata, equal log times."""
+    text = b"float64 x\n"
+    with McapLogWriter(path, profile="mixed") as writer:
+        ids = [
+            writer.add_raw_channel(
+                topic,
+                schema_name=name,
+                schema_encoding=encoding,
+                schema_data=data,
+                message_encoding=kind,
+                metadata=metadata,
+            )
+            for topic, name, encoding, data, kind, metadata in (
+                ("/a", "own/msg/A", "ros2msg", text, "cdr", {"offered_qos_profiles": "- depth: 1"}),
+                ("/a", "own/msg/A", "ros2msg", text, "cdr", {"offered_qos_profiles": "- depth: 1"}),
+                ("/b", "", "", b"", "json", {}),
+                ("/c", "pb.C", "protobuf", b"\x0a\x01", "protobuf", {"k": "v"}),
+            )
+        ]
+        rng = np.random.default_rng(1)
+        times = T0 + np.sort(rng.integers(0, 500, size=3000))
+        writer.write(
+            [],
+            [
+                RawMessage(ids[i % 4], int(t), int(t) - i, 7 * i, rng.bytes(int(rng.integers(0, 1500))))
+                for i, t in enumerate(times)
+            ],
+        )
+        writer.attachment("notes.txt", "text/plain", b"windy", T0, T0 - 1)
+        writer.metadata("car", {"tyres": "used"})
+
+
+def test_an_mcap_copy_equals_its_source(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _many_sided_source(source)
+    _copy(source, target)
+    assert _content(target) == _content(source)
+    with target.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "mixed"
+        summary = reader.get_summary()
+        assert summary is not None
+        assert len(summary.channels) == 4
+        (attachment,) = reader.iter_attachments()
+        assert (attachment.name, attachment.media_type, attachment.data) == ("notes.txt", "text/plain", b"windy")
+        assert (attachment.log_time, attachment.create_time) == (T0, T0 - 1)
+        assert [(m.name, m.metadata) for m in reader.iter_metadata()] == [("car", {"tyres": "used"})]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "data/drives/comma2k19_segment.mcap",
+        "data/drives/faulty/revs_250lm_a_disorder.mcap",
+        "reader_corpus/plotjuggler_pj-mcap-server/test_unsupported_encoding.mcap",
+        "reader_corpus/rerun/foxglove_log.mcap",
+    ],
+)
+def test_copies_of_recordings_equal_their_sources(shared_dir: Path, tmp_path: Path, name: str) -> None:
+    _copy(shared_dir / name, tmp_path / "copy.mcap")
+    copied, original = _content(tmp_path / "copy.mcap"), _content(shared_dir / name)
+    assert len(copied) == len(original)
+    assert [m[0] for m in copied] == [m[0] for m in original]
+    # The other reader leaves the order of equal log times open.
+    assert Counter(copied) == Counter(original)
+
+
+def test_a_database_copy_keeps_bytes_and_definitions(shared_dir: Path, tmp_path: Path) -> None:
+    from rosbags.highlevel import AnyReader
+
+    source = shared_dir / "data/drives/lunda_v40"
+    _copy(source, tmp_path / "copy.mcap")
+    with AnyReader([source]) as reader:
+        expected = [(stamp, c.topic, c.msgtype, bytes(data)) for c, stamp, data in reader.messages()]
+    copied = [(m[0], m[1], m[4][0], m[7]) for m in _content(tmp_path / "copy.mcap")]  # type: ignore[index]
+    assert sorted(copied) == sorted(expected)
+    assert len(decoded_by_rosbags([tmp_path / "copy.mcap"])["/vbox/slip"]) == 2396
+
+
+def test_an_old_database_copy_gets_the_definitions_of_common_types(shared_dir: Path, tmp_path: Path) -> None:
+    _copy(shared_dir / "reader_corpus/foxglove_mcap/chatter.db3", tmp_path / "copy.mcap")
+    chatter = decoded_by_rosbags([tmp_path / "copy.mcap"])["/chatter"]
+    assert len(chatter) == 7
+    assert all(m.data.startswith("Hello") for _, m in chatter)
+
+
+@pytest.mark.parametrize(
+    "name", ["reader_corpus/plotjuggler/tilt_laser.bag", "reader_corpus/foxglove_rosbag1/example-bz2.bag"]
+)
+def test_a_ros1_bag_becomes_ros2_cdr_of_the_same_content(shared_dir: Path, tmp_path: Path, name: str) -> None:
+    _copy(shared_dir / name, tmp_path / "copy.mcap")
+    original, copied = decoded_by_rosbags([shared_dir / name]), decoded_by_rosbags([tmp_path / "copy.mcap"])
+    assert set(copied) == set(original)
+    for topic, messages in original.items():
+        theirs = sorted((stamp, _without_sequence_number(m)) for stamp, m in messages)
+        ours = sorted((stamp, _without_sequence_number(m)) for stamp, m in copied[topic])
+        assert ours == theirs, topic
+    log = open_log(tmp_path / "copy.mcap")
+    assert {t.encoding for t in log.topics} == {"cdr"}
+    log.close()
+
+
+def _without_sequence_number(message: object) -> str:
+    """Text of a message; ROS 2 headers have no sequence number."""
+    if hasattr(message, "__dict__"):
+        members = {k: v for k, v in vars(message).items() if k not in ("seq", "__msgtype__")}
+        return "{" + ", ".join(f"{k}: {_without_sequence_number(v)}" for k, v in members.items()) + "}"
+    if isinstance(message, list):
+        return "[" + ", ".join(_without_sequence_number(m) for m in message) + "]"
+    if isinstance(message, np.ndarray):
+        return f"{message.dtype} {message.tolist()}"
+    return repr(message)
+
+
+def test_header_sequence_numbers_of_ros1_become_message_sequences(shared_dir: Path, tmp_path: Path) -> None:
+    source = shared_dir / "reader_corpus/plotjuggler/tilt_laser.bag"
+    _copy(source, tmp_path / "copy.mcap")
+    expected = [m.header.seq for _, m in decoded_by_rosbags([source])["/imu_data"]]
+    assert len(set(expected)) > 100
+    assert [m[6] for m in _content(tmp_path / "copy.mcap") if m[1] == "/imu_data"] == expected
+
+
+def test_a_window_gives_the_messages_of_that_window(shared_dir: Path, tmp_path: Path) -> None:
+    log = open_log(shared_dir / "data/drives/faulty/revs_250lm_a_disorder.mcap")
+    with McapLogWriter(tmp_path / "x.mcap") as writer:
+        channels = register_channels(writer, log)
+        start, end = log.start_ns + 20 * 10**9, log.start_ns + 50 * 10**9
+        whole = [m for m in iterate_raw(log, channels) if start <= m.log_time_ns < end]
+        assert list(iterate_raw(log, channels, start, end)) == whole
+        assert len(whole) > 10_000
+    log.close()
+
+
+def test_memory_does_not_grow_with_the_log(tmp_path: Path) -> None:
+    def peak_bytes(n: int) -> int:
+        path = tmp_path / f"{n}.mcap"
+        with McapLogWriter(path) as writer:
+            id_ = writer.add_raw_channel(
+                "/a", schema_name="", schema_encoding="", schema_data=b"", message_encoding="json", metadata={}
+            )
+            blob = np.random.default_rng(0).bytes(20_000)
+            writer.write([], (RawMessage(id_, T0 + i, T0 + i, i, blob) for i in range(n)))
+        tracemalloc.start()
+        _copy(path, tmp_path / "copy.mcap")
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak
+
+    peak_bytes(200)  # imports
+    assert peak_bytes(4000) < 2 * peak_bytes(1000)
