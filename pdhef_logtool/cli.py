@@ -264,8 +264,10 @@ def view(
 def _stdout() -> Console:
     from rich.console import Console
 
-    # A pipe has no width of its own: tables are then as wide as they need to be, so that nothing is cut.
-    return Console(soft_wrap=False) if sys.stdout.isatty() else Console(width=160, force_terminal=False)
+    # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS says otherwise.
+    if sys.stdout.isatty() or os.environ.get("COLUMNS"):
+        return Console()
+    return Console(width=160)
 
 
 def _say(text: str) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.alignment import SURVEY_S, AlignmentPlan, align, plan_alignment
+from pdhef_logtool.alignment import SURVEY_S, AlignmentPlan, align, count_late, plan_alignment
 from pdhef_logtool.evaluation.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -16,12 +16,15 @@ from pdhef_logtool.evaluation.truth import (
     estimate_truth_latency,
     plan_truth,
     truth_at,
+    yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import ClockModel, Mapping, fit_clocks, join_channels, merge_losses, read_signals
 from pdhef_logtool.signals import Channel, Loss, Signals
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import VehicleParameters
+
+_LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,8 +53,9 @@ class DrivePlan:
 
     @property
     def truth_latency_s(self) -> float:
-        """Latency that all estimators' comparison with truth uses."""
-        return 0.0 if self.latency is None else self.latency.latency_s
+        """Latency that all estimators' comparison with truth uses; 0 unless it stands out of its own uncertainty."""
+        known = self.latency is not None and abs(self.latency.latency_s) > 2.0 * self.latency.std_error_s
+        return self.latency.latency_s if known and self.latency is not None else 0.0
 
     @property
     def has_truth_pose(self) -> bool:
@@ -94,12 +98,8 @@ def plan_drive(log: DriveLog, mapping: Mapping, vehicle: VehicleParameters, star
         derived = derive_truth(survey.truth, plan=truth)
         derivation = dict(derived.derivation)
         gyro = survey.signals.get("yaw_rate_rad_s")
-        rate = survey.truth.get("yaw_rate_rad_s")
-        if rate is None and np.isfinite(derived.track.yaw_rate_rad_s).any():
-            known = np.isfinite(derived.track.yaw_rate_rad_s)
-            stamps = derived.track.stamps_ns[known]
-            rate = Channel("yaw_rate_rad_s", "rad/s", "derived", stamps, stamps, derived.track.yaw_rate_rad_s[known])
-        if gyro is not None and rate is not None and len(gyro) and len(rate):
+        rate = survey.truth.get("yaw_rate_rad_s") or yaw_rate_channel(derived)
+        if gyro is not None and len(gyro) and len(rate):
             latency = estimate_truth_latency(gyro, rate)
     return DrivePlan(
         mapping=mapping,
@@ -162,6 +162,12 @@ class DriveReader:
     ) -> DriveWindow:
         plan = self.plan
         aligned = align(signals, plan.alignment, start_ns, end_ns)
+        late = [
+            Loss("late", _LATE, signals[name].source, start_ns, end_ns, count, "note")
+            for name, count in count_late(signals, plan.alignment, start_ns, end_ns).items()
+            if count
+        ]
+        self.losses = merge_losses([self.losses, late])
         at_stamps = None
         if plan.truth is not None:
             at_stamps = truth_at(derive_truth(truth, plan=plan.truth), aligned.stamps_ns, plan.truth_latency_s)

@@ -220,7 +220,7 @@ def _run_open_log(
             context = _estimate(reader, estimators, sinks, store, lambda share: progress(log_input.stem, 0.8 * share))
             progress(log_input.stem, 0.8)
             rows, events = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
-        losses = merge_losses([log.lost, reader.losses])
+        losses = merge_losses([log.lost, reader.losses, *(sink.lost for sink in sinks)])
         report = build_report(
             _facts(
                 log, log_input, sha256, plan, missing, vehicle, estimators, skipped, rows, events, losses, warnings,
@@ -438,7 +438,12 @@ def _facts(
 ) -> ReportFacts:
     mapping = plan.mapping
     mapped = set(mapping.topics)
-    notes = [] if plan.latency is None else [f"latency: {plan.latency.reason}"]
+    notes = []
+    if plan.latency is not None:
+        found = plan.latency
+        measured = f"{found.latency_s * 1e3:.1f} ms ± {found.std_error_s * 1e3:.1f} ms" if found.reliable else "unknown"
+        verdict = "applied" if plan.truth_latency_s else "not applied: it does not stand out of its own uncertainty"
+        notes.append(f"latency {measured} ({found.reason}), {verdict}")
     notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
     if "cg" in plan.derivation:
         notes.append(plan.derivation["cg"])
@@ -466,7 +471,7 @@ def _facts(
             quantities=[
                 _truth_quantity(name, how, mapping, samples) for name, how in plan.derivation.items() if name != "cg"
             ],
-            latency_s=None if plan.latency is None else plan.latency.latency_s,
+            latency_s=None if plan.latency is None else plan.truth_latency_s,
             not_independent=sorted(plan.dependent),
             notes=notes,
         ),

@@ -27,6 +27,9 @@ _COLUMNS: tuple[tuple[str, str, str, float, int], ...] = (
     ("1 s lateral\nRMSE m", "lateral_1s_m", "rmse", 1.0, 3),
 )
 _SEGMENTS = ("linear", "nonlinear")
+_LEAVE_FIRST = ("v_x\nRMSE m/s", "\nmax °", "1 s lateral\nRMSE m", "v_y\nRMSE m/s", "\np95 °", "a_y\nRMSE m/s²")
+#: Width of the columns that always stand: name, two segments, NIS.
+_FIXED_WIDTH = 43
 
 
 def render_run(result: RunResult, console: Console) -> None:
@@ -64,7 +67,7 @@ def _render_log(one: LogResult, console: Console) -> None:
             start = report["log"]["start_ns"]
             span = f", {(loss['start_ns'] - start) / 1e9:.2f} to {(loss['end_ns'] - start) / 1e9:.2f} s"
         console.print(f"  {word}: {count}{loss['what']} ({loss['where']}{span})", highlight=False)
-    console.print(_table(report))
+    console.print(_table(report, console.width))
     if not report["truth"]["available"]:
         console.print("  no truth in this log: estimates, NIS and disagreement only", highlight=False)
     if report["truth"]["not_independent"]:
@@ -75,12 +78,16 @@ def _render_log(one: LogResult, console: Console) -> None:
     console.print()
 
 
-def _table(report: Mapping[str, Any]) -> Table:
+def _table(report: Mapping[str, Any], width: int) -> Table:
     from rich.table import Table
 
     values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
     present = {(m["signal"], m["metric"]) for m in report["metrics"] if m["segment"] == "all"}
     shown = [c for c in _COLUMNS if (c[1], c[2]) in present]
+    # On a narrow terminal the columns that matter least go, rather than all of them being squeezed.
+    for head in _LEAVE_FIRST:
+        if _width(shown) > width:
+            shown = [c for c in shown if c[0] != head]
     table = Table(box=None, header_style="bold", pad_edge=True)
     table.add_column("\nestimator")
     dependent = report["truth"]["not_independent"]
@@ -105,6 +112,10 @@ def _table(report: Mapping[str, Any]) -> Table:
             cells.append(_cell(_nis_ratio(values, name), 1.0, 2))
         table.add_row(*cells)
     return table
+
+
+def _width(columns: list[tuple[str, str, str, float, int]]) -> int:
+    return _FIXED_WIDTH + sum(max(len(line) for line in head.splitlines()) + 2 for head, *_ in columns)
 
 
 def _nis_ratio(values: Mapping[tuple[str, str, str, str], float | None], name: str) -> float | None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -163,10 +163,13 @@ class Inspection:
         return {key: _json_value(value) for key, value in document.items()}
 
 
-def inspect_log(path: Path, mapping: Mapping | None = None) -> Inspection:
+def inspect_log(
+    path: Path, mapping: Mapping | None = None, *, prefer_truth: Literal["perfect", "rtk"] = "perfect"
+) -> Inspection:
     """Read a log once through and report on it; without a mapping the well-known types are recognised.
 
-    Memory is bounded by windows of ten minutes, whatever the log's length.
+    Memory is bounded by windows of ten minutes, whatever the log's length. ``prefer_truth`` is the choice of
+    :func:`pdhef_logtool.mapping.auto_map`.
 
     Raises
     ------
@@ -177,16 +180,18 @@ def inspect_log(path: Path, mapping: Mapping | None = None) -> Inspection:
     """
     log = open_log(path)
     try:
-        return inspect_drive_log(log, mapping)
+        return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
     finally:
         log.close()
 
 
-def inspect_drive_log(log: DriveLog, given: Mapping | None = None) -> Inspection:
+def inspect_drive_log(
+    log: DriveLog, given: Mapping | None = None, *, prefer_truth: Literal["perfect", "rtk"] = "perfect"
+) -> Inspection:
     """Do what :func:`inspect_log` does with a log that is open already."""
     ambiguities: tuple[Ambiguity, ...] = ()
     if given is None:
-        auto = auto_map(log)
+        auto = auto_map(log, prefer_truth=prefer_truth)
         mapping, ambiguities = auto.mapping, auto.ambiguities
     else:
         check_mapping(given, log)
@@ -412,8 +417,12 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
     Raises
     ------
     OutputError
-        The file cannot be written.
+        The file exists already (somebody may have edited it) or cannot be written.
     """
+    if path.exists():
+        raise OutputError(
+            expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
+        )
     text = mapping_to_toml(inspection.mapping, comments=mapping_comments(inspection))
     unfinished = path.with_name(f".{path.name}.part")
     try:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Protocol, Self
 
 from pdhef_logtool.errors import OutputError
-from pdhef_logtool.signals import Signals
+from pdhef_logtool.signals import Loss, Signals
 from pdhef_logtool.tracks import StateTrack
 
 #: Name of the track that holds the truth.
@@ -35,6 +35,11 @@ class Sink(Protocol):
     current window opens the next one. Then either :meth:`finish` or :meth:`abort` ends the sink; nothing stands
     under the final name before :meth:`finish` returns.
     """
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """What of the source this output cannot hold."""
+        ...
 
     def append_signals(self, signals: Signals) -> None:
         """Take what the estimators saw in this window."""

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.errors import OutputError
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.signals import FloatArray, Signals
+from pdhef_logtool.signals import FloatArray, Loss, Signals
 from pdhef_logtool.sinks.base import Event, PendingFile
 from pdhef_logtool.sinks.schema import arrow_schema
 from pdhef_logtool.tracks import TRACK_COLUMNS, StateTrack, make_track
@@ -55,6 +55,11 @@ class EstimatesSink:
             )
         except OSError as error:
             raise _cannot_write(path, error) from error
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """Nothing: this output holds no source data."""
+        return ()
 
     def append_signals(self, signals: Signals) -> None:
         """Take nothing: estimates.parquet holds no inputs."""

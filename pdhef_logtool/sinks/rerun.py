@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from pdhef_logtool.errors import OutputError
 from pdhef_logtool.geometry import wrap_angle
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Loss, Signals
 from pdhef_logtool.sinks.base import TRUTH, Event, PendingFile
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
@@ -116,6 +116,11 @@ class RerunSink:
             raise OutputError(expected="a place to write to", got=str(error), where=str(path)) from error
         self._recording.send_recording_name(log_name)
         self._recording.send_recording_start_time_nanos(start_ns)
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """Nothing: this output holds no source data."""
+        return ()
 
     def append_signals(self, signals: Signals) -> None:
         """Draw what the estimators saw in this window."""
