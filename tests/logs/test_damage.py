@@ -184,3 +184,46 @@ def test_a_damaged_record_length_costs_only_up_to_the_next_indexed_chunk(
     np.testing.assert_array_equal(values, np.setdiff1d(np.arange(N), np.arange(100, 200)) * 0.5)
     assert [loss.kind for loss in log.lost] == ["bad-record"]
     log.close()
+
+
+def test_a_byte_that_only_the_crc_shows_costs_its_chunk(tmp_path: Path) -> None:
+    from mcap.writer import CompressionType, Writer
+
+    path = tmp_path / "plain.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000, compression=CompressionType.NONE)
+        writer.start()
+        channel = writer.register_channel("/t", "json", writer.register_schema("T", "", b""))
+        for i in range(N):
+            writer.add_message(channel, T0 + i, b'{"a": %03d}' % (100 + i), T0 + i, i)
+        writer.finish()
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b'{"a": 350}', b'{"a": 950}'))
+    log = open_log(path)
+    values = log.read({"/t": ["a"]})["/t"].fields["a"]
+    (loss,) = log.lost
+    assert loss.kind == "bad-chunk"
+    assert len(values) == N - (loss.count or 0) < N
+    assert not np.isin([350.0, 950.0], values).any()
+    log.close()
+
+
+def test_a_chunk_whose_index_is_cut_gives_all_its_topics(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    path = tmp_path / "log.mcap"
+    stamps = T0 + np.arange(N) * 10_000_000
+    with McapLogWriter(path) as writer:
+        for topic in ("/a", "/b"):
+            writer.add_topic(topic, "sensor_msgs/msg/Imu")
+        writer.write([TopicBatch(topic, stamps, stamps, {}) for topic in ("/a", "/b")])
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    (chunk,) = summary.chunk_indexes
+    second_index = sorted(chunk.message_index_offsets.values())[1]
+    path.write_bytes(path.read_bytes()[: second_index + 20])
+    log = open_log(path)
+    assert {t: len(c) for t, c in log.read_stamps().items()} == {"/a": N, "/b": N}
+    assert [loss.kind for loss in log.lost] == ["truncated"]
+    log.close()
