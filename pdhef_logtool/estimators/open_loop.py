@@ -52,6 +52,9 @@ def _open_loop(dt, steer, ax, speed, friction, default_friction, p, state, value
         elif ok:
             state[3] = state[0] * math.tan(steer[k]) / (p.front_m + p.rear_m)
             state[2] = p.rear_m * state[3]
+        ok = ok and math.isfinite(state[2]) and math.isfinite(state[3])
+        if not ok:
+            state[2] = math.nan  # steering lost, or a vehicle too light for its tyres: start anew
         state[4] = steer[k]
         state[5] = mu
         valid[k] = ok

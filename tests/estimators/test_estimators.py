@@ -328,6 +328,22 @@ def test_spikes_do_no_harm(fault, plain):
     assert worst(track.vx_m_s - reference.vx_m_s, settled) < 0.3
 
 
+@pytest.mark.parametrize("name", ["open-loop", "phy-ukf"])
+@pytest.mark.parametrize("delay_s", [0.0, 0.25])
+@pytest.mark.filterwarnings("error")
+def test_a_vehicle_that_no_step_can_follow_claims_nothing_infinite(name, delay_s, plain):
+    """A yaw inertia in the wrong unit makes the model faster than any step: the state runs away, and is dropped."""
+    toy = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 0.001})
+    sparse = keep(plain, np.arange(len(plain)) % 20 == 0)
+    track, _ = make_estimator(name, toy).run(replace(sparse, ready_ns=sparse.stamps_ns + round(delay_s * 1e9)), None)
+    assert not track.valid[5:].all()
+    for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"):
+        assert np.isfinite(getattr(track, column)[track.valid]).all()
+        assert np.isnan(getattr(track, column)[~track.valid]).all()
+    if name == "phy-ukf":
+        assert np.isfinite(track.covariance[track.valid]).all()
+
+
 @pytest.mark.parametrize("limit", ["steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"])
 def test_only_what_no_vehicle_can_do_is_dropped(limit, plain):
     hard = {"steer_rad": 0.6, "ax_m_s2": 60.0, "ay_m_s2": 45.0, "yaw_rate_rad_s": 8.0, "speed_m_s": 110.0}[limit]

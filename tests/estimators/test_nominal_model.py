@@ -71,8 +71,9 @@ def test_blend_has_no_step_in_speed(vy, r, steer, mu):
         below = nominal_model.state_derivative(vx - 1e-9, vy, r, steer, 0.0, mu, P)
         above = nominal_model.state_derivative(vx + 1e-9, vy, r, steer, 0.0, mu, P)
         np.testing.assert_allclose(below, above, rtol=0, atol=1e-5)
-        outputs = [nominal_model.measured_lateral_acceleration(v, vy, r, steer, mu, P) for v in (vx - 1e-9, vx + 1e-9)]
-        assert outputs[0] == pytest.approx(outputs[1], abs=1e-6)
+        for output in (nominal_model.measured_lateral_acceleration, nominal_model.planar_lateral_acceleration):
+            at = [output(v, vy, r, steer, mu, P) for v in (vx - 1e-9, vx + 1e-9)]
+            assert at[0] == pytest.approx(at[1], abs=1e-6)
 
 
 @pytest.mark.parametrize("vx", [-5.0, -1.0, 0.0, 0.5, 1.4])

@@ -22,7 +22,7 @@ from reference_car import (
     with_noise,
 )
 
-from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood
+from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood, sideslip_std
 from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.signals import Signals
 from pdhef_logtool.vehicle import default_vehicle
@@ -142,16 +142,26 @@ def test_a_gate_that_opened_closes_again(good):
     assert rejected(posteriors(edited(changed, "speed_m_s", at, 90.0)))[at]
 
 
+def test_the_gate_holds_anew_after_it_opened(good):
+    """Opening lets one sample in; the next one that contradicts has to last for 0.2 s again."""
+    changed = replace(good.signals, speed_m_s=good.signals.speed_m_s + np.where(good.time_s >= 4.0, 8.0, 0.0))
+    steps = posteriors(changed)
+    opened = 400 + int(np.argmax(~rejected(steps)[400:] & np.isfinite(steps.innovation[400:, 2])))
+    assert opened > 415
+    worse = edited(changed, "speed_m_s", opened + 2, 90.0)
+    assert rejected(posteriors(worse))[opened + 2]
+
+
 # --- standstill ------------------------------------------------------------------------------------------------------
 
 
-def stop_and_go() -> Drive:
+def stop_and_go(steer: float = 0.15) -> Drive:
     """Drive at 6 m/s, stand from 5 to 9 s with the wheels turned, drive on."""
 
     def speed(t):
         return np.clip(6.0 - 2.0 * np.clip(t - 2.0, 0, None), 0.0, None) + np.clip(1.5 * (t - 9.0), 0.0, 6.0)
 
-    return rolling_drive(speed, lambda t: 0.15 * np.ones_like(t), 14.0)
+    return rolling_drive(speed, lambda t: np.full_like(t, steer), 14.0)
 
 
 def still_noise(signals: Signals, still: np.ndarray) -> Signals:
@@ -186,9 +196,10 @@ def test_standstill_learns_the_bias_of_the_accelerometer():
     assert steps.x[850, 3] == pytest.approx(0.5, abs=0.15)
 
 
-def test_standstill_ends_when_the_speed_sensor_falls_silent():
-    """Without a speed sample a car that drives off is not held in place."""
-    made = stop_and_go()
+@pytest.mark.parametrize("steer", [0.0, 0.15])
+def test_standstill_ends_when_the_speed_sensor_falls_silent(steer):
+    """Without a speed sample a car that drives off is not held in place, be it straight on or in a bend."""
+    made = stop_and_go(steer)
     still = (made.time_s >= 5.0) & (made.time_s <= 9.0)
     signals = still_noise(made.signals, still)
     signals = edited(signals, "speed_m_s", made.time_s > 7.0, np.nan)
@@ -390,6 +401,22 @@ def test_innovations_are_consistent_when_the_model_is_right():
     ratio = steps.nis[100:] / steps.nis_dof[100:]
     assert ratio.mean() == pytest.approx(1.0, abs=0.06)
     assert not rejected(steps).any()
+
+
+def test_sideslip_std_is_the_first_order_band():
+    """Against the gradient of atan2 by differences, with a covariance whose correlation matters."""
+    vx, vy = np.array([12.0, 9.0]), np.array([4.0, -6.0])
+    covariance = np.array([[[0.5, 0.4, 0], [0.4, 0.6, 0], [0, 0, 1]], [[0.5, -0.3, 0], [-0.3, 0.2, 0], [0, 0, 1]]])
+    h = 1e-6
+    gradient = np.stack(
+        [
+            (np.arctan2(vy, vx + h) - np.arctan2(vy, vx - h)) / (2 * h),
+            (np.arctan2(vy + h, vx) - np.arctan2(vy - h, vx)) / (2 * h),
+        ],
+        axis=1,
+    )
+    want = np.sqrt(np.einsum("ki,kij,kj->k", gradient, covariance[:, :2, :2], gradient))
+    np.testing.assert_allclose(sideslip_std(vx, vy, covariance), want, rtol=1e-6)
 
 
 def test_sideslip_band_is_the_delta_method_of_its_covariance(good):
