@@ -98,6 +98,19 @@ def test_steady_load_transfer_is_the_moment_of_the_cg() -> None:
     assert 0.52 < (fz[1] - fz[0]) / (2.0 * transfer) < 0.62
 
 
+def test_load_transfer_on_the_move_is_what_rolls_the_body(lane_change: Motion) -> None:
+    # Springs and dampers carry the sprung mass's moment less what turns it: m_s arm (a_y + g roll) - I d2roll/dt2.
+    arm = (M * H_CG - 140.0 * 0.30) / 1300.0 - 0.10
+    inertia = 480.0 + 1300.0 * arm**2 * 140.0 / M
+    a_y, roll = lane_change.column("ay_m_s2"), lane_change.column("roll_rad")
+    rolling = np.gradient(lane_change.column("roll_rate_rad_s"), 1e-3)
+    springs = 1300.0 * arm * (a_y + G * roll) - inertia * rolling
+    links = (M * 0.10 + 140.0 * (0.30 - 0.10)) * a_y
+    fz = loads(lane_change)
+    carried = 0.5 * TRACK * (fz[:, 1] - fz[:, 0] + fz[:, 3] - fz[:, 2])
+    assert np.abs(carried - springs - links).max() < 0.025 * np.abs(carried).max()
+
+
 def test_braking_loads_the_front_axle() -> None:
     path = np.stack([np.arange(400.0) * 0.5, np.zeros(400), np.zeros(400), np.linspace(30.0, 5.0, 400)], axis=1)
     motion = simulate_motion(Plan(30.0, 4.0, path=path), 0.85)
