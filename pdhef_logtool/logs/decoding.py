@@ -1,7 +1,8 @@
 """Undecoded messages of one channel to columns of the fields asked for.
 
 ROS messages are read as fixed-layout records as long as their strings and sequences keep their lengths, and one by
-one through the rosbags deserialiser where they do not. A path is resolved once per channel, never per message.
+one through the rosbags deserialiser where they do not; JSON and protobuf messages are read one by one. A path is
+resolved once per channel, never per message.
 
 A quaternion struct (members x, y, z, w) read as a whole gives the columns w, x, y, z; x, y, z structs keep that order.
 """
@@ -13,6 +14,7 @@ import math
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial as bind
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,7 @@ from pdhef_logtool.logs.message_schema import (
     SchemaError,
     Selection,
     Step,
+    bytes_of_text,
     json_schema,
     resolve,
     ros_schema,
@@ -77,6 +80,12 @@ def channel_schema(channel: ChannelRecord, distro: str = "", example: bytes | No
             except ValueError as error:
                 raise SchemaError(f"the first message is no JSON: {error}") from error
         raise SchemaError("JSON without a schema and without a message")
+    if channel.encoding == "protobuf":
+        if channel.schema_encoding != "protobuf":
+            raise SchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
+        from pdhef_logtool.logs.protobuf_schema import protobuf_schema
+
+        return protobuf_schema(channel.schema_name, channel.schema_data)
     raise SchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
 
 
@@ -148,16 +157,30 @@ class ChannelDecoder:
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self._single_decoder()
+        getters = [(s.path, self._getter(s)) for s in self.selections]
         values: dict[str, list[object]] = {s.path: [] for s in self.selections}
         for row, at, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
             message = decode(bytes(block.buffer[at : at + n]))
             if message is None:
                 self.undecodable.append(row)
-            for s in self.selections:
-                values[s.path].append(_single_value(message, s))
+            for path, get in getters:
+                values[path].append(get(message))
         return {s.path: self._single_column(s, values[s.path]) for s in self.selections}
 
+    def _getter(self, selection: Selection) -> Callable[[object], object]:
+        if self.schema.wire == "protobuf":
+            from pdhef_logtool.logs.protobuf_schema import compile_getter
+
+            plain = compile_getter(self.schema, selection)
+        else:
+            plain = bind(_single_value, selection=selection)
+        if not selection.text:
+            return plain
+        return lambda message: bytes_of_text(plain(message), selection.text)
+
     def _single_decoder(self) -> Callable[[bytes], object]:
+        if self.schema.wire == "protobuf":
+            return _protobuf_decoder(self.schema.message_class)
         store, name = self.schema.store, self.schema.type_name
         if store is None:
 
@@ -192,6 +215,18 @@ class ChannelDecoder:
         return _column(selection.shape, values, width_known)
 
 
+def _protobuf_decoder(message_class: Any) -> Callable[[bytes], object]:
+    from google.protobuf.message import DecodeError
+
+    def decode_protobuf(data: bytes) -> object:
+        try:
+            return message_class.FromString(data)
+        except DecodeError:
+            return None
+
+    return decode_protobuf
+
+
 def compile_decoder(schema: MessageSchema, topic: str, paths: Sequence[str]) -> ChannelDecoder:
     """Resolve paths against a schema once.
 
@@ -205,7 +240,7 @@ def compile_decoder(schema: MessageSchema, topic: str, paths: Sequence[str]) -> 
 def undecodable_topic(topic: str, reason: str) -> MappingError:
     """Return the error for fields asked of a topic whose messages cannot be decoded."""
     return MappingError(
-        expected="messages as ROS 2 CDR, ROS 1 or JSON with a schema that parses",
+        expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
         got=reason,
         where=topic,
         remedy="map another topic",

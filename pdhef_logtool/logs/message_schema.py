@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import difflib
 import json
 import re
@@ -77,15 +78,17 @@ Node: TypeAlias = Scalar | Struct | Array | Unknown
 
 @dataclass(frozen=True, slots=True)
 class MessageSchema:
-    """A message type: its tree, and for ROS types the definitions to decode with.
+    """A message type: its tree, and what its messages are decoded with.
 
-    ``wire`` is ``cdr``, ``ros1`` or ``json``.
+    ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` holds the definitions of ROS types,
+    ``message_class`` is the class of a protobuf type.
     """
 
     type_name: str
     wire: str
     root: Node
     store: Typestore | None = None
+    message_class: Any = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,13 +97,18 @@ class Selection:
 
     ``components`` are the places to read, as steps (member name or index): one for a scalar or an array, one a
     column for a vector, seconds and nanoseconds for a time; ``dynamic`` places are judged by their first value.
+    ``text`` is how an array of bytes is written where it stands as a text: ``hex``, ``base64`` or empty.
     """
 
     path: str
     shape: Literal["scalar", "array", "vector", "time", "dynamic"]
     components: tuple[tuple[Step, ...], ...]
     length: int | None = None  # columns of an array of fixed length
+    text: str = ""
 
+
+#: Endings of a path that read a text as the bytes that it encodes.
+TEXT_ENDINGS = {"|hex": "hex", "|base64": "base64"}
 
 #: Member that stands in a message type without members.
 _FILLER = "structure_needs_at_least_one_member"
@@ -333,7 +341,8 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
     ------
     MappingError : the type has no such path, or it names what is no number; the nearest paths are named.
     """
-    steps = parse_path(path)
+    ending = next((e for e in TEXT_ENDINGS if path.endswith(e)), "")
+    steps = parse_path(path.removesuffix(ending))
     node: Node = schema.root
     for step in steps:
         if isinstance(node, Unknown):
@@ -344,6 +353,17 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             node = node.item
         else:
             raise _no_such_path(schema, topic, path)
+    if ending:
+        # Records of ROS messages are read without their texts.
+        is_text = isinstance(node, Unknown) or (isinstance(node, Scalar) and node.kind == "string")
+        if not is_text or schema.wire not in ("json", "protobuf"):
+            raise MappingError(
+                expected=f"a text of {TEXT_ENDINGS[ending]} digits in a JSON or protobuf message",
+                got=repr(path),
+                where=topic,
+                remedy=f"drop the ending {ending}",
+            )
+        return Selection(path, "array", (steps,), None, TEXT_ENDINGS[ending])
     if isinstance(node, Unknown):
         return Selection(path, "dynamic", (steps,))
     if isinstance(node, Scalar):
@@ -385,6 +405,19 @@ def _no_number(schema: MessageSchema, topic: str, path: str, what: str) -> Mappi
         where=topic,
         remedy=f"nearest: {', '.join(below)}" if below else "",
     )
+
+
+def bytes_of_text(value: object, encoding: str) -> list[int] | None:
+    """Decode a text of ``hex`` or ``base64`` digits; None where it is no such text."""
+    if not isinstance(value, str):
+        return None
+    try:
+        if encoding == "hex":
+            digits = value.strip().removeprefix("0x").removeprefix("0X")
+            return list(bytes.fromhex(digits.replace(":", " ").replace("-", " ")))
+        return list(base64.b64decode(value, validate=True))
+    except ValueError:
+        return None
 
 
 def value_at(message: object, steps: Sequence[Step]) -> object:

@@ -1,0 +1,190 @@
+"""Protobuf message types from the descriptors that a log carries, and accessors compiled from dotted paths.
+
+A message without a value tells two cases apart, as the language does: a plain scalar of proto3 that is not on the wire
+is its default (0), whereas an absent sub-message, an unset ``optional`` and the members of a ``oneof`` that are not the
+set one are absent (NaN). Maps and types that contain themselves have no place among columns and are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any
+
+from pdhef_logtool.logs.message_schema import Array, MessageSchema, Node, Scalar, SchemaError, Selection, Step, Struct
+
+#: Protobuf nests by reference, so that a small file can describe an endless tree.
+_MAX_DEPTH = 16
+_WELL_KNOWN = "google/protobuf/"
+
+
+@lru_cache(maxsize=256)
+def protobuf_schema(type_name: str, data: bytes) -> MessageSchema:
+    """Parse a serialized ``FileDescriptorSet``.
+
+    Parameters
+    ----------
+    type_name : full name of the message, for example ``foxglove.LocationFix``.
+    data : the set, with all files that the message's own imports; Google's well-known types may be left out.
+
+    Raises
+    ------
+    SchemaError : the set does not parse, lacks a file, or does not hold the type.
+    """
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from google.protobuf.message import DecodeError
+
+    files = descriptor_pb2.FileDescriptorSet()
+    try:
+        files.ParseFromString(data)
+    except DecodeError as error:
+        raise SchemaError(f"the descriptors of {type_name} do not parse: {error}") from error
+    pool = descriptor_pool.DescriptorPool()
+    by_name = {file.name: file for file in files.file}
+    try:
+        for name in _in_order(by_name):
+            pool.AddSerializedFile(by_name[name].SerializeToString())
+        descriptor = pool.FindMessageTypeByName(type_name.removeprefix("."))
+        message_class = message_factory.GetMessageClass(descriptor)
+    except KeyError as error:
+        raise SchemaError(f"the descriptors hold no message {type_name}") from error
+    except (TypeError, ValueError, RecursionError) as error:
+        raise SchemaError(f"the descriptors of {type_name} are not consistent: {error}") from error
+    return MessageSchema(type_name, "protobuf", _message_node(descriptor, ()), None, message_class)
+
+
+def _in_order(files: dict[str, Any]) -> list[str]:
+    """Return the files' names, imported ones first; well-known files that are not there are added."""
+    ordered: list[str] = []
+    open_: set[str] = set()
+
+    def visit(name: str, importer: str) -> None:
+        if name in ordered:
+            return
+        if name in open_:
+            raise SchemaError(f"{name} imports itself")
+        if name not in files:
+            files[name] = _well_known_file(name, importer)
+        open_.add(name)
+        for dependency in files[name].dependency:
+            visit(dependency, name)
+        ordered.append(name)
+
+    for name in list(files):
+        visit(name, "")
+    return ordered
+
+
+def _well_known_file(name: str, importer: str) -> Any:
+    """Return Google's own file of this name, which writers may leave out."""
+    import importlib
+
+    from google.protobuf import descriptor_pb2
+
+    if name.startswith(_WELL_KNOWN) and name.endswith(".proto"):
+        module = name.removeprefix(_WELL_KNOWN).removesuffix(".proto")
+        try:
+            found = importlib.import_module(f"google.protobuf.{module}_pb2")
+        except ImportError:
+            pass
+        else:
+            return descriptor_pb2.FileDescriptorProto.FromString(found.DESCRIPTOR.serialized_pb)
+    raise SchemaError(f"{importer} imports {name}, which the descriptors lack")
+
+
+def _message_node(descriptor: Any, above: tuple[str, ...]) -> Struct:
+    inside = (*above, descriptor.full_name)
+    members: dict[str, Node] = {}
+    for field in descriptor.fields:
+        node = _field_node(field, inside)
+        if node is not None:
+            members[field.name] = node
+    return Struct(members)
+
+
+def _field_node(field: Any, inside: tuple[str, ...]) -> Node | None:
+    """Return a field's node; None where it has no place among columns."""
+    from google.protobuf.descriptor import FieldDescriptor
+
+    node: Node
+    if field.message_type is not None:
+        kind = field.message_type
+        if kind.GetOptions().map_entry or kind.full_name in inside or len(inside) >= _MAX_DEPTH:
+            return None
+        node = _message_node(kind, inside)
+    elif field.type == FieldDescriptor.TYPE_STRING:
+        node = Scalar("string")
+    elif field.type == FieldDescriptor.TYPE_BYTES:
+        node = Array(Scalar("number", "u1"), None)
+    else:
+        node = Scalar("bool" if field.type == FieldDescriptor.TYPE_BOOL else "number")
+    return Array(node, None) if _is_repeated(field) else node
+
+
+def compile_getter(schema: MessageSchema, selection: Selection) -> Callable[[Any], object]:
+    """Turn a resolved path into a function of a message: one value, or a tuple of them for several components.
+
+    The function gives None for what a message lacks, and for None.
+    """
+    descriptor = schema.message_class.DESCRIPTOR
+    components = selection.components
+    if len(components) == 1:
+        return _compile_steps(descriptor, components[0])
+    # The components of a time or a vector share all but their last step.
+    shared = _compile_steps(descriptor, components[0][:-1])
+    parent = _descriptor_at(descriptor, components[0][:-1])
+    parts = tuple(_compile_steps(parent, steps[-1:]) for steps in components)
+
+    def get_all(message: Any) -> object:
+        struct = shared(message)
+        return tuple(part(struct) for part in parts)
+
+    return get_all
+
+
+def _descriptor_at(descriptor: Any, steps: Sequence[Step]) -> Any:
+    for step in steps:
+        if isinstance(step, str):
+            descriptor = descriptor.fields_by_name[step].message_type
+    return descriptor
+
+
+def _compile_steps(descriptor: Any, steps: Sequence[Step]) -> Callable[[Any], object]:
+    """Compile steps from a message of one type; every step is (name, whether it can be absent, index or -1)."""
+    plan: list[tuple[str, bool, int]] = []
+    field = None
+    for step in steps:
+        if isinstance(step, int):
+            name, optional, _ = plan[-1]
+            plan[-1] = (name, optional, step)
+            continue
+        field = descriptor.fields_by_name[step]
+        # A default that the type declares (proto2) stands for an absent value.
+        plan.append((step, field.has_presence and not field.has_default_value, -1))
+        descriptor = field.message_type
+    whole = bool(plan) and plan[-1][2] < 0 and field is not None and _is_array(field)
+
+    def get(message: Any) -> object:
+        for name, optional, index in plan:
+            if message is None or (optional and not message.HasField(name)):
+                return None
+            message = getattr(message, name)
+            if index >= 0:
+                if index >= len(message):
+                    return None
+                message = message[index]
+        return list(message) if whole and message is not None else message
+
+    return get
+
+
+def _is_array(field: Any) -> bool:
+    from google.protobuf.descriptor import FieldDescriptor
+
+    return _is_repeated(field) or bool(field.type == FieldDescriptor.TYPE_BYTES)
+
+
+def _is_repeated(field: Any) -> bool:
+    # Releases up to 6.30 say it by the label only, which later ones deprecate.
+    known = getattr(field, "is_repeated", None)
+    return bool(field.label == field.LABEL_REPEATED) if known is None else bool(known)
