@@ -169,6 +169,8 @@ def _filter(  # type: ignore[no-untyped-def]
     nu = np.empty(MEASUREMENTS)
     z = np.empty(MEASUREMENTS)
     use = np.empty(MEASUREMENTS, dtype=np.bool_)
+    given = np.empty(MEASUREMENTS, dtype=np.bool_)
+    at_gate = np.empty(MEASUREMENTS)
     for k in range(dt.shape[0]):
         restart = not dt[k] <= RESTART_GAP_S
         if restart:
@@ -219,12 +221,15 @@ def _filter(  # type: ignore[no-untyped-def]
                 _measure(chi, steer_k, mu_k, p, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 opens = False
+                outside = False
                 seen = 0
                 squares = 0.0
                 for i in range(MEASUREMENTS):
                     S[i, i] += r_std[i] * r_std[i]
                     nu[i] = z[i] - z_hat[i]
                     use[i] = math.isfinite(nu[i]) and (i != Z_AY or steer_ok)
+                    given[i] = use[i]
+                    at_gate[i] = nu[i]
                     if memory[M_REJECTED + i] > 0.0:
                         memory[M_REJECTED + i] += dt[k]
                     if use[i]:
@@ -235,9 +240,14 @@ def _filter(  # type: ignore[no-untyped-def]
                         if square <= GATE_SIGMA**2:
                             memory[M_REJECTED + i] = 0.0
                         else:
+                            outside = True
+                            at_gate[i] = math.copysign(GATE_SIGMA * math.sqrt(S[i, i]), nu[i])
                             memory[M_REJECTED + i] = max(memory[M_REJECTED + i], JUST_REJECTED_S)
                             use[i] = memory[M_REJECTED + i] > GATE_OPENS_AFTER_S
                             opens = opens or use[i]
+                if outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
+                    _, _, likelihood_at_gate = kalman_update(x.copy(), P.copy(), at_gate, S, Pxz, given)
+                    out_ll[k] = likelihood_at_gate
                 if opens:
                     for i in range(n):
                         for j in range(n):
@@ -254,7 +264,8 @@ def _filter(  # type: ignore[no-untyped-def]
                 if dof > 0:
                     out_nis[k] = nis
                     out_dof[k] = dof
-                    out_ll[k] = log_likelihood
+                    if not outside:
+                        out_ll[k] = log_likelihood
                 if seen > 0:
                     memory[M_NIS] += min(1.0, dt[k] / DIVERGED_AVERAGE_S) * (squares / seen - memory[M_NIS])
                 # Standstill: the speed sensor reads zero and nothing turns, for a while.
@@ -455,7 +466,11 @@ class PhysicsUkf:
         return track, FilterCarry(after.x, after.P, after.memory, after.last_stamp_ns, steps.since(max(newest, 0)))
 
 
-def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, float]:
-    """Return the Gaussian log-likelihood of all innovations of a drive and how many scalar innovations it sums."""
+def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:
+    """Return the Gaussian log-likelihood of all innovations of a drive and how many scalar innovations it sums.
+
+    A sample beyond the gate counts with the likelihood at the gate: a filter gains nothing by rejecting samples, and
+    no single outlier decides.
+    """
     steps, _ = estimator.filter_steps(signals, None)
-    return float(steps.log_likelihood.sum()), float(steps.nis_dof.sum())
+    return float(steps.log_likelihood.sum()), int(np.isfinite(steps.innovation).sum())

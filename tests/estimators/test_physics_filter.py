@@ -393,6 +393,29 @@ def test_innovation_likelihood_peaks_at_the_true_process_noise():
     assert math.isfinite(total)
 
 
+def test_rejecting_a_sample_gains_nothing(good):
+    """Beyond the gate an innovation counts as one at the gate, however far it is; none is left out of the count."""
+    at = 400
+
+    def likelihood(column, size):
+        return innovation_log_likelihood(UKF, edited(good.signals, column, at, size))
+
+    for column in CHANNELS:
+        normal, count = innovation_log_likelihood(UKF, good.signals)
+        far, farther = likelihood(column, 42.0), likelihood(column, 49.0)
+        assert far[1] == farther[1] == count
+        assert far[0] == pytest.approx(farther[0], abs=1e-9)
+        assert normal - far[0] > 10.0
+    # one channel alone: the density at six standard deviations is known
+    alone = good.signals
+    for column in ("ay_m_s2", "speed_m_s"):
+        alone = edited(alone, column, slice(at - 1, at + 1), np.nan)
+    spike = posteriors(edited(alone, "yaw_rate_rad_s", at, 40.0))
+    normal = posteriors(alone)
+    variance = normal.innovation[at, 1] ** 2 / normal.nis[at]
+    assert spike.log_likelihood[at] == pytest.approx(-18.0 - 0.5 * math.log(2 * math.pi * variance), rel=1e-9)
+
+
 def test_innovations_are_consistent_when_the_model_is_right():
     """NIS of the matched filter is chi-square: its mean is its degrees of freedom; NEES covers all states."""
     q, r = np.array([0.1, 0.2, 0.1, 0.05]), np.array([0.12, 0.004, 0.08])
