@@ -126,6 +126,10 @@ _CODES = {
 }  # fmt: skip
 
 
+#: Line between two definitions; some writers make it shorter than the 80 signs of the convention.
+_SEPARATOR = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
+
+
 @lru_cache(maxsize=256)
 def ros_schema(type_name: str, encoding: str, text: str, wire: str, distro: str = "") -> MessageSchema:
     """Parse a ROS message definition.
@@ -148,6 +152,7 @@ def ros_schema(type_name: str, encoding: str, text: str, wire: str, distro: str 
     base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
     try:
         if text.strip():
+            text = _SEPARATOR.sub("=" * 80, text)
             types = get_types_from_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
             store = get_typestore(Stores.EMPTY)
             missing = _referenced(types) - set(types)
@@ -163,7 +168,8 @@ def ros_schema(type_name: str, encoding: str, text: str, wire: str, distro: str 
     except SchemaError:
         raise
     except (TypesysError, KeyError, ValueError, TypeError, IndexError, SyntaxError, RecursionError) as error:
-        raise SchemaError(f"the definition of {type_name} does not parse: {error}") from error
+        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(":")
+        raise SchemaError(f"the definition of {type_name} does not parse: {reason}") from error
     return MessageSchema(type_name, wire, root, store)
 
 

@@ -12,8 +12,13 @@ from pdhef_logtool.errors import LogError, MappingError
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 
-# Their test fixtures carry a definition that is not the one the payloads were written with.
-_WRONG_DEFINITIONS = {("ros2_rosbag2/rosbag2_py/test/resources/sqlite3/talker/talker.db3", "/rosout")}
+# Their test fixtures carry a definition that is not the one the payloads were written with, or align a double to 4.
+_WRONG_DEFINITIONS = {
+    ("ros2_rosbag2/rosbag2_py/test/resources/sqlite3/talker/talker.db3", "/rosout"),
+    ("plotjuggler_pj-mcap-server/test_embedded_timestamp.mcap", "/stamped/value"),
+}
+# A schema that is no definition, and protobuf messages with the text of a .proto file in the place of descriptors.
+_UNDECODABLE = {"/bad/data", "/proto/data"}
 
 
 def _corpus(shared_dir: Path) -> tuple[Path, list[dict[str, object]]]:
@@ -49,7 +54,7 @@ def test_every_recording_ends_as_catalogued(shared_dir: Path) -> None:
 def _field_problems(log: DriveLog, file: str) -> list[str]:
     problems = []
     for topic in log.topics:
-        if topic.encoding not in ("cdr", "ros1", "json") or topic.name == "/bad/data":
+        if topic.encoding not in ("cdr", "ros1", "json", "protobuf") or topic.name in _UNDECODABLE:
             continue
         paths = numeric_paths(log, topic.name)
         columns = log.read({topic.name: paths})[topic.name]
@@ -105,6 +110,35 @@ def test_a_database_that_its_folder_declares_in_another_format_is_not_decoded_as
     assert {t.encoding for t in log.topics} == {"wrong_format"}
     with pytest.raises(MappingError, match="wrong_format"):
         log.read({"/test_topic": ["bool_value"]})
+    log.close()
+
+
+def test_definitions_behind_a_short_separator_are_read(shared_dir: Path) -> None:
+    log = open_log(shared_dir / "reader_corpus" / "plotjuggler_pj-mcap-server/test_embedded_timestamp.mcap")
+    assert {"header.sec", "header.nanosec", "value"} <= {f.path for f in log.fields("/stamped/value")}
+    log.close()
+
+
+def test_protobuf_of_another_writer_reads_as_its_own_library_reads_it(shared_dir: Path) -> None:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from mcap.reader import make_reader
+
+    path = shared_dir / "reader_corpus" / "rerun/foxglove_log.mcap"
+    stamps, levels = [], []
+    with path.open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages():
+            assert schema is not None
+            pool = descriptor_pool.DescriptorPool()
+            for proto in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+                pool.Add(proto)
+            parsed = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString(message.data)
+            stamps.append(parsed.timestamp.ToNanoseconds())
+            levels.append(parsed.level)
+    log = open_log(path)
+    columns = log.read({"/text_log": ["timestamp", "level"]})["/text_log"]
+    assert columns.fields["timestamp"].tolist() == stamps
+    assert columns.fields["level"].tolist() == levels
+    assert len(set(levels)) > 1
     log.close()
 
 
