@@ -23,7 +23,7 @@ from pdhef_logtool.logs.decoding import (
 )
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
 from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves
-from pdhef_logtool.signals import IntArray, Loss
+from pdhef_logtool.signals import BoolArray, IntArray, Loss
 
 #: Neighbouring windows share the span at their border; this many decoded spans are kept for the next window.
 _KEPT_SPANS = 2
@@ -265,13 +265,10 @@ class ColumnarLog:
             block = self.load(c, span, frozenset(topic_of))
             if block is None:
                 continue
-            keep = np.ones(len(block), dtype=np.bool_)
-            if start_ns is not None:
-                keep &= block.log_time_ns >= start_ns
-            if end_ns is not None:
-                keep &= block.log_time_ns < end_ns
+            keep = _in_window(block.log_time_ns, start_ns, end_ns)
             for id_, topic in topic_of.items():
-                rows = np.flatnonzero(keep & (block.channel == id_))
+                mine = block.channel == id_
+                rows = np.flatnonzero(mine if keep is None else mine & keep)
                 if rows.size:
                     part = self._decode(plans[topic], c, span, id_, block, rows)
                     if part is not None:
@@ -310,6 +307,16 @@ class _Part:
         self.log_time_ns = log_time_ns
         self.publish_time_ns = publish_time_ns
         self.fields = fields
+
+
+def _in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
+    """Tell which log times lie in [start, end); None: all of them."""
+    keep: BoolArray | None = None
+    if start_ns is not None:
+        keep = log_time_ns >= start_ns
+    if end_ns is not None:
+        keep = (log_time_ns < end_ns) if keep is None else keep & (log_time_ns < end_ns)
+    return None if keep is None or keep.all() else keep
 
 
 def _join(topic: str, plan: _Plan, parts: Sequence[_Part]) -> Columns:

@@ -42,9 +42,8 @@ from pdhef_logtool.logs.wire_layout import (
     layout_of_message,
     leaf_values,
     matches,
-    records,
 )
-from pdhef_logtool.signals import IntArray
+from pdhef_logtool.signals import BoolArray, IntArray
 
 #: Stands in a time column where the message lacks the time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
@@ -122,13 +121,14 @@ class ChannelDecoder:
         self, block: Block, rows: IntArray, left: IntArray, partial: list[tuple[IntArray, dict[str, NDArray[Any]]]]
     ) -> IntArray:
         """Read what has a fixed layout; returns the rows that have none."""
+        offset, length = block.offset[rows], block.length[rows]
         no_layout: list[IntArray] = []
         tried = 0
         while left.size and tried <= len(self._layouts):
             if tried == len(self._layouts):
                 if tried >= _LAYOUTS_PER_CHANNEL:
                     break
-                at, n = int(block.offset[rows[left[0]]]), int(block.length[rows[left[0]]])
+                at, n = int(offset[left[0]]), int(length[left[0]])
                 try:
                     layout = layout_of_message(self.schema.root, self.schema.wire, bytes(block.buffer[at : at + n]))
                 except NoLayoutError:
@@ -140,20 +140,28 @@ class ChannelDecoder:
                 self._layouts.append(layout)
             layout = self._layouts[tried]
             tried += 1
-            # Up to three bytes of padding may follow a CDR message.
-            surplus = block.length[rows[left]] - layout.size
-            fits = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
-            candidates = left[fits]
-            data = records(block.buffer, block.offset[rows[candidates]], layout.size)
-            good = matches(layout, data, self.schema.wire)
-            fits[np.flatnonzero(fits)[~good]] = False
-            if np.any(good):
-                partial.append((left[fits], self._record_columns(layout, data[good])))
-            left = left[~fits]
+            fits = self._fits(layout, block, offset[left], length[left])
+            if fits.all():
+                partial.append((left, self._record_columns(layout, block, offset[left])))
+                left = left[:0]
+            elif fits.any():
+                partial.append((left[fits], self._record_columns(layout, block, offset[left[fits]])))
+                left = left[~fits]
         return np.concatenate([*no_layout, left]) if no_layout else left
 
-    def _record_columns(self, layout: WireLayout, data: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-        return {s.path: _record_column(layout, data, s) for s in self.selections}
+    def _fits(self, layout: WireLayout, block: Block, offset: IntArray, length: IntArray) -> BoolArray:
+        """Tell which messages have a layout: their size first, as the guards must not be looked for past the end."""
+        # Up to three bytes of padding may follow a CDR message.
+        surplus = length - layout.size
+        fits = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
+        if fits.all():
+            return matches(layout, block.buffer, offset, self.schema.wire)
+        sized = np.flatnonzero(fits)
+        fits[sized] = matches(layout, block.buffer, offset[sized], self.schema.wire)
+        return fits
+
+    def _record_columns(self, layout: WireLayout, block: Block, offset: IntArray) -> dict[str, NDArray[Any]]:
+        return {s.path: _record_column(layout, block.buffer, offset, s) for s in self.selections}
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self._single_decoder()
@@ -286,9 +294,11 @@ def _is_sorted(order: IntArray) -> bool:
     return bool(np.all(order[1:] >= order[:-1]))
 
 
-def _record_column(layout: WireLayout, data: NDArray[np.uint8], selection: Selection) -> NDArray[Any]:
-    found = [leaf_values(layout, data, steps) for steps in selection.components]
-    n = data.shape[0]
+def _record_column(
+    layout: WireLayout, buffer: bytes | memoryview, offset: IntArray, selection: Selection
+) -> NDArray[Any]:
+    found = [leaf_values(layout, buffer, offset, steps) for steps in selection.components]
+    n = len(offset)
     if selection.shape == "time":
         seconds, nanoseconds = found
         if seconds is None or nanoseconds is None:
@@ -298,7 +308,7 @@ def _record_column(layout: WireLayout, data: NDArray[np.uint8], selection: Selec
         return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in found])
     if found[0] is None:
         return missing_column(selection, n)
-    return found[0].astype(np.float64)
+    return found[0].astype(np.float64, copy=False)
 
 
 def _single_value(message: object, selection: Selection) -> object:

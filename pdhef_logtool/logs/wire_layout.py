@@ -20,6 +20,10 @@ from pdhef_logtool.logs.message_schema import Array, Node, Scalar, Step, Struct,
 #: Arrays of structs (or of texts) are unrolled up to this many elements.
 UNROLLED_ELEMENTS = 64
 
+_CDR_HEAD = np.dtype("<u2")
+_LITTLE_ENDIAN_CDR = 0x0100  # the bytes 0, 1
+_WORD = np.dtype("<u4")
+
 Steps: TypeAlias = tuple[Step, ...]
 
 
@@ -145,45 +149,42 @@ class _Builder:
         self.at += dtype.itemsize * (1 if count is None else count)
 
 
-def records(buffer: bytes | memoryview, offset: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
-    """Gather N byte records of one size from a buffer, as uint8 [N, size]."""
-    if offset.size == 0:
-        return np.empty((0, size), dtype=np.uint8)
-    # Overlapping records at every byte: indexing then copies whole records.
-    view = np.ndarray((len(buffer) - size + 1,), dtype=np.dtype((np.void, size)), buffer=buffer, strides=(1,))
-    return view[offset].view(np.uint8).reshape(len(offset), size)
-
-
-def matches(layout: WireLayout, rows: NDArray[np.uint8], wire: str) -> NDArray[np.bool_]:
-    """Tell which byte records [N, >= size] have this layout."""
-    fits = np.ones(rows.shape[0], dtype=np.bool_)
+def matches(layout: WireLayout, buffer: bytes | memoryview, offset: NDArray[np.int64], wire: str) -> NDArray[np.bool_]:
+    """Tell which messages at these offsets [N] have this layout; all of them hold ``layout.size`` bytes."""
+    fits = np.ones(len(offset), dtype=np.bool_)
     if wire == "cdr":
-        fits &= (rows[:, 0] == 0) & (rows[:, 1] == 1)
-    for offset, expected in layout.guards:
-        fits &= rows[:, offset : offset + 4].copy().view("<u4")[:, 0] == expected
+        fits &= _gather(buffer, offset, 0, _CDR_HEAD) == _LITTLE_ENDIAN_CDR
+    for at, expected in layout.guards:
+        fits &= _gather(buffer, offset, at, _WORD) == expected
     return fits
 
 
-def leaf_values(layout: WireLayout, rows: NDArray[np.uint8], steps: Sequence[Step]) -> NDArray[Any] | None:
+def leaf_values(
+    layout: WireLayout, buffer: bytes | memoryview, offset: NDArray[np.int64], steps: Sequence[Step]
+) -> NDArray[Any] | None:
     """Return the values [N] or [N, k] at these steps, in their own type; None where this layout has no such place."""
     key = tuple(steps)
     leaf = layout.leaves.get(key)
-    index: int | None = None
     if leaf is None and key and isinstance(key[-1], int):
-        leaf, index = layout.leaves.get(key[:-1]), key[-1]
-        if leaf is not None and (leaf.count is None or index >= leaf.count):
+        whole, index = layout.leaves.get(key[:-1]), key[-1]
+        if whole is None or whole.count is None or index >= whole.count:
             return None
+        return _gather(buffer, offset, whole.offset + index * whole.dtype.itemsize, whole.dtype)
     if leaf is None:
         return None
-    width = leaf.dtype.itemsize
-    if index is not None:
-        start = leaf.offset + index * width
-        return _columns(rows, start, width, leaf.dtype)[:, 0]
-    values = _columns(rows, leaf.offset, width * (1 if leaf.count is None else leaf.count), leaf.dtype)
-    return values[:, 0] if leaf.count is None else values
+    if leaf.count is None:
+        return _gather(buffer, offset, leaf.offset, leaf.dtype)
+    if leaf.count == 0:
+        return np.empty((len(offset), 0), dtype=leaf.dtype)
+    row = np.dtype((np.void, leaf.dtype.itemsize * leaf.count))
+    return _gather(buffer, offset, leaf.offset, row).view(leaf.dtype).reshape(len(offset), leaf.count)
 
 
-def _columns(rows: NDArray[np.uint8], start: int, width: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    if width == 0:
-        return np.empty((rows.shape[0], 0), dtype=dtype)
-    return np.ascontiguousarray(rows[:, start : start + width]).view(dtype)
+def _gather(buffer: bytes | memoryview, offset: NDArray[np.int64], at: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Copy what lies ``at`` bytes behind each offset, as an array [N]."""
+    if offset.size == 0:
+        return np.empty(0, dtype=dtype)
+    # An overlapping item at every byte: indexing then copies items. As plain bytes, which need no alignment.
+    item = np.dtype((np.void, dtype.itemsize))
+    places = len(buffer) - at - dtype.itemsize + 1
+    return np.ndarray((places,), dtype=item, buffer=buffer, offset=at, strides=(1,))[offset].view(dtype)
