@@ -82,7 +82,7 @@ def test_slip_builds_up_over_the_relaxation_length(speed: float) -> None:
     alpha, kappa, step = 0.002, 0.0, 1e-5
     t = 0.0
     slip = 0.0
-    while slip < (1.0 - math.exp(-1.0)) * alpha:
+    while slip < (1.0 - math.exp(-1.0)) * alpha and t < 1.0:
         scaled = forces_n(TYRE, kappa, slip, 3530.0, 0.85)[2]
         slip += step * slip_rates(TYRE, kappa, slip, scaled, speed, -alpha * speed, speed)[1]
         t += step
