@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -35,12 +36,17 @@ from pdhef_logtool.logs.container import (
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.signals import IntArray, Loss
 
+if TYPE_CHECKING:
+    import zstandard
+
 MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
+_MAPPED_BYTES = 32 << 20  # pages of the file that may stay mapped, roughly
+_PAGES_AROUND_BYTES = 64 << 10  # Linux maps this much around a place that is read
 _LARGEST_CHUNK_BYTES = 4 << 30  # a larger claim is damage, not a chunk
 _MESSAGE_HEAD = np.dtype(
     {
@@ -77,6 +83,8 @@ class McapContainer:
         self._extents: list[tuple[int, int, bool, tuple[int, int]]] = []  # start, end, is chunk, its message indexes
         self._attachment_at: list[tuple[int, int]] = []
         self._metadata_at: list[tuple[int, int]] = []
+        self._zstd: zstandard.ZstdDecompressor | None = None
+        self._touched_bytes = 0
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise self._no_log("the MCAP magic bytes", "other content")
@@ -143,6 +151,8 @@ class McapContainer:
                 walk.record(opcode, at, at + 9, end)
             except (struct.error, UnicodeDecodeError, ValueError, IndexError, McapError) as error:
                 walk.damaged_record(at, error)
+            # Reading a header maps the pages around it as well.
+            self._touched(min(end - at, _PAGES_AROUND_BYTES))
             at = end
         walk.finish()
 
@@ -208,6 +218,7 @@ class McapContainer:
         del want
         start, end, is_chunk, index_extent = self._extents[span.index]
         if not is_chunk:
+            self._touched(end - start)
             return _scan_messages(self._data[start:end], None)
         content = self.chunk_content(start, end)
         indexed = self._indexed_messages(content, *index_extent)
@@ -228,7 +239,9 @@ class McapContainer:
             raise SpanDamageError("the chunk's records run past its end")
         if size > _LARGEST_CHUNK_BYTES:
             raise SpanDamageError(f"it claims {size} bytes")
-        content = _decompress(compression, data[at : at + stored], size)
+        with memoryview(data) as view, view[at : at + stored] as compressed:
+            content = self._decompress(compression, compressed, size)
+        self._touched(end - start)
         if len(content) != size:
             raise SpanDamageError(f"decompressed to {len(content)} bytes instead of {size}")
         if crc and zlib.crc32(content) != crc:
@@ -249,8 +262,48 @@ class McapContainer:
             at += 9 + length
         if not offsets:
             return None
-        offset = np.sort(np.concatenate(offsets))
+        # Each channel's offsets ascend already, which the stable sort makes use of.
+        offset = np.sort(np.concatenate(offsets), kind="stable")
         return _gather_messages(content, offset)
+
+    def crc_up_to(self, end: int) -> int:
+        """Return the CRC of the file's first bytes."""
+        crc = 0
+        for start in range(0, end, _MAPPED_BYTES):
+            with memoryview(self._data) as view, view[start : min(start + _MAPPED_BYTES, end)] as part:
+                crc = zlib.crc32(part, crc)
+            self._touched(_MAPPED_BYTES)
+        return crc
+
+    def _touched(self, size: int) -> None:
+        """Give pages of the mapped file back now and then: they count as memory of this process."""
+        self._touched_bytes += size
+        if self._touched_bytes >= _MAPPED_BYTES:
+            self._touched_bytes = 0
+            if hasattr(mmap, "MADV_DONTNEED"):
+                self._data.madvise(mmap.MADV_DONTNEED)
+
+    def _decompress(self, compression: str, stored: memoryview, size: int) -> bytes:
+        """Undo a chunk's compression; every library's own error becomes one."""
+        if compression == "":
+            return bytes(stored)
+        if compression == "zstd":
+            return self._decompress_zstd(stored, size)
+        if compression == "lz4":
+            return _decompress_lz4(stored)
+        raise SpanDamageError(f"unknown compression {compression!r}")
+
+    def _decompress_zstd(self, stored: memoryview, size: int) -> bytes:
+        import zstandard
+
+        if self._zstd is None:
+            self._zstd = zstandard.ZstdDecompressor()
+        try:
+            if zstandard.frame_content_size(stored) not in (-1, size):
+                raise SpanDamageError("its compressed content has another size")
+            return self._zstd.decompress(stored, max_output_size=size)
+        except (zstandard.ZstdError, OverflowError, MemoryError) as error:
+            raise SpanDamageError(str(error)) from error
 
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments; a damaged one was reported by the walk and is left out."""
@@ -324,12 +377,9 @@ class _Walk:
         self.data_end = True
         of = self.of
         (crc,) = struct.unpack_from("<I", of._data, start)
-        if crc and not all(is_chunk for _, _, is_chunk, _ in of._extents):
-            with memoryview(of._data) as view:
-                actual = zlib.crc32(view[:at])
-            if actual != crc:
-                what = "the CRC of the data section does not match: some unchunked messages are damaged"
-                of._lost.append(Loss("bad-data-crc", what, str(of.path)))
+        if crc and not all(is_chunk for _, _, is_chunk, _ in of._extents) and of.crc_up_to(at) != crc:
+            what = "the CRC of the data section does not match: some unchunked messages are damaged"
+            of._lost.append(Loss("bad-data-crc", what, str(of.path)))
 
     def _attachment(self, start: int, end: int) -> None:
         of, data = self.of, self.of._data
@@ -427,29 +477,7 @@ class _Walk:
                 of._spans[i] = Span(span.index, span.start_ns, span.end_ns, counts)
 
 
-def _decompress(compression: str, stored: bytes, size: int) -> bytes:
-    """Undo a chunk's compression; every library's own error becomes one."""
-    if compression == "":
-        return stored
-    if compression == "zstd":
-        return _decompress_zstd(stored, size)
-    if compression == "lz4":
-        return _decompress_lz4(stored)
-    raise SpanDamageError(f"unknown compression {compression!r}")
-
-
-def _decompress_zstd(stored: bytes, size: int) -> bytes:
-    import zstandard
-
-    try:
-        if zstandard.frame_content_size(stored) not in (-1, size):
-            raise SpanDamageError("its compressed content has another size")
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-    except (zstandard.ZstdError, OverflowError, MemoryError) as error:
-        raise SpanDamageError(str(error)) from error
-
-
-def _decompress_lz4(stored: bytes) -> bytes:
+def _decompress_lz4(stored: memoryview) -> bytes:
     import lz4.frame
 
     try:
@@ -459,26 +487,50 @@ def _decompress_lz4(stored: bytes) -> bytes:
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
-    """Read message headers at known offsets; None unless they are messages and cover the whole content."""
-    if offset.size == 0 or offset[-1] + _MESSAGE_HEAD.itemsize > len(content) or offset[0] < 0:
+    """Read message headers at known ascending offsets; None if the content holds other messages than these."""
+    n = len(content)
+    if offset.size == 0 or offset[0] < 0 or offset[-1] + _MESSAGE_HEAD.itemsize > n:
         return None
-    heads = np.ndarray((len(content) - 30,), dtype=_MESSAGE_HEAD, buffer=content, strides=(1,))[offset]
-    length = heads["size"].astype(np.int64) - 22
-    if (
-        np.any(heads["op"] != Opcode.MESSAGE)
-        or np.any(length < 0)
-        or int(length.sum()) + 31 * len(offset) != len(content)
-    ):
+    # Gathered as plain bytes: NumPy copies structured items member by member.
+    plain = np.dtype((np.void, _MESSAGE_HEAD.itemsize))
+    heads = np.ndarray((n - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))[offset]
+    heads = heads.view(_MESSAGE_HEAD)
+    size = heads["size"].astype(np.int64)
+    ends = offset + (9 + size)
+    if (heads["op"] != Opcode.MESSAGE).any() or (size < 22).any() or (ends > n).any():
         return None
+    starts = np.append(offset, n)
+    ends = np.append(0, ends)
+    if (starts != ends).any():
+        others = _records_between(content, ends, starts)
+        if others is None or any(opcode == Opcode.MESSAGE for opcode, _, _ in others):
+            return None
+    latest = np.uint64(MAX_TIME_NS)
     return Block(
         buffer=content,
         channel=heads["channel"].astype(np.int64),
-        log_time_ns=np.minimum(heads["log"], np.uint64(MAX_TIME_NS)).astype(np.int64),
-        publish_time_ns=np.minimum(heads["publish"], np.uint64(MAX_TIME_NS)).astype(np.int64),
+        log_time_ns=np.minimum(heads["log"], latest).view(np.int64),
+        publish_time_ns=np.minimum(heads["publish"], latest).view(np.int64),
         sequence=heads["sequence"].astype(np.int64),
         offset=offset + 31,
-        length=length,
+        length=size - 22,
     )
+
+
+def _records_between(content: bytes, starts: IntArray, ends: IntArray) -> list[tuple[int, int, int]] | None:
+    """Return opcode and extent of the records in the gaps [starts, ends); None if a gap is not filled by records."""
+    found: list[tuple[int, int, int]] = []
+    gaps = np.flatnonzero(starts != ends)
+    for at, end in zip(starts[gaps].tolist(), ends[gaps].tolist(), strict=True):
+        while at < end:
+            if at + 9 > end:
+                return None
+            opcode, length = _RECORD.unpack_from(content, at)
+            found.append((opcode, at + 9, at + 9 + length))
+            at += 9 + length
+        if at != end:
+            return None
+    return found
 
 
 def _scan_messages(content: bytes, declare: McapContainer | None) -> Block:
