@@ -109,13 +109,20 @@ class AlignmentPlan:
     @property
     def lookback_ns(self) -> int:
         """Longest time between a grid stamp and the arrival of a sample used there."""
-        return _ns(max(c.max_gap_s for c in self.channels) + max(c.max_delay_s for c in self.channels))
+        return _ns(self._longest_gap_s + self._longest_delay_s)
 
     @property
     def margin_ns(self) -> int:
         """How much :func:`align` needs before ``start_ns`` and after ``end_ns``, in stamps or in log time."""
-        reach = max(c.max_gap_s for c in self.channels) + LATE_NEIGHBOURHOOD_S
-        return self.lookback_ns + _ns(reach + max(c.max_delay_s for c in self.channels))
+        return self.lookback_ns + _ns(self._longest_gap_s + LATE_NEIGHBOURHOOD_S + self._longest_delay_s)
+
+    @property
+    def _longest_gap_s(self) -> float:
+        return max((c.max_gap_s for c in self.channels), default=0.0)
+
+    @property
+    def _longest_delay_s(self) -> float:
+        return max((c.max_delay_s for c in self.channels), default=0.0)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as JSON-able dictionaries and lists."""
@@ -164,6 +171,17 @@ def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wh
         unused=tuple(sorted(unused.items())),
         speed_from=speed_from,
     )
+
+
+def has_imu(channels: Mapping[str, Channel]) -> bool:
+    """Return whether a channel of the IMU has the two samples that :func:`plan_alignment` needs."""
+    return any(len(channels[name]) >= 2 for name in _IMU if name in channels)
+
+
+def no_alignment(channels: Mapping[str, Channel]) -> AlignmentPlan:
+    """Return the plan of a log without IMU: no grid, and none of the channels is used."""
+    unused = tuple((name, "without an IMU there are no stamps to bring it to") for name in sorted(channels))
+    return AlignmentPlan("", (), float("nan"), (), unused, "none")
 
 
 def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> Signals:

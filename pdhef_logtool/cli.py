@@ -17,6 +17,8 @@ from pdhef_logtool.errors import EXIT_FAILURE, EXIT_PARTIAL, PdhefError, UsageEr
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from pdhef_logtool.pipeline import RunResult
+
 app = typer.Typer(
     name="pdhef",
     no_args_is_help=True,
@@ -49,6 +51,13 @@ def _root(
 JsonFlag = Annotated[bool, typer.Option("--json", help="One JSON document on stdout instead of tables.")]
 MappingFile = Annotated[
     Path | None, typer.Option("--mapping", "-m", help="mapping.toml: topic.field -> signal. Default: recognised types.")
+]
+ThresholdsFile = Annotated[
+    Path | None,
+    typer.Option("--thresholds", help="thresholds.toml: limits on figures; exit code 4 when one is broken."),
+]
+JunitFile = Annotated[
+    Path | None, typer.Option("--junit", help="Write the verdicts of --thresholds as JUnit XML, for CI.")
 ]
 TruthChoice = Annotated[
     str | None, typer.Option("--prefer-truth", help="perfect or rtk: which truth of a simulated log counts.")
@@ -104,6 +113,8 @@ def inspect(
 
   pdhef run drive.mcap -o out --start +60s --end end-5s --json
 
+  pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml
+
 Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of 1e15 or more), or
 RFC 3339 (2026-01-31T12:00:00Z)."""
 )
@@ -125,6 +136,8 @@ def run(
         str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
     ] = None,
     prefer_truth: TruthChoice = None,
+    thresholds: ThresholdsFile = None,
+    junit: JunitFile = None,
     config: Annotated[Path | None, typer.Option("--config", help="pdhef.toml; flags win over it.")] = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -144,15 +157,94 @@ def run(
             "annotate": annotate,
             "sensors": sensors,
             "prefer_truth": prefer_truth,
+            "thresholds": thresholds,
         },
     )
     with _progress() as progress:
-        result = run_logs(logs, output, settings, progress=progress, warn=_warn)
+        result = run_logs(logs, output, settings, junit=junit, progress=progress, warn=_warn)
     if as_json:
         _print_json(result.to_dict())
     else:
         render_run(result, _stdout())
-    raise typer.Exit(result.exit_code)
+    _end(result)
+
+
+@app.command(
+    epilog="""Examples:
+
+  pdhef metrics drive.mcap --estimate /localization/odometry
+
+  pdhef metrics drive.mcap --estimate sideslip_rad=/esc/state.beta --estimate vx_m_s=/esc/state.speed --name esc
+
+  pdhef metrics drive.mcap --estimate /pdhef/phy_ukf/state --truth /ins/odometry --vehicle car.toml -o out
+
+  pdhef metrics drive.mcap --mapping mapping.toml --thresholds limits.toml --junit gate.xml
+
+The type tells the signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and pdhef_msgs/VehicleStateEstimate; others
+need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, ay_m_s2, their *_std_*, valid. Scales, offsets, signs
+and several estimators stand in a mapping file, one [estimates.NAME.SIGNAL] table a signal."""
+)
+def metrics(
+    log: Annotated[str, typer.Argument(help="MCAP file, rosbag1 file, rosbag2 folder or .db3 file.")],
+    estimate: Annotated[
+        list[str] | None,
+        typer.Option("--estimate", help="[SIGNAL=]TOPIC[.FIELD], repeatable. Default: the mapping's [estimates]."),
+    ] = None,
+    truth: Annotated[
+        list[str] | None,
+        typer.Option("--truth", help="[SIGNAL=]TOPIC[.FIELD], repeatable. Default: the mapped or recognised truth."),
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="What the estimator is called; or which of [estimates] is scored.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder for tables and report. Default: print only.")
+    ] = None,
+    vehicle: Annotated[
+        Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml: place of the truth, friction, low speed.")
+    ] = None,
+    mapping: MappingFile = None,
+    start: Annotated[str | None, typer.Option("--start", help="Start of the slice, as in pdhef run.")] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End of the slice, as in pdhef run.")] = None,
+    prefer_truth: TruthChoice = None,
+    thresholds: ThresholdsFile = None,
+    junit: JunitFile = None,
+    config: Annotated[Path | None, typer.Option("--config", help="pdhef.toml; flags win over it.")] = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Score an estimate that somebody else recorded in the log against the truth."""
+    from pdhef_logtool.config import load_config
+    from pdhef_logtool.recorded_estimates import score_log
+    from pdhef_logtool.summary import render_run
+
+    settings = load_config(
+        config,
+        {
+            "vehicle": vehicle,
+            "mapping": mapping,
+            "start": start,
+            "end": end,
+            "prefer_truth": prefer_truth,
+            "thresholds": thresholds,
+        },
+    )
+    with _progress() as progress:
+        result = score_log(
+            log,
+            settings,
+            estimates=estimate or (),
+            truth=truth or (),
+            name=name,
+            output=output,
+            junit=junit,
+            progress=progress,
+            warn=_warn,
+        )
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        render_run(result, _stdout())
+    _end(result)
 
 
 @app.command(
@@ -276,6 +368,19 @@ def _say(text: str) -> None:
 
 def _warn(text: str) -> None:
     print(f"warning: {text}", file=sys.stderr)  # noqa: T201
+
+
+def _end(result: RunResult) -> NoReturn:
+    """Leave with the result's exit code; what closed the gate, and what the code does not show, goes to stderr."""
+    failed = [v for v in result.verdicts if v.failed]
+    for verdict in failed:
+        where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"
+        _say(f"pdhef: threshold failed: {where}: {verdict.reason}")
+    if failed:
+        for one in result.results:
+            if one.outcome.outcome != "ok":
+                _say(f"pdhef: {one.outcome.log} besides {one.outcome.outcome}")
+    raise typer.Exit(result.exit_code)
 
 
 def _print_json(document: Any) -> None:

@@ -17,6 +17,7 @@ SENSOR_SUITES = ("full", "esp")
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
 WINDOW_S = 600.0
+_FILES = ("vehicle", "mapping", "thresholds")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,7 @@ class RunConfig:
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
+    thresholds : limits that the figures are held against; None = no gate.
     """
 
     estimators: tuple[str, ...] = DEFAULT_ESTIMATORS
@@ -43,12 +45,13 @@ class RunConfig:
     sensors: Literal["full", "esp"] = "full"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: float = WINDOW_S
+    thresholds: Path | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
         document["estimators"] = list(self.estimators)
-        for key in ("vehicle", "mapping"):
+        for key in _FILES:
             path = document[key]
             document[key] = None if path is None else Path(path).name
         return document
@@ -86,7 +89,7 @@ def _read_file(path: Path) -> dict[str, Any]:
     if "estimators" in raw:
         names = raw["estimators"]
         raw["estimators"] = tuple(names.split(",") if isinstance(names, str) else names)
-    for key in ("vehicle", "mapping"):
+    for key in _FILES:
         if key in raw:
             raw[key] = path.parent / str(raw[key])
     for key in ("start", "end"):

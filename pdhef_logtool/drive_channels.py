@@ -7,7 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.alignment import SURVEY_S, AlignmentPlan, align, count_late, plan_alignment
+from pdhef_logtool.alignment import (
+    SURVEY_S,
+    AlignmentPlan,
+    align,
+    count_late,
+    has_imu,
+    no_alignment,
+    plan_alignment,
+)
 from pdhef_logtool.evaluation.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -78,8 +86,20 @@ class DriveWindow:
     share_done: float
 
 
-def plan_drive(log: DriveLog, mapping: Mapping, vehicle: VehicleParameters, start_ns: int, end_ns: int) -> DrivePlan:
+def plan_drive(
+    log: DriveLog,
+    mapping: Mapping,
+    vehicle: VehicleParameters,
+    start_ns: int,
+    end_ns: int,
+    *,
+    require_imu: bool = True,
+) -> DrivePlan:
     """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and truth.
+
+    Parameters
+    ----------
+    require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
 
     Raises
     ------
@@ -88,9 +108,12 @@ def plan_drive(log: DriveLog, mapping: Mapping, vehicle: VehicleParameters, star
     """
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     survey = read_signals(log, mapping, clocks, start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
-    alignment = plan_alignment(
-        survey.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
-    )
+    if require_imu or has_imu(survey.signals):
+        alignment = plan_alignment(
+            survey.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
+        )
+    else:
+        alignment = no_alignment(survey.signals)
     truth = plan_truth(survey.truth, truth_position_m=vehicle.truth_position_m) if survey.truth else None
     latency = None
     derivation: dict[str, str] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,15 +16,17 @@ from pdhef_logtool.config import RunConfig, time_slice
 from pdhef_logtool.drive_channels import DrivePlan, DriveReader, plan_drive
 from pdhef_logtool.errors import (
     EXIT_FAILURE,
+    EXIT_GATE,
     EXIT_OK,
     EXIT_PARTIAL,
     EstimatorError,
     MappingError,
     OutputError,
     PdhefError,
+    UsageError,
 )
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.registry import Skipped, runnable
+from pdhef_logtool.estimators.registry import runnable
 from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -51,6 +53,7 @@ from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehic
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
 
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
@@ -61,32 +64,43 @@ _DERIVED_UNITS = {"position_m": "m"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogResult:
-    """What came out of one log; ``report`` is the document of report.json, None if the log failed."""
+    """What came out of one log; ``report`` is the document of report.json, None if the log failed.
+
+    ``verdicts``: how its figures stand against the thresholds; None without thresholds.
+    """
 
     outcome: LogOutcome
     output: Path | None
     report: dict[str, Any] | None
     rows: tuple[MetricRow, ...]
+    verdicts: tuple[Verdict, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """What came out of a run."""
+    """What came out of a run; ``output`` is None when nothing was to be written."""
 
-    output: Path
+    output: Path | None
     results: tuple[LogResult, ...]
 
     @property
     def exit_code(self) -> int:
-        """0 if all is well, 3 if some input was lost or some logs failed, 1 if all failed."""
+        """0 if all is well, 4 if a threshold failed, 3 if input was lost or some logs failed, 1 if all failed."""
         if all(r.report is None for r in self.results):
             return EXIT_FAILURE
+        if any(v.failed for v in self.verdicts):
+            return EXIT_GATE
         return EXIT_OK if all(r.outcome.outcome == "ok" for r in self.results) else EXIT_PARTIAL
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """The verdicts of all logs in order."""
+        return tuple(v for r in self.results for v in r.verdicts or ())
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         return {
-            "output": str(self.output),
+            "output": None if self.output is None else str(self.output),
             "exit_code": self.exit_code,
             "logs": [
                 {
@@ -94,6 +108,7 @@ class RunResult:
                     "outcome": r.outcome.outcome,
                     "output": None if r.output is None else str(r.output),
                     "report": r.report,
+                    **({} if r.verdicts is None else {"verdicts": [v.to_dict() for v in r.verdicts]}),
                 }
                 for r in self.results
             ],
@@ -105,6 +120,7 @@ def run_logs(
     output: Path,
     config: RunConfig,
     *,
+    junit: Path | None = None,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> RunResult:
@@ -114,7 +130,8 @@ def run_logs(
 
     Parameters
     ----------
-    arguments : logs, folders, glob patterns. progress, warn : called with lines for people.
+    arguments : logs, folders, glob patterns. junit : where the verdicts of the thresholds are written as JUnit XML.
+    progress, warn : called with lines for people.
 
     Raises
     ------
@@ -126,10 +143,11 @@ def run_logs(
     inputs = find_logs(arguments)
     vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
+    thresholds = read_thresholds(config, junit)
     if config.vehicle is None:
         warn(f"no --vehicle: the default {vehicle.name} is assumed, so the model-based estimates are of another car")
-    _make_folder(output)
-    results = []
+    make_folder(output)
+    results: list[LogResult] = []
     for number, log_input in enumerate(inputs):
 
         def of_all(text: str, share: float, number: int = number) -> None:
@@ -144,9 +162,41 @@ def run_logs(
             warn(reason)
             outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
             result = LogResult(outcome, None, None, ())
-        results.append(result)
-    _write_run(output, config, results)
+        results.append(judge(result, thresholds))
+    write_run(output, config.to_dict(), results)
+    write_verdicts(junit, results)
     return RunResult(output, tuple(results))
+
+
+def read_thresholds(config: RunConfig, junit: Path | None) -> tuple[Threshold, ...] | None:
+    """Return the configured thresholds, None without; raises UsageError when they are wrong or miss for ``junit``."""
+    from pdhef_logtool.evaluation.thresholds import load_thresholds
+
+    if config.thresholds is not None:
+        return load_thresholds(config.thresholds)
+    if junit is not None:
+        raise UsageError(
+            expected="thresholds to give verdicts on", got="none", where="--junit", remedy="--thresholds FILE"
+        )
+    return None
+
+
+def judge(result: LogResult, thresholds: Sequence[Threshold] | None) -> LogResult:
+    """Return the result with verdicts; a log that failed has no figures, so that its thresholds fail too."""
+    from pdhef_logtool.evaluation.thresholds import check_thresholds
+
+    if thresholds is None:
+        return result
+    verdicts = check_thresholds(thresholds, result.rows, log=result.outcome.log)
+    return replace(result, verdicts=tuple(verdicts))
+
+
+def write_verdicts(junit: Path | None, results: Sequence[LogResult]) -> None:
+    """Write JUnit XML if a file is asked for; raises OutputError."""
+    from pdhef_logtool.sinks.junit import write_junit
+
+    if junit is not None:
+        write_junit(junit, {r.outcome.log: r.verdicts or () for r in results})
 
 
 def run_log(
@@ -192,7 +242,7 @@ def _run_open_log(
         warnings.append(text)
         warn(f"{log_input.stem}: {text}")
 
-    mapping, missing = _choose_mapping(log, mapping, config, tell)
+    mapping, missing = choose_mapping(log, mapping, config, tell)
     start_ns, end_ns = time_slice(config, log.start_ns, log.end_ns)
     plan = plan_drive(log, mapping, vehicle, start_ns, end_ns)
     for warning in plausibility_warnings(plan.survey_signals):
@@ -221,9 +271,11 @@ def _run_open_log(
             progress(log_input.stem, 0.8)
             rows, events = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
         losses = merge_losses([log.lost, reader.losses, *(sink.lost for sink in sinks)])
+        ran = [EstimatorFacts(e.name, causal=e.causal) for e in estimators]
+        left_out = [EstimatorFacts(s.name, causal=True, skipped=s.reason) for s in skipped]
         report = build_report(
-            _facts(
-                log, log_input, sha256, plan, missing, vehicle, estimators, skipped, rows, events, losses, warnings,
+            report_facts(
+                log, log_input, sha256, plan, missing, vehicle, [*ran, *left_out], rows, events, losses, warnings,
                 reader.samples or {},
             )
         )  # fmt: skip
@@ -245,10 +297,21 @@ def _run_open_log(
     return LogResult(outcome, folder, report, tuple(rows))
 
 
-def _choose_mapping(
-    log: DriveLog, mapping: Mapping | None, config: RunConfig, tell: Callable[[str], None]
+def choose_mapping(
+    log: DriveLog,
+    mapping: Mapping | None,
+    config: RunConfig,
+    tell: Callable[[str], None],
+    *,
+    require_signals: bool = True,
 ) -> tuple[Mapping, tuple[str, ...]]:
-    """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently."""
+    """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently.
+
+    Raises
+    ------
+    MappingError
+        The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
+    """
     if mapping is not None:
         check_mapping(mapping, log)
         for note in mapping.notes:
@@ -259,7 +322,7 @@ def _choose_mapping(
         tell(str(ambiguity))
     for note in found.mapping.notes:
         tell(note)
-    if not found.mapping.signals:
+    if require_signals and not found.mapping.signals:
         raise MappingError(
             expected="topics of well-known message types",
             got=", ".join(sorted({t.type_name for t in log.topics})) or "no topics",
@@ -303,7 +366,7 @@ def _open_sinks(
     return sinks
 
 
-class _Pose:
+class DeadReckoning:
     """Dead-reckons one track from window to window, from the true pose at the start where there is one."""
 
     def __init__(self) -> None:
@@ -311,6 +374,7 @@ class _Pose:
         self._pose: tuple[float, float, float] | None = None
 
     def add(self, track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
+        """Return the next window of the track with its pose; ``start`` is where the first window begins."""
         if len(track) == 0:
             return track
         stamps, vx, vy, rate = track.stamps_ns, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
@@ -326,7 +390,8 @@ class _Pose:
         return track.with_pose(x[skip:], y[skip:], yaw[skip:])
 
 
-def _first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
+def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
+    """Return the first known pose x, y, yaw of the truth; the origin without one."""
     if truth is not None:
         known = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))
         if known.size:
@@ -344,7 +409,7 @@ def _estimate(
 ) -> Signals:
     """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
     carries: dict[str, Any] = {}
-    poses = {e.name: _Pose() for e in estimators} | {TRUTH: _Pose()}
+    poses = {e.name: DeadReckoning() for e in estimators} | {TRUTH: DeadReckoning()}
     seen: list[Signals] = []
     start: tuple[float, float, float] | None = None
     for window in reader.windows():
@@ -352,7 +417,7 @@ def _estimate(
             continue
         seen.append(window.signals)
         if start is None:
-            start = _first_pose(window.truth)
+            start = first_pose(window.truth)
         for sink in sinks:
             sink.append_signals(window.signals)
         if window.truth is not None:
@@ -396,7 +461,7 @@ def _evaluate(
     masks = segment_masks(signals, truth, vehicle)
     slow = vehicle.low_speed_blend_m_s
     rows: list[MetricRow] = []
-    events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(signals.stamps_ns, _without_whole(masks))]
+    events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(signals.stamps_ns, without_whole(masks))]
     for estimator in estimators:
         track = store.read(estimator.name)
         assert track is not None
@@ -417,25 +482,26 @@ def _evaluate(
     return rows, sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
 
 
-def _without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
+def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
+    """Return the masks that are worth an event: not the whole drive, nor what is only not nonlinear."""
     return {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
 
 
-def _facts(
+def report_facts(
     log: DriveLog,
     log_input: LogInput,
     sha256: str,
     plan: DrivePlan,
     missing: Sequence[str],
     vehicle: VehicleParameters,
-    estimators: Sequence[Estimator],
-    skipped: Sequence[Skipped],
+    estimators: Sequence[EstimatorFacts],
     rows: Sequence[MetricRow],
     events: Sequence[Event],
     losses: Sequence[Loss],
     warnings: Sequence[str],
     samples: dict[str, int],
 ) -> ReportFacts:
+    """Gather what report.json says of one log; ``samples`` are the messages that were used, by source."""
     mapping = plan.mapping
     mapped = set(mapping.topics)
     notes = []
@@ -465,8 +531,7 @@ def _facts(
         missing_signals=list(missing),
         vehicle_name=vehicle.name,
         vehicle_sha256=hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest(),
-        estimators=[EstimatorFacts(e.name, causal=e.causal) for e in estimators]
-        + [EstimatorFacts(s.name, causal=True, skipped=s.reason) for s in skipped],
+        estimators=list(estimators),
         truth=TruthFacts(
             quantities=[
                 _truth_quantity(name, how, mapping, samples) for name, how in plan.derivation.items() if name != "cg"
@@ -504,7 +569,8 @@ def hash_log(path: Path) -> str:
     return total.hexdigest()
 
 
-def _make_folder(output: Path) -> None:
+def make_folder(output: Path) -> None:
+    """Make an output folder; raises OutputError."""
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -513,8 +579,9 @@ def _make_folder(output: Path) -> None:
         ) from None
 
 
-def _write_run(output: Path, config: RunConfig, results: Sequence[LogResult]) -> None:
+def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult]) -> None:
+    """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values."""
     from pdhef_logtool.sinks.parquet import write_metrics
 
     write_metrics(output / "metrics.parquet", [row for r in results for row in r.rows])
-    write_json(output / "run.json", build_run(tool_versions(), config.to_dict(), None, [r.outcome for r in results]))
+    write_json(output / "run.json", build_run(tool_versions(), config, None, [r.outcome for r in results]))

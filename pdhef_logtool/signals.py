@@ -50,6 +50,21 @@ TRUTH_UNITS: dict[str, str] = {
     "position_std_m": "m",
 }
 
+#: Every quantity that a recorded estimate may consist of, with its unit. ``valid`` is 0 where it must not be used.
+ESTIMATE_UNITS: dict[str, str] = {
+    "vx_m_s": "m/s",
+    "vy_m_s": "m/s",
+    "yaw_rate_rad_s": "rad/s",
+    "sideslip_rad": "rad",
+    "ay_m_s2": "m/s^2",
+    "vx_std_m_s": "m/s",
+    "vy_std_m_s": "m/s",
+    "yaw_rate_std_rad_s": "rad/s",
+    "sideslip_std_rad": "rad",
+    "valid": "1",
+    "diverged": "1",
+}
+
 #: Signals the alignment's output carries as one column each.
 ALIGNED_SIGNALS = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
 

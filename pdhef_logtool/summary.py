@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.pipeline import LogResult, RunResult
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ def render_run(result: RunResult, console: Console) -> None:
     """Print one table a log and where the outputs are."""
     for one in result.results:
         _render_log(one, console)
+    if result.verdicts:
+        _render_verdicts(result.verdicts, console)
     failed = [r for r in result.results if r.report is None]
     lost = [r for r in result.results if r.outcome.lost]
     if len(result.results) > 1 or failed:
@@ -44,7 +47,27 @@ def render_run(result: RunResult, console: Console) -> None:
             f"{len(lost)} with input lost",
             highlight=False,
         )
-    console.print(f"outputs in {result.output}", highlight=False, soft_wrap=True)
+    if result.output is not None:
+        console.print(f"outputs in {result.output}", highlight=False, soft_wrap=True)
+
+
+def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", pad_edge=True)
+    for head in ("threshold", "estimator", "log"):
+        table.add_column(head, overflow="fold")
+    for head in ("value", "margin"):
+        table.add_column(head, justify="right")
+    table.add_column("verdict")
+    for v in verdicts:
+        mark = "" if v.independent else " †"
+        value, margin = ("-" if x is None else f"{x:.4g}" for x in (v.value, v.margin))
+        table.add_row(v.threshold.label + mark, v.estimator, v.log, value, margin, v.outcome)
+    console.print(table)
+    failed = sum(v.failed for v in verdicts)
+    console.print(f"{len(verdicts)} verdicts, {failed} failed", highlight=False)
+    console.print()
 
 
 def _render_log(one: LogResult, console: Console) -> None:
@@ -71,7 +94,7 @@ def _render_log(one: LogResult, console: Console) -> None:
     if not report["truth"]["available"]:
         console.print("  no truth in this log: estimates, NIS and disagreement only", highlight=False)
     if report["truth"]["not_independent"]:
-        console.print("  † the truth channel is an input of the estimators: no independent check", highlight=False)
+        console.print("  † the truth is an input or the estimate itself: no independent check", highlight=False)
     for estimator in report["estimators"]:
         if estimator["outcome"] == "skipped":
             console.print(f"  {estimator['name']} skipped: {estimator['reason']}", highlight=False)

@@ -31,6 +31,18 @@ from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
 
+SEGMENTS = (
+    "all",
+    "linear",
+    "nonlinear",
+    "standstill",
+    "straight",
+    "cornering-left",
+    "cornering-right",
+    "slalom",
+    "braking",
+    "accelerating",
+)
 LINEAR_SHARE, NONLINEAR_SHARE = 0.3, 0.5
 GRIP_SMOOTHING_HZ, MANOEUVRE_SMOOTHING_HZ = 4.0, 1.0
 #: A longer step between stamps ends every run and every interval.

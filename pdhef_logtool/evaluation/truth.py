@@ -323,11 +323,17 @@ def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) ->
     return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against truth yaw rate")
 
 
-def dependent_signals(signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel]) -> dict[str, str]:
+def dependent_signals(
+    signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel], *, role: str = "input"
+) -> dict[str, str]:
     """Find truth channels that are an input channel in disguise.
 
     Equal means: at the same stamps (or, for channels of the same length, sample by sample) values agree to 1e-6
     relative, more than the rounding of float32, on at least 99 % of the samples, and the channel is not constant.
+
+    Parameters
+    ----------
+    role : what the sentences call the channels of ``signals_channels``.
 
     Returns
     -------
@@ -342,7 +348,7 @@ def dependent_signals(signals_channels: Mapping[str, Channel], truth_channels: M
             share = _same_share(channel, truth)
             if share >= SAME_SHARE:
                 found[name] = (
-                    f"{truth.source} equals the input {signal} ({channel.source}) on {share:.1%} of its samples"
+                    f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
                 )
                 break
     return found
@@ -703,13 +709,14 @@ def _same_share(a: Channel, b: Channel) -> float:
     _, i, j = np.intersect1d(a.stamps_ns, b.stamps_ns, assume_unique=True, return_indices=True)
     shares = [0.0]
     if i.size >= max(10, 0.5 * min(len(a), len(b))):
-        shares.append(_share_equal(a.values[i], b.values[j]))
+        shares.append(share_equal(a.values[i], b.values[j]))
     if len(a) == len(b) >= 10:
-        shares.append(_share_equal(a.values, b.values))
+        shares.append(share_equal(a.values, b.values))
     return max(shares)
 
 
-def _share_equal(x: FloatArray, y: FloatArray) -> float:
+def share_equal(x: FloatArray, y: FloatArray) -> float:
+    """Return the share of samples [N], N ≥ 1, that agree to ``SAME_RELATIVE``; 0 for a constant."""
     if np.ptp(x) == 0.0:
         return 0.0
     return float(np.mean(np.abs(x - y) <= SAME_RELATIVE * np.maximum(np.abs(x), np.abs(y))))

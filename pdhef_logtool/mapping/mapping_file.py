@@ -15,15 +15,21 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from pdhef_logtool.errors import MappingError
 from pdhef_logtool.mapping.records import (
     AUTO_STAMP,
+    CAN_PREFIX,
     RECORDER_STAMPS,
     VECTOR_COLUMNS,
+    CanDataEncoding,
+    CanSettings,
     Clock,
     Mapping,
     QualityGate,
     SignalSource,
     StampUnit,
 )
-from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, WHEELS
+from pdhef_logtool.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
+
+#: Names in the tables that are no estimator's.
+RESERVED_NAMES = ("truth", "sensors")
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]
@@ -76,6 +82,26 @@ class _GateTable(_Timed):
         return self
 
 
+class _CanTable(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    dbc: Name | Annotated[list[Name], Field(min_length=1)]
+    id_field: str = ""
+    data_field: str = ""
+    data_encoding: CanDataEncoding = "bytes"
+    length_field: str = ""
+    extended_field: str = ""
+    bus_field: str = ""
+    bus: int | None = None
+    id_mask: Annotated[int, Field(ge=1, lt=1 << 29)] = (1 << 29) - 1
+
+    @model_validator(mode="after")
+    def _bus_has_a_field(self) -> _CanTable:
+        if (self.bus is None) != (not self.bus_field):
+            raise ValueError("bus and bus_field belong together")
+        return self
+
+
 def load_mapping(path: Path) -> Mapping:
     """Read mapping.toml.
 
@@ -91,11 +117,11 @@ def load_mapping(path: Path) -> Mapping:
         raise MappingError(expected="a mapping TOML file", got="no such file", where=str(path)) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
         raise MappingError(expected="a mapping TOML file", got=str(error), where=str(path)) from None
-    return mapping_from_dict(raw, where=str(path))
+    return mapping_from_dict(raw, where=str(path), folder=path.parent)
 
 
-def mapping_from_dict(raw: dict[str, Any], *, where: str) -> Mapping:
-    """Build a mapping from parsed TOML; every problem is reported in one line.
+def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path()) -> Mapping:
+    """Build a mapping from parsed TOML; every problem is reported in one line. DBC files are relative to ``folder``.
 
     Raises
     ------
@@ -103,12 +129,19 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str) -> Mapping:
         Entries are wrong, unknown, missing or contradict one another.
     """
     problems: list[str] = []
-    sections = ("signals", "truth", "truth_quality")
+    sections = ("signals", "truth", "truth_quality", "estimates", "can")
     problems += [f"{key}: unknown table{_near(key, sections)}" for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
     quality = _read_gate(raw["truth_quality"], problems) if "truth_quality" in raw else None
-    mapping = Mapping(signals=signals, truth=truth, quality=quality, origin="file")
+    estimates = _read_estimates(raw.get("estimates", {}), problems)
+    can = _read_can(raw["can"], folder, problems) if "can" in raw else None
+    mapping = Mapping(signals=signals, truth=truth, quality=quality, origin="file", can=can, estimates=estimates)
+    if "can" not in raw:
+        # Others than estimators read the estimates, so that they are looked through as well.
+        every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
+        names = [s.name for s in every if s.can_signal is not None]
+        problems += [f"{name}: field = {CAN_PREFIX}... needs [can] with a dbc" for name in names]
     problems += _contradictions(mapping)
     if problems:
         raise MappingError(
@@ -165,6 +198,31 @@ def _read_section(
     return out
 
 
+def _read_estimates(raw: object, problems: list[str]) -> dict[str, dict[str, SignalSource]]:
+    if not isinstance(raw, dict):
+        problems.append("estimates: must be a table of estimators, each a table of signals")
+        return {}
+    out: dict[str, dict[str, SignalSource]] = {}
+    for name, tables in raw.items():
+        if not name or name in RESERVED_NAMES:
+            problems.append(f"estimates.{name}: an estimator may not be called {name!r}")
+        elif isinstance(tables, dict) and "topic" in tables and not isinstance(tables["topic"], dict):
+            problems.append(f"estimates.{name}: name the estimator too: [estimates.NAME.{name}]")
+        else:
+            out[name] = _read_section(tables, f"estimates.{name}", tuple(ESTIMATE_UNITS), (), problems)
+    return out
+
+
+def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | None:
+    try:
+        model = _CanTable.model_validate(raw)
+    except ValidationError as error:
+        problems += _pydantic_problems(error, "can", tuple(_CanTable.model_fields))
+        return None
+    files = model.dbc if isinstance(model.dbc, list) else [model.dbc]
+    return CanSettings(dbc=tuple(folder / f for f in files), **model.model_dump(exclude={"dbc"}))
+
+
 def _shape_problem(name: str, model: _SourceTable) -> str:
     columns = VECTOR_COLUMNS.get(name, 1)
     for key, value in (("field", model.field), ("scale", model.scale), ("offset", model.offset)):
@@ -172,6 +230,11 @@ def _shape_problem(name: str, model: _SourceTable) -> str:
             return f"{key} must be a single value, {name} is no vector"
         if isinstance(value, list) and len(value) != columns:
             return f"{key} must hold {columns} entries, got {len(value)}"
+    fields = model.field if isinstance(model.field, list) else [model.field]
+    if columns > 1 and any(f.startswith(CAN_PREFIX) for f in fields):
+        return f"{name} is a vector: frames of several signals do not come together"
+    if any(f.startswith(CAN_PREFIX) and f.count(".") != 1 for f in fields):
+        return f"field must be {CAN_PREFIX}<message>.<signal>"
     return ""
 
 
@@ -219,7 +282,8 @@ def _contradictions(mapping: Mapping) -> list[str]:
         for a, b in pairs
         if a in mapping.signals and b in mapping.signals
     ]
-    for section, sources in (("signals", mapping.signals), ("truth", mapping.truth)):
+    estimates = [(f"estimates.{name}", sources) for name, sources in mapping.estimates.items()]
+    for section, sources in (("signals", mapping.signals), ("truth", mapping.truth), *estimates):
         first: dict[tuple[str, tuple[str, ...]], str] = {}
         for name, source in sources.items():
             key = (source.topic, source.paths)
@@ -257,6 +321,8 @@ def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = No
     lines += _comment(notes.get("", ""))
     for note in mapping.notes:
         lines += _comment(note)
+    if mapping.can is not None:
+        lines += ["", *_can_lines(mapping.can)]
     for section, sources, units in (("signals", mapping.signals, SIGNAL_UNITS), ("truth", mapping.truth, TRUTH_UNITS)):
         for name in (n for n in units if n in sources):
             source = sources[name]
@@ -264,6 +330,10 @@ def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = No
             lines += _comment(notes.get(f"{section}.{name}", notes.get(name, "")))
             lines.append(f"[{section}.{name}]{' ' * max(1, 30 - len(section) - len(name))}# {units[name]}")
             lines += _source_lines(source)
+    for estimator, sources in mapping.estimates.items():
+        for name in (n for n in ESTIMATE_UNITS if n in sources):
+            lines += ["", f"[estimates.{_toml(estimator)}.{name}]  # {ESTIMATE_UNITS[name]}"]
+            lines += _source_lines(sources[name])
     if mapping.quality is not None:
         lines.append("")
         lines += _comment(notes.get("truth_quality", "truth is kept where this holds"))
@@ -321,6 +391,22 @@ def _source_lines(source: SignalSource) -> list[str]:
         lines.append(f"stamp_unit = {_toml(source.stamp_unit)}")
     if source.clock != "utc":
         lines.append(f"clock = {_toml(source.clock)}")
+    return lines
+
+
+def _can_lines(can: CanSettings) -> list[str]:
+    files = tuple(path.absolute().as_posix() for path in can.dbc)
+    lines = ["[can]", f"dbc = {_toml(files)}"]
+    for key in ("id_field", "data_field", "length_field", "extended_field", "bus_field"):
+        value = getattr(can, key)
+        if value:
+            lines.append(f"{key} = {_toml(value)}")
+    if can.data_encoding != "bytes":
+        lines.append(f"data_encoding = {_toml(can.data_encoding)}")
+    if can.bus is not None:
+        lines.append(f"bus = {can.bus}")
+    if can.id_mask != CanSettings(()).id_mask:
+        lines.append(f"id_mask = {can.id_mask:#x}")
     return lines
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 #: Number of columns of the truth channels that are vectors; all other signals are scalars.
@@ -16,6 +17,12 @@ VECTOR_COLUMNS: dict[str, int] = {
 
 StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]
+
+#: How a frame's bytes stand in a message: as numbers, or as a text of digits.
+CanDataEncoding: TypeAlias = Literal["bytes", "hex", "base64"]
+
+#: Start of a field that names a signal of a DBC: ``can:<message>.<signal>``.
+CAN_PREFIX = "can:"
 
 #: Values of ``stamp`` that name the recorder's times instead of a field of the message.
 RECORDER_STAMPS = ("log_time", "publish_time")
@@ -58,6 +65,19 @@ class SignalSource:
         return self.field if isinstance(self.field, tuple) else (self.field,)
 
     @property
+    def can_signal(self) -> tuple[str, str] | None:
+        """Message and signal of the DBC if the source is one."""
+        if not isinstance(self.field, str) or not self.field.startswith(CAN_PREFIX):
+            return None
+        message, _, signal = self.field.removeprefix(CAN_PREFIX).partition(".")
+        return message, signal
+
+    @property
+    def read_topic(self) -> str:
+        """Topic that a log offers the source under: a CAN signal has a view of its own, with its frames only."""
+        return self.topic if self.can_signal is None else self.label
+
+    @property
     def label(self) -> str:
         """``/topic.field``, for people and for ``Channel.source``."""
         return f"{self.topic}.{self.field if isinstance(self.field, str) else '{' + ','.join(self.field) + '}'}"
@@ -66,6 +86,30 @@ class SignalSource:
     def columns(self) -> int:
         """Number of columns of the signal's values; 1 for a scalar."""
         return VECTOR_COLUMNS.get(self.name, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class CanSettings:
+    """How raw CAN frames are read.
+
+    Attributes
+    ----------
+    dbc : the files that describe the frames.
+    id_field, data_field, length_field, extended_field : paths in the messages that hold frames; empty: found by name.
+    data_encoding : how the bytes stand in ``data_field``.
+    bus_field, bus : frames of other buses are left out, where both are given.
+    id_mask : bits of the identifier that tell messages apart; all 29 by default.
+    """
+
+    dbc: tuple[Path, ...]
+    id_field: str = ""
+    data_field: str = ""
+    data_encoding: CanDataEncoding = "bytes"
+    length_field: str = ""
+    extended_field: str = ""
+    bus_field: str = ""
+    bus: int | None = None
+    id_mask: int = (1 << 29) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,6 +160,9 @@ class Mapping:
     quality : gate on the truth, if any.
     origin : ``file`` or ``auto`` (recognised types).
     notes : sentences that the reader of a report must know of this mapping.
+    can : how raw CAN frames are read, for sources whose field is ``can:<message>.<signal>``.
+    estimates : estimates that somebody else recorded in the log, by estimator and quantity (``ESTIMATE_UNITS``). They
+        are no part of :meth:`sources`: only ``pdhef metrics`` reads them.
     """
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
@@ -123,6 +170,8 @@ class Mapping:
     quality: QualityGate | None = None
     origin: Literal["file", "auto"] = "file"
     notes: tuple[str, ...] = ()
+    can: CanSettings | None = None
+    estimates: dict[str, dict[str, SignalSource]] = field(default_factory=dict)
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, truth, the gate."""

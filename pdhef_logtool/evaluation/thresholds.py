@@ -1,0 +1,313 @@
+"""Limits on figures: strict reading of thresholds.toml, and one verdict a threshold and estimator.
+
+A threshold that finds no figure is *not evaluated*, which fails like a figure beyond its limit, so that a renamed
+signal or a log without truth cannot pass a gate silently; ``optional = true`` turns that into *skipped*.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pdhef_logtool.errors import UsageError
+from pdhef_logtool.evaluation.consistency import SENSORS
+from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, MetricRow
+from pdhef_logtool.evaluation.segments import SEGMENTS
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Name = Annotated[str, Field(min_length=1)]
+Outcome: TypeAlias = Literal["pass", "fail", "not evaluated", "skipped"]
+
+#: Metrics in the unit of their signal; those of ``_OTHER_UNITS`` have one of their own.
+_ERROR_METRICS = ("rmse", "mae", "bias", "p95_abs", "max_abs", "residual_rms", "residual_bias", "disagreement_rms")
+_OTHER_UNITS = {
+    "rmse_relative": "1",
+    "coverage95": "1",
+    "availability": "1",
+    "lag_s": "s",
+    "nees": "1",
+    "nis": "1",
+    "nis_dof": "1",
+    "nis_autocorrelation": "1",
+    "diverged": "1",
+    "not_independent": "1",
+}
+METRICS = (*_ERROR_METRICS, *_OTHER_UNITS)
+SIGNALS: dict[str, str] = {**SCORED_SIGNALS, "position_m": "m", "lateral_1s_m": "m", "state": "1"}
+#: Units that people may write limits in, by the unit of metrics.parquet, with the factor to it.
+_CONVERSIONS: dict[tuple[str, str], float] = {
+    ("deg", "rad"): math.pi / 180.0,
+    ("deg/s", "rad/s"): math.pi / 180.0,
+    ("ms", "s"): 1e-3,
+    ("%", "1"): 1e-2,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """One limit: ``minimum`` ≤ figure ≤ ``maximum``, in ``unit``, for every estimator whose name matches the glob.
+
+    ``factor`` turns ``unit`` into the unit of metrics.parquet.
+    """
+
+    signal: str
+    metric: str
+    estimator: str = "*"
+    segment: str = "all"
+    minimum: float | None = None
+    maximum: float | None = None
+    unit: str = "1"
+    factor: float = 1.0
+    optional: bool = False
+
+    @property
+    def label(self) -> str:
+        """``sideslip_rad rmse (all) <= 0.5 deg``, for tables and test reports."""
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        limits = []
+        if self.minimum is not None:
+            limits.append(f">= {self.minimum:g}{unit}")
+        if self.maximum is not None:
+            limits.append(f"<= {self.maximum:g}{unit}")
+        return f"{self.signal} {self.metric} ({self.segment}) {' and '.join(limits)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How one estimator stands against one threshold in one log.
+
+    Attributes
+    ----------
+    estimator : its name, or the threshold's pattern where no estimator matched.
+    value, margin : in the threshold's unit; None where there is no figure. A margin below 0 is a failure.
+    n : samples behind the figure.
+    independent : False where the truth of the figure is an input or the estimate itself.
+    reason : one sentence for a person, empty for a plain pass.
+    """
+
+    log: str
+    estimator: str
+    threshold: Threshold
+    outcome: Outcome
+    value: float | None = None
+    margin: float | None = None
+    n: int = 0
+    independent: bool = True
+    reason: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether the gate is closed by it: a figure beyond its limit, or none where one is demanded."""
+        return self.outcome in ("fail", "not evaluated")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as JSON-able values; limits, value and margin in ``unit``."""
+        limit = self.threshold
+        return {
+            "log": self.log,
+            "estimator": self.estimator,
+            "signal": limit.signal,
+            "segment": limit.segment,
+            "metric": limit.metric,
+            "min": limit.minimum,
+            "max": limit.maximum,
+            "unit": limit.unit,
+            "value": self.value,
+            "margin": self.margin,
+            "n": self.n,
+            "independent": self.independent,
+            "outcome": self.outcome,
+            "reason": self.reason,
+        }
+
+
+class _ThresholdTable(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    estimator: Name = "*"
+    signal: Name
+    segment: Name = "all"
+    metric: Name
+    min: Finite | None = None
+    max: Finite | None = None
+    unit: Name | None = None
+    optional: bool = False
+
+
+def load_thresholds(path: Path) -> tuple[Threshold, ...]:
+    """Read thresholds.toml.
+
+    Raises
+    ------
+    UsageError
+        The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
+    """
+    try:
+        with path.open("rb") as file:
+            raw: dict[str, Any] = tomllib.load(file)
+    except FileNotFoundError:
+        raise UsageError(expected="a thresholds TOML file", got="no such file", where=str(path)) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise UsageError(expected="a thresholds TOML file", got=str(error), where=str(path)) from None
+    return thresholds_from_dict(raw, where=str(path))
+
+
+def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold, ...]:
+    """Build thresholds from parsed TOML; every problem is reported in one line.
+
+    Raises
+    ------
+    UsageError
+        Entries are wrong, unknown, missing or contradict one another, or there is no threshold at all.
+    """
+    problems = [f"{key}: unknown table{_near(key, ('threshold',))}" for key in raw if key != "threshold"]
+    tables = raw.get("threshold", [])
+    if not isinstance(tables, list) or not tables:
+        problems.append("threshold: give at least one [[threshold]] table")
+        tables = []
+    found = [_read_table(table, f"threshold[{i}]", problems) for i, table in enumerate(tables)]
+    seen: dict[tuple[str, ...], int] = {}
+    for i, threshold in enumerate(found):
+        if threshold is None:
+            continue
+        key = (threshold.estimator, threshold.signal, threshold.segment, threshold.metric)
+        if key in seen:
+            problems.append(f"threshold[{i}]: limits the same figure as threshold[{seen[key]}]")
+        seen.setdefault(key, i)
+    if problems:
+        raise UsageError(
+            expected="the entries of thresholds.toml",
+            got="; ".join(problems),
+            where=where,
+            remedy="see docs/formats.md for every entry",
+        )
+    return tuple(t for t in found if t is not None)
+
+
+def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | None:
+    try:
+        table = _ThresholdTable.model_validate(raw)
+    except ValidationError as error:
+        problems += _pydantic_problems(error, where)
+        return None
+    before = len(problems)
+    for key, value, known in (
+        ("signal", table.signal, tuple(SIGNALS)),
+        ("metric", table.metric, METRICS),
+        ("segment", table.segment, SEGMENTS),
+    ):
+        if value not in known:
+            problems.append(f"{where}.{key}: unknown {key} {value!r}{_near(value, known)}")
+    if table.min is None and table.max is None:
+        problems.append(f"{where}: give min, max or both")
+    elif table.min is not None and table.max is not None and table.min > table.max:
+        problems.append(f"{where}: min must not be above max")
+    if len(problems) > before:
+        return None
+    native = _OTHER_UNITS.get(table.metric) or SIGNALS[table.signal]
+    unit = native if table.unit is None else table.unit
+    factor = 1.0 if unit == native else _CONVERSIONS.get((unit, native))
+    if factor is None:
+        allowed = [native, *(u for u, of in _CONVERSIONS if of == native)]
+        problems.append(f"{where}.unit: {table.signal} {table.metric} is in {' or '.join(allowed)}, not {unit!r}")
+        return None
+    return Threshold(
+        signal=table.signal,
+        metric=table.metric,
+        estimator=table.estimator,
+        segment=table.segment,
+        minimum=table.min,
+        maximum=table.max,
+        unit=unit,
+        factor=factor,
+        optional=table.optional,
+    )
+
+
+def _pydantic_problems(error: ValidationError, where: str) -> list[str]:
+    problems = []
+    for e in error.errors(include_url=False):
+        key = str(e["loc"][0]) if e["loc"] else ""
+        at = f"{where}.{key}" if key else where
+        if e["type"] == "extra_forbidden":
+            problems.append(f"{at}: unknown entry{_near(key, tuple(_ThresholdTable.model_fields))}")
+        else:
+            problems.append(f"{at}: {'is missing' if e['type'] == 'missing' else e['msg']}")
+    return problems
+
+
+def _near(name: str, known: tuple[str, ...]) -> str:
+    close = get_close_matches(name, known, n=1, cutoff=0.5)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow], *, log: str) -> list[Verdict]:
+    """Hold the figures of one log against the thresholds.
+
+    Parameters
+    ----------
+    rows : figures of this log; none when it failed.
+
+    Returns
+    -------
+    In the order of the thresholds, a verdict for every estimator that matches and has the figure; one verdict, *not
+    evaluated* or *skipped*, where there is none. Rows of ``sensors`` and of pairs (``a~b``) are only meant by a
+    threshold that names them, or whose pattern has a ``~``.
+    """
+    verdicts = []
+    for threshold in thresholds:
+        figure = (threshold.signal, threshold.segment, threshold.metric)
+        found = [r for r in rows if (r.signal, r.segment, r.metric) == figure and _is_meant(threshold, r.estimator)]
+        if not found:
+            verdicts.append(_without_figure(threshold, log, threshold.estimator, "no such figure in this log"))
+        for row in found:
+            if math.isfinite(row.value):
+                verdicts.append(_judge(threshold, row))
+            else:
+                verdicts.append(_without_figure(threshold, log, row.estimator, "the figure could not be computed"))
+    return verdicts
+
+
+def _is_meant(threshold: Threshold, name: str) -> bool:
+    pattern = threshold.estimator
+    if (name == SENSORS or "~" in name) and "~" not in pattern:
+        return name == pattern
+    return fnmatchcase(name, pattern)
+
+
+def _without_figure(threshold: Threshold, log: str, estimator: str, reason: str) -> Verdict:
+    outcome: Outcome = "skipped" if threshold.optional else "not evaluated"
+    return Verdict(log, estimator, threshold, outcome, reason=reason)
+
+
+def _judge(threshold: Threshold, row: MetricRow) -> Verdict:
+    value = row.value / threshold.factor
+    margins = []
+    if threshold.maximum is not None:
+        margins.append(threshold.maximum - value)
+    if threshold.minimum is not None:
+        margins.append(value - threshold.minimum)
+    margin = min(margins)
+    passed = margin >= 0.0
+    reasons = [] if passed else [f"{value:.6g} {threshold.unit} is beyond the limit by {-margin:.3g}"]
+    if not row.independent:
+        reasons.append("not independent of the truth")
+    return Verdict(
+        log=row.log,
+        estimator=row.estimator,
+        threshold=threshold,
+        outcome="pass" if passed else "fail",
+        value=value,
+        margin=margin,
+        n=row.n,
+        independent=row.independent,
+        reason="; ".join(reasons),
+    )
