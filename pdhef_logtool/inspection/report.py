@@ -317,7 +317,7 @@ def _signal_report(
         own.add(f"{source.name} ({quality.describe()})")
     dropped = {x.kind: x.count or 0 for x in losses if x.where in own}
     # Messages that were sorted back are used.
-    dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.topic and x.kind in TOPIC_DROPS}
+    dropped |= {x.kind: x.count or 0 for x in losses if x.where == source.read_topic and x.kind in TOPIC_DROPS}
     clock = clocks[clock_key(source)]
     return SignalReport(
         name=source.name,

@@ -15,12 +15,13 @@ from pdhef_logtool.mapping.checking import check_mapping, resolve_mapping
 from pdhef_logtool.mapping.clocks import ClockModel, apply_clock, clock_key, fit_clock_line, fit_clocks
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_to_toml
 from pdhef_logtool.mapping.recognition import Ambiguity, AutoMapping, auto_map
-from pdhef_logtool.mapping.records import VECTOR_COLUMNS, Mapping, QualityGate, SignalSource
+from pdhef_logtool.mapping.records import VECTOR_COLUMNS, CanSettings, Mapping, QualityGate, SignalSource
 
 __all__ = [
     "VECTOR_COLUMNS",
     "Ambiguity",
     "AutoMapping",
+    "CanSettings",
     "CleanSamples",
     "ClockModel",
     "MappedChannels",

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
+from pdhef_logtool.mapping.can_frames import CanSignalLog, with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping
 from pdhef_logtool.mapping.clocks import ClockModel, apply_clock, clock_key, raw_stamps, stamp_request
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
@@ -129,6 +130,7 @@ def read_signals(
     clocks : from :func:`pdhef_logtool.mapping.fit_clocks` over the whole span that is going to be read.
     """
     resolved = resolve_mapping(log, mapping)
+    log = with_can_signals(log, resolved)
     gate = resolved.quality
     gate_source = gate.as_source() if gate is not None else None
     requests: dict[str, list[str]] = {}
@@ -136,6 +138,8 @@ def read_signals(
         _request(log, source, requests)
     columns = log.read(requests, start_ns, end_ns) if requests else {}
     losses = _topic_losses(log, resolved, clocks, columns)
+    if isinstance(log, CanSignalLog):
+        losses += log.short_frames
     signals = {n: _channel(log, s, SIGNAL_UNITS[n], clocks, columns, losses) for n, s in resolved.signals.items()}
     truth = {n: _channel(log, s, TRUTH_UNITS[n], clocks, columns, losses) for n, s in resolved.truth.items()}
     if gate is not None and gate_source is not None and truth:
@@ -176,7 +180,7 @@ def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
 
 
 def _request(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
-    paths = requests.setdefault(source.topic, [])
+    paths = requests.setdefault(source.read_topic, [])
     paths += [p for p in (*stamp_request(log, source), *source.paths) if p not in paths]
 
 
@@ -200,26 +204,26 @@ def _topic_losses(
     seen: set[str] = set()
     for source in (*mapping.signals.values(), *mapping.truth.values()):
         key = clock_key(source)
-        if key in seen or source.topic not in columns:
+        if key in seen or source.read_topic not in columns:
             continue
         seen.add(key)
-        topic = columns[source.topic]
+        topic = columns[source.read_topic]
         stamps, usable = raw_stamps(log, topic, source)
         times = topic.log_time_ns
         if not usable.all():
-            losses.append(_loss("bad-stamp", source.topic, times[~usable]))
+            losses.append(_loss("bad-stamp", source.read_topic, times[~usable]))
             stamps, times = stamps[usable], times[usable]
         if stamps.shape[0] > 1 and not np.all(stamps[1:] > stamps[:-1]):
             late = np.concatenate([[False], stamps[1:] < np.maximum.accumulate(stamps)[:-1]])
             if late.any():
-                losses.append(_loss("out-of-order", source.topic, times[late]))
+                losses.append(_loss("out-of-order", source.read_topic, times[late]))
             order = np.argsort(stamps, kind="stable")
             repeated = np.concatenate([[False], stamps[order][1:] == stamps[order][:-1]])
             if repeated.any():
-                losses.append(_loss("duplicate-stamp", source.topic, times[order[repeated]]))
+                losses.append(_loss("duplicate-stamp", source.read_topic, times[order[repeated]]))
         clock = clocks.get(key)
         if clock is not None and not clock.delay_known:
-            losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.topic, severity="note"))
+            losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.read_topic, severity="note"))
     return losses
 
 
@@ -231,7 +235,7 @@ def _channel(
     columns: dict[str, Columns],
     losses: list[Loss],
 ) -> Channel:
-    topic = columns.get(source.topic)
+    topic = columns.get(source.read_topic)
     if topic is None or len(topic) == 0:
         empty = np.empty(0, np.int64)
         shape = (0,) if source.columns == 1 else (0, source.columns)
@@ -285,7 +289,7 @@ def _apply_gate(
     _request(log, source, requests)
     # Truth in this window may hang on a gate message that was recorded before the window, or after it.
     columns = log.read(requests, start_ns - hold_ns - GATE_MARGIN_NS, end_ns + GATE_MARGIN_NS)
-    topic = columns.get(source.topic)
+    topic = columns.get(source.read_topic)
     stamps = np.empty(0, np.int64)
     values = np.empty(0)
     if topic is not None and len(topic):

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 
 from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo
+from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, SignalSource
 
 #: Where messages keep their measurement time, best first.
@@ -69,15 +70,18 @@ def check_mapping(mapping: Mapping, log: DriveLog) -> None:
     Raises
     ------
     MappingError
-        Topics, fields or stamps are not in the log; all are named, with the nearest that are.
+        Topics, fields or stamps are not in the log, or messages or signals not in the DBC; all are named, with the
+        nearest that are.
     """
+    log = with_can_signals(log, mapping)
     topics = {t.name: t for t in log.topics}
+    own = {s.name for s in log.topics if s.encoding != "can"}
     problems: list[str] = []
     for source in mapping.sources():
-        if source.topic not in topics:
-            problems.append(f"{source.name}: no topic {source.topic}{_near(source.topic, set(topics))}")
+        if source.read_topic not in topics:
+            problems.append(f"{source.name}: no topic {source.topic}{_near(source.topic, own)}")
             continue
-        fields = log.fields(source.topic)
+        fields = log.fields(source.read_topic)
         if not fields:
             continue  # The encoding carries no schema: only reading can tell.
         problems += [f"{source.name}: {text}" for text in _field_problems(source, fields)]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
+from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Clock, Mapping, SignalSource, StampUnit
 from pdhef_logtool.signals import FloatArray, IntArray
@@ -59,7 +60,7 @@ class ClockModel:
 
 def clock_key(source: SignalSource) -> str:
     """Return the key of a source's clock: the topic and the stamp it uses."""
-    return f"{source.topic}.{source.stamp}"
+    return f"{source.read_topic}.{source.stamp}"
 
 
 def apply_clock(stamps_ns: IntArray, clock: ClockModel) -> IntArray:
@@ -127,12 +128,13 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
         A device clock has no usable stamp in the span.
     """
     resolved = resolve_mapping(log, mapping)
+    log = with_can_signals(log, resolved)
     wanted: dict[str, SignalSource] = {}
     for source in resolved.sources():
         wanted.setdefault(clock_key(source), source)
     requests: dict[str, list[str]] = {}
     for source in wanted.values():
-        paths = requests.setdefault(source.topic, [])
+        paths = requests.setdefault(source.read_topic, [])
         paths += [p for p in stamp_request(log, source) if p not in paths]
     stamps: dict[str, list[IntArray]] = {key: [] for key in wanted}
     times: dict[str, list[IntArray]] = {key: [] for key in wanted}
@@ -140,11 +142,11 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     for window_start, window_end in _survey_windows(start_ns, end_ns):
         columns = log.read(requests, window_start, window_end)
         for key, source in wanted.items():
-            if source.topic not in columns:
+            if source.read_topic not in columns:
                 continue
-            raw, usable = raw_stamps(log, columns[source.topic], source)
+            raw, usable = raw_stamps(log, columns[source.read_topic], source)
             stamps[key].append(raw[usable])
-            times[key].append(columns[source.topic].log_time_ns[usable])
+            times[key].append(columns[source.read_topic].log_time_ns[usable])
             steps[key].append(np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9)
     return {
         key: _clock_of(

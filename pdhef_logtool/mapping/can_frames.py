@@ -1,0 +1,428 @@
+"""Raw CAN frames into signals of a user's DBC, column by column.
+
+A source whose field is ``can:<message>.<signal>`` gets a view of its own: the frames of that message (and, for a
+multiplexed signal, of that selector) with the signal as a column. Everything behind it reads the view like a topic.
+
+A signal's bits are gathered from the few bytes that hold it, for all frames at once. Bit numbers follow the DBC: bit b
+is bit b mod 8 of byte b div 8; a little-endian signal starts at its least significant bit, a big-endian one at its
+most significant bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
+from pdhef_logtool.mapping.records import Mapping as SignalMapping
+from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Loss
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database, Message, Signal
+
+# Where frames keep their parts, best first; names are compared in lower case without underscores.
+ID_NAMES = ("id", "canid", "arbitrationid", "address", "identifier", "frameid", "msgid", "messageid")
+DATA_NAMES = ("data", "payload", "dat", "bytes")
+LENGTH_NAMES = ("dlc", "len", "length", "datalength", "size")
+EXTENDED_NAMES = ("isextended", "isextendedid", "extended", "ide", "iseff")
+ERROR_NAMES = ("iserror", "iserrorframe", "errorframe", "error")
+REMOTE_NAMES = ("isrtr", "isremote", "isremoteframe", "remoteframe", "rtr", "remote")
+
+#: Flags that SocketCAN and DBC files keep above the 29 bits of an identifier.
+EXTENDED_FLAG = 1 << 31
+NO_DATA_FLAGS = (1 << 30) | (1 << 29)
+ID_BITS = (1 << 29) - 1
+STANDARD_ID_BITS = (1 << 11) - 1
+
+SHORT_FRAME = "frame shorter than its message in the DBC dropped"
+
+
+def with_can_signals(log: DriveLog, mapping: SignalMapping) -> DriveLog:
+    """Return a log that offers a view for each ``can:`` source of the mapping; the log itself if there is none.
+
+    Raises
+    ------
+    MappingError
+        A DBC cannot be read, lacks a message or signal, or a topic holds no recognisable frames; all are named.
+    """
+    sources = [s for s in mapping.sources() if s.can_signal is not None]
+    if not sources or isinstance(log, CanSignalLog):
+        return log
+    if mapping.can is None:
+        raise MappingError(
+            expected="[can] with dbc = the file that describes the frames",
+            got=f"{sources[0].label} without it",
+            where="mapping",
+            remedy="see docs/formats.md",
+        )
+    return CanSignalLog(log, sources, mapping.can)
+
+
+def raw_bits(data: NDArray[np.uint8], start: int, length: int, byte_order: str) -> NDArray[np.uint64]:
+    """Gather an unsigned integer of at most 64 bits from frames.
+
+    Parameters
+    ----------
+    data : uint8 [N, k]; all bytes of the signal must be there.
+    start : of the signal's least (little-endian) or most (big-endian) significant bit, in the DBC's numbering.
+    byte_order : ``little_endian`` or ``big_endian``.
+    """
+    if byte_order == "little_endian":
+        first, skipped = divmod(start, 8)
+        last = (start + length - 1) // 8
+        columns = range(first, last + 1)
+    else:
+        top = 8 * (start // 8) + 7 - start % 8
+        first, last = top // 8, (top + length - 1) // 8
+        skipped = 8 * (last + 1) - (top + length)
+        columns = range(last, first - 1, -1)
+    value = np.zeros(data.shape[0], np.uint64)
+    for i, column in enumerate(columns):
+        byte = data[:, column].astype(np.uint64)
+        shift = 8 * i - skipped
+        value |= byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
+    return value & np.uint64((1 << length) - 1)
+
+
+def signal_values(data: NDArray[np.uint8], signal: Signal) -> FloatArray:
+    """Decode one signal of frames uint8 [N, k] to ``scale * raw + offset``, float64 [N]."""
+    raw = raw_bits(data, signal.start, signal.length, signal.byte_order)
+    number: NDArray[Any]
+    if signal.is_float:
+        width = signal.length // 8
+        number = raw.astype(f"<u{width}").view(f"<f{width}").astype(np.float64)
+    elif signal.is_signed:
+        sign = np.uint64(1 << (signal.length - 1))
+        number = ((raw ^ sign) - sign).view(np.int64)
+    else:
+        number = raw
+    return np.asarray(number.astype(np.float64) * float(signal.scale) + float(signal.offset), dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class _FramePaths:
+    """Where a topic's messages keep the parts of a frame; None where they have no such part."""
+
+    identifier: str
+    data: str
+    length: str | None
+    extended: str | None
+    no_data: tuple[str, ...]
+    bus: str | None
+
+    @property
+    def all(self) -> tuple[str, ...]:
+        optional = (self.length, self.extended, *self.no_data, self.bus)
+        return (self.identifier, self.data, *(p for p in optional if p is not None))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _CanView:
+    """One signal of one topic. ``selectors`` are the multiplexers that have to hold one of their values."""
+
+    source: SignalSource
+    paths: _FramePaths
+    message: Message
+    signal: Signal
+    selectors: tuple[tuple[Signal, tuple[int, ...]], ...]
+    unflagged_may_be_extended: bool
+
+
+class CanSignalLog:
+    """A log with a view for each CAN signal; everything else is the log's own.
+
+    ``short_frames`` counts what the last read dropped: :class:`Loss` by topic and message.
+    """
+
+    def __init__(self, log: DriveLog, sources: Sequence[SignalSource], settings: CanSettings) -> None:
+        self._log = log
+        self._settings = settings
+        self._views: dict[str, _CanView] = {}
+        self.short_frames: tuple[Loss, ...] = ()
+        databases = [(path, _load_dbc(path)) for path in settings.dbc]
+        known = {t.name for t in log.topics}
+        paths: dict[str, _FramePaths | str] = {}
+        problems: list[str] = []
+        for source in sources:
+            if source.topic not in known:
+                continue  # check_mapping names it, with the nearest topic.
+            if source.topic not in paths:
+                paths[source.topic] = _frame_paths(source.topic, log.fields(source.topic), settings)
+            view = _make_view(source, paths[source.topic], databases)
+            if isinstance(view, str):
+                problems.append(view)
+            else:
+                self._views[source.read_topic] = view
+        if problems:
+            raise MappingError(
+                expected="CAN frames, and messages and signals of the DBC",
+                got="; ".join(dict.fromkeys(problems)),
+                where=", ".join(p.name for p in settings.dbc),
+                remedy='write field = "can:<message>.<signal>"; [can] says where frames keep their parts',
+            )
+
+    @property
+    def path(self) -> Path:
+        """The file or folder."""
+        return self._log.path
+
+    @property
+    def kind(self) -> str:
+        """The container format."""
+        return self._log.kind
+
+    @property
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """The log's topics, and one for each view."""
+        own = {t.name: t for t in self._log.topics}
+        views = (
+            TopicInfo(name, v.message.name, "can", own[v.source.topic].messages) for name, v in self._views.items()
+        )
+        return (*own.values(), *views)
+
+    @property
+    def start_ns(self) -> int:
+        """First log time."""
+        return self._log.start_ns
+
+    @property
+    def end_ns(self) -> int:
+        """Last log time + 1."""
+        return self._log.end_ns
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """What the log could not read."""
+        return self._log.lost
+
+    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
+        """Return a topic's leaves; of a view those of its topic and the signal."""
+        view = self._views.get(topic)
+        if view is None:
+            return self._log.fields(topic)
+        return (*self._log.fields(view.source.topic), *(FieldInfo(p, "number") for p in view.source.paths))
+
+    def read(
+        self, requests: Mapping[str, Sequence[str]], start_ns: int | None = None, end_ns: int | None = None
+    ) -> dict[str, Columns]:
+        """Read fields; each topic of frames is read once, however many signals are taken from it."""
+        raw: dict[str, list[str]] = {}
+        for topic, paths in requests.items():
+            view = self._views.get(topic)
+            own = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.source.paths))
+            merged = raw.setdefault(topic if view is None else view.source.topic, [])
+            merged += [p for p in own if p not in merged]
+        read = self._log.read(raw, start_ns, end_ns) if raw else {}
+        short: dict[str, Loss] = {}
+        found = {}
+        for topic, paths in requests.items():
+            view = self._views.get(topic)
+            found[topic] = read[topic] if view is None else self._view_columns(view, read, topic, paths, short)
+        self.short_frames = tuple(short.values())
+        return found
+
+    def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
+        """Read only log and publish times of every topic of the log."""
+        return self._log.read_stamps(start_ns, end_ns)
+
+    def close(self) -> None:
+        """Release the files."""
+        self._log.close()
+
+    def _view_columns(
+        self, view: _CanView, read: dict[str, Columns], topic: str, paths: Sequence[str], short: dict[str, Loss]
+    ) -> Columns:
+        frames = read[view.source.topic]
+        rows = np.flatnonzero(_is_message(frames, view, self._settings))
+        data, available = _payload(frames, view.paths, rows)
+        long_enough = available >= view.message.length
+        if not long_enough.all():
+            times = frames.log_time_ns[rows[~long_enough]]
+            where = f"{view.source.topic}.{CAN_PREFIX}{view.message.name}"
+            short[where] = Loss(
+                "undecodable", SHORT_FRAME, where, int(times.min()), int(times.max()) + 1, times.shape[0]
+            )
+        use = long_enough
+        if data.shape[1] >= view.message.length:  # otherwise no frame is long enough
+            for selector, sent_under in view.selectors:
+                raw = raw_bits(data, selector.start, selector.length, selector.byte_order)
+                use = use & np.isin(raw, np.asarray(sent_under, np.uint64))
+        rows, data = rows[use], data[use]
+        values = signal_values(data, view.signal) if rows.shape[0] else np.empty(0)
+        fields = {p: values if p in view.source.paths else frames.fields[p][rows] for p in paths}
+        return Columns(topic, frames.log_time_ns[rows], frames.publish_time_ns[rows], fields)
+
+
+def _is_message(frames: Columns, view: _CanView, settings: CanSettings) -> BoolArray:
+    """Return which frames [N] carry data of the view's message."""
+    number = np.asarray(frames.fields[view.paths.identifier], dtype=np.float64)
+    known = np.isfinite(number) & (number >= 0.0) & (number < 2.0**32)
+    # Signed 32-bit fields hold an identifier with the extended flag as a negative number.
+    negative = np.isfinite(number) & (number < 0.0) & (number >= -(2.0**31))
+    ids: IntArray = np.where(known, number, np.where(negative, number + 2.0**32, 0.0)).astype(np.int64)
+    fits = (known | negative) & ((ids & NO_DATA_FLAGS) == 0)
+    bare = ids & ID_BITS
+    fits &= (bare & settings.id_mask) == (view.message.frame_id & settings.id_mask)
+    flagged = (ids & EXTENDED_FLAG) != 0
+    if view.paths.extended is not None:
+        flagged |= frames.fields[view.paths.extended] > 0.0
+    elif view.unflagged_may_be_extended and view.message.is_extended_frame:
+        flagged[:] = True
+    flagged |= bare > STANDARD_ID_BITS
+    fits &= flagged == view.message.is_extended_frame
+    for path in view.paths.no_data:
+        fits &= ~(frames.fields[path] > 0.0)
+    if view.paths.bus is not None and settings.bus is not None:
+        fits &= frames.fields[view.paths.bus] == settings.bus
+    return np.asarray(fits, dtype=np.bool_)
+
+
+def _payload(frames: Columns, paths: _FramePaths, rows: IntArray) -> tuple[NDArray[np.uint8], IntArray]:
+    """Return the bytes [N, k] of frames and how many of them each frame has [N]."""
+    number = np.asarray(frames.fields[paths.data], dtype=np.float64)[rows]
+    if number.ndim == 1:
+        number = number[:, np.newaxis]
+    valid = np.isfinite(number) & (number >= 0.0) & (number <= 255.0)
+    available = np.cumprod(valid, axis=1, dtype=np.int64).sum(axis=1)
+    if paths.length is not None:
+        told = np.asarray(frames.fields[paths.length], dtype=np.float64)[rows]
+        # Above 8 a length code of CAN FD is no number of bytes, and the array itself has the right length.
+        shorter = (told >= 0.0) & (told <= 8.0) & (told < available)
+        available = np.where(shorter, told, available).astype(np.int64)
+    return np.where(valid, number, 0.0).astype(np.uint8), available
+
+
+def _make_view(
+    source: SignalSource, paths: _FramePaths | str, databases: Sequence[tuple[Path, Database]]
+) -> _CanView | str:
+    """Return the view of a source, or what is wrong with it."""
+    if isinstance(paths, str):
+        return paths
+    names = source.can_signal
+    if names is None or not all(names):
+        return f"{source.label} names no message and signal"
+    message_name, signal_name = names
+    holders = [(path, m) for path, database in databases for m in database.messages if m.name == message_name]
+    if not holders:
+        near = _near(message_name, [m.name for _, d in databases for m in d.messages])
+        return f"the DBC has no message {message_name}{near}"
+    if len(holders) > 1:
+        return f"message {message_name} is in {' and in '.join(p.name for p, _ in holders)}"
+    message = holders[0][1]
+    by_name = {s.name: s for s in message.signals}
+    if signal_name not in by_name:
+        return f"message {message_name} has no signal {signal_name}{_near(signal_name, list(by_name))}"
+    signal = by_name[signal_name]
+    if signal.length > 64:
+        return f"{message_name}.{signal_name} has {signal.length} bits, at most 64 make a number"
+    same_id = [
+        m for _, d in databases for m in d.messages if m.frame_id == message.frame_id and not m.is_extended_frame
+    ]
+    return _CanView(source, paths, message, signal, tuple(_selectors(signal, by_name)), not same_id)
+
+
+def _selectors(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tuple[Signal, tuple[int, ...]]]:
+    """Yield the multiplexers above a signal and the values under which it is sent."""
+    seen: set[str] = set()
+    while signal.multiplexer_ids and signal.name not in seen:
+        seen.add(signal.name)
+        selector = by_name.get(signal.multiplexer_signal or "")
+        if selector is None:
+            return
+        yield selector, tuple(int(v) for v in signal.multiplexer_ids)
+        signal = selector
+
+
+def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSettings) -> _FramePaths | str:
+    """Find the parts of frames among a topic's fields, or return what is missing."""
+    kinds = _plain_kinds(fields)
+    problems: list[str] = []
+
+    def find(names: Sequence[str], given: str, entry: str, allowed: tuple[str, ...]) -> str | None:
+        if given:
+            return given
+        found = _best([p for p, kind in kinds.items() if kind in allowed], names)
+        if len(found) > 1:
+            problems.append(f"{topic} has {' and '.join(found)}: say which in [can] {entry}")
+        return found[0] if found else None
+
+    numbers = ("number", "bool")
+    identifier = find(ID_NAMES, settings.id_field, "id_field", ("number",))
+    data = find(DATA_NAMES, settings.data_field, "data_field", ("array", "string"))
+    for path, what, entry in ((identifier, "identifier", "id_field"), (data, "data", "data_field")):
+        if path is None:
+            problems.append(f"{topic} has no field that is known as a frame's {what}: name it in [can] {entry}")
+    if data is not None and settings.data_encoding != "bytes":
+        data += f"|{settings.data_encoding}"
+    elif data is not None and kinds.get(data) == "string":
+        problems.append(f'{topic}.{data} is a text: say [can] data_encoding = "hex" or "base64"')
+    length = find(LENGTH_NAMES, settings.length_field, "length_field", ("number",))
+    extended = find(EXTENDED_NAMES, settings.extended_field, "extended_field", numbers)
+    flags = [_best([p for p, k in kinds.items() if k in numbers], n) for n in (ERROR_NAMES, REMOTE_NAMES)]
+    if problems or identifier is None or data is None:
+        return "; ".join(problems)
+    no_data = tuple(p for found in flags for p in found)
+    return _FramePaths(identifier, data, length, extended, no_data, settings.bus_field or None)
+
+
+def _plain_kinds(fields: tuple[FieldInfo, ...]) -> dict[str, str]:
+    """Return kinds by path, arrays of numbers as one ``array``; what stands inside arrays of structs is left out."""
+    kinds: dict[str, str] = {}
+    for leaf in fields:
+        base, bracket, rest = leaf.path.partition("[")
+        if not bracket:
+            kinds[base] = leaf.kind
+        elif rest.endswith("]") and "." not in rest and "[" not in rest and leaf.kind == "number":
+            kinds[base] = "array"
+    return kinds
+
+
+def _best(paths: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Return the paths whose last part bears the first of the names that any has, the least nested of them."""
+    for name in names:
+        found = [p for p in paths if p.rsplit(".", 1)[-1].replace("_", "").lower() == name]
+        if found:
+            depth = min(p.count(".") for p in found)
+            return [p for p in found if p.count(".") == depth]
+    return []
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    close = get_close_matches(name, known, n=1, cutoff=0.3)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def _load_dbc(path: Path) -> Database:
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise MappingError(
+            expected="a DBC file", got=error.strerror or str(error), where=str(path), remedy="correct [can] dbc"
+        ) from None
+    return _load_cached(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=16)
+def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
+    import cantools
+    from cantools.database.can import Database
+
+    expected = "a DBC file"
+    try:
+        # Overlapping signals are an error of the file, not of the signals that are asked for.
+        found = cantools.database.load_file(path, strict=False)
+    except Exception as error:  # noqa: BLE001  cantools' parsers raise whatever a malformed file leads them to.
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise MappingError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
+    if not isinstance(found, Database):
+        raise MappingError(expected=expected, got="a file of another kind", where=str(path), remedy="correct [can] dbc")
+    return found

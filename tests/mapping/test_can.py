@@ -1,0 +1,395 @@
+"""Raw CAN frames become the columns that cantools decodes frame by frame."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cantools
+import numpy as np
+import pytest
+from cantools.database.can import Message, Signal
+from cantools.database.conversion import BaseConversion
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.inspection.report import inspect_log
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping, check_mapping, fit_clocks, load_mapping, mapping_to_toml, read_signals
+from pdhef_logtool.mapping.can_frames import signal_values
+
+S = 1_000_000_000
+
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: ECU
+BO_ 256 Motion: 8 ECU
+ SG_ Speed : 0|16@1+ (0.01,0) [0|655.35] "km/h" ECU
+ SG_ YawRate : 23|16@0- (0.005,-1) [-200|200] "deg/s" ECU
+ SG_ Valid : 63|1@1+ (1,0) [0|1] "" ECU
+BO_ 2566844672 Extended: 4 ECU
+ SG_ Accel : 0|32@1- (1,0) [0|0] "m/s2" ECU
+BO_ 257 Switched: 4 ECU
+ SG_ Page M : 0|8@1+ (1,0) [0|0] "" ECU
+ SG_ OnFirst m0 : 8|16@1- (0.1,0) [0|0] "" ECU
+ SG_ OnThird m2 : 15|24@0+ (1,5) [0|0] "" ECU
+SIG_VALTYPE_ 2566844672 Accel : 1;
+"""
+
+
+@dataclass(frozen=True)
+class Frame:
+    id: int
+    data: bytes
+    extended: bool = False
+    error: bool = False
+    remote: bool = False
+
+
+@st.composite
+def _signals(draw: st.DrawFn) -> tuple[Signal, int]:
+    """A signal anywhere in a frame of up to 64 bytes, and the frame's length."""
+    size = draw(st.sampled_from([1, 2, 5, 8, 12, 64]))
+    is_float = size >= 8 and draw(st.booleans())
+    length = draw(st.sampled_from([16, 32, 64])) if is_float else draw(st.integers(1, min(64, 8 * size)))
+    at = draw(st.integers(0, 8 * size - length))
+    order = draw(st.sampled_from(["little_endian", "big_endian"]))
+    # Counted along the wire for big-endian signals: their start is bit 7 of byte 0 for at = 0.
+    start = at if order == "little_endian" else 8 * (at // 8) + 7 - at % 8
+    scale = draw(st.sampled_from([1, 0.01, -0.25, 3, 1e-7]))
+    conversion = BaseConversion.factory(scale, draw(st.sampled_from([0, -40, 0.5])), None, is_float)
+    signed = not is_float and draw(st.booleans())
+    return Signal("S", start, length, order, signed, conversion=conversion), size
+
+
+@settings(max_examples=300, derandomize=True, deadline=None)
+@given(layout=_signals(), frames=st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
+def test_any_layout_decodes_as_cantools_decodes_it(layout: tuple[Signal, int], frames: list[bytes]) -> None:
+    signal, size = layout
+    message = Message(1, "M", size, [signal])
+    data = np.frombuffer(b"".join(f[:size] for f in frames), np.uint8).reshape(len(frames), size)
+    expected = [float(message.decode(f[:size], decode_choices=False)["S"]) for f in frames]  # type: ignore[index,call-overload,arg-type]
+    with np.errstate(over="ignore", invalid="ignore"):
+        got = signal_values(data, signal)
+    # Integers above 2^53 are rounded once more or less than in cantools' integer arithmetic.
+    np.testing.assert_allclose(got, expected, rtol=4e-16 * 4, atol=0.0)
+
+
+# ---------------------------------------------------------------------------------------------- whole logs
+
+_ROS_FRAME = (
+    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n"
+    + "=" * 80
+    + "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    + "=" * 80
+    + "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)
+
+
+def _write(path: Path, encoding: str, schema: tuple[str, str, bytes], payloads: Sequence[bytes]) -> None:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema_id = writer.register_schema(*schema) if schema[0] else 0
+        channel = writer.register_channel("/can/raw", encoding, schema_id)
+        for i, payload in enumerate(payloads):
+            writer.add_message(channel, S + i * 1_000_000, payload, S + i * 1_000_000)
+        writer.finish()
+
+
+def _write_ros(path: Path, frames: Sequence[Frame]) -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(_ROS_FRAME, "can_msgs/msg/Frame"))
+    kinds = store.types
+    payloads = []
+    for i, f in enumerate(frames):
+        stamp = kinds["builtin_interfaces/msg/Time"](sec=1, nanosec=i * 1_000_000)
+        message = kinds["can_msgs/msg/Frame"](
+            header=kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="can0"),
+            id=f.id,
+            is_rtr=f.remote,
+            is_extended=f.extended,
+            is_error=f.error,
+            dlc=len(f.data),
+            data=np.frombuffer(f.data.ljust(8, b"\xaa"), np.uint8),
+        )
+        payloads.append(bytes(store.serialize_cdr(message, "can_msgs/msg/Frame")))
+    _write(path, "cdr", ("can_msgs/msg/Frame", "ros2msg", _ROS_FRAME.encode()), payloads)
+
+
+def _write_json(path: Path, frames: Sequence[Frame], data: Callable[[bytes], object]) -> None:
+    # No flag for extended identifiers: bit 31 of the identifier says it, as SocketCAN has it.
+    rows = [{"arbitration_id": f.id | (f.extended << 31), "data": data(f.data)} for f in frames]
+    kind = {"type": "string"} if isinstance(rows[0]["data"], str) else {"type": "array", "items": {"type": "integer"}}
+    schema = {"type": "object", "properties": {"arbitration_id": {"type": "integer"}, "data": kind}}
+    _write(path, "json", ("Can", "jsonschema", json.dumps(schema).encode()), [json.dumps(r).encode() for r in rows])
+
+
+def _write_protobuf(path: Path, frames: Sequence[Frame]) -> None:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    file = descriptor_pb2.FileDescriptorProto(name="can.proto", package="can", syntax="proto3")
+    message = file.message_type.add(name="Frame")
+    for i, (name, kind) in enumerate((("address", 13), ("dat", 12), ("extended", 8))):
+        message.field.add(name=name, number=i + 1, type=kind, label=1)
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    make = message_factory.GetMessageClass(pool.FindMessageTypeByName("can.Frame"))
+    payloads = [make(address=f.id, dat=f.data, extended=f.extended).SerializeToString() for f in frames]
+    descriptors = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
+    _write(path, "protobuf", ("can.Frame", "protobuf", descriptors), payloads)
+
+
+def _mapping(folder: Path, fields: dict[str, str], more: str = "", dbc: str = DBC) -> Mapping:
+    (folder / "car.dbc").write_text(dbc)
+    tables = [f'[can]\ndbc = "car.dbc"\n{more}']
+    tables += [f'[signals.{n}]\ntopic = "/can/raw"\nfield = "{f}"\n' for n, f in fields.items()]
+    (folder / "mapping.toml").write_text("\n".join(tables))
+    return load_mapping(folder / "mapping.toml")
+
+
+_FIELDS = {
+    "speed_m_s": "can:Motion.Speed",
+    "yaw_rate_rad_s": "can:Motion.YawRate",
+    "ax_m_s2": "can:Extended.Accel",
+    "ay_m_s2": "can:Switched.OnFirst",
+    "friction": "can:Switched.OnThird",
+}
+
+
+def _expected(frames: Sequence[Frame], field: str) -> list[tuple[int, float]]:
+    """(stamp, value) of every frame that cantools decodes to the signal."""
+    database: Any = cantools.database.load_string(DBC, "dbc")
+    name, signal = field.removeprefix("can:").split(".")
+    message = database.get_message_by_name(name)
+    found = []
+    for i, f in enumerate(frames):
+        if f.error or f.remote or (f.id, f.extended) != (message.frame_id, message.is_extended_frame):
+            continue
+        try:
+            values = message.decode(f.data, decode_choices=False)
+        except cantools.database.DecodeError:
+            continue
+        if signal in values and np.isfinite(values[signal]):
+            found.append((S + i * 1_000_000, float(values[signal])))
+    return found
+
+
+def _read(path: Path, mapping: Mapping) -> Any:
+    log = open_log(path)
+    try:
+        check_mapping(mapping, log)
+        clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+        return read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    finally:
+        log.close()
+
+
+_EXTENDED_ID = 2566844672 & (2**29 - 1)
+_DATA = st.binary(min_size=8, max_size=8)
+_PAGES = st.builds(lambda page, rest: bytes([page]) + rest, st.integers(0, 3), st.binary(min_size=3, max_size=3))
+_FRAMES = st.lists(
+    st.one_of(
+        st.builds(Frame, st.just(256), _DATA),
+        st.builds(Frame, st.just(256), st.binary(max_size=7)),
+        st.builds(Frame, st.just(257), _PAGES),
+        st.builds(Frame, st.just(_EXTENDED_ID), st.binary(min_size=4, max_size=4), st.just(True)),
+        st.builds(Frame, st.just(256), _DATA, st.just(True)),
+        st.builds(Frame, st.just(999), _DATA),
+    ),
+    min_size=1,
+    max_size=30,
+)
+
+
+@pytest.mark.parametrize("form", ["ros", "json", "hex", "base64", "protobuf"])
+@settings(max_examples=15, derandomize=True, deadline=None)
+@given(frames=_FRAMES)
+def test_frames_of_every_encoding_decode_as_cantools_decodes_them(
+    tmp_path_factory: pytest.TempPathFactory, form: str, frames: list[Frame]
+) -> None:
+    folder = tmp_path_factory.mktemp("can")
+    path = folder / "can.mcap"
+    more = ""
+    if form == "ros":
+        _write_ros(path, frames)
+    elif form == "json":
+        _write_json(path, frames, list)
+    elif form == "protobuf":
+        _write_protobuf(path, frames)
+    else:
+        _write_json(path, frames, bytes.hex if form == "hex" else lambda x: base64.b64encode(x).decode())
+        more = f'data_encoding = "{form}"'
+    channels = _read(path, _mapping(folder, _FIELDS, more))
+    for name, field in _FIELDS.items():
+        channel = channels.signals[name]
+        expected = _expected(frames, field)
+        assert channel.stamps_ns.tolist() == [t for t, _ in expected]
+        assert channel.values.tolist() == pytest.approx([v for _, v in expected], rel=1e-15)
+    short = sum(f.id == 256 and not f.extended and len(f.data) < 8 for f in frames)
+    counted = {x.where: x.count for x in channels.losses if x.kind == "undecodable"}
+    assert counted == ({"/can/raw.can:Motion": short} if short else {})
+
+
+def test_error_and_remote_frames_carry_no_data(tmp_path: Path) -> None:
+    data = bytes(range(8))
+    frames = [Frame(256, data), Frame(256, data, error=True), Frame(256, data, remote=True), Frame(256, data)]
+    _write_ros(tmp_path / "a.mcap", frames)
+    channel = _read(tmp_path / "a.mcap", _mapping(tmp_path, {"speed_m_s": "can:Motion.Speed"})).signals["speed_m_s"]
+    assert channel.stamps_ns.tolist() == [S, S + 3_000_000]
+
+
+def test_socketcan_flags_in_a_signed_identifier(tmp_path: Path) -> None:
+    raw = {"extended": (_EXTENDED_ID | 1 << 31) - 2**32, "remote": 256 | 1 << 30, "error": 256 | 1 << 29}
+    rows = [{"id": value, "data": [0, 0, 128, 63, 1, 1, 1, 1]} for value in raw.values()]
+    schema = {"type": "object", "properties": {"id": {"type": "integer"},
+                                               "data": {"type": "array", "items": {"type": "integer"}}}}  # fmt: skip
+    _write(tmp_path / "a.mcap", "json", ("Can", "jsonschema", json.dumps(schema).encode()),
+           [json.dumps(r).encode() for r in rows])  # fmt: skip
+    channels = _read(tmp_path / "a.mcap", _mapping(tmp_path, {k: _FIELDS[k] for k in ("ax_m_s2", "speed_m_s")}))
+    assert channels.signals["ax_m_s2"].values.tolist() == [1.0]
+    assert len(channels.signals["speed_m_s"]) == 0
+
+
+def test_another_bus_and_masked_bits_are_told_apart(tmp_path: Path) -> None:
+    rows = [{"msg": {"no": 256 | priority << 11, "raw": [value, 0, 0, 0, 0, 0, 0, 0]}, "port": bus, "ide": 0}
+            for priority, value, bus in ((0, 1, 0), (0, 2, 1), (0, 3, 0))]  # fmt: skip
+    _write(tmp_path / "a.mcap", "json", ("", "", b""), [json.dumps(r).encode() for r in rows])
+    more = 'id_field = "msg.no"\ndata_field = "msg.raw"\nbus_field = "port"\nbus = 0'
+    channel = _read(tmp_path / "a.mcap", _mapping(tmp_path, {"speed_m_s": _FIELDS["speed_m_s"]}, more)).signals
+    assert channel["speed_m_s"].values.tolist() == pytest.approx([0.01, 0.03])
+    # The lowest three bits left out of the comparison: 0x101 counts as 0x100 too.
+    rows = [{"id": i, "data": [i & 7] + [0] * 7} for i in (256, 257, 263, 264)]
+    _write(tmp_path / "b.mcap", "json", ("", "", b""), [json.dumps(r).encode() for r in rows])
+    more = f"id_mask = {(1 << 29) - 8}"
+    channel = _read(tmp_path / "b.mcap", _mapping(tmp_path, {"speed_m_s": _FIELDS["speed_m_s"]}, more)).signals
+    assert channel["speed_m_s"].values.tolist() == pytest.approx([0.0, 0.01, 0.07])
+
+
+def test_windows_join_to_the_whole(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    frames = [Frame(int(rng.choice([256, 257])), rng.bytes(8)) for _ in range(200)]
+    frames = [f if f.id == 256 else Frame(257, bytes([f.data[0] % 3]) + f.data[1:4]) for f in frames]
+    _write_ros(tmp_path / "a.mcap", frames)
+    mapping = _mapping(tmp_path, _FIELDS)
+    log = open_log(tmp_path / "a.mcap")
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    whole = read_signals(log, mapping, clocks, log.start_ns, log.end_ns).signals
+    cut = log.start_ns + 77_000_000
+    parts = [read_signals(log, mapping, clocks, a, b).signals for a, b in ((log.start_ns, cut), (cut, log.end_ns))]
+    log.close()
+    for name, channel in whole.items():
+        np.testing.assert_array_equal(np.concatenate([p[name].values for p in parts]), channel.values)
+        np.testing.assert_array_equal(np.concatenate([p[name].stamps_ns for p in parts]), channel.stamps_ns)
+    assert len(whole["ay_m_s2"]) > 10
+
+
+def test_inspect_shows_the_signals_and_counts_short_frames(tmp_path: Path) -> None:
+    frames = [Frame(256, bytes([i, 0] + [0] * 6)) for i in range(50)] + [Frame(256, b"123")]
+    _write_ros(tmp_path / "a.mcap", frames)
+    mapping = _mapping(tmp_path, {"speed_m_s": "can:Motion.Speed"})
+    found = inspect_log(tmp_path / "a.mcap", mapping)
+    report = found.signals["speed_m_s"]
+    assert (report.topic, report.field, report.samples) == ("/can/raw", "can:Motion.Speed", 50)
+    assert report.maximum == pytest.approx(0.49)
+    assert [(x.kind, x.count, x.severity) for x in found.lost] == [("undecodable", 1, "lost")]
+    assert [t.name for t in found.topics] == ["/can/raw"]
+
+
+def test_the_mapping_is_written_as_it_was_read(tmp_path: Path) -> None:
+    more = 'id_field = "a"\ndata_field = "b"\ndata_encoding = "hex"\nlength_field = "c"\nextended_field = "d"\n'
+    more += 'bus_field = "e"\nbus = 2\nid_mask = 0x1FFFFF00'
+    mapping = _mapping(tmp_path, _FIELDS, more)
+    assert mapping.can is not None
+    assert mapping.can.dbc == (tmp_path / "car.dbc",)
+    (tmp_path / "again.toml").write_text(mapping_to_toml(mapping))
+    assert load_mapping(tmp_path / "again.toml") == mapping
+
+
+# --------------------------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    ("field", "says"),
+    [
+        ("can:Motoin.Speed", r"no message Motoin \(did you mean Motion\?\)"),
+        ("can:Motion.YawRat", r"no signal YawRat \(did you mean YawRate\?\)"),
+    ],
+)
+def test_an_unknown_name_tells_the_nearest(tmp_path: Path, field: str, says: str) -> None:
+    _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
+    mapping = _mapping(tmp_path, {"speed_m_s": field})
+    with pytest.raises(MappingError, match=says):
+        _read(tmp_path / "a.mcap", mapping)
+
+
+def test_an_unknown_topic_tells_the_nearest(tmp_path: Path) -> None:
+    _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
+    (tmp_path / "car.dbc").write_text(DBC)
+    text = '[can]\ndbc = "car.dbc"\n[signals.speed_m_s]\ntopic = "/can/rwa"\nfield = "can:Motion.Speed"\n'
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(MappingError, match=r"no topic /can/rwa \(did you mean /can/raw\?\)"):
+        _read(tmp_path / "a.mcap", load_mapping(tmp_path / "m.toml"))
+
+
+@pytest.mark.parametrize("text", ["", "BO_ 256 Motion: 8 ECU\n SG_ Speed : nonsense", "\x00\xff\x00", None])
+def test_a_dbc_that_cannot_be_used_is_one_clear_line(tmp_path: Path, text: str | None) -> None:
+    _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
+    mapping = _mapping(tmp_path, {"speed_m_s": "can:Motion.Speed"}, dbc=text or "")
+    if text is None:
+        (tmp_path / "car.dbc").unlink()
+    with pytest.raises(MappingError) as error:
+        _read(tmp_path / "a.mcap", mapping)
+    assert "car.dbc" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_message_of_two_files_is_not_guessed(tmp_path: Path) -> None:
+    _write_ros(tmp_path / "a.mcap", [Frame(256, bytes(8))])
+    _mapping(tmp_path, {})
+    (tmp_path / "other.dbc").write_text(DBC)
+    text = '[can]\ndbc = ["car.dbc", "other.dbc"]\n[signals.speed_m_s]\ntopic = "/can/raw"\nfield = "can:Motion.Speed"'
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(MappingError, match=r"Motion is in car.dbc and in other.dbc"):
+        _read(tmp_path / "a.mcap", load_mapping(tmp_path / "m.toml"))
+
+
+@pytest.mark.parametrize(
+    ("row", "says"),
+    [
+        ({"number": 256, "data": [1]}, "id_field"),
+        ({"id": 256, "content": [1]}, "data_field"),
+        ({"a": {"id": 256}, "b": {"id": 1}, "data": [1]}, "a.id and b.id"),
+        ({"id": 256, "data": "AA"}, "data_encoding"),
+    ],
+)
+def test_frames_that_are_not_recognised_ask_for_the_field(tmp_path: Path, row: dict[str, object], says: str) -> None:
+    _write(tmp_path / "a.mcap", "json", ("", "", b""), [json.dumps(row).encode()])
+    with pytest.raises(MappingError, match=says):
+        _read(tmp_path / "a.mcap", _mapping(tmp_path, {"speed_m_s": "can:Motion.Speed"}))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('[signals.speed_m_s]\ntopic = "/c"\nfield = "can:A.b"', r"needs \[can\]"),
+        ('[can]\ndbc = "a.dbc"\n[signals.speed_m_s]\ntopic = "/c"\nfield = "can:A"', "can:<message>.<signal>"),
+        ('[can]\ndbc = []', "can.dbc"),
+        ('[can]\ndbcs = "a.dbc"', "did you mean dbc"),
+        ('[can]\ndbc = "a.dbc"\nbus = 1', "belong together"),
+        ('[can]\ndbc = "a.dbc"\n[truth.quat_wxyz]\ntopic = "/c"\nfield = "can:A.b"', "is a vector"),
+    ],
+)  # fmt: skip
+def test_wrong_entries_are_named(tmp_path: Path, text: str, says: str) -> None:
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(MappingError, match=says):
+        load_mapping(tmp_path / "m.toml")
