@@ -37,13 +37,11 @@ from pdhef_logtool.logs.message_schema import (
     value_at,
 )
 from pdhef_logtool.logs.wire_layout import (
+    LayoutReader,
     NoLayoutError,
-    WireLayout,
     layout_of_message,
-    leaf_values,
-    matches,
 )
-from pdhef_logtool.signals import BoolArray, IntArray
+from pdhef_logtool.signals import IntArray
 
 #: Stands in a time column where the message lacks the time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
@@ -98,7 +96,7 @@ class ChannelDecoder:
     schema: MessageSchema
     selections: tuple[Selection, ...]
     undecodable: list[int] = field(default_factory=list)
-    _layouts: list[WireLayout] = field(default_factory=list)
+    _layouts: list[LayoutReader] = field(default_factory=list)
     _columns_of: dict[str, tuple[str, int]] = field(default_factory=dict)
 
     def columns(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
@@ -137,31 +135,36 @@ class ChannelDecoder:
                     if len(no_layout) >= _LAYOUTS_PER_CHANNEL:
                         break
                     continue
-                self._layouts.append(layout)
-            layout = self._layouts[tried]
+                wanted = [steps for s in self.selections for steps in s.components]
+                self._layouts.append(LayoutReader(layout, self.schema.wire, wanted))
+            reader = self._layouts[tried]
             tried += 1
-            fits = self._fits(layout, block, offset[left], length[left])
-            if fits.all():
-                partial.append((left, self._record_columns(layout, block, offset[left])))
-                left = left[:0]
-            elif fits.any():
-                partial.append((left[fits], self._record_columns(layout, block, offset[left[fits]])))
-                left = left[~fits]
+            left = self._read_layout(reader, block, offset, length, left, partial)
         return np.concatenate([*no_layout, left]) if no_layout else left
 
-    def _fits(self, layout: WireLayout, block: Block, offset: IntArray, length: IntArray) -> BoolArray:
-        """Tell which messages have a layout: their size first, as the guards must not be looked for past the end."""
+    def _read_layout(
+        self,
+        layout: LayoutReader,
+        block: Block,
+        offset: IntArray,
+        length: IntArray,
+        left: IntArray,
+        partial: list[tuple[IntArray, dict[str, NDArray[Any]]]],
+    ) -> IntArray:
+        """Read what has this layout; returns the rows that have not."""
         # Up to three bytes of padding may follow a CDR message.
-        surplus = length - layout.size
-        fits = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
-        if fits.all():
-            return matches(layout, block.buffer, offset, self.schema.wire)
-        sized = np.flatnonzero(fits)
-        fits[sized] = matches(layout, block.buffer, offset[sized], self.schema.wire)
-        return fits
-
-    def _record_columns(self, layout: WireLayout, block: Block, offset: IntArray) -> dict[str, NDArray[Any]]:
-        return {s.path: _record_column(layout, block.buffer, offset, s) for s in self.selections}
+        surplus = length[left] - layout.size
+        sized = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
+        candidates = left if sized.all() else left[sized]
+        if not candidates.size:
+            return left
+        fits, parts = layout.gather(block.buffer, offset[candidates])
+        read = candidates if fits is None else candidates[fits]
+        if not read.size:
+            return left
+        n = len(read)
+        partial.append((read, {s.path: _record_column(layout, parts, n, s) for s in self.selections}))
+        return left[:0] if n == len(left) else np.setdiff1d(left, read, assume_unique=True)
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
         decode = self._single_decoder()
@@ -294,11 +297,8 @@ def _is_sorted(order: IntArray) -> bool:
     return bool(np.all(order[1:] >= order[:-1]))
 
 
-def _record_column(
-    layout: WireLayout, buffer: bytes | memoryview, offset: IntArray, selection: Selection
-) -> NDArray[Any]:
-    found = [leaf_values(layout, buffer, offset, steps) for steps in selection.components]
-    n = len(offset)
+def _record_column(layout: LayoutReader, parts: Sequence[NDArray[Any]], n: int, selection: Selection) -> NDArray[Any]:
+    found = [layout.values(parts, n, steps) for steps in selection.components]
     if selection.shape == "time":
         seconds, nanoseconds = found
         if seconds is None or nanoseconds is None:
@@ -308,7 +308,7 @@ def _record_column(
         return np.column_stack([np.full(n, np.nan) if f is None else f.astype(np.float64) for f in found])
     if found[0] is None:
         return missing_column(selection, n)
-    return found[0].astype(np.float64, copy=False)
+    return found[0].astype(np.float64)
 
 
 def _single_value(message: object, selection: Selection) -> object:

@@ -8,7 +8,7 @@ size counted from after the 4-byte encapsulation header. ROS 1 packs without ali
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -23,6 +23,8 @@ UNROLLED_ELEMENTS = 64
 _CDR_HEAD = np.dtype("<u2")
 _LITTLE_ENDIAN_CDR = 0x0100  # the bytes 0, 1
 _WORD = np.dtype("<u4")
+#: Bytes between two places up to which copying them along is quicker than a second look.
+_STRETCH_GAP_BYTES = 512
 
 Steps: TypeAlias = tuple[Step, ...]
 
@@ -149,42 +151,115 @@ class _Builder:
         self.at += dtype.itemsize * (1 if count is None else count)
 
 
-def matches(layout: WireLayout, buffer: bytes | memoryview, offset: NDArray[np.int64], wire: str) -> NDArray[np.bool_]:
-    """Tell which messages at these offsets [N] have this layout; all of them hold ``layout.size`` bytes."""
-    fits = np.ones(len(offset), dtype=np.bool_)
-    if wire == "cdr":
-        fits &= _gather(buffer, offset, 0, _CDR_HEAD) == _LITTLE_ENDIAN_CDR
-    for at, expected in layout.guards:
-        fits &= _gather(buffer, offset, at, _WORD) == expected
-    return fits
+class LayoutReader:
+    """Reads chosen leaves of the messages that have one layout.
+
+    The places needed (leaves, and the guards that tell whether a message has the layout) are gathered in stretches:
+    one copy a stretch and message, whatever else the message holds.
+
+    Parameters
+    ----------
+    layout : the layout. wire : ``cdr`` or ``ros1``.
+    wanted : steps of the leaves to read; what the layout has not is left out.
+    """
+
+    def __init__(self, layout: WireLayout, wire: str, wanted: Iterable[Steps]) -> None:
+        self.size = layout.size
+        self._places: dict[Steps, tuple[int, str]] = {}
+        self._stretches: list[_Stretch] = []
+        self._empty: dict[Steps, np.dtype[Any]] = {}
+        found: list[tuple[int, np.dtype[Any], int | Steps]] = []
+        if wire == "cdr":
+            found.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
+        found += [(offset, _WORD, expected) for offset, expected in layout.guards]
+        for steps in wanted:
+            leaf = _leaf_at(layout, steps)
+            if leaf is not None and leaf.count == 0:
+                self._empty[steps] = leaf.dtype
+            elif leaf is not None:
+                dtype = leaf.dtype if leaf.count is None else np.dtype((leaf.dtype, (leaf.count,)))
+                found.append((leaf.offset, dtype, steps))
+        found.sort(key=lambda place: place[0])
+        group: list[tuple[int, np.dtype[Any], int | Steps]] = []
+        end = 0
+        for place in found:
+            if group and place[0] - end > _STRETCH_GAP_BYTES:
+                self._add(group)
+                group = []
+            group.append(place)
+            end = max(end, place[0] + place[1].itemsize)
+        if group:
+            self._add(group)
+
+    def _add(self, group: Sequence[tuple[int, np.dtype[Any], int | Steps]]) -> None:
+        start = group[0][0]
+        end = max(offset + dtype.itemsize for offset, dtype, _ in group)
+        record = np.dtype(
+            {
+                "names": [f"f{i}" for i in range(len(group))],
+                "formats": [dtype for _, dtype, _ in group],
+                "offsets": [offset - start for offset, _, _ in group],
+                "itemsize": end - start,
+            }
+        )
+        guards = []
+        for i, (_, _, what) in enumerate(group):
+            if isinstance(what, int):
+                guards.append((f"f{i}", what))
+            else:
+                self._places[what] = (len(self._stretches), f"f{i}")
+        self._stretches.append(_Stretch(start, np.dtype((np.void, end - start)), record, tuple(guards)))
+
+    def gather(
+        self, buffer: bytes | memoryview, offset: NDArray[np.int64]
+    ) -> tuple[NDArray[np.bool_] | None, list[NDArray[Any]]]:
+        """Gather the messages at these offsets [N], all of which hold ``size`` bytes.
+
+        Returns
+        -------
+        fits : which of them have the layout [N]; None: all. stretches : of those that have it, for :meth:`values`.
+        """
+        parts: list[NDArray[Any]] = []
+        fits: NDArray[np.bool_] | None = None
+        for stretch in self._stretches:
+            # An overlapping item at every byte: indexing then copies items. As plain bytes, which need no alignment
+            # and are copied as a whole.
+            places = len(buffer) - stretch.start - stretch.plain.itemsize + 1
+            view = np.ndarray((places,), dtype=stretch.plain, buffer=buffer, offset=stretch.start, strides=(1,))
+            part = view[offset].view(stretch.record)
+            parts.append(part)
+            for name, expected in stretch.guards:
+                right = part[name] == expected
+                fits = right if fits is None else fits & right
+        if fits is None or fits.all():
+            return None, parts
+        return fits, [part[fits] for part in parts]
+
+    def values(self, parts: Sequence[NDArray[Any]], n: int, steps: Steps) -> NDArray[Any] | None:
+        """Return a leaf of N gathered messages, [N] or [N, k] in its own type; None where the layout has no such."""
+        place = self._places.get(steps)
+        if place is not None:
+            values: NDArray[Any] = parts[place[0]][place[1]]
+            return values
+        return np.empty((n, 0), dtype=self._empty[steps]) if steps in self._empty else None
 
 
-def leaf_values(
-    layout: WireLayout, buffer: bytes | memoryview, offset: NDArray[np.int64], steps: Sequence[Step]
-) -> NDArray[Any] | None:
-    """Return the values [N] or [N, k] at these steps, in their own type; None where this layout has no such place."""
-    key = tuple(steps)
-    leaf = layout.leaves.get(key)
-    if leaf is None and key and isinstance(key[-1], int):
-        whole, index = layout.leaves.get(key[:-1]), key[-1]
-        if whole is None or whole.count is None or index >= whole.count:
-            return None
-        return _gather(buffer, offset, whole.offset + index * whole.dtype.itemsize, whole.dtype)
-    if leaf is None:
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """Bytes of a message that are gathered together: as plain bytes, and the same bytes as named places."""
+
+    start: int
+    plain: np.dtype[Any]
+    record: np.dtype[Any]
+    guards: tuple[tuple[str, int], ...]
+
+
+def _leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:
+    """Return the leaf at these steps, be it an element of an array of primitives."""
+    leaf = layout.leaves.get(steps)
+    if leaf is not None or not steps or not isinstance(steps[-1], int):
+        return leaf
+    whole = layout.leaves.get(steps[:-1])
+    if whole is None or whole.count is None or steps[-1] >= whole.count:
         return None
-    if leaf.count is None:
-        return _gather(buffer, offset, leaf.offset, leaf.dtype)
-    if leaf.count == 0:
-        return np.empty((len(offset), 0), dtype=leaf.dtype)
-    row = np.dtype((np.void, leaf.dtype.itemsize * leaf.count))
-    return _gather(buffer, offset, leaf.offset, row).view(leaf.dtype).reshape(len(offset), leaf.count)
-
-
-def _gather(buffer: bytes | memoryview, offset: NDArray[np.int64], at: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Copy what lies ``at`` bytes behind each offset, as an array [N]."""
-    if offset.size == 0:
-        return np.empty(0, dtype=dtype)
-    # An overlapping item at every byte: indexing then copies items. As plain bytes, which need no alignment.
-    item = np.dtype((np.void, dtype.itemsize))
-    places = len(buffer) - at - dtype.itemsize + 1
-    return np.ndarray((places,), dtype=item, buffer=buffer, offset=at, strides=(1,))[offset].view(dtype)
+    return Leaf(whole.offset + steps[-1] * whole.dtype.itemsize, whole.dtype, None)
