@@ -12,7 +12,7 @@ from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, SignalSource
 
 #: Where messages keep their measurement time, best first.
-STAMP_PATHS = ("header.stamp", "stamp")
+STAMP_PATHS = ("header.stamp", "stamp", "timestamp")
 
 #: Names that seconds and nanoseconds have in encodings without a time type.
 SECONDS_NAMES = ("sec", "secs")
@@ -29,6 +29,11 @@ def stamp_path_of(fields: tuple[FieldInfo, ...]) -> str:
         if path in times or split_stamp(path, paths) is not None:
             return path
     return RECORDER_STAMPS[0]
+
+
+def has_path(fields: tuple[FieldInfo, ...], path: str) -> bool:
+    """Return whether a schema has a leaf at a path, or an array that the path names an element of."""
+    return _kind_of(path, {f.path: f.kind for f in fields}) not in (None, "struct")
 
 
 def split_stamp(path: str, paths: set[str]) -> tuple[str, str] | None:

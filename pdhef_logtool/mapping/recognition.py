@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
-from pdhef_logtool.mapping.checking import stamp_path_of
+from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.signals import WHEELS, FloatArray
@@ -38,16 +38,31 @@ OWN_PREFIX = "/pdhef/"
 PROBE_NS = 2_000_000_000
 PROBE_AT = (0.0, 0.25, 0.5, 0.75, 1.0)
 
+#: Where a type keeps its velocities; the braces stand for ``linear`` or ``angular``.
 TWIST_FIELDS = {
-    "nav_msgs/Odometry": "twist.twist",
-    "geometry_msgs/TwistStamped": "twist",
-    "geometry_msgs/TwistWithCovarianceStamped": "twist.twist",
-    "geometry_msgs/Twist": "",
+    "nav_msgs/Odometry": "twist.twist.{}",
+    "geometry_msgs/TwistStamped": "twist.{}",
+    "geometry_msgs/TwistWithCovarianceStamped": "twist.twist.{}",
+    "geometry_msgs/Twist": "{}",
+    "foxglove.Odometry": "{}_velocity",
+}
+#: Types whose velocities are in the body frame by convention.
+BODY_TWIST_TYPES = frozenset({"nav_msgs/Odometry", "foxglove.Odometry"})
+#: First entries of the covariances whose −1 disowns a quantity (REP 145).
+TWIST_COVARIANCES = {
+    "nav_msgs/Odometry": "twist.covariance[0]",
+    "geometry_msgs/TwistWithCovarianceStamped": "twist.covariance[0]",
+}
+POSE_COVARIANCES = {
+    "nav_msgs/Odometry": "pose.covariance[0]",
+    "geometry_msgs/PoseWithCovarianceStamped": "pose.covariance[0]",
 }
 POSE_FIELDS = {
     "nav_msgs/Odometry": "pose.pose",
     "geometry_msgs/PoseStamped": "pose",
     "geometry_msgs/PoseWithCovarianceStamped": "pose.pose",
+    "foxglove.PoseInFrame": "pose",
+    "foxglove.Odometry": "pose",
 }
 STEERING_FIELDS = {
     "autoware_vehicle_msgs/SteeringReport": "steering_tire_angle",
@@ -61,7 +76,16 @@ SPEED_FIELDS = {
 }
 WHEEL_SPEED_TYPES = frozenset({"truthsim_msgs/WheelSpeeds"})
 IMU_TYPES = frozenset({"sensor_msgs/Imu"})
-FIX_TYPES = frozenset({"sensor_msgs/NavSatFix"})
+FIX_TYPES = frozenset({"sensor_msgs/NavSatFix", "foxglove.LocationFix"})
+#: Types that hold positions of which nobody says which one is the vehicle's.
+SEVERAL_POSITIONS = {
+    "foxglove.PosesInFrame": "it holds a list of poses, and which one is the vehicle's is not said",
+    "foxglove.LocationFixes": "it holds a list of fixes, and which one is the vehicle's is not said",
+    "foxglove.FrameTransform": "which of its frames is the vehicle is not said",
+    "foxglove.FrameTransforms": "which of its frames is the vehicle is not said",
+}
+#: What a type must have to be what its name says; of an IMU any of them, of others all.
+_IMU_PATHS = ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,14 +134,19 @@ class _Finding:
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def source(self, name: str, topic: str, path: str | tuple[str, ...]) -> SignalSource:
-        return SignalSource(name=name, topic=topic, field=path, stamp=stamp_path_of(self.log.fields(topic)))
+    def source(
+        self, name: str, topic: str, path: str | tuple[str, ...], *, scale: float = 1.0, offset: float = 0.0
+    ) -> SignalSource:
+        stamp = stamp_path_of(self.log.fields(topic))
+        return SignalSource(name=name, topic=topic, field=path, stamp=stamp, scale=scale, offset=offset)
 
     def values(self, topic: str, path: str) -> FloatArray:
         return self.samples.get(topic, {}).get(path, np.empty(0))
 
     def is_given(self, topic: str, path: str) -> bool:
-        """Return whether a field holds anything: nothing seen counts as given, only NaN does not."""
+        """Return whether the type has a field that holds anything: nothing seen counts as given, only NaN does not."""
+        if not has_path(self.log.fields(topic), path):
+            return False
         seen = self.values(topic, path)
         return seen.shape[0] == 0 or bool(np.isfinite(seen).any())
 
@@ -148,8 +177,11 @@ def auto_map(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfec
     prefer_truth : which truth to take from a simulated log, the perfect one under ``/truth/perfect`` or the
         RTK-like one; a log with only one of them gets that.
     """
-    topics = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
+    there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
+    unlike = [t for t in there if not _has_its_fields(log, t)]
+    topics = [t for t in there if t not in unlike]
     found = _Finding(log=log, samples=_probe(log, topics))
+    found.notes += [f"{t.name} is not used: its fields are not those of {t.type_name}" for t in unlike]
     _map_imu(found, topics)
     _map_steering(found, topics)
     _map_speed(found, topics)
@@ -162,7 +194,41 @@ def auto_map(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfec
 
 
 def _type(topic: TopicInfo) -> str:
-    return topic.type_name.replace("/msg/", "/")
+    """Return a topic's type as the tables here spell it, whatever encoding it comes in.
+
+    JSON and protobuf spell ROS types with dots too (``ros.sensor_msgs.Imu``), ROS spells Foxglove's with slashes.
+    """
+    name = topic.type_name.replace("::", "/").replace("/msg/", "/")
+    if name.startswith(("foxglove_msgs/", "foxglove/")):
+        return "foxglove." + name.partition("/")[2]
+    if topic.encoding in ("json", "protobuf") and not name.startswith("foxglove."):
+        name = name.removeprefix("ros.").replace(".msg.", ".").replace(".", "/")
+    return name
+
+
+def _twist(topic: TopicInfo, part: str, axis: str) -> str:
+    return f"{TWIST_FIELDS[_type(topic)].format(part)}.{axis}"
+
+
+def _has_its_fields(log: DriveLog, topic: TopicInfo) -> bool:
+    """Return whether a topic of a known type can be read as that type; a name alone promises nothing."""
+    kind = _type(topic)
+    if kind in IMU_TYPES:
+        fields = log.fields(topic.name)
+        return any(has_path(fields, p) for p in _IMU_PATHS)
+    needed: list[str] = []
+    if kind in FIX_TYPES:
+        needed += ["latitude", "longitude"]
+    needed += [table[kind] for table in (STEERING_FIELDS, SPEED_FIELDS) if kind in table]
+    either: list[str] = []
+    if kind in TWIST_FIELDS:
+        either.append(_twist(topic, "linear", "x"))
+    if kind in POSE_FIELDS:
+        either.append(_join(POSE_FIELDS[kind], "position.x"))
+    if not needed and not either:
+        return True
+    fields = log.fields(topic.name)
+    return all(has_path(fields, p) for p in needed) and (not either or any(has_path(fields, p) for p in either))
 
 
 def _words(name: str) -> frozenset[str]:
@@ -192,22 +258,20 @@ def _probe(log: DriveLog, topics: list[TopicInfo]) -> dict[str, dict[str, FloatA
         kind = _type(topic)
         paths: list[str] = []
         if kind in IMU_TYPES:
-            paths += ["linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z"]
+            paths += _IMU_PATHS
             paths += ["linear_acceleration_covariance[0]", "angular_velocity_covariance[0]"]
         if kind in TWIST_FIELDS:
-            base = TWIST_FIELDS[kind]
-            paths += [_join(base, p) for p in ("linear.x", "linear.y", "linear.z", "angular.z")]
-            if "Covariance" in kind or "Odometry" in kind:
-                paths.append("twist.covariance[0]")
+            paths += [_twist(topic, "linear", axis) for axis in "xyz"] + [_twist(topic, "angular", "z")]
+            paths += [TWIST_COVARIANCES[kind]] if kind in TWIST_COVARIANCES else []
         if kind in POSE_FIELDS:
             base = POSE_FIELDS[kind]
             paths += [_join(base, f"position.{a}") for a in "xy"] + [_join(base, f"orientation.{a}") for a in "xyzw"]
-            if "Covariance" in kind or "Odometry" in kind:
-                paths.append("pose.covariance[0]")
+            paths += [POSE_COVARIANCES[kind]] if kind in POSE_COVARIANCES else []
         if kind in FIX_TYPES:
-            paths += ["latitude", "longitude", "altitude", "status.status"]
+            paths += ["latitude", "longitude", "altitude", "status.status", "heading", "course"]
         if paths:
-            requests[topic.name] = paths
+            fields = log.fields(topic.name)
+            requests[topic.name] = [p for p in dict.fromkeys(paths) if has_path(fields, p)]
     if not requests:
         return {}
     span = max(0, log.end_ns - log.start_ns - PROBE_NS)
@@ -293,7 +357,7 @@ def _map_speed(found: _Finding, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     kind = _type(chosen)
-    path = SPEED_FIELDS[kind] if kind in SPEED_FIELDS else _join(TWIST_FIELDS[kind], "linear.x")
+    path = SPEED_FIELDS[kind] if kind in SPEED_FIELDS else _twist(chosen, "linear", "x")
     found.signals["speed_m_s"] = found.source("speed_m_s", chosen.name, path)
 
 
@@ -325,6 +389,9 @@ def _map_truth(found: _Finding, topics: list[TopicInfo], prefer: str) -> None:
         left = sorted(t.name for t in candidates if _truth_group(t) != prefer)
         found.notes.append(f"{prefer} truth taken; {', '.join(left)} not used")
         candidates = kept
+    for topic in topics:
+        if _is_truth(topic) and _type(topic) in SEVERAL_POSITIONS:
+            found.ambiguities.append(Ambiguity("truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)]))
     velocity = _map_truth_velocity(found, candidates)
     _map_truth_position(found, candidates, velocity)
 
@@ -339,13 +406,12 @@ def _map_truth_velocity(found: _Finding, candidates: list[TopicInfo]) -> TopicIn
     )
     if chosen is None:
         return None
-    base = TWIST_FIELDS[_type(chosen)]
-    forward = found.values(chosen.name, _join(base, "linear.x"))
-    left = found.values(chosen.name, _join(base, "linear.y"))
+    forward = found.values(chosen.name, _twist(chosen, "linear", "x"))
+    left = found.values(chosen.name, _twist(chosen, "linear", "y"))
     body = _looks_like_body_frame(forward, left)
-    if _type(chosen) != "nav_msgs/Odometry" and _words(chosen.name) & NAVIGATION_WORDS and body is not True:
+    if _type(chosen) not in BODY_TWIST_TYPES and _words(chosen.name) & NAVIGATION_WORDS and body is not True:
         # Receivers publish their velocity in east, north, up under the same type.
-        up = found.values(chosen.name, _join(base, "linear.z"))
+        up = found.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
         if body is None or not np.isfinite(up).any():
             found.ambiguities.append(
@@ -355,7 +421,7 @@ def _map_truth_velocity(found: _Finding, candidates: list[TopicInfo]) -> TopicIn
         found.ambiguities.append(
             Ambiguity("truth velocity frame", readings, readings[1], "x is not the direction of travel")
         )
-        paths = tuple(_join(base, f"linear.{a}") for a in "xyz")
+        paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
         found.truth["enu_velocity_m_s"] = found.source("enu_velocity_m_s", chosen.name, paths)
         return chosen
     if body is False:
@@ -367,8 +433,8 @@ def _map_truth_velocity(found: _Finding, candidates: list[TopicInfo]) -> TopicIn
                 "the type's convention is the body frame, although x is mostly not the direction of travel",
             )
         )
-    for name, path in (("vx_m_s", "linear.x"), ("vy_m_s", "linear.y"), ("yaw_rate_rad_s", "angular.z")):
-        full = _join(base, path)
+    for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
+        full = _twist(chosen, part, axis)
         values = found.values(chosen.name, full)
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
         if found.is_given(chosen.name, full) and not filler:
@@ -387,9 +453,8 @@ def _looks_like_body_frame(forward: FloatArray, left: FloatArray) -> bool | None
 
 
 def _has_twist(found: _Finding, topic: TopicInfo) -> bool:
-    base = TWIST_FIELDS[_type(topic)]
-    forward, left = _join(base, "linear.x"), _join(base, "linear.y")
-    if found.is_disowned(topic.name, "twist.covariance[0]"):
+    forward, left = _twist(topic, "linear", "x"), _twist(topic, "linear", "y")
+    if found.is_disowned(topic.name, TWIST_COVARIANCES.get(_type(topic), "")):
         return False
     if not (found.is_given(topic.name, forward) and found.is_given(topic.name, left)):
         return False
@@ -408,7 +473,7 @@ def _span(values: FloatArray) -> float:
 
 
 def _has_pose(found: _Finding, topic: TopicInfo) -> bool:
-    if _type(topic) not in POSE_FIELDS or found.is_disowned(topic.name, "pose.covariance[0]"):
+    if _type(topic) not in POSE_FIELDS or found.is_disowned(topic.name, POSE_COVARIANCES.get(_type(topic), "")):
         return False
     base = POSE_FIELDS[_type(topic)]
     if not all(found.is_given(topic.name, _join(base, f"position.{a}")) for a in "xy"):
@@ -452,6 +517,17 @@ def _map_fix(found: _Finding, fix: TopicInfo, *, alone: bool) -> None:
     for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude"), ("alt_m", "altitude")):
         if found.is_given(fix.name, path):
             found.truth[name] = found.source(name, fix.name, path)
+    # Foxglove's fixes may have angles, clockwise from north; those of vehicles count counter-clockwise from east.
+    angles = {p: found.values(fix.name, p) for p in ("heading", "course")}
+    given = {p for p, values in angles.items() if np.isfinite(values).any()}
+    if given == {"heading", "course"} and np.array_equal(angles["heading"], angles["course"], equal_nan=True):
+        given.remove("heading")
+        found.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it tells no sideslip")
+    for name, path in (("yaw_rad", "heading"), ("course_rad", "course")):
+        if path in given:
+            found.truth[name] = found.source(name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
+    if "heading" in given:
+        found.notes.append(f"truth yaw comes from {fix.name}.heading: only two antennas or an INS make it a truth")
     status = found.values(fix.name, "status.status")
     if not alone or status.shape[0] == 0:
         return
