@@ -112,7 +112,7 @@ def _write_ros(path: Path, frames: Sequence[Frame]) -> None:
     kinds = store.types
     payloads = []
     for i, f in enumerate(frames):
-        stamp = kinds["builtin_interfaces/msg/Time"](sec=1, nanosec=i * 1_000_000)
+        stamp = kinds["builtin_interfaces/msg/Time"](sec=1 + i // 1000, nanosec=i % 1000 * 1_000_000)
         message = kinds["can_msgs/msg/Frame"](
             header=kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="can0"),
             id=f.id,
