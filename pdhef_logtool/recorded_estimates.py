@@ -6,10 +6,8 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from difflib import get_close_matches
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +16,7 @@ import numpy as np
 from pdhef_logtool.config import RunConfig, time_slice
 from pdhef_logtool.drive_channels import DrivePlan, DriveReader, plan_drive
 from pdhef_logtool.errors import MappingError, UsageError
-from pdhef_logtool.estimators.physics import sideslip_std
+from pdhef_logtool.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.evaluation.interpolation import Bracket
 from pdhef_logtool.evaluation.truth import (
     SAME_SHARE,
@@ -29,27 +27,20 @@ from pdhef_logtool.evaluation.truth import (
     truth_at,
 )
 from pdhef_logtool.logs.discovery import LogInput, find_logs
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, TopicInfo, windows
+from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import (
     Mapping as SignalMapping,
 )
 from pdhef_logtool.mapping import (
     SignalSource,
-    apply_clock,
     check_mapping,
-    clock_key,
-    fit_clocks,
     join_channels,
     load_mapping,
     merge_losses,
     read_signals,
-    resolve_mapping,
 )
-from pdhef_logtool.mapping.channels import LOSS_TEXTS, si_values
-from pdhef_logtool.mapping.clocks import raw_stamps, stamp_request
-from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES
-from pdhef_logtool.mapping.recognition import TWIST_FIELDS
+from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.pipeline import (
     DeadReckoning,
     LogResult,
@@ -67,10 +58,8 @@ from pdhef_logtool.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.signals import (
-    ESTIMATE_UNITS,
     TRUTH_UNITS,
     WHEELS,
-    BoolArray,
     Channel,
     FloatArray,
     IntArray,
@@ -85,54 +74,6 @@ from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehic
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
-
-STATE_TYPE = "pdhef_msgs/VehicleStateEstimate"
-#: Quantities that set the estimate's stamps, best first; any other is interpolated to them.
-BASE_ORDER = ("sideslip_rad", "vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2")
-#: No quantity is interpolated, and no sensor, across a step of more than this many of its median periods.
-GAP_PERIODS = 3.0
-
-_STATE_FIELDS = (*BASE_ORDER, "sideslip_std_rad", "valid", "diverged")
-_STDS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
-#: Twist fields below a message's twist.
-_TWIST = {"vx_m_s": "linear.x", "vy_m_s": "linear.y", "yaw_rate_rad_s": "angular.z"}
-
-
-@dataclass(frozen=True, slots=True)
-class CovarianceSource:
-    """A covariance matrix of ``size`` rows in a message; ``planar`` are its places of v_x, v_y and yaw rate."""
-
-    topic: str
-    field: str
-    size: int
-    planar: tuple[int, int, int]
-
-
-@dataclass(frozen=True, slots=True)
-class EstimateSource:
-    """Where one estimator's recorded state is: its name, its quantities (``ESTIMATE_UNITS``), its covariance if any."""
-
-    name: str
-    signals: Mapping[str, SignalSource]
-    covariance: CovarianceSource | None = None
-
-    def as_mapping(self) -> SignalMapping:
-        """Return the sources as a mapping, for what works on mappings: checks, stamps, clocks."""
-        return SignalMapping(signals=dict(self.signals))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedEstimate:
-    """A recorded estimate on its own stamps.
-
-    ``channels`` are its quantities on their own stamps, NaN left out; ``samples`` counts the messages by source.
-    """
-
-    track: StateTrack
-    channels: Mapping[str, Channel]
-    tells_divergence: bool
-    samples: Mapping[str, int] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
 
 
 def score_log(
@@ -226,16 +167,16 @@ class _Scoring:
         self, mapping: SignalMapping | None, estimates: Sequence[str], truth: Sequence[str], name: str | None
     ) -> None:
         """Decide which fields are estimate, truth and sensors."""
-        tables = {} if mapping is None else mapping.estimates
-        self.estimates = choose_estimates(self.log, estimates, tables, name)
+        self.estimates = choose_estimates(self.log, estimates, mapping, name)
         named = sources_of(self.log, truth, TRUTH_UNITS, "--truth")[0] if truth else None
+        can = None if mapping is None else mapping.can
         if mapping is not None and not mapping.signals and not mapping.truth:
             mapping = None  # a file of estimates alone leaves the rest to recognition
         if mapping is not None and named is not None:
             mapping = self._with_truth(mapping, named)
         chosen, self.missing = choose_mapping(self.log, mapping, self.config, self.tell, require_signals=False)
         if mapping is None and named is not None:
-            chosen = self._with_truth(chosen, named)
+            chosen = replace(self._with_truth(chosen, named), can=can)
             check_mapping(chosen, self.log)
         self.mapping = chosen
         for estimate in self.estimates:
@@ -400,316 +341,6 @@ def _write(
     write_json(folder / "report.json", report)
 
 
-# ---- which fields ----
-
-
-def choose_estimates(
-    log: DriveLog, flags: Sequence[str], tables: Mapping[str, Mapping[str, SignalSource]], name: str | None
-) -> tuple[EstimateSource, ...]:
-    """Return the estimates to score: those of the flags, else of the mapping file's tables.
-
-    Raises
-    ------
-    UsageError
-        There is none, or none called ``name``, or the flags contradict one another.
-    MappingError
-        The log has no such topic.
-    """
-    if name is not None and (not name or name in RESERVED_NAMES):
-        raise UsageError(expected="a name of an estimator", got=repr(name), where="--name")
-    if flags:
-        signals, covariance = sources_of(log, flags, ESTIMATE_UNITS, "--estimate")
-        if not set(signals) & set(BASE_ORDER):
-            raise UsageError(expected=f"one of {', '.join(BASE_ORDER)}", got=", ".join(signals), where="--estimate")
-        base = next(signals[s] for s in BASE_ORDER if s in signals)
-        if covariance is not None and (base.topic != covariance.topic or set(_STDS) & set(signals)):
-            covariance = None  # it belongs to other stamps, or named deviations win over it
-        return (EstimateSource(name or _name_of(base.topic), signals, covariance),)
-    chosen = {n: dict(t) for n, t in tables.items() if name is None or n == name}
-    if not chosen:
-        got = "none" if name is None else f"none called {name!r}" + (f" but {', '.join(tables)}" if tables else "")
-        raise UsageError(
-            expected="an estimate to score",
-            got=got,
-            where="pdhef metrics",
-            remedy="give --estimate [SIGNAL=]TOPIC.FIELD, or [estimates.NAME.SIGNAL] tables in a mapping file",
-        )
-    for n, signals in chosen.items():
-        if not set(signals) & set(BASE_ORDER):
-            raise UsageError(
-                expected=f"one of {', '.join(BASE_ORDER)}", got=", ".join(signals) or "none", where=f"estimates.{n}"
-            )
-    return tuple(EstimateSource(n, signals) for n, signals in chosen.items())
-
-
-def _name_of(topic: str) -> str:
-    words = [w for w in re.split(r"[^A-Za-z0-9]+", topic) if w]
-    if words[:1] == ["pdhef"] and len(words) > 2:
-        words = words[1:-1]  # our own /pdhef/<estimator>/state
-        return "-".join(words)
-    name = "_".join(words) or "estimate"
-    return f"{name}_" if name in RESERVED_NAMES else name
-
-
-def sources_of(
-    log: DriveLog, texts: Sequence[str], units: Mapping[str, str], option: str
-) -> tuple[dict[str, SignalSource], CovarianceSource | None]:
-    """Turn ``[SIGNAL=]TOPIC[.FIELD]`` texts into sources by name, and the covariance of a topic named as a whole.
-
-    Raises
-    ------
-    UsageError
-        The signal is not known or cannot be told from the topic's type, or one is named twice.
-    MappingError
-        The log has no such topic.
-    """
-    sources: dict[str, SignalSource] = {}
-    covariances: list[CovarianceSource] = []
-    for text in texts:
-        signal, rest = _split_signal(text, units, option)
-        topic, path = _split_topic(log, rest, option)
-        if signal is not None:
-            if not path:
-                raise UsageError(expected=f"{signal}={topic.name}.FIELD", got=text, where=option)
-            found = {signal: path}
-        else:
-            found, covariance = _recognise(topic, path, units, text, option)
-            covariances += covariance
-        for name, field_path in found.items():
-            if name in sources:
-                raise UsageError(
-                    expected="each signal once",
-                    got=f"{name} from {sources[name].label} and from {topic.name}.{field_path}",
-                    where=option,
-                    remedy="several estimators stand in a mapping file, one [estimates.NAME.SIGNAL] table a signal",
-                )
-            sources[name] = SignalSource(name=name, topic=topic.name, field=field_path)
-    return sources, covariances[0] if len(covariances) == 1 else None
-
-
-def _split_signal(text: str, units: Mapping[str, str], option: str) -> tuple[str | None, str]:
-    head, equals, rest = text.partition("=")
-    if not equals or not re.fullmatch(r"\s*\w*\s*", head):
-        return None, text.strip()
-    signal = head.strip()
-    if signal not in units:
-        close = get_close_matches(signal, list(units), n=1, cutoff=0.5)
-        raise UsageError(
-            expected=f"SIGNAL out of {', '.join(units)}",
-            got=repr(signal),
-            where=f"{option} {text}",
-            remedy=f"did you mean {close[0]}?" if close else "",
-        )
-    return signal, rest.strip()
-
-
-def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]:
-    """Split TOPIC.FIELD at the longest topic of the log that fits: outside of ROS 2, topics may hold dots."""
-    fitting = [t for t in log.topics if text == t.name or text.startswith(f"{t.name}.")]
-    if fitting:
-        topic = max(fitting, key=lambda t: len(t.name))
-        return topic, text[len(topic.name) + 1 :]
-    names = [t.name for t in log.topics]
-    close = get_close_matches(text, names, n=1, cutoff=0.5) or get_close_matches(text.split(".")[0], names, n=1)
-    raise MappingError(
-        expected="TOPIC.FIELD with a topic of this log",
-        got=text,
-        where=f"{log.path} {option}",
-        remedy=f"did you mean {close[0]}?" if close else "pdhef inspect lists the topics",
-    )
-
-
-def _recognise(
-    topic: TopicInfo, path: str, units: Mapping[str, str], text: str, option: str
-) -> tuple[dict[str, str], list[CovarianceSource]]:
-    """Return the fields by signal that a topic's type tells, all of them or the one that was named."""
-    kind = topic.type_name.replace("/msg/", "/")
-    known: dict[str, str] = {}
-    covariance: list[CovarianceSource] = []
-    if kind == STATE_TYPE:
-        known = {name: name for name in _STATE_FIELDS}
-        covariance = [CovarianceSource(topic.name, "covariance", 3, (0, 1, 2))]
-    elif kind in TWIST_FIELDS:
-        base = TWIST_FIELDS[kind]
-        known = {name: f"{base}.{below}" if base else below for name, below in _TWIST.items()}
-        if base == "twist.twist":
-            covariance = [CovarianceSource(topic.name, "twist.covariance", 6, (0, 1, 5))]
-    found = {name: field_path for name, field_path in known.items() if name in units and path in ("", field_path)}
-    if not found:
-        raise UsageError(
-            expected="SIGNAL=TOPIC.FIELD, as the type does not tell which signal this is",
-            got=f"{text} ({topic.type_name or 'no type'})",
-            where=option,
-            remedy=f"SIGNAL is one of {', '.join(units)}",
-        )
-    return found, covariance if path == "" else []
-
-
-# ---- reading ----
-
-
-def read_estimate(
-    log: DriveLog, source: EstimateSource, start_ns: int, end_ns: int, window_s: float
-) -> tuple[RecordedEstimate, list[Loss]]:
-    """Read one recorded estimate with log time in [start, end) onto the stamps of its first quantity of BASE_ORDER.
-
-    NaN stays: where an estimator says nothing it is not available, which is a figure and no loss.
-
-    Raises
-    ------
-    MappingError
-        The slice holds no message of it, or not one number.
-    """
-    mapping = resolve_mapping(log, source.as_mapping())
-    clocks = fit_clocks(log, mapping, start_ns, end_ns)
-    requests: dict[str, list[str]] = {}
-    for s in mapping.signals.values():
-        paths = requests.setdefault(s.topic, [])
-        paths += [p for p in (*stamp_request(log, s), *s.paths) if p not in paths]
-    if source.covariance is not None:
-        requests[source.covariance.topic].append(source.covariance.field)
-    parts: dict[str, list[tuple[IntArray, IntArray, FloatArray]]] = {name: [] for name in mapping.signals}
-    matrices: list[FloatArray] = []
-    losses: list[Loss] = []
-    base = next(name for name in BASE_ORDER if name in mapping.signals)
-    for a, b in windows(start_ns, end_ns, round(window_s * 1e9)):
-        columns = log.read(requests, a, b)
-        for name, s in mapping.signals.items():
-            topic = columns.get(s.topic)
-            if topic is None or len(topic) == 0:
-                continue
-            raw, usable = raw_stamps(log, topic, s)
-            stamps = apply_clock(raw, clocks[clock_key(s)]) - np.int64(round(s.latency_s * 1e9))
-            values = _in_range(si_values(topic, s), s)
-            parts[name].append((stamps[usable], topic.log_time_ns[usable], values[usable]))
-            if name == base:
-                losses += _stamp_losses(topic, usable, s)
-                if source.covariance is not None:
-                    matrices.append(_planar_covariance(topic, source.covariance)[usable])
-    channels, kept = {}, {}
-    for name, s in mapping.signals.items():
-        channels[name], kept[name] = _ordered(name, s, parts[name])
-    stamps_ns = channels[base].stamps_ns
-    if not any(np.isfinite(channels[name].values).any() for name in BASE_ORDER if name in channels):
-        wanted = ", ".join(s.label for n, s in mapping.signals.items() if n in BASE_ORDER)
-        raise MappingError(
-            expected="numbers in the recorded estimate",
-            got="none in the chosen slice",
-            where=f"{log.path} {wanted}",
-            remedy="check topic, field and slice",
-        )
-    repeated = sum(p[0].shape[0] for p in parts[base]) - len(channels[base])
-    if repeated:
-        where = mapping.signals[base].topic
-        losses.append(Loss("duplicate-stamp", LOSS_TEXTS["duplicate-stamp"], where, count=repeated, severity="note"))
-    covariance = np.concatenate(matrices)[kept[base]] if matrices else None
-    track, notes = _track(source.name, stamps_ns, channels, covariance)
-    finite = {n: without_nan(c) for n, c in channels.items() if n in BASE_ORDER}
-    samples = {s.label: len(channels[n]) for n, s in mapping.signals.items()}
-    return RecordedEstimate(track, finite, "diverged" in channels, samples, notes), losses
-
-
-def without_nan(channel: Channel) -> Channel:
-    """Return the channel without the samples that are not numbers."""
-    known = np.isfinite(channel.values)
-    return replace(
-        channel,
-        stamps_ns=channel.stamps_ns[known],
-        arrival_ns=channel.arrival_ns[known],
-        values=channel.values[known],
-    )
-
-
-def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
-    with np.errstate(invalid="ignore"):
-        outside = np.zeros(values.shape[0], dtype=np.bool_)
-        if source.valid_min is not None:
-            outside |= values < source.valid_min
-        if source.valid_max is not None:
-            outside |= values > source.valid_max
-    return np.where(outside | ~np.isfinite(values), np.nan, values)
-
-
-def _stamp_losses(topic: Columns, usable: BoolArray, source: SignalSource) -> list[Loss]:
-    bad = topic.log_time_ns[~usable]
-    if not bad.shape[0]:
-        return []
-    span = (int(bad.min()), int(bad.max()) + 1)
-    return [Loss("bad-stamp", LOSS_TEXTS["bad-stamp"], source.topic, *span, int(bad.shape[0]))]
-
-
-def _ordered(
-    name: str, source: SignalSource, parts: Sequence[tuple[IntArray, IntArray, FloatArray]]
-) -> tuple[Channel, IntArray]:
-    """Return the samples in order of unique stamps, the first arrival of each kept, and their places in the parts."""
-    empty = np.empty(0, dtype=np.int64)
-    stamps, arrival = (np.concatenate([p[i] for p in parts]) if parts else empty for i in (0, 1))
-    values = np.concatenate([p[2] for p in parts]) if parts else np.empty(0)
-    order = np.lexsort((arrival, stamps))
-    ordered = stamps[order]
-    first = np.concatenate([[True], ordered[1:] > ordered[:-1]]) if len(ordered) else np.empty(0, dtype=np.bool_)
-    kept = order[first]
-    return Channel(name, ESTIMATE_UNITS[name], source.label, stamps[kept], arrival[kept], values[kept]), kept
-
-
-def _planar_covariance(topic: Columns, source: CovarianceSource) -> FloatArray:
-    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN where it is unknown (all zero, or −1 first, as ROS says)."""
-    raw = np.asarray(topic.fields[source.field], dtype=np.float64)
-    n = raw.shape[0]
-    if raw.ndim != 2 or raw.shape[1] != source.size**2:
-        return np.full((n, 3, 3), np.nan)
-    places = np.array(source.planar)
-    planar = raw.reshape(n, source.size, source.size)[:, places[:, None], places]
-    unknown = (planar == 0.0).all(axis=(1, 2)) | (raw[:, 0] < 0.0)
-    return np.where(unknown[:, None, None], np.nan, planar)
-
-
-def _track(
-    name: str, stamps_ns: IntArray, channels: Mapping[str, Channel], covariance: FloatArray | None
-) -> tuple[StateTrack, tuple[str, ...]]:
-    notes: list[str] = []
-    columns: dict[str, FloatArray] = {}
-    for quantity, channel in channels.items():
-        same = np.array_equal(channel.stamps_ns, stamps_ns)
-        columns[quantity] = channel.values if same else _interpolated(channel, stamps_ns)
-        if not same and quantity in BASE_ORDER:
-            notes.append(f"{quantity} has other stamps than the estimate and is interpolated to them")
-    if "sideslip_rad" in columns:
-        columns["sideslip_rad"] = np.arctan2(np.sin(columns["sideslip_rad"]), np.cos(columns["sideslip_rad"]))
-        if "vx_m_s" in columns and "vy_m_s" not in columns:
-            columns["vy_m_s"] = columns["vx_m_s"] * np.tan(columns["sideslip_rad"])
-            notes.append("v_y is v_x times tan of the sideslip")
-    if covariance is None or not np.isfinite(covariance).any():
-        covariance = _diagonal([columns.get(s, np.full(stamps_ns.shape[0], np.nan)) for s in _STDS])
-    flags = {flag: columns[flag] >= 0.5 for flag in ("valid", "diverged") if flag in columns}
-    if covariance.shape[0] and "sideslip_std_rad" not in columns and {"vx_m_s", "vy_m_s"} <= columns.keys():
-        # Where only deviations are known the correlation of the two velocities counts as 0.
-        completed = np.where(np.eye(3, dtype=np.bool_), covariance, np.nan_to_num(covariance, nan=0.0))
-        columns["sideslip_std_rad"] = sideslip_std(columns["vx_m_s"], columns["vy_m_s"], completed)
-    state = {n: c for n, c in columns.items() if n not in (*_STDS, "valid", "diverged")}
-    return make_track(name, stamps_ns, covariance=covariance, **state, **flags), tuple(notes)
-
-
-def _diagonal(stds: Sequence[FloatArray]) -> FloatArray:
-    std = np.stack(stds, axis=1)
-    if not np.isfinite(std).any():
-        return np.empty((0, 3, 3))
-    covariance = np.full((std.shape[0], 3, 3), np.nan)
-    for i in range(3):
-        covariance[:, i, i] = std[:, i] ** 2
-    return covariance
-
-
-def _interpolated(channel: Channel, stamps_ns: IntArray) -> FloatArray:
-    known = without_nan(channel)
-    bracket = Bracket(known.stamps_ns, stamps_ns, _gap_ns(known.stamps_ns))
-    return bracket.angle(known.values) if channel.name == "sideslip_rad" else bracket.linear(known.values)
-
-
-def _gap_ns(stamps_ns: IntArray) -> int:
-    return round(GAP_PERIODS * float(np.median(np.diff(stamps_ns)))) if stamps_ns.shape[0] > 1 else 0
-
-
 def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int]]:
     """Read and derive the whole truth on its own clock, window by window, with losses and samples by source.
 
@@ -793,7 +424,7 @@ def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:
         values: FloatArray = getattr(signals, name)
         known = np.isfinite(values)
         at = signals.stamps_ns[known]
-        return Bracket(at, stamps_ns, _gap_ns(at)).linear(values[known])
+        return Bracket(at, stamps_ns, gap_ns(at)).linear(values[known])
 
     names = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
     return Signals(

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
-COMMANDS = ("inspect", "run", "simulate", "estimators", "view")
+COMMANDS = ("inspect", "run", "metrics", "simulate", "estimators", "view")
 
 
 def _pdhef(
@@ -34,7 +34,7 @@ def test_help_says_what_the_command_does(command: tuple[str, ...]) -> None:
     result = _pdhef(*command, "--help")
     assert result.returncode == 0
     assert "Usage: " in result.stdout
-    if command in (("inspect",), ("run",), ("simulate",), ("view",)):
+    if command in (("inspect",), ("run",), ("metrics",), ("simulate",), ("view",)):
         assert "Examples:" in result.stdout
 
 

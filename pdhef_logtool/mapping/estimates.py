@@ -1,0 +1,193 @@
+"""Which fields of a log are an estimate that somebody else recorded: flags ``[SIGNAL=]TOPIC[.FIELD]`` and tables."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+from pdhef_logtool.errors import MappingError, UsageError
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES
+from pdhef_logtool.mapping.recognition import TWIST_COVARIANCES, TWIST_FIELDS
+from pdhef_logtool.mapping.records import CanSettings, SignalSource
+from pdhef_logtool.mapping.records import Mapping as SignalMapping
+from pdhef_logtool.signals import ESTIMATE_UNITS
+
+STATE_TYPE = "pdhef_msgs/VehicleStateEstimate"
+#: Quantities that set the estimate's stamps, best first; any other is interpolated to them.
+BASE_ORDER = ("sideslip_rad", "vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2")
+#: Standard deviations in the order of the covariance.
+STDS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
+
+_STATE_FIELDS = (*BASE_ORDER, "sideslip_std_rad", "valid", "diverged")
+#: Part and axis of a twist.
+_TWIST = {"vx_m_s": ("linear", "x"), "vy_m_s": ("linear", "y"), "yaw_rate_rad_s": ("angular", "z")}
+
+
+@dataclass(frozen=True, slots=True)
+class CovarianceSource:
+    """A covariance matrix of ``size`` rows in a message; ``planar`` are its places of v_x, v_y and yaw rate."""
+
+    topic: str
+    field: str
+    size: int
+    planar: tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateSource:
+    """Where one estimator's recorded state is: its name, its quantities (``ESTIMATE_UNITS``), its covariance if any."""
+
+    name: str
+    signals: Mapping[str, SignalSource]
+    covariance: CovarianceSource | None = None
+    can: CanSettings | None = None
+
+    def as_mapping(self) -> SignalMapping:
+        """Return the sources as a mapping, for what works on mappings: checks, stamps, clocks."""
+        return SignalMapping(signals=dict(self.signals), can=self.can)
+
+
+def choose_estimates(
+    log: DriveLog, flags: Sequence[str], mapping: SignalMapping | None, name: str | None
+) -> tuple[EstimateSource, ...]:
+    """Return the estimates to score: those of the flags, else of the mapping file's ``[estimates]`` tables.
+
+    Raises
+    ------
+    UsageError
+        There is none, or none called ``name``, or the flags contradict one another.
+    MappingError
+        The log has no such topic.
+    """
+    tables = {} if mapping is None else mapping.estimates
+    can = None if mapping is None else mapping.can
+    if name is not None and (not name or name in RESERVED_NAMES):
+        raise UsageError(expected="a name of an estimator", got=repr(name), where="--name")
+    if flags:
+        signals, covariance = sources_of(log, flags, ESTIMATE_UNITS, "--estimate")
+        if not set(signals) & set(BASE_ORDER):
+            raise UsageError(expected=f"one of {', '.join(BASE_ORDER)}", got=", ".join(signals), where="--estimate")
+        base = next(signals[s] for s in BASE_ORDER if s in signals)
+        if covariance is not None and (base.topic != covariance.topic or set(STDS) & set(signals)):
+            covariance = None  # it belongs to other stamps, or named deviations win over it
+        return (EstimateSource(name or _name_of(base.topic), signals, covariance, can),)
+    chosen = {n: dict(t) for n, t in tables.items() if name is None or n == name}
+    if not chosen:
+        got = "none" if name is None else f"none called {name!r}" + (f" but {', '.join(tables)}" if tables else "")
+        raise UsageError(
+            expected="an estimate to score",
+            got=got,
+            where="pdhef metrics",
+            remedy="give --estimate [SIGNAL=]TOPIC.FIELD, or [estimates.NAME.SIGNAL] tables in a mapping file",
+        )
+    for n, signals in chosen.items():
+        if not set(signals) & set(BASE_ORDER):
+            raise UsageError(
+                expected=f"one of {', '.join(BASE_ORDER)}", got=", ".join(signals) or "none", where=f"estimates.{n}"
+            )
+    return tuple(EstimateSource(n, signals, can=can) for n, signals in chosen.items())
+
+
+def _name_of(topic: str) -> str:
+    words = [w for w in re.split(r"[^A-Za-z0-9]+", topic) if w]
+    if words[:1] == ["pdhef"] and len(words) > 2:
+        words = words[1:-1]  # our own /pdhef/<estimator>/state
+        return "-".join(words)
+    name = "_".join(words) or "estimate"
+    return f"{name}_" if name in RESERVED_NAMES else name
+
+
+def sources_of(
+    log: DriveLog, texts: Sequence[str], units: Mapping[str, str], option: str
+) -> tuple[dict[str, SignalSource], CovarianceSource | None]:
+    """Turn ``[SIGNAL=]TOPIC[.FIELD]`` texts into sources by name, and the covariance of a topic named as a whole.
+
+    Raises
+    ------
+    UsageError
+        The signal is not known or cannot be told from the topic's type, or one is named twice.
+    MappingError
+        The log has no such topic.
+    """
+    sources: dict[str, SignalSource] = {}
+    covariances: list[CovarianceSource] = []
+    for text in texts:
+        signal, rest = _split_signal(text, units, option)
+        topic, path = _split_topic(log, rest, option)
+        if signal is not None:
+            if not path:
+                raise UsageError(expected=f"{signal}={topic.name}.FIELD", got=text, where=option)
+            found = {signal: path}
+        else:
+            found, covariance = _recognise(topic, path, units, text, option)
+            covariances += covariance
+        for name, field_path in found.items():
+            if name in sources:
+                raise UsageError(
+                    expected="each signal once",
+                    got=f"{name} from {sources[name].label} and from {topic.name}.{field_path}",
+                    where=option,
+                    remedy="several estimators stand in a mapping file, one [estimates.NAME.SIGNAL] table a signal",
+                )
+            sources[name] = SignalSource(name=name, topic=topic.name, field=field_path)
+    return sources, covariances[0] if len(covariances) == 1 else None
+
+
+def _split_signal(text: str, units: Mapping[str, str], option: str) -> tuple[str | None, str]:
+    head, equals, rest = text.partition("=")
+    if not equals or not re.fullmatch(r"\s*\w*\s*", head):
+        return None, text.strip()
+    signal = head.strip()
+    if signal not in units:
+        close = get_close_matches(signal, list(units), n=1, cutoff=0.5)
+        raise UsageError(
+            expected=f"SIGNAL out of {', '.join(units)}",
+            got=repr(signal),
+            where=f"{option} {text}",
+            remedy=f"did you mean {close[0]}?" if close else "",
+        )
+    return signal, rest.strip()
+
+
+def _split_topic(log: DriveLog, text: str, option: str) -> tuple[TopicInfo, str]:
+    """Split TOPIC.FIELD at the longest topic of the log that fits: outside of ROS 2, topics may hold dots."""
+    fitting = [t for t in log.topics if text == t.name or text.startswith(f"{t.name}.")]
+    if fitting:
+        topic = max(fitting, key=lambda t: len(t.name))
+        return topic, text[len(topic.name) + 1 :]
+    names = [t.name for t in log.topics]
+    close = get_close_matches(text, names, n=1, cutoff=0.5) or get_close_matches(text.split(".")[0], names, n=1)
+    raise MappingError(
+        expected="TOPIC.FIELD with a topic of this log",
+        got=text,
+        where=f"{log.path} {option}",
+        remedy=f"did you mean {close[0]}?" if close else "pdhef inspect lists the topics",
+    )
+
+
+def _recognise(
+    topic: TopicInfo, path: str, units: Mapping[str, str], text: str, option: str
+) -> tuple[dict[str, str], list[CovarianceSource]]:
+    """Return the fields by signal that a topic's type tells, all of them or the one that was named."""
+    kind = topic.type_name.replace("/msg/", "/")
+    known: dict[str, str] = {}
+    covariance: list[CovarianceSource] = []
+    if kind == STATE_TYPE:
+        known = {name: name for name in _STATE_FIELDS}
+        covariance = [CovarianceSource(topic.name, "covariance", 3, (0, 1, 2))]
+    elif kind in TWIST_FIELDS:
+        known = {name: f"{TWIST_FIELDS[kind].format(part)}.{axis}" for name, (part, axis) in _TWIST.items()}
+        if kind in TWIST_COVARIANCES:
+            covariance = [CovarianceSource(topic.name, TWIST_COVARIANCES[kind].removesuffix("[0]"), 6, (0, 1, 5))]
+    found = {name: field_path for name, field_path in known.items() if name in units and path in ("", field_path)}
+    if not found:
+        raise UsageError(
+            expected="SIGNAL=TOPIC.FIELD, as the type does not tell which signal this is",
+            got=f"{text} ({topic.type_name or 'no type'})",
+            where=option,
+            remedy=f"SIGNAL is one of {', '.join(units)}",
+        )
+    return found, covariance if path == "" else []

@@ -1,0 +1,136 @@
+"""``pdhef metrics`` and the gate of thresholds as a user and a CI system meet them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+PDHEF = [sys.executable, "-m", "pdhef_logtool"]
+ESTIMATE = ("--estimate", "/pdhef/phy_ukf/state")
+LIMITS = """
+[[threshold]]
+signal = "sideslip_rad"
+metric = "rmse"
+max = {limit}
+unit = "deg"
+[[threshold]]
+estimator = "pd-hef"
+signal = "sideslip_rad"
+metric = "rmse"
+max = 0.1
+optional = true
+"""
+
+
+def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "COLUMNS": "100"}
+    return subprocess.run([*PDHEF, *arguments], capture_output=True, text=True, env=environment, check=False)
+
+
+@pytest.fixture(scope="module")
+def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    out = tmp_path_factory.mktemp("annotated")
+    vehicle = str(sample_logs_dir / "vehicle.toml")
+    made = _pdhef(
+        "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(out), "-e", "phy-ukf", "--annotate", "full", "-v", vehicle
+    )
+    assert made.returncode == 0, made.stderr
+    return str(out / "logs/dlc/annotated.mcap")
+
+
+def _limits(tmp_path: Path, limit: float) -> str:
+    path = tmp_path / "limits.toml"
+    path.write_text(LIMITS.format(limit=limit))
+    return str(path)
+
+
+def test_table_goes_to_stdout_and_assumptions_to_stderr(annotated: str) -> None:
+    result = _pdhef("metrics", annotated, *ESTIMATE)
+    assert result.returncode == 0
+    assert "phy-ukf" in result.stdout
+    assert "no --vehicle" in result.stderr
+    assert "outputs in" not in result.stdout
+    assert all(len(line) <= 100 for line in result.stdout.splitlines())
+
+
+def test_json_is_one_document(annotated: str, tmp_path: Path) -> None:
+    result = _pdhef("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--json")
+    document = json.loads(result.stdout)
+    assert document["exit_code"] == result.returncode == 0
+    assert document["output"] is None
+    assert [v["outcome"] for v in document["logs"][0]["verdicts"]] == ["pass", "skipped"]
+    assert document["logs"][0]["report"]["estimators"][0]["name"] == "phy-ukf"
+
+
+def test_passed_gate_is_0_and_failed_gate_is_4(annotated: str, tmp_path: Path) -> None:
+    junit = tmp_path / "gate.xml"
+    passed = _pdhef("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 10.0), "--junit", str(junit))
+    assert passed.returncode == 0, passed.stderr
+    assert "pass" in passed.stdout
+    assert ET.parse(junit).getroot().attrib["failures"] == "0"
+    failed = _pdhef("metrics", annotated, *ESTIMATE, "--thresholds", _limits(tmp_path, 0.01), "--junit", str(junit))
+    assert failed.returncode == 4
+    assert "beyond the limit" in failed.stderr
+    (suite,) = ET.parse(junit).getroot()
+    assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["skipped"]) == ("2", "1", "1")
+
+
+def test_run_has_the_same_gate(sample_logs_dir: Path, tmp_path: Path) -> None:
+    logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "sweep.mcap")]
+    junit = tmp_path / "gate.xml"
+    result = _pdhef(
+        "run", *logs, "-o", str(tmp_path / "out"), "-e", "zero", "--annotate", "none",
+        "--thresholds", _limits(tmp_path, 0.01), "--junit", str(junit),
+    )  # fmt: skip
+    assert result.returncode == 4
+    assert [s.attrib["name"] for s in ET.parse(junit).getroot()] == ["dlc", "sweep"]
+    assert (tmp_path / "out/run.json").is_file()
+
+
+def test_failed_gate_wins_over_lost_input_and_both_are_said(sample_logs_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "logs").mkdir()
+    whole = (sample_logs_dir / "dlc.mcap").read_bytes()
+    (tmp_path / "logs/cut.mcap").write_bytes(whole[: len(whole) * 3 // 4])
+    log = str(tmp_path / "logs/cut.mcap")
+    arguments = ("run", log, "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out"))
+    assert _pdhef(*arguments, "--thresholds", _limits(tmp_path, 10.0)).returncode == 3
+    both = _pdhef(*arguments, "--thresholds", _limits(tmp_path, 0.01))
+    assert both.returncode == 4
+    assert "threshold failed" in both.stderr
+    assert "lost" in both.stderr
+    (tmp_path / "logs/bad.mcap").write_bytes(b"no log")
+    junit = tmp_path / "gate.xml"
+    several = _pdhef(
+        "run", str(tmp_path / "logs"), "-e", "zero", "--annotate", "none", "-o", str(tmp_path / "out2"),
+        "--thresholds", _limits(tmp_path, 10.0), "--junit", str(junit),
+    )  # fmt: skip
+    assert several.returncode == 4  # a log that could not be read has not met its threshold
+    failures = {s.attrib["name"]: s.attrib["failures"] for s in ET.parse(junit).getroot()}
+    assert failures == {"bad": "1", "cut": "0"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("--estimate", "/pdhef/phy_ukf/stat"), 1, "did you mean /pdhef/phy_ukf/state?"),
+        (("--estimate", "vx_m_s=/pdhef/phy_ukf/state.vx"), 1, "did you mean vx_m_s?"),
+        (("--estimate", "/imu/data.angular_velocity.z"), 2, "SIGNAL="),
+        ((), 2, "--estimate"),
+        ((*ESTIMATE, "--junit", "gate.xml"), 2, "--thresholds"),
+        ((*ESTIMATE, "--thresholds", "none.toml"), 2, "none.toml"),
+        ((*ESTIMATE, "--start", "900"), 2, "--start"),
+    ],
+)
+def test_errors_are_one_line(annotated: str, arguments: tuple[str, ...], code: int, said: str) -> None:
+    result = _pdhef("metrics", annotated, *arguments)
+    assert result.returncode == code
+    lines = [line for line in result.stderr.splitlines() if not line.startswith("warning: ")]
+    assert len(lines) == 1, result.stderr
+    assert said in lines[0]
+    assert result.stdout == ""

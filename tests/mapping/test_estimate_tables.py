@@ -1,0 +1,81 @@
+"""[estimates.NAME.SIGNAL] tables and ``[SIGNAL=]TOPIC[.FIELD]`` texts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.mapping import load_mapping, mapping_to_toml
+from pdhef_logtool.mapping.estimates import choose_estimates, sources_of
+from pdhef_logtool.signals import ESTIMATE_UNITS
+
+TABLES = """
+[signals.yaw_rate_rad_s]
+topic = "/imu"
+field = "gyro.z"
+[estimates.esc.sideslip_rad]
+topic = "/esc"
+field = "beta"
+scale = 0.017453292519943295
+latency_s = 0.02
+[estimates.esc.vx_m_s]
+topic = "/esc"
+field = "speed"
+[estimates."my ekf 2.1".vy_m_s]
+topic = "/ekf"
+field = "vy"
+"""
+
+
+def _log(**topics: dict[str, np.ndarray]) -> FakeLog:  # type: ignore[type-arg]
+    times = np.arange(10, dtype=np.int64) * 10_000_000 + 1_700_000_000_000_000_000
+    return FakeLog({name: FakeTopic("custom/Type", times, fields) for name, fields in topics.items()})
+
+
+def test_tables_are_read_and_written_back(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text(TABLES)
+    mapping = load_mapping(tmp_path / "m.toml")
+    assert list(mapping.estimates) == ["esc", "my ekf 2.1"]
+    assert mapping.estimates["esc"]["sideslip_rad"].latency_s == 0.02
+    assert "/esc" not in mapping.topics  # a run reads no estimates
+    (tmp_path / "again.toml").write_text(mapping_to_toml(mapping))
+    assert load_mapping(tmp_path / "again.toml").estimates == mapping.estimates
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('[estimates.a.sideslip]\ntopic = "/a"\nfield = "b"', "estimates.a.sideslip: unknown name"),
+        ('[estimates.sideslip_rad]\ntopic = "/a"\nfield = "b"', "[estimates.NAME.sideslip_rad]"),
+        ('[estimates.truth.vx_m_s]\ntopic = "/a"\nfield = "b"', "may not be called 'truth'"),
+        ('[estimates.a.vx_m_s]\ntopic = "/a"\nfeld = "b"', "feld: unknown entry"),
+        ("estimates = 3", "estimates: must be"),
+    ],
+)
+def test_wrong_tables_are_named(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "m.toml").write_text(text)
+    with pytest.raises(MappingError) as caught:
+        load_mapping(tmp_path / "m.toml")
+    assert said in str(caught.value)
+
+
+def test_topics_with_dots_are_found_by_the_longest_that_fits() -> None:
+    values = {"c": np.zeros(10), "b.c": np.zeros(10)}
+    log = _log(**{"a": values, "a.b": values})
+    sources, _ = sources_of(log, ["vx_m_s=a.b.c", "vy_m_s=a.c"], ESTIMATE_UNITS, "--estimate")  # type: ignore[arg-type]
+    assert {n: (s.topic, s.field) for n, s in sources.items()} == {"vx_m_s": ("a.b", "c"), "vy_m_s": ("a", "c")}
+
+
+def test_flags_win_over_tables(tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text(TABLES)
+    mapping = load_mapping(tmp_path / "m.toml")
+    log = _log(**{"/esc": {"beta": np.zeros(10)}})
+    (flag,) = choose_estimates(log, ["sideslip_rad=/esc.beta"], mapping, None)  # type: ignore[arg-type]
+    assert flag.name == "esc"
+    assert flag.signals["sideslip_rad"].scale == 1.0
+    tables = choose_estimates(log, [], mapping, None)  # type: ignore[arg-type]
+    assert [e.name for e in tables] == ["esc", "my ekf 2.1"]
