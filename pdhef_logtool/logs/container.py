@@ -30,6 +30,7 @@ class ChannelRecord:
     schema_encoding: str  # "ros2msg" | "ros2idl" | "ros1msg" | "jsonschema" | "protobuf" | ""
     schema_data: bytes
     metadata: Mapping[str, str] = field(default_factory=dict)
+    schema_id: int = 0  # in an MCAP file; 0: no schema
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +68,34 @@ class Block:
     def __len__(self) -> int:
         """Return the number of messages."""
         return int(self.channel.shape[0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawChunk:
+    """A chunk that another file holds, to be written as it is.
+
+    Whoever makes one has decompressed it and checked its CRC, and knows that the channels it holds or declares have
+    the same ids and the same definitions in the file that is written.
+
+    Attributes
+    ----------
+    compression, stored : compression and compressed bytes, as in the other file.
+    size, crc : bytes and CRC-32 of the decompressed records.
+    channel, log_time_ns, offset : int64 [N] of its messages; offset of the record in the decompressed bytes.
+    """
+
+    compression: str
+    stored: bytes
+    size: int
+    crc: int
+    channel: IntArray
+    log_time_ns: IntArray
+    offset: IntArray
+
+    @property
+    def start_ns(self) -> int:
+        """First log time."""
+        return int(self.log_time_ns.min())
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ from pdhef_logtool.logs.container import (
     Block,
     ChannelRecord,
     MetadataRecord,
+    RawChunk,
     Span,
     SpanDamageError,
     block_from_lists,
@@ -211,6 +212,7 @@ class McapContainer:
                 schema_encoding=encoding,
                 schema_data=schema.data if schema else b"",
                 metadata=dict(channel.metadata),
+                schema_id=channel.schema_id if schema else 0,
             )
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
@@ -247,6 +249,58 @@ class McapContainer:
         if crc and zlib.crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
         return content
+
+    def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
+        """Return the chunk that a block was read from, to be written to another file as it is.
+
+        Parameters
+        ----------
+        span, block : the span, and what :meth:`load` gave, so that the chunk is known to be sound.
+        kept : channels that have the same id and definition in the other file.
+
+        Returns
+        -------
+        The chunk; None if these messages are in none, or if it holds or declares anything that the other file has
+        not.
+        """
+        start, _, is_chunk, _ = self._extents[span.index]
+        if not is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
+            return None
+        if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
+            return None  # the index could not hold the time that the message has
+        content = bytes(block.buffer)
+        head = block.offset - _MESSAGE_HEAD.itemsize
+        others = _records_between(content, np.append(0, block.offset + block.length), np.append(head, len(content)))
+        if others is None or not all(self._is_known(op, content[at:end], kept) for op, at, end in others):
+            return None
+        _, _, size, crc = _CHUNK.unpack_from(self._data, start)
+        (n,) = struct.unpack_from("<I", self._data, start + 28)
+        compression = self._data[start + 32 : start + 32 + n].decode()
+        (length,) = struct.unpack_from("<Q", self._data, start + 32 + n)
+        at = start + 40 + n
+        return RawChunk(
+            compression=compression,
+            stored=self._data[at : at + length],
+            size=size,
+            crc=crc or zlib.crc32(content),
+            channel=block.channel,
+            log_time_ns=block.log_time_ns,
+            offset=head,
+        )
+
+    def _is_known(self, opcode: int, payload: bytes, kept: frozenset[int]) -> bool:
+        """Tell whether a record of a chunk declares only what the kept channels are declared as in this file."""
+        try:
+            if opcode == Opcode.CHANNEL:
+                channel = Channel.read(ReadDataStream(BytesIO(payload)))
+                return channel.id in kept and channel == self._raw_channels[channel.id]
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(payload)))
+                used = {self._raw_channels[id_].schema_id for id_ in kept}
+                return schema.id in used and schema == self._schemas[schema.id]
+        except (struct.error, UnicodeDecodeError, ValueError, McapError):
+            return False
+        return True
 
     def _indexed_messages(self, content: bytes, start: int, end: int) -> Block | None:
         """Return the chunk's messages through its message indexes; None if these do not name all of them."""

@@ -1,5 +1,7 @@
 """Lossless copies of a log's messages into an MCAP: ready bytes in log-time order, a few spans in memory at a time.
 
+Chunks of an MCAP whose channels are all kept are copied as they are, checked but not compressed anew.
+
 MCAP sources keep schema, topic, encoding, channel metadata, both times, sequence and payload; attachments and metadata
 records come along. rosbag2 databases keep their CDR bytes and definitions. ROS 1 messages become ROS 2 CDR.
 """
@@ -15,13 +17,15 @@ import numpy as np
 
 from pdhef_logtool.errors import LogError
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, MetadataRecord
+from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, Container, MetadataRecord, RawChunk, Span
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.message_schema import SchemaError, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 from pdhef_logtool.signals import Loss
 
+_LARGEST_ID = 0xFFFF
 _HEADER = "std_msgs/msg/Header"
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
@@ -39,12 +43,14 @@ class SourceChannels:
     numbered : ROS 1 channels whose messages begin with a header: its sequence number, which a ROS 2 header has not,
         becomes the message's.
     lost : channels and messages that cannot be copied.
+    verbatim : channels of MCAP files that keep their id, their schema's id and their definition.
     """
 
     ids: Mapping[_Key, int]
     converters: Mapping[_Key, Callable[[bytes], bytes | None]]
     numbered: frozenset[_Key]
     lost: tuple[Loss, ...]
+    verbatim: frozenset[_Key] = frozenset()
 
 
 def source_profile(log: DriveLog) -> str:
@@ -59,7 +65,8 @@ def register_channels(
 ) -> SourceChannels:
     """Add every channel of a log to a writer but those whose topic is to be left out.
 
-    Channels that only repeat over split files become one. A ROS 1 channel whose definition does not parse cannot be
+    Channels that only repeat over split files become one. Channels of an MCAP keep their ids (those of the first file
+    where the ids of split files contradict each other). A ROS 1 channel whose definition does not parse cannot be
     converted and is left out with a loss.
     """
     columnar = _columnar(log)
@@ -68,6 +75,8 @@ def register_channels(
     numbered: set[_Key] = set()
     lost: list[Loss] = []
     known: dict[tuple[object, ...], int] = {}
+    verbatim: set[_Key] = set()
+    places = _Places(columnar)
     for c, container in enumerate(columnar.containers):
         same_file: set[int] = set()
         for channel in container.channels.values():
@@ -94,6 +103,7 @@ def register_channels(
             )
             id_ = known.get(identity)
             if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
+                channel_id, schema_id = places.of(c, target)
                 id_ = writer.add_raw_channel(
                     target.topic,
                     schema_name=target.schema_name,
@@ -101,11 +111,50 @@ def register_channels(
                     schema_data=target.schema_data,
                     message_encoding=target.encoding,
                     metadata=target.metadata,
+                    channel_id=channel_id,
+                    schema_id=schema_id,
                 )
                 known[identity] = id_
             same_file.add(id_)
             ids[(c, channel.id)] = id_
-    return SourceChannels(ids, converters, frozenset(numbered), tuple(lost))
+            if target is channel and places.keeps(c, channel, id_):
+                verbatim.add((c, channel.id))
+    return SourceChannels(ids, converters, frozenset(numbered), tuple(lost), frozenset(verbatim))
+
+
+class _Places:
+    """Which ids the channels and schemas of MCAP files get in the copy: their own where these are free."""
+
+    def __init__(self, log: ColumnarLog) -> None:
+        self._files = {c: f for c, f in enumerate(log.containers) if isinstance(f, McapContainer)}
+        used = [id_ for f in self._files.values() for id_ in f.channels]
+        self._next_channel = max(used, default=0) + 1
+        self._channels: dict[int, int] = {}  # schema id by channel id, both of the copy
+        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+
+    def of(self, c: int, channel: ChannelRecord) -> tuple[int | None, int | None]:
+        """Return the channel id and the schema id for a new channel; None: the writer's choice."""
+        if c not in self._files:
+            return None, None
+        schema_id = self._schema(channel)
+        id_ = channel.id
+        if id_ in self._channels:
+            id_, self._next_channel = self._next_channel, self._next_channel + 1
+        if id_ > _LARGEST_ID:
+            return None, schema_id
+        self._channels[id_] = 0 if schema_id is None else schema_id
+        return id_, schema_id
+
+    def _schema(self, channel: ChannelRecord) -> int | None:
+        if not channel.schema_id:
+            return None
+        definition = (channel.schema_name, channel.schema_encoding, channel.schema_data)
+        fits = self._schemas.setdefault(channel.schema_id, definition) == definition
+        return channel.schema_id if fits else None
+
+    def keeps(self, c: int, channel: ChannelRecord, id_: int) -> bool:
+        """Tell whether a channel has its own ids in the copy."""
+        return c in self._files and id_ == channel.id and self._channels.get(id_) == channel.schema_id
 
 
 def iterate_raw(
@@ -116,14 +165,38 @@ def iterate_raw(
     Messages of equal log time come in file order. Spans that overlap in time are merged; no more of them are held
     than overlap. Damaged spans are left out and reported by ``log.lost``.
     """
-    columnar = _columnar(log)
+    for item in _iterate(_columnar(log), channels, start_ns, end_ns, whole=False):
+        assert isinstance(item, RawMessage)
+        yield item
+
+
+def iterate_copy(
+    log: DriveLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[RawMessage | RawChunk]:
+    """Yield what :func:`iterate_raw` does, but chunks that can be copied as they are as such.
+
+    These are sound chunks of MCAP files (a damaged one is left out and reported) that lie in the window and hold and
+    declare nothing but channels with their own ids. They come in order of their first log times, and where they
+    overlap in the order of the file.
+    """
+    return _iterate(_columnar(log), channels, start_ns, end_ns, whole=True)
+
+
+def _iterate(
+    columnar: ColumnarLog, channels: SourceChannels, start_ns: int | None, end_ns: int | None, whole: bool
+) -> Iterator[RawMessage | RawChunk]:
+    kept = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(columnar.containers))]
     spans = [
         (span.start_ns, c, span)
         for c, container in enumerate(columnar.containers)
         for span in container.spans
-        if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
+        if (start_ns is None or span.end_ns > start_ns)
+        and (end_ns is None or span.start_ns < end_ns)
+        and (not span.counts or any((c, id_) in channels.ids for id_ in span.counts))
     ]
     spans.sort(key=lambda item: (item[0], item[1], item[2].index))
+    if whole:
+        spans = _in_file_order_where_overlapping(spans, kept)
     open_spans: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
     at = 0
     while at < len(spans) or open_spans:
@@ -131,10 +204,16 @@ def iterate_raw(
             _, c, span = spans[at]
             at += 1
             block = columnar.load(c, span)
-            if block is not None:
-                cursor = _Cursor(block, start_ns, end_ns)
-                if cursor.rows:
-                    heapq.heappush(open_spans, (cursor.time, c, span.index, 0, cursor))
+            if block is None:
+                continue
+            if whole:
+                chunk = _raw_chunk(columnar.containers[c], span, block, kept[c])
+                if chunk is not None and _inside(block, start_ns, end_ns):
+                    yield chunk
+                    continue
+            cursor = _Cursor(block, start_ns, end_ns)
+            if cursor.rows:
+                heapq.heappush(open_spans, (cursor.time, c, span.index, 0, cursor))
         if not open_spans:
             continue
         _, c, index, _, cursor = heapq.heappop(open_spans)
@@ -152,6 +231,42 @@ def iterate_raw(
             if cursor.time >= limit:
                 heapq.heappush(open_spans, (cursor.time, c, index, cursor.taken, cursor))
                 break
+
+
+def _raw_chunk(container: Container, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
+    return container.raw_chunk(span, block, kept) if isinstance(container, McapContainer) else None
+
+
+def _inside(block: Block, start_ns: int | None, end_ns: int | None) -> bool:
+    """Tell whether all messages lie in [start, end)."""
+    after = start_ns is None or int(block.log_time_ns.min()) >= start_ns
+    return after and (end_ns is None or int(block.log_time_ns.max()) < end_ns)
+
+
+def _in_file_order_where_overlapping(
+    spans: Sequence[tuple[int, int, Span]], kept: Sequence[frozenset[int]]
+) -> list[tuple[int, int, Span]]:
+    """Sort groups of overlapping spans that will all be copied as they are back to the order of the file.
+
+    Readers give messages of equal log times in file order, which is then that of the source.
+    """
+    ordered: list[tuple[int, int, Span]] = []
+    group: list[tuple[int, int, Span]] = []
+    end_ns = 0
+
+    def close() -> None:
+        if all(kept[c].issuperset(span.counts) for _, c, span in group):
+            group.sort(key=lambda item: (item[1], item[2].index))
+        ordered.extend(group)
+        group.clear()
+
+    for item in spans:
+        if group and item[0] >= end_ns:
+            close()
+        end_ns = max(end_ns, item[2].end_ns) if group else item[2].end_ns
+        group.append(item)
+    close()
+    return ordered
 
 
 def iterate_attachments(log: DriveLog) -> Iterator[Attachment]:

@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool import __version__
 from pdhef_logtool.errors import MappingError, OutputError
+from pdhef_logtool.logs.container import RawChunk
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.signals import IntArray
@@ -45,6 +46,7 @@ from pdhef_logtool.signals import IntArray
 LIBRARY = f"pdhef-logtool {__version__}"
 _MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_BYTES = 1 << 20
+_LARGEST_ID = 0xFFFF
 _HEAD = np.dtype(
     {
         "names": ["op", "size", "channel", "sequence", "log", "publish"],
@@ -93,6 +95,42 @@ class _Records:
     rows: NDArray[np.uint8]
 
 
+class _Merged:
+    """Message records of several channels in order of log time, taken from the front."""
+
+    def __init__(self, records: Sequence[_Records]) -> None:
+        self.rows = [r.rows for r in records]
+        log_time = np.concatenate([np.empty(0, dtype=np.int64), *[r.log_time_ns for r in records]])
+        order = np.argsort(log_time, kind="stable")
+        each = [len(r.rows) for r in records]
+        self.log_time_ns: IntArray = log_time[order]
+        self.channel: IntArray = np.repeat(np.array([r.channel for r in records], dtype=np.int64), each)[order]
+        self.length: IntArray = np.repeat(np.array([r.rows.shape[1] for r in records], dtype=np.int64), each)[order]
+        self.source: IntArray = np.repeat(np.arange(len(records)), each)[order]
+        self.row: IntArray = (order - np.repeat(np.cumsum([0, *each])[:-1], each)[order]).astype(np.int64)
+        self.ends: IntArray = np.cumsum(self.length)
+        self.at = 0
+
+    def take_until(self, until_ns: int | None) -> slice:
+        """Take what lies before a time (all that is left when None)."""
+        first, self.at = self.at, len(self.log_time_ns)
+        if until_ns is not None:
+            self.at = max(first, int(np.searchsorted(self.log_time_ns, until_ns, side="left")))
+        return slice(first, self.at)
+
+    def take_chunk(self) -> slice:
+        """Take one chunk full."""
+        first = self.at
+        base = int(self.ends[first - 1]) if first else 0
+        self.at = max(int(np.searchsorted(self.ends, base + _CHUNK_BYTES, side="right")), first + 1)
+        return slice(first, self.at)
+
+    @property
+    def next_ns(self) -> int | None:
+        """Log time of the first record that is left."""
+        return int(self.log_time_ns[self.at]) if self.at < len(self.log_time_ns) else None
+
+
 class McapLogWriter:
     """Writes one MCAP file under a temporary name and renames it on :meth:`close`; leaves nothing on an error.
 
@@ -109,9 +147,9 @@ class McapLogWriter:
     def __init__(self, path: Path, *, profile: str = "ros2") -> None:
         self._path = path
         self._temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-        self._schemas: list[Schema] = []
+        self._schemas: dict[int, Schema] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
-        self._channels: list[Channel] = []
+        self._channels: dict[int, Channel] = {}
         self._encoders: dict[str, tuple[int, CdrEncoder]] = {}
         self._sequences: Counter[int] = Counter()
         self._counts: Counter[int] = Counter()
@@ -204,51 +242,93 @@ class McapLogWriter:
         schema_data: bytes,
         message_encoding: str,
         metadata: Mapping[str, str],
+        channel_id: int | None = None,
+        schema_id: int | None = None,
     ) -> int:
-        """Add a channel for :class:`RawMessage` and return its id; without name and encoding it has no schema."""
-        if len(self._channels) >= 0xFFFF:
-            raise OutputError(expected="at most 65535 channels", got="more", where=str(self._path))
-        schema_id = 0
+        """Add a channel for :class:`RawMessage` and return its id; without name and encoding it has no schema.
+
+        Ids are given out in ascending order unless named: a :class:`RawChunk` needs its channels and schemas under
+        the ids that it holds.
+
+        Raises
+        ------
+        OutputError : an id is taken by something else, or there are too many channels.
+        """
+        schema = 0
         if schema_name or schema_encoding:
-            key = (schema_name, schema_encoding, schema_data)
-            schema_id = self._schema_ids.get(key, 0)
-            if not schema_id:
-                schema_id = len(self._schemas) + 1
-                self._schema_ids[key] = schema_id
-                schema = Schema(id=schema_id, data=schema_data, encoding=schema_encoding, name=schema_name)
-                self._schemas.append(schema)
-                self._emit_record(schema)
+            schema = self._add_schema(schema_name, schema_encoding, schema_data, schema_id)
+        if channel_id is None:
+            channel_id = self._free_id(self._channels, first=1)
+        elif channel_id in self._channels:
+            raise self._taken("channel", channel_id)
         channel = Channel(
-            id=len(self._channels) + 1,
+            id=channel_id,
             topic=topic,
             message_encoding=message_encoding,
             metadata=dict(metadata),
-            schema_id=schema_id,
+            schema_id=schema,
         )
-        self._channels.append(channel)
+        self._channels[channel_id] = channel
         self._emit_record(channel)
-        return channel.id
+        return channel_id
 
-    def write(self, batches: Sequence[TopicBatch], raws: Iterable[RawMessage] = ()) -> None:
+    def _add_schema(self, name: str, encoding: str, data: bytes, id_: int | None) -> int:
+        key = (name, encoding, data)
+        if id_ is None:
+            id_ = self._schema_ids.get(key) or self._free_id(self._schemas, first=1)
+        known = self._schemas.get(id_)
+        if known is None:
+            known = Schema(id=id_, data=data, encoding=encoding, name=name)
+            self._schemas[id_] = known
+            self._schema_ids.setdefault(key, id_)
+            self._emit_record(known)
+        elif (known.name, known.encoding, known.data) != key:
+            raise self._taken("schema", id_)
+        return id_
+
+    def _free_id(self, taken: Mapping[int, object], first: int) -> int:
+        """Return an id above all that are taken, or a gap where there is none above."""
+        above = max(taken, default=first - 1) + 1
+        if above <= _LARGEST_ID:
+            return above
+        free = next((i for i in range(first, _LARGEST_ID + 1) if i not in taken), None)
+        if free is None:
+            raise OutputError(expected="at most 65535 channels", got="more", where=str(self._path))
+        return free
+
+    def _taken(self, what: str, id_: int) -> OutputError:
+        return OutputError(expected=f"a {what} id that is free", got=str(id_), where=str(self._path))
+
+    def write(self, batches: Sequence[TopicBatch], raws: Iterable[RawMessage | RawChunk] = ()) -> None:
         """Write messages merged by log time; on equal times raw messages come first, then batches in their order.
 
-        Raw messages are consumed as they come (in ascending log time) and not held.
+        Raw messages are consumed as they come (in ascending log time) and not held. Raw chunks are written as they
+        are; the batches then go into chunks of their own, and all chunks into the order of their first log times.
         """
         records = [self._encode(batch) for batch in batches if len(batch.log_time_ns)]
         for record in records:
             if np.any(np.diff(record.log_time_ns) < 0):
-                topic = self._channels[record.channel - 1].topic
+                topic = self._channels[record.channel].topic
                 raise MappingError(expected="ascending log times", got="a step back", where=topic)
-        done = [0] * len(records)
+        merged = _Merged(records)
         group: list[RawMessage] = []
         size = 0
         for raw in raws:
+            if isinstance(raw, RawChunk):
+                start_ns = raw.start_ns
+                if group:
+                    self._write_group(merged, group, until_ns=start_ns)
+                    group, size = [], 0
+                while merged.next_ns is not None and merged.next_ns < start_ns:
+                    self._write_merged([], merged, merged.take_chunk())
+                self._emit_chunk(raw)
+                continue
             group.append(raw)
             size += len(raw.data) + _HEAD.itemsize
             if size >= _CHUNK_BYTES:
-                self._write_group(records, done, group, until_ns=raw.log_time_ns)
+                self._write_group(merged, group, until_ns=raw.log_time_ns)
                 group, size = [], 0
-        self._write_group(records, done, group, until_ns=None)
+        self._write_group(merged, group, until_ns=None)
 
     def _encode(self, batch: TopicBatch) -> _Records:
         if batch.topic not in self._encoders:
@@ -269,25 +349,13 @@ class McapLogWriter:
         rows[:, _HEAD.itemsize :] = payload
         return _Records(channel, batch.log_time_ns.astype(np.int64), rows)
 
-    def _write_group(
-        self, records: Sequence[_Records], done: list[int], group: Sequence[RawMessage], until_ns: int | None
-    ) -> None:
+    def _write_group(self, merged: _Merged, group: Sequence[RawMessage], until_ns: int | None) -> None:
         """Write raw messages and the batch rows that belong before ``until_ns`` (all that are left when None)."""
-        parts: list[_Records] = []
-        for i, record in enumerate(records):
-            end = (
-                len(record.log_time_ns)
-                if until_ns is None
-                else max(done[i], int(np.searchsorted(record.log_time_ns, until_ns, side="left")))
-            )
-            if end > done[i]:
-                parts.append(_Records(record.channel, record.log_time_ns[done[i] : end], record.rows[done[i] : end]))
-                done[i] = end
-        self._write_merged(group, parts)
+        self._write_merged(group, merged, merged.take_until(until_ns))
 
-    def _write_merged(self, raws: Sequence[RawMessage], parts: Sequence[_Records]) -> None:
-        """Merge by log time and cut into chunks."""
-        if not raws and not parts:
+    def _write_merged(self, raws: Sequence[RawMessage], merged: _Merged, part: slice) -> None:
+        """Merge raw messages and a part of the batch rows by log time and cut into chunks."""
+        if not raws and part.start == part.stop:
             return
         raw_bytes = [
             _MESSAGE_HEAD.pack(
@@ -296,44 +364,44 @@ class McapLogWriter:
             + r.data
             for r in raws
         ]
-        log_time = np.concatenate(
-            [np.array([r.log_time_ns for r in raws], dtype=np.int64), *[p.log_time_ns for p in parts]]
-        )
-        channel = np.concatenate(
-            [np.array([r.channel for r in raws], dtype=np.int64), *[np.full(len(p.rows), p.channel) for p in parts]]
-        )
-        length = np.concatenate(
-            [np.array([len(b) for b in raw_bytes], dtype=np.int64)]
-            + [np.full(len(p.rows), p.rows.shape[1], dtype=np.int64) for p in parts]
-        )
-        source = np.concatenate(
-            [np.zeros(len(raws), dtype=np.int64)] + [np.full(len(p.rows), i + 1) for i, p in enumerate(parts)]
-        )
-        order = np.argsort(log_time, kind="stable")
-        log_time, channel, length, source = log_time[order], channel[order], length[order], source[order]
-        row_of = _row_numbers(order, len(raws), parts)
+        log_time, channel, length = merged.log_time_ns[part], merged.channel[part], merged.length[part]
+        source, row = merged.source[part], merged.row[part]
+        if raws:
+            n = len(raws)
+            log_time = np.concatenate([np.array([r.log_time_ns for r in raws], dtype=np.int64), log_time])
+            channel = np.concatenate([np.array([r.channel for r in raws], dtype=np.int64), channel])
+            length = np.concatenate([np.array([len(b) for b in raw_bytes], dtype=np.int64), length])
+            source = np.concatenate([np.full(n, -1), source])
+            row = np.concatenate([np.arange(n), row])
+            order = np.argsort(log_time, kind="stable")
+            log_time, channel, length = log_time[order], channel[order], length[order]
+            source, row = source[order], row[order]
         ends = np.cumsum(length)
         first = 0
-        while first < len(order):
+        while first < len(log_time):
             base = int(ends[first - 1]) if first else 0
             last = max(int(np.searchsorted(ends, base + _CHUNK_BYTES, side="right")), first + 1)
             at = ends[first:last] - length[first:last] - base
             content = np.empty(int(ends[last - 1]) - base, dtype=np.uint8)
-            part_source, part_row = source[first:last], row_of[first:last]
+            part_source, part_row = source[first:last], row[first:last]
             for i in np.unique(part_source).tolist():
                 mine = part_source == i
-                _scatter(content, at[mine], part_row[mine], raw_bytes if i == 0 else parts[i - 1].rows)
-            self._emit_chunk(content.tobytes(), channel[first:last], log_time[first:last], at)
+                _scatter(content, at[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
+            self._emit_compressed(content.tobytes(), channel[first:last], log_time[first:last], at)
             first = last
 
-    def _emit_chunk(self, content: bytes, channel: IntArray, log_time: IntArray, offset: IntArray) -> None:
+    def _emit_compressed(self, content: bytes, channel: IntArray, log_time: IntArray, offset: IntArray) -> None:
         import zstandard
 
         stored = zstandard.ZstdCompressor(level=3).compress(content)
+        self._emit_chunk(RawChunk("zstd", stored, len(content), zlib.crc32(content), channel, log_time, offset))
+
+    def _emit_chunk(self, chunk: RawChunk) -> None:
+        channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
         start_ns, end_ns = int(log_time.min()), int(log_time.max())
-        compression = b"zstd"
+        compression = chunk.compression.encode()
         body = (
-            struct.pack("<QQQI", start_ns, end_ns, len(content), zlib.crc32(content))
+            struct.pack("<QQQI", start_ns, end_ns, chunk.size, chunk.crc)
             + struct.pack("<I", len(compression))
             + compression
             + struct.pack("<Q", len(stored))
@@ -360,9 +428,9 @@ class McapLogWriter:
                 message_end_time=end_ns,
                 message_index_offsets=offsets,
                 message_index_length=self._at - index_at,
-                compression="zstd",
+                compression=chunk.compression,
                 compressed_size=len(stored),
-                uncompressed_size=len(content),
+                uncompressed_size=chunk.size,
             )
         )
         self._first_ns = start_ns if self._first_ns is None else min(self._first_ns, start_ns)
@@ -425,8 +493,8 @@ class McapLogWriter:
             schema_count=len(self._schemas),
         )
         groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
-            (Opcode.SCHEMA, self._schemas),
-            (Opcode.CHANNEL, self._channels),
+            (Opcode.SCHEMA, list(self._schemas.values())),
+            (Opcode.CHANNEL, list(self._channels.values())),
             (Opcode.STATISTICS, [statistics]),
             (Opcode.CHUNK_INDEX, self._chunk_indexes),
             (Opcode.ATTACHMENT_INDEX, self._attachment_indexes),
@@ -475,12 +543,6 @@ class McapLogWriter:
         at = self._at
         self._emit(data)
         return at, len(data)
-
-
-def _row_numbers(order: IntArray, raws: int, parts: Sequence[_Records]) -> IntArray:
-    """Return each merged message's row in its own source."""
-    rows = np.concatenate([np.arange(raws), *[np.arange(len(p.rows)) for p in parts]])
-    return rows[order].astype(np.int64)
 
 
 def _scatter(

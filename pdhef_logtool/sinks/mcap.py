@@ -12,12 +12,12 @@ import numpy as np
 
 from pdhef_logtool.errors import OutputError
 from pdhef_logtool.geometry import quat_from_yaw
-from pdhef_logtool.logs.container import Attachment
+from pdhef_logtool.logs.container import Attachment, RawChunk
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.source_copy import (
     iterate_attachments,
+    iterate_copy,
     iterate_metadata,
-    iterate_raw,
     register_channels,
     source_profile,
 )
@@ -62,7 +62,9 @@ def topic_of(estimator: str, what: str) -> str:
 
 
 class AnnotatedMcapSink:
-    """Writes the annotated log window by window; messages of the source pass through one at a time.
+    """Writes the annotated log window by window; what the source holds passes through a chunk at a time.
+
+    Sound chunks that hold nothing but what stays are written as they are, others message by message.
 
     Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp) and ``odometry`` (``nav_msgs/msg/Odometry``, the
     stamps that are valid and have a pose, as the message can say neither). Log and publish time are the scored stamp.
@@ -84,8 +86,8 @@ class AnnotatedMcapSink:
         self._topics: dict[str, str] = {}
         self._window: dict[str, list[TopicBatch]] = {}
         self._lost: tuple[Loss, ...] = ()
-        self._raws: Iterator[RawMessage] = iter(())
-        self._next: RawMessage | None = None
+        self._raws: Iterator[RawMessage | RawChunk] = iter(())
+        self._next: RawMessage | RawChunk | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -101,7 +103,7 @@ class AnnotatedMcapSink:
             self._writer.abort()
             raise
         self._lost = channels.lost
-        self._raws = iterate_raw(source, channels)
+        self._raws = iterate_copy(source, channels)
 
     @property
     def lost(self) -> tuple[Loss, ...]:
@@ -159,16 +161,17 @@ class AnnotatedMcapSink:
         if ends:
             self._writer.write(batches, raws=self._raws_before(max(ends)))
 
-    def _raws_before(self, end_ns: int | None) -> Iterator[RawMessage]:
+    def _raws_before(self, end_ns: int | None) -> Iterator[RawMessage | RawChunk]:
         while True:
-            message = self._next if self._next is not None else next(self._raws, None)
+            raw = self._next if self._next is not None else next(self._raws, None)
             self._next = None
-            if message is None:
+            if raw is None:
                 return
-            if end_ns is not None and message.log_time_ns >= end_ns:
-                self._next = message
+            at_ns = raw.start_ns if isinstance(raw, RawChunk) else raw.log_time_ns
+            if end_ns is not None and at_ns >= end_ns:
+                self._next = raw
                 return
-            yield message
+            yield raw
 
     def _attach(self, attachment: Attachment) -> None:
         self._writer.attachment(

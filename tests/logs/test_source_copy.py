@@ -13,6 +13,7 @@ from recorded import decoded_by_rosbags
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import (
     iterate_attachments,
+    iterate_copy,
     iterate_metadata,
     iterate_raw,
     register_channels,
@@ -23,12 +24,12 @@ from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 T0 = 1_700_000_000_000_000_000
 
 
-def _copy(source: Path, target: Path) -> None:
+def _copy(source: Path, target: Path, whole: bool = False) -> None:
     log = open_log(source)
     with McapLogWriter(target, profile=source_profile(log)) as writer:
         channels = register_channels(writer, log)
         assert channels.lost == ()
-        writer.write([], iterate_raw(log, channels))
+        writer.write([], (iterate_copy if whole else iterate_raw)(log, channels))
         for a in iterate_attachments(log):
             writer.attachment(a.name, a.media_type, a.data, a.log_time_ns, a.create_time_ns)
         for m in iterate_metadata(log):
@@ -89,12 +90,13 @@ def _many_sided_source(path: Path) -> None:
         writer.metadata("car", {"tyres": "used"})
 
 
-def test_an_mcap_copy_equals_its_source(tmp_path: Path) -> None:
+@pytest.mark.parametrize("whole", [False, True])
+def test_an_mcap_copy_equals_its_source(tmp_path: Path, whole: bool) -> None:
     from mcap.reader import make_reader
 
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _many_sided_source(source)
-    _copy(source, target)
+    _copy(source, target, whole)
     assert _content(target) == _content(source)
     with target.open("rb") as file:
         reader = make_reader(file)
@@ -117,8 +119,9 @@ def test_an_mcap_copy_equals_its_source(tmp_path: Path) -> None:
         "reader_corpus/rerun/foxglove_log.mcap",
     ],
 )
-def test_copies_of_recordings_equal_their_sources(shared_dir: Path, tmp_path: Path, name: str) -> None:
-    _copy(shared_dir / name, tmp_path / "copy.mcap")
+@pytest.mark.parametrize("whole", [False, True])
+def test_copies_of_recordings_equal_their_sources(shared_dir: Path, tmp_path: Path, name: str, whole: bool) -> None:
+    _copy(shared_dir / name, tmp_path / "copy.mcap", whole)
     copied, original = _content(tmp_path / "copy.mcap"), _content(shared_dir / name)
     assert len(copied) == len(original)
     assert [m[0] for m in copied] == [m[0] for m in original]

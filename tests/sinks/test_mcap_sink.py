@@ -143,7 +143,13 @@ def test_summary_statistics_and_indexes_are_there(annotated):
     assert statistics.chunk_count == len(summary.chunk_indexes) > 0
     assert statistics.message_start_time == 1_700_000_000_000_000_123
     assert statistics.message_end_time == 1_700_000_005_992_000_123
-    assert all(c.compression == "zstd" and c.message_index_length > 0 for c in summary.chunk_indexes)
+    assert all(c.message_index_length > 0 for c in summary.chunk_indexes)
+    # Chunks of the source stay as they are; ours are zstd.
+    source_ids = {c.id for c in summary.channels.values() if c.topic in SOURCE_TOPICS}
+    for chunk in summary.chunk_indexes:
+        held = set(chunk.message_index_offsets)
+        assert chunk.compression == ("lz4" if held & source_ids else "zstd")
+        assert held <= source_ids or not held & source_ids
     indexed = set().union(*(c.message_index_offsets for c in summary.chunk_indexes))
     assert indexed == set(summary.channels)
     assert [a.name for a in summary.attachment_indexes] == ["calibration.txt", "report.json", "report.json"]
@@ -175,10 +181,15 @@ def test_source_is_kept_bit_for_bit(annotated, source):
 
 
 def test_messages_are_merged_by_log_time(annotated):
-    with annotated.open("rb") as stream:
-        times = [m.log_time for _, _, m in NonSeekingReader(stream).iter_messages(log_time_order=False)]
+    times = [t for _, t, *_ in messages(annotated)]
     assert len(times) == sum(n for _, _, n in TOPICS.values())
     assert times == sorted(times)
+    with annotated.open("rb") as stream:
+        starts = [c.message_start_time for c in make_reader(stream).get_summary().chunk_indexes]
+        stream.seek(0)
+        sequential = [m.log_time for _, _, m in NonSeekingReader(stream).iter_messages(log_time_order=False)]
+    assert starts == sorted(starts)
+    assert sorted(sequential) == times
 
 
 def test_metrics_record_and_report_attachment(annotated):

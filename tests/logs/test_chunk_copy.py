@@ -1,0 +1,321 @@
+"""Chunks that a full copy takes over as they are, and what makes it go message by message instead."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from pdhef_logtool.errors import OutputError
+from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.container import RawChunk
+from pdhef_logtool.logs.mcap_log import McapContainer
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+
+T0 = 1_700_000_000_000_000_000
+TEXT = b"float64 x\n"
+
+
+def _write(path: Path, n: int = 600, *, compression=CompressionType.ZSTD, chunk_size=20_000, extra=(), **options):
+    """Write three channels with the mcap library, which declares them inside the first chunk; ids as it gives them."""
+    rng = np.random.default_rng(4)
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=compression, chunk_size=chunk_size, **options)
+        writer.start(profile="ros2", library="recorder")
+        a = writer.register_schema("own/msg/A", "ros2msg", TEXT)
+        b = writer.register_schema("own/msg/B", "ros2msg", TEXT + b"float64 y\n")
+        channels = [
+            writer.register_channel("/a", "cdr", a, {"qos": "1"}),
+            writer.register_channel("/b", "cdr", b),
+            writer.register_channel("/c", "octets", 0),
+            *(writer.register_channel(topic, "cdr", a) for topic in extra),
+        ]
+        for i in range(n):
+            time = T0 + 1_000_000 * i
+            writer.add_message(channels[i % len(channels)], time, rng.bytes(200), time - i, sequence=5 * i)
+        writer.finish()
+
+
+def _annotate(source: Path | ColumnarLog, target: Path, leave_out=lambda _: False, batches: bool = True, window=()):
+    """Copy with a topic of ours beside it, which begins before and ends behind the source."""
+    log = open_log(source) if isinstance(source, Path) else source
+    with McapLogWriter(target, profile=source_profile(log)) as writer:
+        channels = register_channels(writer, log, leave_out=leave_out)
+        writer.add_topic("/ours", "std_msgs/msg/Float64")
+        stamps = T0 - 50_000_000 + np.arange(7000) * 100_000
+        ours = [TopicBatch("/ours", stamps, stamps, {"data": np.arange(7000.0)})] if batches else []
+        items = list(iterate_copy(log, channels, *window))
+        writer.write(ours, items)
+    lost = log.lost
+    log.close()
+    return items, lost
+
+
+def _chunks(path: Path) -> list[Chunk]:
+    with path.open("rb") as stream:
+        return [r for r in StreamReader(stream, emit_chunks=True).records if isinstance(r, Chunk)]
+
+
+def _messages(path: Path, without: str = "/ours") -> list[tuple[object, ...]]:
+    with path.open("rb") as stream:
+        return [
+            (c.topic, c.message_encoding, tuple(c.metadata.items()), s and (s.name, s.encoding, s.data))
+            + (m.log_time, m.publish_time, m.sequence, m.data)
+            for s, c, m in make_reader(stream, validate_crcs=True).iter_messages()
+            if c.topic != without
+        ]
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_chunks_are_taken_over_bit_for_bit(tmp_path: Path, compression: CompressionType) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source, compression=compression)
+    items, lost = _annotate(source, target)
+    assert lost == ()
+    assert len(items) == len(_chunks(source)) > 5
+    assert all(isinstance(item, RawChunk) for item in items)
+    copied = [c for c in _chunks(target) if c in _chunks(source)]  # data, size, CRC, compression and both times
+    assert copied == _chunks(source)
+    assert _messages(target) == _messages(source)
+    with target.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        ours = [m.log_time for _, _, m in reader.iter_messages(topics="/ours")]
+    assert ours == (T0 - 50_000_000 + np.arange(7000) * 100_000).tolist()
+    statistics = summary.statistics
+    assert (statistics.message_count, statistics.channel_count) == (7600, 4)
+    assert statistics.channel_message_counts == {1: 200, 2: 200, 3: 200, 4: 7000}
+    assert (statistics.message_start_time, statistics.message_end_time) == (T0 - 50_000_000, T0 + 649_900_000)
+    starts = [c.message_start_time for c in summary.chunk_indexes]
+    assert starts == sorted(starts)
+    assert statistics.chunk_count == len(starts)
+
+
+def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source)
+    _annotate(source, target)
+    window = {"start_time": T0 + 123_000_000, "end_time": T0 + 124_000_000}
+    for topic in ("/a", "/b", "/c"):
+        for options in ({}, window):
+            with source.open("rb") as a, target.open("rb") as b:
+                expected = [m.data for _, _, m in make_reader(a).iter_messages(topics=topic, **options)]
+                assert [m.data for _, _, m in make_reader(b).iter_messages(topics=topic, **options)] == expected
+    log = open_log(target)
+    assert sum(t.messages for t in log.topics) == 7600
+    container = log.containers[0]
+    assert isinstance(container, McapContainer)
+    for span in container.spans:
+        # Nothing but the chunk's index was read for these counts; the load goes through every message.
+        block = container.load(span)
+        ids, counts = np.unique(block.channel, return_counts=True)
+        assert dict(zip(ids.tolist(), counts.tolist(), strict=True)) == span.counts
+    log.close()
+
+
+def test_other_readers_agree(tmp_path: Path) -> None:
+    from rerun.chunk import McapReader
+    from rosbags.highlevel import AnyReader
+
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    with McapLogWriter(source) as writer:
+        writer.add_topic("/x", "std_msgs/msg/Float64")
+        stamps = T0 + np.arange(200_000) * 1000
+        writer.write([TopicBatch("/x", stamps, stamps, {"data": np.arange(200_000.0)})])
+    items, _ = _annotate(source, target)
+    assert len(items) > 5
+    with AnyReader([target]) as reader:
+        x = [c for c in reader.connections if c.topic == "/x"]
+        got = [(t, reader.deserialize(raw, c.msgtype).data) for c, t, raw in reader.messages(x)]
+    assert got == list(zip(stamps.tolist(), np.arange(200_000.0).tolist(), strict=True))
+    rows = {}
+    for chunk in McapReader(target).stream():
+        if not chunk.is_static:
+            rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    assert rows["/x"] == 200_000
+    assert rows["/ours"] == 7000
+
+
+def _damage_chunk(path: Path, number: int) -> tuple[int, int]:
+    """Flip a byte inside the compressed records of a chunk; returns the log times it held as [start, end)."""
+    with path.open("rb") as stream:
+        index = sorted(make_reader(stream).get_summary().chunk_indexes, key=lambda c: c.chunk_start_offset)[number]
+    data = bytearray(path.read_bytes())
+    data[index.chunk_start_offset + index.chunk_length - 100] ^= 0x40
+    path.write_bytes(data)
+    return index.message_start_time, index.message_end_time + 1
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_damaged_chunk_is_dropped_and_said(tmp_path: Path, compression: CompressionType) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source, compression=compression)
+    intact = _messages(source)
+    start, end = _damage_chunk(source, 2)
+    items, lost = _annotate(source, target)
+    assert [(x.kind, x.start_ns, x.end_ns) for x in lost] == [("bad-chunk", start, end)]
+    assert all(isinstance(item, RawChunk) for item in items)
+    assert _messages(target) == [m for m in intact if not start <= m[4] < end]  # type: ignore[operator]
+    assert _messages(target) != intact
+
+
+def test_a_chunk_without_crc_gets_one(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source, enable_crcs=False)
+    assert {c.uncompressed_crc for c in _chunks(source)} == {0}
+    _annotate(source, target, batches=False)
+    copied = _chunks(target)
+    assert [c.data for c in copied] == [c.data for c in _chunks(source)]
+    import zstandard
+
+    for chunk in copied:
+        content = zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=chunk.uncompressed_size)
+        assert chunk.uncompressed_crc == zlib.crc32(content) != 0
+
+
+def test_chunks_that_hold_what_is_left_out_are_taken_apart(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source, extra=("/old",))
+    items, lost = _annotate(source, target, leave_out=lambda topic: topic == "/old")
+    assert lost == ()
+    assert all(isinstance(item, RawMessage) for item in items)
+    assert _messages(target) == [m for m in _messages(source) if m[0] != "/old"]
+
+
+def test_chunks_of_what_is_left_out_alone_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source, first, second = (tmp_path / f"{name}.mcap" for name in ("source", "first", "second"))
+    _write(source)
+    _annotate(source, first)
+    loads: list[int] = []
+    load = McapContainer.load
+    monkeypatch.setattr(McapContainer, "load", lambda self, span, want=None: (loads.append(1), load(self, span))[1])
+    items, _ = _annotate(first, second, leave_out=lambda topic: topic == "/ours")
+    assert [c for c in _chunks(second) if c in _chunks(source)] == _chunks(source)
+    assert len(loads) == len(items) == len(_chunks(source)) < len(_chunks(first))
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_unchunked_messages_are_copied_one_by_one(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source, use_chunking=False)
+    items, _ = _annotate(source, target)
+    assert all(isinstance(item, RawMessage) for item in items)
+    assert sorted(_messages(target), key=repr) == sorted(_messages(source), key=repr)
+
+
+def test_a_window_takes_apart_only_the_chunks_at_its_ends(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source)
+    window = (T0 + 100_500_000, T0 + 400_500_000)
+    items, _ = _annotate(source, target, window=window)
+    kinds = ["chunk" if isinstance(item, RawChunk) else "message" for item in items]
+    inside = [c for c in _chunks(source) if c.message_start_time >= window[0] and c.message_end_time < window[1]]
+    assert kinds.count("chunk") == len(inside) >= 2
+    assert _messages(target) == [m for m in _messages(source) if window[0] <= m[4] < window[1]]  # type: ignore[operator]
+
+
+def _split(tmp_path: Path, swap: bool) -> ColumnarLog:
+    """Two files of one recording; in the second the ids of the topics are swapped, or the same."""
+    containers = []
+    for k in range(2):
+        path = tmp_path / f"{k}.mcap"
+        with McapLogWriter(path) as writer:
+            names = ["/b", "/a"] if swap and k else ["/a", "/b"]
+            ids = {
+                name: writer.add_raw_channel(
+                    name,
+                    schema_name=f"own/msg/{name[1].upper()}",
+                    schema_encoding="ros2msg",
+                    schema_data=TEXT,
+                    message_encoding="cdr",
+                    metadata={},
+                )
+                for name in names
+            }
+            times = T0 + 10**9 * k + np.arange(100)
+            writer.write(
+                [], [RawMessage(ids["/b" if i % 2 else "/a"], int(t), 0, i, b"x") for i, t in enumerate(times)]
+            )
+        containers.append(McapContainer(path))
+    return ColumnarLog(tmp_path, "rosbag2-mcap", containers)
+
+
+@pytest.mark.parametrize("swap", [False, True])
+def test_split_files_keep_their_chunks_while_their_ids_agree(tmp_path: Path, swap: bool) -> None:
+    target = tmp_path / "copy.mcap"
+    items, _ = _annotate(_split(tmp_path, swap), target)
+    assert isinstance(items[0], RawChunk)
+    assert [type(item) for item in items[1:]] == ([RawMessage] * 100 if swap else [RawChunk])
+    expected = _messages(tmp_path / "0.mcap") + _messages(tmp_path / "1.mcap")
+    assert _messages(target) == expected
+    with target.open("rb") as stream:
+        assert len(make_reader(stream).get_summary().channels) == 3
+
+
+def test_overlapping_chunks_keep_the_order_of_the_file(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    with source.open("wb") as stream:
+        writer = Writer(stream, chunk_size=1)  # a chunk a message pair: late, early, and one of both times
+        writer.start(profile="ros2", library="recorder")
+        channel = writer.register_channel("/a", "octets", 0)
+        for times in ((5, 9), (2, 6), (20, 21), (12, 13)):
+            writer._Writer__chunk_size = 10**6  # type: ignore[attr-defined]
+            for t in times:
+                writer.add_message(channel, T0 + t, bytes([t]), T0)
+            writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
+        writer.finish()
+    assert [c.message_start_time - T0 for c in _chunks(source)] == [5, 2, 20, 12]
+    _annotate(source, target, batches=False)
+    assert [c.message_start_time - T0 for c in _chunks(target)] == [5, 2, 12, 20]
+    assert _messages(target) == _messages(source)
+
+
+def test_ids_at_the_end_of_their_range_leave_room_for_more(tmp_path: Path) -> None:
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    with McapLogWriter(source) as writer:
+        id_ = writer.add_raw_channel(
+            "/a", schema_name="A", schema_encoding="ros2msg", schema_data=TEXT, message_encoding="cdr", metadata={},
+            channel_id=0xFFFF, schema_id=0xFFFF,
+        )  # fmt: skip
+        writer.write([], [RawMessage(id_, T0, T0, 0, b"1")])
+    items, _ = _annotate(source, target)
+    assert isinstance(items[0], RawChunk)
+    assert _messages(target) == _messages(source)
+    with target.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert {c.topic: c.id for c in summary.channels.values()} == {"/a": 0xFFFF, "/ours": 1}
+    assert set(summary.schemas) == {0xFFFF, 1}
+
+
+def test_a_taken_id_is_refused(tmp_path: Path) -> None:
+    channel = {"schema_encoding": "ros2msg", "schema_data": TEXT, "message_encoding": "cdr", "metadata": {}}
+    with McapLogWriter(tmp_path / "x.mcap") as writer:
+        writer.add_raw_channel("/a", schema_name="A", channel_id=3, schema_id=2, **channel)
+        with pytest.raises(OutputError, match="channel id"):
+            writer.add_raw_channel("/b", schema_name="A", channel_id=3, schema_id=2, **channel)
+        with pytest.raises(OutputError, match="schema id"):
+            writer.add_raw_channel("/b", schema_name="B", channel_id=4, schema_id=2, **channel)
+
+
+def test_an_index_that_omits_a_message_does_not_hide_it(tmp_path: Path) -> None:
+    """The copy's index names every message, even where the source's does not."""
+    source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
+    _write(source, n=30, chunk_size=10**6)
+    data = bytearray(source.read_bytes())
+    # The first message index (of one channel): give its last entry the place of its first.
+    at = next(i for i in range(len(data)) if data[i] == 7 and data[i + 1 : i + 9] == struct.pack("<Q", 6 + 160))
+    data[at + 15 + 144 : at + 15 + 160] = data[at + 15 : at + 15 + 16]
+    source.write_bytes(data)
+    items, _ = _annotate(source, target, batches=False)
+    assert isinstance(items[0], RawChunk)
+    with target.open("rb") as stream:
+        assert len(list(make_reader(stream).iter_messages())) == 30
