@@ -315,6 +315,44 @@ def _list_manoeuvres(manoeuvres: Any, as_json: bool) -> None:
     _stdout().print(table)
 
 
+@app.command(
+    epilog="""Examples:
+
+  pdhef identify drives/ -o car.toml --vehicle guess.toml
+
+  pdhef identify drive.mcap -o car.toml --vehicle guess.toml --end 150 --holdout 0"""
+)
+def identify(
+    logs: Annotated[list[str], typer.Argument(help="Logs with truth, folders that hold some, or glob patterns.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="vehicle.toml to write; a plot goes beside it.")],
+    vehicle: Annotated[
+        Path | None, typer.Option("--vehicle", "-v", help="Starting file: mass, geometry, sensor noise, priors.")
+    ] = None,
+    mapping: MappingFile = None,
+    start: Annotated[str | None, typer.Option("--start", help="Start of the slice of each log (as for run).")] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End of the slice of each log (as for run).")] = None,
+    holdout: Annotated[
+        float, typer.Option("--holdout", help="Share at the end of each slice that is only scored, once.")
+    ] = 0.25,
+    prefer_truth: TruthChoice = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Fit axle tyres, steering, roll gradient, biases and the filter's noise to drives with truth."""
+    from pdhef_logtool.config import load_config
+    from pdhef_logtool.summary import render_identification
+    from pdhef_logtool.training.identify_command import run_identification
+
+    settings = load_config(
+        None, {"vehicle": vehicle, "mapping": mapping, "start": start, "end": end, "prefer_truth": prefer_truth}
+    )
+    with _progress() as progress:
+        result = run_identification(logs, output, settings, holdout=holdout, progress=progress, warn=_warn)
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        render_identification(result, _stdout())
+
+
 @app.command()
 def estimators(as_json: JsonFlag = False) -> None:
     """List the estimators that run can use."""

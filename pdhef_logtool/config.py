@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pdhef_logtool.errors import UsageError
-from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, check_names
+from pdhef_logtool.estimators.registry import check_names
 
 ANNOTATE = ("full", "sidecar", "none")
 SENSOR_SUITES = ("full", "esp")
@@ -26,7 +26,7 @@ class RunConfig:
 
     Attributes
     ----------
-    estimators : names, in the order of the tables.
+    estimators : names, in the order of the tables; None = every one that the vehicle file suits.
     vehicle, mapping : files; None = the default sedan, recognised types.
     start, end : slice as given (:func:`parse_time`); None = the log's own.
     annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only.
@@ -36,7 +36,7 @@ class RunConfig:
     thresholds : limits that the figures are held against; None = no gate.
     """
 
-    estimators: tuple[str, ...] = DEFAULT_ESTIMATORS
+    estimators: tuple[str, ...] | None = None
     vehicle: Path | None = None
     mapping: Path | None = None
     start: str | None = None
@@ -50,7 +50,7 @@ class RunConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
-        document["estimators"] = list(self.estimators)
+        document["estimators"] = None if self.estimators is None else list(self.estimators)
         for key in _FILES:
             path = document[key]
             document[key] = None if path is None else Path(path).name
@@ -99,7 +99,8 @@ def _read_file(path: Path) -> dict[str, Any]:
 
 
 def _check(config: RunConfig) -> None:
-    check_names(config.estimators)
+    if config.estimators is not None:
+        check_names(config.estimators)
     for name, value, allowed in (
         ("annotate", config.annotate, ANNOTATE),
         ("sensors", config.sensors, SENSOR_SUITES),

@@ -30,7 +30,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import ClockModel, Mapping, fit_clocks, join_channels, merge_losses, read_signals
 from pdhef_logtool.signals import Channel, Loss, Signals
 from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.vehicle import VehicleParameters, correct_signals
 
 _LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
 
@@ -48,6 +48,7 @@ class DrivePlan:
     """
 
     mapping: Mapping
+    vehicle: VehicleParameters
     clocks: dict[str, ClockModel]
     alignment: AlignmentPlan
     truth: TruthPlan | None
@@ -126,6 +127,7 @@ def plan_drive(
             latency = estimate_truth_latency(gyro, rate)
     return DrivePlan(
         mapping=mapping,
+        vehicle=vehicle,
         clocks=clocks,
         alignment=alignment,
         truth=truth,
@@ -184,7 +186,7 @@ class DriveReader:
         self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int, share: float
     ) -> DriveWindow:
         plan = self.plan
-        aligned = align(signals, plan.alignment, start_ns, end_ns)
+        aligned = correct_signals(align(signals, plan.alignment, start_ns, end_ns), plan.vehicle)
         late = [
             Loss("late", _LATE, signals[name].source, start_ns, end_ns, count, "note")
             for name, count in count_late(signals, plan.alignment, start_ns, end_ns).items()

@@ -26,7 +26,7 @@ from pdhef_logtool.errors import (
     UsageError,
 )
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.registry import runnable
+from pdhef_logtool.estimators.registry import default_names, runnable
 from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -250,7 +250,10 @@ def _run_open_log(
     for name, reason in plan.alignment.unused:
         tell(f"{name} is not used: {reason}")
     estimators, skipped = runnable(
-        config.estimators, vehicle, plan.alignment.available, use_speed=config.sensors == "full"
+        config.estimators or default_names(vehicle),
+        vehicle,
+        plan.alignment.available,
+        use_speed=config.sensors == "full",
     )
     for skip in skipped:
         tell(f"{skip.name} is skipped: {skip.reason}")

@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from pdhef_logtool.training.identify_command import IdentifyResult
+
 _DEG = math.degrees(1.0)
 #: Column head, signal, metric, factor to the shown unit, digits.
 _COLUMNS: tuple[tuple[str, str, str, float, int], ...] = (
@@ -148,3 +150,33 @@ def _nis_ratio(values: Mapping[tuple[str, str, str, str], float | None], name: s
 
 def _cell(value: float | None, factor: float, digits: int) -> str:
     return "-" if value is None else f"{value * factor:.{digits}f}"
+
+
+def render_identification(result: IdentifyResult, console: Console) -> None:
+    """Print what was identified, how well it is known, and how well the filter then does."""
+    from rich.table import Table
+
+    found = result.identification
+    table = Table(box=None, header_style="bold")
+    for head, side in (("parameter", "left"), ("value", "right"), ("95 % interval", "right"), ("prior", "right")):
+        table.add_column(head, justify="right" if side == "right" else "left")
+    table.add_column("unit")
+    table.add_column("")
+    for p in found.parameters:
+        interval = f"{p.low:.4g} to {p.high:.4g}" if p.excited else "-"
+        remark = "filter noise" if p.tuning else "" if p.excited else "kept: not excited further"
+        table.add_row(p.name, f"{p.value:.5g}", interval, f"{p.prior:.4g}", p.unit, remark)
+    console.print(table)
+    console.print()
+    scores = Table("part", box=None, header_style="bold")
+    for head in ("seconds", "β = 0", "phy-ukf, starting file", "phy-ukf-tuned, identified"):
+        scores.add_column(head, justify="right")
+    for s in found.scores:
+        scores.add_row(
+            s.part, f"{s.seconds:.1f}", f"{s.zero_deg:.3f}°", f"{s.start_file_deg:.3f}°", f"{s.identified_deg:.3f}°"
+        )
+    console.print("sideslip RMSE", highlight=False)
+    console.print(scores)
+    for note in found.notes:
+        console.print(f"  {note}", highlight=False)
+    console.print(f"vehicle in {result.vehicle_file}, plot in {result.plot_file}", highlight=False, soft_wrap=True)

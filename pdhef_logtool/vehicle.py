@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from pdhef_logtool.errors import VehicleError
+from pdhef_logtool.signals import Signals
 
 GRAVITY_M_S2 = 9.80665
 
@@ -55,9 +59,10 @@ class Tyres(_Record):
 
 
 class Sensors(_Record):
-    """1-sigma white noise of the sensors; R of the sensor-level filters.
+    """1-sigma white noise of the sensors, which is R of the sensor-level filters, and their constant biases.
 
-    Defaults are METHOD §9's noise for a production car's sensors.
+    A bias is what the sensor reads too much; it is taken off before any estimator sees the signal. The defaults of
+    the noise are METHOD §9's for a production car's sensors.
     """
 
     ax_std_m_s2: Positive = 0.12
@@ -65,6 +70,9 @@ class Sensors(_Record):
     yaw_rate_std_rad_s: Positive = 0.004
     speed_std_m_s: Positive = 0.08
     steer_std_rad: Positive = 0.0008
+    ax_bias_m_s2: Finite = 0.0
+    ay_bias_m_s2: Finite = 0.0
+    yaw_rate_bias_rad_s: Finite = 0.0
 
 
 class FilterTuning(_Record):
@@ -96,6 +104,7 @@ class VehicleParameters(_Record):
     cg_height_m: NonNegative = 0.55
     wheel_radius_m: Positive = 0.30
     steering_ratio: Positive = 16.0
+    steer_offset_rad: Finite = 0.0
     roll_gradient_rad_per_m_s2: Finite = 0.0
     friction: Positive | None = None
     imu_position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
@@ -105,6 +114,7 @@ class VehicleParameters(_Record):
     tyres: Tyres
     filter: dict[str, FilterTuning] = Field(default_factory=dict)
     network: Network = Network()
+    identification: dict[str, str | float | int | list[str]] = Field(default_factory=dict)
 
     @property
     def wheelbase_m(self) -> float:
@@ -142,6 +152,18 @@ class VehicleParameters(_Record):
         cr = self.cornering_stiffness_n_per_rad(False, friction)
         lf, lr = self.cg_to_front_axle_m, self.cg_to_rear_axle_m
         return self.mass_kg * (lr * cr - lf * cf) / (self.wheelbase_m * cf * cr)
+
+
+def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
+    """Take the vehicle's steering offset and sensor biases off the signals; all estimators get the result."""
+    sensors = vehicle.sensors
+    return replace(
+        signals,
+        steer_rad=signals.steer_rad - vehicle.steer_offset_rad,
+        ax_m_s2=signals.ax_m_s2 - sensors.ax_bias_m_s2,
+        ay_m_s2=signals.ay_m_s2 - sensors.ay_bias_m_s2,
+        yaw_rate_rad_s=signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s,
+    )
 
 
 #: Table 3 of the paper, with METHOD §2's nominal axle tyres. Used when no vehicle file is given.
@@ -210,3 +232,43 @@ def vehicle_from_dict(raw: dict[str, Any], *, where: str) -> VehicleParameters:
     if not math.isfinite(vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)):
         raise VehicleError(expected="tyres with a finite stiffness", got="an infinite one", where=where)
     return vehicle
+
+
+def vehicle_to_toml(vehicle: VehicleParameters, comments: Mapping[str, str] | None = None) -> str:
+    """Return vehicle.toml of the parameters; reading it back gives the same parameters.
+
+    Parameters
+    ----------
+    comments : by dotted entry (``tyres.front.B``); ``""`` stands at the head of the file.
+    """
+    notes = dict(comments or {})
+    lines = [f"# {line}" for line in notes.get("", "").splitlines()]
+    document = vehicle.model_dump(exclude_none=True)
+    _toml_table(document, (), notes, lines)
+    return "\n".join(lines).strip("\n") + "\n"
+
+
+def _toml_table(table: Mapping[str, Any], path: tuple[str, ...], notes: Mapping[str, str], lines: list[str]) -> None:
+    plain = {k: v for k, v in table.items() if not isinstance(v, Mapping) or k == "r_std"}
+    if path and plain:
+        lines += ["", f"[{'.'.join(_toml_key(p) for p in path)}]"]
+    for key, value in plain.items():
+        note = notes.get(".".join((*path, key)))
+        lines.append(f"{_toml_key(key)} = {_toml_value(value)}" + (f"  # {note}" if note else ""))
+    for key, value in table.items():
+        if key not in plain:
+            _toml_table(value, (*path, key), notes, lines)
+
+
+def _toml_key(key: str) -> str:
+    return key if key and all(c.isascii() and (c.isalnum() or c in "-_") for c in key) else json.dumps(key)
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return repr(value)

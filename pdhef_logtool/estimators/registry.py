@@ -15,9 +15,12 @@ DESCRIPTIONS: dict[str, str] = {
     "kinematic": "leaky integral of a_y - v_x r",
     "open-loop": "nominal single-track model from steering and speed alone",
     "phy-ukf": "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
+    "phy-ukf-tuned": "the same with the noise of an identified vehicle file, corrected for body roll",
 }
 
-DEFAULT_ESTIMATORS = tuple(DESCRIPTIONS)
+DEFAULT_ESTIMATORS = ("zero", "gyro", "kinematic", "open-loop", "phy-ukf")
+#: Run by default as well where the vehicle file has what it needs.
+TUNED_ESTIMATORS = ("phy-ukf-tuned",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +64,18 @@ def make_estimator(name: str, vehicle: VehicleParameters, *, use_speed: bool = T
         from pdhef_logtool.estimators.open_loop import OpenLoop
 
         return OpenLoop(vehicle)
+    if name == "phy-ukf-tuned":
+        from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
+
+        return physics_ukf_tuned(vehicle, use_speed=use_speed)
     from pdhef_logtool.estimators.physics import PhysicsUkf
 
     return PhysicsUkf(vehicle, use_speed=use_speed)
+
+
+def default_names(vehicle: VehicleParameters) -> tuple[str, ...]:
+    """Return the estimators that run when none are named."""
+    return DEFAULT_ESTIMATORS + tuple(n for n in TUNED_ESTIMATORS if n in vehicle.filter)
 
 
 def runnable(
@@ -73,6 +85,9 @@ def runnable(
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
     for name in names:
+        if name in TUNED_ESTIMATORS and name not in vehicle.filter:
+            skipped.append(Skipped(name, f"the vehicle file has no [filter.{name}]; pdhef identify writes one"))
+            continue
         estimator = make_estimator(name, vehicle, use_speed=use_speed)
         missing = sorted(estimator.needs - available)
         if missing:

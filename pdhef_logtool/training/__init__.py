@@ -1,0 +1,1 @@
+"""Learning from drives with truth: vehicle identification."""
