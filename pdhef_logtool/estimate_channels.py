@@ -28,12 +28,13 @@ GAP_PERIODS = 3.0
 class RecordedEstimate:
     """A recorded estimate on its own stamps.
 
-    ``channels`` are its quantities on their own stamps, NaN left out; ``samples`` counts the messages by source.
+    ``channels`` are its quantities on their own stamps, NaN left out; ``claimed`` are the names of all that the
+    estimate consists of; ``samples`` counts the messages by source.
     """
 
     track: StateTrack
     channels: Mapping[str, Channel]
-    tells_divergence: bool
+    claimed: frozenset[str]
     samples: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -97,7 +98,7 @@ def read_estimate(
     track, notes = _track(source.name, stamps_ns, channels, covariance)
     finite = {n: _without_nan(c) for n, c in channels.items() if n in BASE_ORDER}
     samples = {s.label: len(channels[n]) for n, s in mapping.signals.items()}
-    return RecordedEstimate(track, finite, "diverged" in channels, samples, notes), losses
+    return RecordedEstimate(track, finite, frozenset(channels), samples, notes), losses
 
 
 def _without_nan(channel: Channel) -> Channel:

@@ -76,6 +76,9 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
 
 
+_RECORDED = "read from the log: nothing says whether it is causal, or what it was computed from"
+
+
 def score_log(
     argument: str,
     config: RunConfig,
@@ -219,7 +222,7 @@ class _Scoring:
         all_losses = merge_losses([log.lost, losses, truth_losses, sensor_losses])
         facts = report_facts(
             log, self.log_input, sha256, plan, self.missing, self.vehicle,
-            [EstimatorFacts(r.track.name, causal=True, notes=r.notes) for r in recorded],
+            [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded],
             rows, events, all_losses, self.warnings, samples,
         )  # fmt: skip
         read = {s.topic for e in self.estimates for s in e.signals.values()}
@@ -301,7 +304,13 @@ class _Scoring:
             )
             if not any(row.metric == "rmse" for row in figures):
                 self.tell(f"{r.track.name}: nowhere are estimate and truth known together, so there are no errors")
-            rows += [row for row in figures if row.metric != "diverged" or r.tells_divergence]
+            # What the estimate does not claim is not missing from it.
+            silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(r.track, n)).any()}
+            rows += [
+                row
+                for row in figures
+                if row.signal not in silent and (row.metric != "diverged" or "diverged" in r.claimed)
+            ]
         return rows, dependent
 
     def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:
