@@ -68,8 +68,16 @@ def _chunks(path: Path) -> list[Chunk]:
 def _messages(path: Path, without: str = "/ours") -> list[tuple[object, ...]]:
     with path.open("rb") as stream:
         return [
-            (c.topic, c.message_encoding, tuple(c.metadata.items()), s and (s.name, s.encoding, s.data))
-            + (m.log_time, m.publish_time, m.sequence, m.data)
+            (
+                c.topic,
+                c.message_encoding,
+                tuple(c.metadata.items()),
+                s and (s.name, s.encoding, s.data),
+                m.log_time,
+                m.publish_time,
+                m.sequence,
+                m.data,
+            )
             for s, c, m in make_reader(stream, validate_crcs=True).iter_messages()
             if c.topic != without
         ]

@@ -1,0 +1,93 @@
+"""A full annotated copy of the one-hour log: two estimators beside the source, whose chunks pass through as they are.
+
+Peers: the same copy with every message of the source taken apart and compressed anew by our own writer, and mcap's
+reader and Writer copying the source alone (a tenth, scaled by 10).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measuring import CACHE, Figure, best_seconds
+from benchmarks.one_hour_log import HOUR_S, START_NS, hour_log
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.source_copy import iterate_copy, iterate_raw, register_channels
+from pdhef_logtool.logs.writer import McapLogWriter
+from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
+from pdhef_logtool.tracks import StateTrack, make_track
+
+_SLICE = 10
+_SLICE_END_NS = START_NS + HOUR_S // _SLICE * 10**9
+_WINDOW_S = 60
+_REPORT = {"log": {"name": "hour", "end_ns": START_NS}, "truth": {"available": False}, "metrics": []}
+
+
+def _track(name: str, begin_s: int) -> StateTrack:
+    stamps_ns = START_NS + begin_s * 10**9 + np.arange(_WINDOW_S * 100, dtype=np.int64) * 10_000_000
+    t = (stamps_ns - START_NS) * 1e-9
+    return make_track(
+        name, stamps_ns, vx_m_s=20.0 + np.sin(t), vy_m_s=0.1 * np.sin(t), yaw_rate_rad_s=0.2 * np.cos(t),
+        x_m=20.0 * t, y_m=np.sin(t), yaw_rad=0.1 * np.sin(t),
+    )  # fmt: skip
+
+
+def annotate(path: Path) -> None:
+    """Write the annotated copy as a run does."""
+    log = open_log(path)
+    sink = AnnotatedMcapSink(CACHE / "annotated.mcap", log)
+    for begin_s in range(0, HOUR_S, _WINDOW_S):
+        for name in ("pd-hef", "phy-ukf"):
+            sink.append(_track(name, begin_s))
+    sink.finish(_REPORT)
+    log.close()
+
+
+def copy_ours(path: Path, whole: bool, end_ns: int | None = None) -> None:
+    """Copy the source alone, by chunks or by messages."""
+    log = open_log(path)
+    with McapLogWriter(CACHE / "copy.mcap") as writer:
+        channels = register_channels(writer, log)
+        iterate = iterate_copy if whole else iterate_raw
+        writer.write([], iterate(log, channels, None, end_ns))
+    log.close()
+
+
+def copy_with_mcap(path: Path, end_ns: int) -> None:
+    """Copy the source with mcap's reader and Writer."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    with path.open("rb") as file, (CACHE / "copy_peer.mcap").open("wb") as out:
+        reader, writer = make_reader(file, validate_crcs=True), Writer(out)
+        writer.start(profile="ros2", library="peer")
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages(end_time=end_ns):
+            if channel.id not in channels:
+                id_ = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, id_)
+            to = channels[channel.id]
+            writer.add_message(to, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.finish()
+
+
+def run() -> list[Figure]:
+    """Measure."""
+    path = hour_log()
+    ways = {
+        "annotate": lambda: annotate(path),
+        "chunks": lambda: copy_ours(path, whole=True),
+        "messages": lambda: copy_ours(path, False, _SLICE_END_NS),
+        "mcap": lambda: copy_with_mcap(path, _SLICE_END_NS),
+    }
+    seconds = best_seconds(ways)
+    chunks, messages, mcap = seconds["chunks"], _SLICE * seconds["messages"], _SLICE * seconds["mcap"]
+    return [
+        Figure("copying", "ours: full annotated copy (1.26 M + 1.44 M messages)", seconds["annotate"], "s"),
+        Figure("copying", "ours: source alone, chunks as they are", chunks, "s"),
+        Figure("copying", "ours: source alone, message by message", messages, "s"),
+        Figure("copying", "mcap reader to Writer, source alone", mcap, "s"),
+        Figure("copying", "message by message / chunks", messages / chunks, "x"),
+        Figure("copying", "mcap / chunks", mcap / chunks, "x"),
+    ]

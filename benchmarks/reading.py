@@ -1,0 +1,117 @@
+"""Reading a mapped run of the one-hour log: against decompression alone, rosbags and mcap; peak memory with images.
+
+All ways read the same seven fields of four topics with every CRC that the way can check. The floor decompresses every
+chunk and checks its CRC, and does nothing else. The peers decode a tenth of the hour (scaled by 10).
+"""
+
+from __future__ import annotations
+
+import sys
+import zlib
+from pathlib import Path
+
+from benchmarks.measuring import Figure, best_seconds, peak_bytes
+from benchmarks.one_hour_log import HOUR_S, MAPPED, START_NS, hour_log, image_log, short_log
+
+#: Share of the hour that the slow ways decode.
+_SLICE = 10
+_SLICE_END_NS = START_NS + HOUR_S // _SLICE * 10**9
+
+
+def read_mapped(path: Path) -> int:
+    """Read the mapped fields with our reader; returns the number of messages."""
+    from pdhef_logtool.logs.open_log import open_log
+
+    log = open_log(path)
+    try:
+        columns = log.read(MAPPED)
+        if log.lost:
+            raise SystemExit(f"{path.name} is damaged; delete it")
+        return sum(len(c) for c in columns.values())
+    finally:
+        log.close()
+
+
+def decompress_all(path: Path) -> int:
+    """Decompress every chunk and check its CRC, from the summary's index."""
+    import zstandard
+    from mcap.reader import make_reader
+
+    decompressor = zstandard.ZstdDecompressor()
+    total = 0
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        if summary is None:
+            raise SystemExit(f"{path.name} has no summary; delete it")
+        for index in summary.chunk_indexes:
+            file.seek(index.chunk_start_offset)
+            record = file.read(index.chunk_length)
+            stored = memoryview(record)[9 + 40 + len(index.compression) :]
+            content = decompressor.decompress(stored, max_output_size=index.uncompressed_size)
+            if zlib.crc32(content) != int.from_bytes(record[33:37], "little"):
+                raise SystemExit(f"{path.name} is damaged; delete it")
+            total += len(content)
+    return total
+
+
+def decode_with_rosbags(path: Path, end_ns: int) -> int:
+    """Decode the mapped topics with rosbags; returns the number of messages."""
+    from rosbags.highlevel import AnyReader
+
+    n = 0
+    with AnyReader([path]) as reader:
+        connections = [c for c in reader.connections if c.topic in MAPPED]
+        for connection, _, data in reader.messages(connections, stop=end_ns):
+            reader.deserialize(data, connection.msgtype)
+            n += 1
+    return n
+
+
+def decode_with_mcap(path: Path, end_ns: int) -> int:
+    """Decode the mapped topics with mcap and mcap-ros2-support; returns the number of messages."""
+    from mcap.reader import make_reader
+    from mcap_ros2.decoder import DecoderFactory
+
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        return sum(1 for _ in reader.iter_decoded_messages(topics=list(MAPPED), end_time=end_ns))
+
+
+def run() -> list[Figure]:
+    """Measure."""
+    path = hour_log()
+    messages = read_mapped(path)
+    fast = best_seconds({"floor": lambda: decompress_all(path), "ours": lambda: read_mapped(path)}, rounds=5)
+    slow = {"rosbags": lambda: decode_with_rosbags(path, _SLICE_END_NS)}
+    try:
+        import mcap_ros2  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        slow["mcap + mcap_ros2"] = lambda: decode_with_mcap(path, _SLICE_END_NS)
+    slice_messages = decode_with_rosbags(path, _SLICE_END_NS)
+    scale = messages / slice_messages
+    peers = {name: scale * seconds for name, seconds in best_seconds(slow, rounds=2).items()}
+    ours = fast["ours"]
+    without = peak_bytes("benchmarks.reading", str(short_log()))
+    with_images = peak_bytes("benchmarks.reading", str(image_log()))
+    figures = [
+        Figure("reading", "floor: decompress all, CRC", fast["floor"], "s"),
+        Figure("reading", "ours: 7 fields of 4 topics, CRC", ours, "s"),
+        Figure("reading", "ours / floor", ours / fast["floor"], "x", 2.0, "at most"),
+    ]
+    for name, seconds in peers.items():
+        target = (35.0, "at least") if name == "rosbags" else (None, "")
+        figures += [
+            Figure("reading", f"{name}: decode the same topics", seconds, "s"),
+            Figure("reading", f"{name} / ours", seconds / ours, "x", *target),
+        ]
+    figures += [
+        Figure("reading", "peak memory, 6 min", without / 1e6, "MB"),
+        Figure("reading", "more with 20 x image bytes", (with_images - without) / 1e6, "MB", 100.0, "at most"),
+    ]
+    return figures
+
+
+if __name__ == "__main__":
+    read_mapped(Path(sys.argv[1]))
