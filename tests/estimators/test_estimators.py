@@ -17,12 +17,15 @@ from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, with
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, check_names, make_estimator, runnable
 from pdhef_logtool.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
 from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import AxleTyre, Tyres, default_vehicle
+from pdhef_logtool.vehicle import AxleTyre, FilterTuning, Tyres, default_vehicle
 
-VEHICLE = default_vehicle()
+#: With the noise that ``phy-ukf-tuned`` looks for in the vehicle file.
+TUNING = FilterTuning(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
+VEHICLE = default_vehicle().model_copy(update={"filter": {"phy-ukf-tuned": TUNING}})
 NAMES = tuple(DESCRIPTIONS)
 #: Those that claim a lateral velocity by a model or by integration.
-CLAIMING = ("kinematic", "open-loop", "phy-ukf")
+FILTERS = ("phy-ukf", "phy-ukf-tuned")
+CLAIMING = ("kinematic", "open-loop", *FILTERS)
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
     update={
         "tyres": Tyres(
@@ -272,7 +275,7 @@ def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
     for column in columns:
         assert np.isfinite(getattr(track, column)[ok]).all(), column
         assert np.isnan(getattr(track, column)[~ok]).all(), f"{column} claims something where it is not valid"
-    if name == "phy-ukf":
+    if name in FILTERS:
         P = track.covariance[ok]
         np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
         assert (np.linalg.eigvalsh(P) > 0).all()
@@ -340,7 +343,7 @@ def test_a_vehicle_that_no_step_can_follow_claims_nothing_infinite(name, delay_s
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"):
         assert np.isfinite(getattr(track, column)[track.valid]).all()
         assert np.isnan(getattr(track, column)[~track.valid]).all()
-    if name == "phy-ukf":
+    if name in FILTERS:
         assert np.isfinite(track.covariance[track.valid]).all()
 
 
@@ -380,7 +383,7 @@ def test_reverse_and_manoeuvring_are_finite_and_signed(name):
     moving = made.time_s > 1.0
     assert worst(track.vx_m_s - made.vx, moving) < 0.5
     assert worst(track.yaw_rate_rad_s - made.r, moving) < 0.15
-    if name in ("open-loop", "phy-ukf"):
+    if name in ("open-loop", *FILTERS):
         assert worst(track.vy_m_s - made.vy, moving & (np.abs(made.vx) < 1.4)) < 0.3
 
 
@@ -403,9 +406,20 @@ def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
 def test_what_cannot_run_is_skipped_with_the_reason():
     estimators, skipped = runnable(NAMES, VEHICLE, frozenset({"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"}))
     assert [e.name for e in estimators] == ["zero", "gyro", "kinematic"]
-    assert [s.name for s in skipped] == ["open-loop", "phy-ukf"]
+    assert [s.name for s in skipped] == ["open-loop", *FILTERS]
     assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
     assert runnable(NAMES, VEHICLE, frozenset(ALIGNED_SIGNALS))[1] == []
+    skipped = runnable(NAMES, default_vehicle(), frozenset(ALIGNED_SIGNALS))[1]
+    assert [s.name for s in skipped] == ["phy-ukf-tuned"]
+    assert "[filter.phy-ukf-tuned]" in skipped[0].reason
+
+
+def test_the_tuned_filter_takes_its_noise_from_the_vehicle_file():
+    tuned, plain_filter = make_estimator("phy-ukf-tuned", VEHICLE), make_estimator("phy-ukf", VEHICLE)
+    assert tuned.q_std == (0.05, 0.02, 0.02, plain_filter.q_std[3])  # what the file leaves out stays
+    assert tuned.measurement_std.tolist() == [0.8, *plain_filter.measurement_std[1:]]
+    assert tuned.roll_correction
+    assert not plain_filter.roll_correction
 
 
 @pytest.mark.parametrize("names", [(), ("zero", "zero"), ("phy-ufk",)])
