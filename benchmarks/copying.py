@@ -63,7 +63,7 @@ def copy_with_mcap(path: Path, end_ns: int) -> None:
         reader, writer = make_reader(file, validate_crcs=True), Writer(out)
         writer.start(profile="ros2", library="peer")
         channels: dict[int, int] = {}
-        for schema, channel, message in reader.iter_messages(end_time=end_ns):
+        for schema, channel, message in reader.iter_messages(ending_before=end_ns):
             if channel.id not in channels:
                 id_ = writer.register_schema(schema.name, schema.encoding, schema.data) if schema else 0
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, id_)

@@ -74,7 +74,7 @@ def decode_with_mcap(path: Path, end_ns: int) -> int:
 
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        return sum(1 for _ in reader.iter_decoded_messages(topics=list(MAPPED), end_time=end_ns))
+        return sum(1 for _ in reader.iter_decoded_messages(topics=list(MAPPED), ending_before=end_ns))
 
 
 def run() -> list[Figure]:

@@ -112,7 +112,7 @@ def test_every_message_is_found_through_the_copied_indexes(tmp_path: Path) -> No
     source, target = tmp_path / "source.mcap", tmp_path / "copy.mcap"
     _write(source)
     _annotate(source, target)
-    window = {"start_time": T0 + 123_000_000, "end_time": T0 + 124_000_000}
+    window = {"starting_at": T0 + 123_000_000, "ending_before": T0 + 124_000_000}
     for topic in ("/a", "/b", "/c"):
         for options in ({}, window):
             with source.open("rb") as a, target.open("rb") as b:

@@ -1,0 +1,268 @@
+"""Columns of random message types against rosbags' deserialiser, message by message; payloads that nobody reads."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.logs.mcap_log import McapContainer
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+
+T0 = 1_700_000_000_000_000_000
+SEPARATOR = "\n" + "=" * 80 + "\nMSG: "
+NUMBERS = {
+    "bool": np.bool_, "int8": np.int8, "uint8": np.uint8, "int16": np.int16, "uint16": np.uint16,
+    "int32": np.int32, "uint32": np.uint32, "int64": np.int64, "uint64": np.uint64,
+    "float32": np.float32, "float64": np.float64,
+}  # fmt: skip
+KINDS = ("plain", "fixed", "sequence")
+
+#: A member: (type, kind, fixed length); a struct is a list of members, where a type may be a struct again.
+_primitive = st.tuples(st.sampled_from([*NUMBERS, "string"]), st.sampled_from(KINDS), st.integers(1, 4))
+
+
+def _struct(depth: int) -> st.SearchStrategy[list[Any]]:
+    member = _primitive
+    if depth:
+        inner = st.tuples(_struct(depth - 1), st.sampled_from(KINDS), st.integers(1, 3))
+        member = st.one_of(_primitive, _primitive, inner)
+    return st.lists(member, min_size=1, max_size=4)
+
+
+def _definition(root: list[Any]) -> tuple[str, dict[str, list[Any]]]:
+    """Return the ros2msg text of own/msg/T0 and the members of every type by name."""
+    types: dict[str, list[Any]] = {}
+
+    def name_of(struct: list[Any]) -> str:
+        name = f"T{len(types)}"
+        types[name] = struct
+        texts[name] = "\n".join(
+            (type_ if isinstance(type_, str) else f"own/{name_of(type_)}")
+            + {"plain": "", "fixed": f"[{n}]", "sequence": "[]"}[kind]
+            + f" m{i}"
+            for i, (type_, kind, n) in enumerate(struct)
+        )
+        names[id(struct)] = name
+        return name
+
+    texts: dict[str, str] = {}
+    names: dict[int, str] = {}
+    name_of(root)
+    text = texts["T0"] + "".join(f"{SEPARATOR}own/{n}\n{t}" for n, t in texts.items() if n != "T0")
+    return text, {
+        name: [(t if isinstance(t, str) else names[id(t)], k, n) for t, k, n in s] for name, s in types.items()
+    }
+
+
+def _random_message(store: Any, types: dict[str, list[Any]], name: str, rng: np.random.Generator, lengths: Any) -> Any:
+    def value(type_: str) -> Any:
+        if type_ in types:
+            return _random_message(store, types, type_, rng, lengths)
+        if type_ == "string":
+            return "x" * lengths()
+        return numbers(type_, 1)[0].item()
+
+    def numbers(type_: str, n: int) -> Any:
+        dtype = np.dtype(NUMBERS[type_])
+        if dtype.kind == "b":
+            return rng.random(n) < 0.5
+        if dtype.kind == "f":
+            return rng.standard_normal(n).astype(dtype)
+        return rng.integers(np.iinfo(dtype).min, np.iinfo(dtype).max, n, dtype=dtype, endpoint=True)
+
+    members = {}
+    for i, (type_, kind, n) in enumerate(types[name]):
+        n = n if kind == "fixed" else lengths()
+        if kind == "plain":
+            members[f"m{i}"] = value(type_)
+        elif type_ in NUMBERS:
+            members[f"m{i}"] = numbers(type_, n)
+        else:
+            members[f"m{i}"] = [value(type_) for _ in range(n)]
+    return store.types[f"own/msg/{name}"](**members)
+
+
+def _numeric_paths(types: dict[str, list[Any]], name: str, steps: str = "") -> Iterator[str]:
+    """Yield a path to every number: of plain ones, of whole arrays, of the first two elements of arrays."""
+    for i, (type_, kind, n) in enumerate(types[name]):
+        path = f"{steps}m{i}"
+        elements = [path] if kind == "plain" else [f"{path}[{k}]" for k in range(min(n, 2) if kind == "fixed" else 2)]
+        if type_ in NUMBERS:
+            yield from dict.fromkeys([path, *elements])
+        elif type_ in types:
+            for element in elements:
+                yield from _numeric_paths(types, type_, f"{element}.")
+
+
+def _expected(message: Any, path: str) -> Any:
+    """Follow a path through a message that rosbags made; None where a sequence is too short."""
+    at = message
+    for part in path.replace("[", ".[").split("."):
+        if part.startswith("["):
+            k = int(part[1:-1])
+            if k >= len(at):
+                return None
+            at = at[k]
+        else:
+            at = getattr(at, part)
+    return at
+
+
+# Without shrinking, which takes minutes through files; the failing type is printed whole.
+@settings(max_examples=60, deadline=None, derandomize=True, report_multiple_bugs=False, phases=[Phase.generate])
+@given(root=_struct(2), seed=st.integers(0, 2**32 - 1), change=st.sampled_from(["never", "once", "always"]))
+def test_columns_equal_the_independent_deserialiser(
+    tmp_path_factory: pytest.TempPathFactory, root: list[Any], seed: int, change: str
+) -> None:
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    text, types = _definition(root)
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(text, "own/msg/T0"))
+    rng = np.random.default_rng(seed)
+    n = 40
+    payloads = []
+    for i in range(n):
+        length = 2 if change == "once" and i >= n // 2 else 1
+        lengths = (lambda: int(rng.integers(0, 4))) if change == "always" else (lambda length=length: length)
+        message = _random_message(store, types, "T0", rng, lengths)
+        payloads.append(bytes(store.serialize_cdr(message, "own/msg/T0")))
+    path = tmp_path_factory.mktemp("columns") / "x.mcap"
+    with McapLogWriter(path) as writer:
+        channel = writer.add_raw_channel(
+            "/t", schema_name="own/msg/T0", schema_encoding="ros2msg", schema_data=text.encode(),
+            message_encoding="cdr", metadata={},
+        )  # fmt: skip
+        other = writer.add_raw_channel(
+            "/o", schema_name="", schema_encoding="", schema_data=b"", message_encoding="octets", metadata={}
+        )
+        for first in range(0, n, 8):  # a chunk each; the layout changes in the middle of one
+            part = enumerate(payloads[first : first + 8], first)
+            raws = [(RawMessage(channel, T0 + i, T0, i, p), RawMessage(other, T0 + i, T0, i, p[:i])) for i, p in part]
+            writer.write([], [message for pair in raws for message in pair])
+    messages = [store.deserialize_cdr(p, "own/msg/T0") for p in payloads]
+    log = open_log(path)
+    assert len(log.containers[0].spans) == 5  # type: ignore[attr-defined]
+    paths = list(_numeric_paths(types, "T0"))
+    read = log.read({"/t": paths})["/t"].fields
+    assert log.lost == ()
+    log.close()
+    for path_ in paths:
+        column, values = read[path_], [_expected(m, path_) for m in messages]
+        if column.ndim == 1:
+            expected = np.array([np.nan if v is None else float(v) for v in values])
+        else:
+            expected = np.full((n, column.shape[1]), np.nan)
+            for row, v in zip(expected, values, strict=True):
+                if v is not None:
+                    row[: len(v)] = v
+        np.testing.assert_array_equal(column, expected, err_msg=path_)
+
+
+def _with_payloads(path: Path, payload_bytes: int, own_chunks: bool) -> None:
+    """Write 200 numbers, and as many payloads of another topic between them or behind them."""
+    from pdhef_logtool.logs.schema_files import message_definition
+
+    name = "std_msgs/msg/Float64"
+    noise = np.random.default_rng(0).bytes(payload_bytes)
+    with McapLogWriter(path) as writer:
+        channel = writer.add_raw_channel(
+            "/x", schema_name=name, schema_encoding="ros2msg", schema_data=message_definition(name).encode(),
+            message_encoding="cdr", metadata={},
+        )  # fmt: skip
+        image = writer.add_raw_channel(
+            "/image", schema_name="", schema_encoding="", schema_data=b"", message_encoding="octets", metadata={}
+        )
+        numbers = [RawMessage(channel, T0 + i, T0, i, b"\0\1\0\0" + np.float64(i).tobytes()) for i in range(200)]
+        images = [RawMessage(image, T0 + i, T0, i, noise) for i in range(200)] if payload_bytes else []
+        if own_chunks:
+            writer.write([], numbers)
+            writer.write([], images)
+        else:
+            writer.write([], sorted([*numbers, *images], key=lambda m: m.log_time_ns))
+
+
+def _peak_bytes(path: Path) -> int:
+    log = open_log(path)
+    tracemalloc.start()
+    read = log.read({"/x": ["data"]})["/x"].fields["data"]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    log.close()
+    np.testing.assert_array_equal(read, np.arange(200.0))
+    return peak
+
+
+def test_memory_does_not_grow_with_payloads_that_nobody_reads(tmp_path: Path) -> None:
+    _with_payloads(tmp_path / "none.mcap", 0, own_chunks=False)
+    _with_payloads(tmp_path / "mixed.mcap", 300_000, own_chunks=False)
+    _peak_bytes(tmp_path / "none.mcap")  # imports
+    # 60 MB of payload; a few chunks of 1 MB are held while they are read.
+    assert _peak_bytes(tmp_path / "mixed.mcap") < _peak_bytes(tmp_path / "none.mcap") + 6_000_000
+
+
+def test_chunks_without_a_mapped_topic_are_not_even_decompressed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _with_payloads(tmp_path / "x.mcap", 300_000, own_chunks=True)
+    log = open_log(tmp_path / "x.mcap")
+    decompressed: list[int] = []
+    content = McapContainer.chunk_content
+
+    def counting(self: McapContainer, start: int, end: int) -> bytes:
+        found = content(self, start, end)
+        decompressed.append(len(found))
+        return found
+
+    monkeypatch.setattr(McapContainer, "chunk_content", counting)
+    log.read({"/x": ["data"]})
+    assert decompressed == [200 * (31 + 12)]
+    log.read({"/image": []})
+    assert sum(decompressed[1:]) == 200 * (31 + 300_000)
+    log.close()
+
+
+def test_big_payloads_are_not_copied_for_the_field_beside_them(tmp_path: Path) -> None:
+    """A mapped stamp of an image costs the stamp, not the image."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    name = "sensor_msgs/msg/Image"
+    time, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    path = tmp_path / "x.mcap"
+    with McapLogWriter(path) as writer:
+        definition = store.generate_msgdef(name, ros_version=2)[0]
+        channel = writer.add_raw_channel(
+            "/image", schema_name=name, schema_encoding="ros2msg", schema_data=definition.encode(),
+            message_encoding="cdr", metadata={},
+        )  # fmt: skip
+        pixels = np.zeros(1000 * 300, dtype=np.uint8)
+        raws = []
+        for i in range(60):
+            image = store.types[name](
+                header=header(stamp=time(sec=i, nanosec=5), frame_id="camera"), height=300, width=1000,
+                encoding="mono8", is_bigendian=0, step=1000, data=pixels,
+            )  # fmt: skip
+            raws.append(RawMessage(channel, T0 + i, T0, i, bytes(store.serialize_cdr(image, name))))
+        writer.write([], raws)
+    log = open_log(path)
+    log.read({"/image": ["header.stamp"]}, T0, T0 + 1)  # imports
+    (span, *_) = log.containers[0].spans  # type: ignore[attr-defined]
+    block = log.load(0, span)  # type: ignore[attr-defined]
+    plan = log._cached_plan("/image", ("header.stamp", "height"))  # type: ignore[attr-defined]
+    tracemalloc.start()
+    part = log._decode(plan, 0, span, channel, block, np.arange(len(block)))  # type: ignore[attr-defined]
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    log.close()
+    assert len(block) >= 3
+    assert part.fields["header.stamp"].tolist() == [i * 10**9 + 5 for i in range(len(block))]
+    assert peak < 500_000 < block.length.sum()
