@@ -32,6 +32,10 @@ from pdhef_logtool.signals import Channel, Loss, Signals
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import VehicleParameters, correct_signals
 
+#: A silence of a channel is told from here on, and from this many of its periods.
+TOLD_GAP_S = 1.0
+TOLD_GAP_PERIODS = 10.0
+_JUMP = "samples whose stamps jump back behind what had been processed were dropped"
 _LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
 
 
@@ -164,6 +168,12 @@ class DriveReader:
             self.losses = merge_losses([self.losses, part.losses])
             for store, new in ((signals, part.signals), (truth, part.truth)):
                 for name, channel in new.items():
+                    self.losses = merge_losses([self.losses, _gaps(store.get(name), channel)])
+                    back = 0 if done_ns is None else int(np.searchsorted(channel.stamps_ns, done_ns - margin))
+                    if back:
+                        first, last_back = int(channel.stamps_ns[0]), int(channel.stamps_ns[back - 1]) + 1
+                        jump = Loss("time-jump", _JUMP, channel.source, first, last_back, back)
+                        self.losses = merge_losses([self.losses, [jump]])
                     counts[channel.source] = counts.get(channel.source, 0) + len(channel)
                     store[name] = join_channels([store[name], channel]) if name in store else channel
             self.samples = counts
@@ -207,3 +217,26 @@ def _since(channel: Channel, stamp_ns: int) -> Channel:
         arrival_ns=channel.arrival_ns[first:],
         values=channel.values[first:],
     )
+
+
+def _gaps(before: Channel | None, channel: Channel) -> list[Loss]:
+    """Return the silences within a window's channel and between it and the window before."""
+    stamps = channel.stamps_ns
+    if before is not None and len(before):
+        stamps = np.concatenate([before.stamps_ns[-1:], stamps])
+    if stamps.shape[0] < 3:
+        return []
+    steps = np.diff(stamps)
+    least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
+    return [
+        Loss(
+            "gap",
+            f"no samples for {steps[i] * 1e-9:.2f} s",
+            channel.source,
+            int(stamps[i]),
+            int(stamps[i + 1]),
+            1,
+            "note",
+        )
+        for i in np.flatnonzero(steps > least)
+    ]

@@ -86,7 +86,8 @@ def _render_log(one: LogResult, console: Console) -> None:
     )
     for loss in report["losses"]:
         word = "lost" if loss["severity"] == "lost" else "note"
-        count = "" if loss["count"] is None else f"{loss['count']} × "
+        told = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
+        count = "" if told else f"{loss['count']} × "
         span = ""
         if loss["start_ns"] is not None and loss["end_ns"] is not None:
             start = report["log"]["start_ns"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -53,13 +54,39 @@ def test_f1tenth_bags_run(shared_dir: Path, tmp_path: Path, name: str) -> None:
     assert estimates.filter(pl.col("estimator") == "phy-ukf")["valid"].mean() > 0.99
 
 
-def test_a_lost_chunk_is_said_and_the_rest_is_used(shared_dir: Path, tmp_path: Path) -> None:
-    folder = shared_dir / "data/drives"
-    _, intact, _ = _run(folder / "revs_250lm_a.mcap", "revs_250lm.toml", "revs_250lm.toml", tmp_path / "intact")
-    _, hurt, code = _run(
-        folder / "faulty/revs_250lm_a_flipped_byte.mcap", "revs_250lm.toml", "revs_250lm.toml", tmp_path / "hurt"
-    )
-    assert code == 3
+@pytest.fixture(scope="module")
+def intact(shared_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> pl.DataFrame:
+    out = tmp_path_factory.mktemp("intact")
+    log = shared_dir / "data/drives/revs_250lm_a.mcap"
+    return _run(log, "revs_250lm.toml", "revs_250lm.toml", out)[1]
+
+
+#: File, exit code, first loss and end of the last gap, s from the first stamp (README of the faulty drives).
+FAULTY = [
+    ("revs_250lm_a_flipped_byte.mcap", 3, 146.2, 154.8),
+    ("revs_250lm_a_flipped_byte_crc_only.mcap", 3, 94.5, 103.2),
+    ("revs_250lm_a_truncated60.mcap", 3, 180.5, None),
+    ("revs_250lm_a_split", 0, None, None),
+    ("revs_250lm_a_disorder.mcap", 3, 9.2, 165.0),
+]
+
+
+def _single_losses_s(shared_dir: Path, name: str) -> list[float]:
+    """Seconds at which single samples of a faulty drive are lost: NaN, and stamps that hide the sample's own."""
+    faults = json.loads((shared_dir / "data/drives/faulty/faults.json").read_text())[name]
+    if "nan" not in faults:
+        return []
+    return [n["stamp_s"] for n in faults["nan"]] + [row / 100.0 for row in faults["stamp_equals_previous"]["rows"]]
+
+
+@pytest.mark.parametrize(("name", "exit_code", "first_loss_s", "last_gap_s"), FAULTY)
+def test_damage_costs_what_it_hit_and_nothing_else(
+    shared_dir: Path, tmp_path: Path, intact: pl.DataFrame, name: str, exit_code: int,
+    first_loss_s: float | None, last_gap_s: float | None,
+) -> None:  # fmt: skip
+    log = shared_dir / "data/drives/faulty" / name
+    _, hurt, code = _run(log, "revs_250lm.toml", "revs_250lm.toml", tmp_path)
+    assert code == exit_code
     start = intact["stamp_ns"].min()
     assert isinstance(start, int)
     columns = [c for c in intact.columns if c != "estimator"]
@@ -68,10 +95,26 @@ def test_a_lost_chunk_is_said_and_the_rest_is_used(shared_dir: Path, tmp_path: P
         elapsed = (pl.col("stamp_ns") - start) / 1e9
         return frame.filter((pl.col("estimator") == "phy-ukf") & (elapsed >= from_s) & (elapsed < to_s)).select(columns)
 
-    # The lost chunk spans 146.2 to 154.8 s of log time.
-    assert part(hurt, 0.0, 146.0).equals(part(intact, 0.0, 146.0), null_equal=True)
-    both = part(hurt, 160.0, 400.0).join(part(intact, 160.0, 400.0), on="stamp_ns", suffix="_intact")
-    assert both.height > 13_000
-    difference = (both["sideslip_rad"] - both["sideslip_rad_intact"]).abs().max()
-    assert isinstance(difference, float)
-    assert math.degrees(difference) < 0.01
+    before = 400.0 if first_loss_s is None else first_loss_s - 0.05
+    assert part(hurt, 0.0, before).equals(part(intact, 0.0, before), null_equal=True)
+    if last_gap_s is not None:
+        both = part(hurt, last_gap_s + 5.0, 280.0).join(part(intact, last_gap_s + 5.0, 280.0), on="stamp_ns")
+        elapsed = (pl.col("stamp_ns") - start) / 1e9
+        for lost_s in _single_losses_s(shared_dir, name):
+            both = both.filter((elapsed < lost_s) | (elapsed >= lost_s + 5.0))
+        assert both.height > 7_000
+        difference = (both["sideslip_rad"] - both["sideslip_rad_right"]).abs().max()
+        assert isinstance(difference, float)
+        assert math.degrees(difference) < 0.01
+
+
+def test_a_silence_of_the_imu_is_told_with_its_interval(shared_dir: Path, tmp_path: Path) -> None:
+    log = shared_dir / "data/drives/faulty/revs_250lm_a_disorder.mcap"
+    _run(log, "revs_250lm.toml", "revs_250lm.toml", tmp_path)
+    report = json.loads((tmp_path / "logs/revs_250lm_a_disorder/report.json").read_text())
+    gaps = {x["where"]: x for x in report["losses"] if x["kind"] == "gap"}
+    gap = gaps["/imu/data.angular_velocity.z"]
+    start = report["log"]["start_ns"]
+    assert (gap["start_ns"] - start) / 1e9 == pytest.approx(135.0, abs=0.05)
+    assert (gap["end_ns"] - start) / 1e9 == pytest.approx(165.0, abs=0.05)
+    assert all(where.startswith("/imu/data") for where in gaps)
