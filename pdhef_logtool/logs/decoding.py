@@ -109,8 +109,11 @@ class ChannelDecoder:
         if left.size or not partial:
             partial.append((left, self._read_singly(block, rows[left])))
         if len(partial) == 1 and len(partial[0][0]) == len(rows):
-            order = partial[0][0]
-            return {p: c if _is_sorted(order) else c[np.argsort(order)] for p, c in partial[0][1].items()}
+            order, columns = partial[0]
+            if _is_sorted(order):
+                return columns
+            back = np.argsort(order)
+            return {path: column[back] for path, column in columns.items()}
         joined = {s.path: concatenate_columns([part[s.path] for _, part in partial]) for s in self.selections}
         back = np.argsort(np.concatenate([at for at, _ in partial]), kind="stable")
         return {path: column[back] for path, column in joined.items()}
@@ -152,13 +155,17 @@ class ChannelDecoder:
         partial: list[tuple[IntArray, dict[str, NDArray[Any]]]],
     ) -> IntArray:
         """Read what has this layout; returns the rows that have not."""
-        # Up to three bytes of padding may follow a CDR message.
-        surplus = length[left] - layout.size
-        sized = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
-        candidates = left if sized.all() else left[sized]
-        if not candidates.size:
-            return left
-        fits, parts = layout.gather(block.buffer, offset[candidates])
+        if len(left) < len(offset):
+            offset, length = offset[left], length[left]
+        candidates = left
+        if not (length == layout.size).all():
+            # Up to three bytes of padding may follow a CDR message.
+            surplus = length - layout.size
+            sized = (surplus >= 0) & (surplus <= (3 if self.schema.wire == "cdr" else 0))
+            candidates, offset = left[sized], offset[sized]
+            if not candidates.size:
+                return left
+        fits, parts = layout.gather(block.buffer, offset)
         read = candidates if fits is None else candidates[fits]
         if not read.size:
             return left
