@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -34,6 +35,23 @@ def test_a_built_wheel_ships_every_schema_file(tmp_path: Path) -> None:
     assert {f"pdhef_logtool/{name}" for name in schemas} <= names
     modules = {p.relative_to(ROOT).as_posix() for p in (ROOT / "pdhef_logtool").rglob("*.py")}
     assert modules <= names
+
+    # The schemas are read from the wheel itself, where no source tree stands beside it.
+    installed = tmp_path / "installed"
+    zipfile.ZipFile(wheel).extractall(installed)
+    code = (
+        "import pdhef_logtool; from pdhef_logtool.sinks.schema import arrow_schema, load_schema;"
+        "print(pdhef_logtool.__file__); print(load_schema('report.schema.json')['$schema']);"
+        "print(arrow_schema('metrics.parquet.json').names[0])"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(installed)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
+    )
+    where, dialect, column = done.stdout.split()
+    assert Path(where).is_relative_to(installed)
+    assert dialect.startswith("https://json-schema.org/")
+    assert column == "log"
 
 
 def test_own_definition_keeps_its_units_and_carries_its_contained_types() -> None:
