@@ -105,6 +105,7 @@ def run() -> list[Figure]:
         figures += [
             Figure("reading", f"{name}: decode the same topics", seconds, "s"),
             Figure("reading", f"{name} / ours", seconds / ours, "x", *target),
+            Figure("reading", f"{name} / floor", seconds / fast["floor"], "x"),
         ]
     figures += [
         Figure("reading", "peak memory, 6 min", without / 1e6, "MB"),
