@@ -31,7 +31,7 @@ $(VENV)/installed-dev: $(VENV)/installed pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	@touch $@
 
-demo: $(VENV)/installed
+demo: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --vehicle sample_logs/vehicle.toml
 	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --vehicle sample_logs/vehicle_mu03.toml
 	@echo
@@ -40,7 +40,13 @@ demo: $(VENV)/installed
 	@echo "  logs/<log>/recording.rrd    open it with: $(BIN)/pdhef view $(OUT)"
 	@echo "  logs/<log>/report.json, estimates.parquet; metrics.parquet and run.json for the whole run"
 
-test: $(VENV)/installed-dev
+# Numba's cache watches the file of a compiled function, not those of the functions that it calls: after an edit of any
+# of our sources all of it goes.
+$(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/*/*.py truthsim/*.py)
+	@find pdhef_logtool truthsim -name '*.nb[ic]' -delete
+	@touch $@
+
+test: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
 lint: $(VENV)/installed-dev
@@ -55,10 +61,10 @@ format: $(VENV)/installed-dev
 
 check: lint test
 
-bench: $(VENV)/installed-dev
+bench: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m benchmarks
 
-samples: $(VENV)/installed
+samples: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/python -m truthsim.samples sample_logs
 
 clean:

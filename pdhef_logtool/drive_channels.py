@@ -16,6 +16,7 @@ from pdhef_logtool.alignment import (
     no_alignment,
     plan_alignment,
 )
+from pdhef_logtool.estimators.base import impossible_readings
 from pdhef_logtool.evaluation.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -36,6 +37,7 @@ from pdhef_logtool.vehicle import VehicleParameters, correct_signals
 TOLD_GAP_S = 1.0
 TOLD_GAP_PERIODS = 10.0
 _JUMP = "samples whose stamps jump back behind what had been processed were dropped"
+_IMPOSSIBLE = "readings that no vehicle can have were taken as missing by the estimators"
 _LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
 
 
@@ -202,7 +204,7 @@ class DriveReader:
             for name, count in count_late(signals, plan.alignment, start_ns, end_ns).items()
             if count
         ]
-        self.losses = merge_losses([self.losses, late])
+        self.losses = merge_losses([self.losses, late, _impossible(aligned)])
         at_stamps = None
         if plan.truth is not None:
             at_stamps = truth_at(derive_truth(truth, plan=plan.truth), aligned.stamps_ns, plan.truth_latency_s)
@@ -217,6 +219,14 @@ def _since(channel: Channel, stamp_ns: int) -> Channel:
         arrival_ns=channel.arrival_ns[first:],
         values=channel.values[first:],
     )
+
+
+def _impossible(signals: Signals) -> list[Loss]:
+    losses = []
+    for name, mask in impossible_readings(signals).items():
+        stamps = signals.stamps_ns[mask]
+        losses.append(Loss("impossible", _IMPOSSIBLE, name, int(stamps[0]), int(stamps[-1]) + 1, len(stamps), "note"))
+    return losses
 
 
 def _gaps(before: Channel | None, channel: Channel) -> list[Loss]:

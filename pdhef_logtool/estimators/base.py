@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pdhef_logtool.signals import IntArray, Signals
+from pdhef_logtool.signals import BoolArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack
 
 #: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
@@ -68,14 +68,18 @@ def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
     return np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
 
 
-def without_impossible(signals: Signals) -> Signals:
-    """Return the signals with readings that no vehicle can have as missing; the same object where there are none."""
+def impossible_readings(signals: Signals) -> dict[str, BoolArray]:
+    """Return by column where a reading is one that no vehicle can have, [N]; columns without any are left out."""
     bad = {c: ~(np.abs(getattr(signals, c)) <= limit) for c, limit in POSSIBLE_MAGNITUDE.items()}
     low, high = POSSIBLE_FRICTION
     bad["friction"] = ~((signals.friction >= low) & (signals.friction <= high))
+    read = {c: mask & ~np.isnan(getattr(signals, c)) for c, mask in bad.items()}
+    return {c: mask for c, mask in read.items() if mask.any()}
+
+
+def without_impossible(signals: Signals) -> Signals:
+    """Return the signals with impossible readings as missing; the same object where there are none."""
     changed: dict[str, Any] = {
-        c: np.where(mask, np.nan, getattr(signals, c))
-        for c, mask in bad.items()
-        if (mask & ~np.isnan(getattr(signals, c))).any()
+        c: np.where(mask, np.nan, getattr(signals, c)) for c, mask in impossible_readings(signals).items()
     }
     return replace(signals, **changed) if changed else signals

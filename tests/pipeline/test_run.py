@@ -246,3 +246,16 @@ def test_esp_suite_is_not_the_full_suite(sample_logs_dir: Path, tmp_path: Path) 
         run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / suite, config)
         rmse[suite] = _value(pl.read_parquet(tmp_path / suite / "metrics.parquet"), "phy-ukf", "vx_m_s", "rmse")
     assert rmse["esp"] > 1.5 * rmse["full"]
+
+
+def test_impossible_readings_are_told(sample_logs_dir: Path, tmp_path: Path) -> None:
+    in_g = NO_TRUTH_MAPPING.replace(
+        'field = "linear_acceleration.y"', 'field = "linear_acceleration.y"\nscale = 96.2361'
+    )
+    (tmp_path / "m.toml").write_text(in_g)
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",))
+    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
+    told = [x for x in report["losses"] if x["kind"] == "impossible"]
+    assert [x["where"] for x in told] == ["ay_m_s2"]
+    assert told[0]["count"] > 10
