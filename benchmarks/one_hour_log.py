@@ -37,12 +37,13 @@ RAW_BYTES_PER_S = 124_650
 _WINDOW_S = 60
 _IMAGE = "sensor_msgs/msg/Image"
 
-#: What a mapped run reads: seven fields of four topics.
+#: What a mapped run reads: eleven fields of all five topics.
 MAPPED = {
     "/imu": ("linear_acceleration.x", "linear_acceleration.y", "angular_velocity.z"),
     "/odometry": ("twist.twist.linear.x", "twist.twist.linear.y"),
     "/steering": ("data",),
     "/velocity": ("twist.linear.x",),
+    "/wheels": ("velocity[0]", "velocity[1]", "velocity[2]", "velocity[3]"),
 }
 
 
