@@ -55,8 +55,13 @@ NOT_EXCITED = 0.8
 DERIVATIVE_STEP = 0.03
 #: Width of the tyres' priors about the axle-force fit, as a share of METHOD §14's widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
+#: Errors beyond this many σ count linearly: a moment in which the filter is lost must not decide the tyres.
+ROBUST_SIGMA = 3.0
 OUTER_PASSES = 2
 MAX_ITERATIONS = 15
+#: Longest step of one iteration, in prior standard deviations, and the relative gain below which it stops.
+MAX_STEP = 2.0
+MIN_GAIN = 1e-3
 MIN_DRIVE_S = 20.0
 
 
@@ -304,8 +309,6 @@ def _minimise(
     -------
     θ, posterior standard deviations in prior units, and the RMSE of each drive in rad.
     """
-    from scipy.optimize import least_squares
-
     index = np.flatnonzero(active)
 
     def full(part: FloatArray) -> FloatArray:
@@ -315,7 +318,7 @@ def _minimise(
 
     def residuals(part: FloatArray) -> FloatArray:
         parts = _sideslip_errors(drives, start, priors, full(part))
-        scaled = [error * weight / s for (error, weight), s in zip(parts, sigma, strict=True)]
+        scaled = [weight * _pseudo_huber(error / s) for (error, weight), s in zip(parts, sigma, strict=True)]
         return np.concatenate([*scaled, part])
 
     def jacobian(part: FloatArray) -> FloatArray:
@@ -327,14 +330,9 @@ def _minimise(
             columns[:, i] = (residuals(moved) - at) / DERIVATIVE_STEP
         return columns
 
-    low = _low_theta(priors)[index]
-    first = np.maximum(theta0[index], low + 1e-6)
-    fit = least_squares(
-        residuals, first, jac=jacobian, bounds=(low, np.full(len(index), 6.0)), max_nfev=MAX_ITERATIONS, ftol=1e-4,
-        xtol=1e-3, gtol=1e-6,
-    )  # fmt: skip
-    theta = full(np.asarray(fit.x))
-    covariance = np.linalg.inv(fit.jac.T @ fit.jac)
+    part, jac = _projected_levenberg_marquardt(residuals, jacobian, theta0[index], _low_theta(priors)[index])
+    theta = full(part)
+    covariance = np.linalg.inv(jac.T @ jac)
     std = np.ones(len(priors))
     std[index] = np.sqrt(np.diag(covariance))
     rmse = [
@@ -342,6 +340,54 @@ def _minimise(
         for error, weight in _sideslip_errors(drives, start, priors, theta)
     ]
     return theta, std, np.array(rmse)
+
+
+def _projected_levenberg_marquardt(
+    residuals: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray], FloatArray],
+    first: FloatArray,
+    low: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Minimise |residuals|² above ``low``; returns the parameters and the Jacobian there.
+
+    Steps are projected to the bounds. (An interior-point method, such as scipy's, hardly moves at all from a start at a
+    bound, and there is where the axle-force fit often ends.)
+    """
+    at = np.maximum(first, low)
+    value = residuals(at)
+    jac = jacobian(at)
+    damping = 1e-3
+    for _ in range(MAX_ITERATIONS):
+        gradient = jac.T @ value
+        free = (at > low) | (gradient < 0.0)
+        normal = jac[:, free].T @ jac[:, free]
+        improved = False
+        for _ in range(6):
+            step = np.zeros(at.size)
+            step[free] = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient[free])
+            candidate = np.maximum(at + np.clip(step, -MAX_STEP, MAX_STEP), low)
+            there = residuals(candidate)
+            if there @ there < value @ value:
+                improved = True
+                break
+            damping *= 8.0
+        if not improved:
+            break
+        gain = 1.0 - (there @ there) / (value @ value)
+        moved = float(np.max(np.abs(candidate - at)))
+        at, value = candidate, there
+        jac = jacobian(at)
+        damping = max(damping / 4.0, 1e-6)
+        if gain < MIN_GAIN and moved < 10.0 * DERIVATIVE_STEP:
+            break
+    return at, jac
+
+
+def _pseudo_huber(scaled: FloatArray) -> FloatArray:
+    """Return residuals whose square grows like the error's own up to ``ROBUST_SIGMA`` and linearly beyond."""
+    c = ROBUST_SIGMA
+    out: FloatArray = np.sign(scaled) * c * np.sqrt(2.0 * (np.sqrt(1.0 + (scaled / c) ** 2) - 1.0))
+    return out
 
 
 def _sideslip_errors(

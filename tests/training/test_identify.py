@@ -18,7 +18,7 @@ from pdhef_logtool.signals import Signals
 from pdhef_logtool.tracks import make_track
 from pdhef_logtool.training.axle_forces import AxleCurve, axle_samples, fit_axle
 from pdhef_logtool.training.fit_data import GUARD_S, FitDrive, split_drive
-from pdhef_logtool.training.identify import identify
+from pdhef_logtool.training.identify import _projected_levenberg_marquardt, identify
 from pdhef_logtool.training.identify_command import run_identification
 from pdhef_logtool.vehicle import AxleTyre, Tyres, VehicleParameters, load_vehicle
 
@@ -215,3 +215,17 @@ def test_250_lm_identified_on_its_first_half_is_good_on_its_second(shared_dir: P
         if (row.signal, row.metric, row.segment) == ("sideslip_rad", "rmse", "all")
     }
     assert rmse["phy-ukf-tuned"] < 0.34 < rmse["zero"]
+
+
+def test_projected_steps_find_the_bounded_minimum_also_from_a_start_at_the_bound() -> None:
+    from scipy.optimize import lsq_linear
+
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        a, b = rng.normal(size=(12, 4)), 3.0 * rng.normal(size=12)
+        low = rng.normal(size=4)
+        found, _ = _projected_levenberg_marquardt(lambda x, a=a, b=b: a @ x - b, lambda _x, a=a: a, low, low)
+        expected = lsq_linear(a, b, bounds=(low, np.full(4, np.inf)), tol=1e-12).x
+        cost, best = np.sum((a @ found - b) ** 2), np.sum((a @ expected - b) ** 2)
+        assert cost <= best * (1 + 1e-3) + 1e-9
+        assert np.all(found >= low)
