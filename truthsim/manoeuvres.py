@@ -16,6 +16,8 @@ from pdhef_logtool.signals import FloatArray
 GRAVITY_M_S2 = 9.80665
 CONTROL_STEP_S = 0.001
 PATH_STEP_M = 0.5
+#: Columns of a road table.
+ROAD_FRICTION_LEFT, ROAD_FRICTION_RIGHT, ROAD_BANK, ROAD_GRADE = range(4)
 
 WHEELBASE_M = 2.87
 #: Understeer that the guesses of scale 1 assume, rad per m/s².
@@ -43,6 +45,12 @@ class Plan:
     steer_rad : mean road-wheel angle every 1 ms, [duration / 1 ms + 1]; empty when a path is followed.
     path : x, y (m), yaw (rad), speed (m/s) every ``PATH_STEP_M``, [P, 4]; empty when the steering is given.
     stops : arc length (m) and dwell (s) of the places to stand still at, [K, 2].
+    torque_n_m : drive and brake torque (N m, all wheels, at least 0) every 1 ms, [duration / 1 ms + 1, 2]; rows of NaN
+        leave the pedals to the driver, who holds the speed. Empty: the driver's throughout.
+    road : friction under the left and the right wheels, bank (rad) and grade (rad) every ``PATH_STEP_M`` of the
+        distance driven (along the path where one is followed), [R, 4]; beyond its end the last row holds. Empty: level,
+        the same friction everywhere. Bank is positive where the road leans to the right (its left edge higher), as a
+        car's roll; grade is positive uphill.
     """
 
     start_speed_m_s: float
@@ -50,6 +58,8 @@ class Plan:
     steer_rad: FloatArray = field(default_factory=lambda: np.empty(0))
     path: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
     stops: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    torque_n_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    road: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
 
 
 @dataclass(frozen=True, slots=True)
