@@ -51,6 +51,8 @@ class Vehicle(NamedTuple):
     #: Lag of link forces and compliances: a 35 kg wheel on a 220 kN/m tyre.
     link_lag_s: float = 0.0126
     #: Steering out of the bend under lateral force, per axle (front) and toe-in of the rear axle, rad/N.
+    #: Steering-wheel angle per road-wheel angle; the vehicle is steered by the latter, as the rack has it.
+    steering_ratio: float = 16.0
     front_compliance_rad_per_n: float = 1.87e-6
     rear_compliance_rad_per_n: float = 1.07e-6
     #: 0 parallel steering, 1 both wheels on one turning centre.
@@ -67,6 +69,11 @@ X, Y, YAW, V_X, V_Y, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE = range(10)
 LINK_A_X, LINK_A_Y, COMPLIANCE_FRONT, COMPLIANCE_REAR = range(10, 14)
 SPIN, SLIP_X, SLIP_Y = 14, 18, 22
 STATE_SIZE = 26
+
+#: What the vehicle is told of the road where it stands: friction under the four wheels, bank (rad, positive to the
+#: right), grade (rad, positive uphill), and how both change per metre driven (rad/m).
+FRICTION, BANK, GRADE, BANK_PER_M, GRADE_PER_M = 0, 4, 5, 6, 7
+ROAD_SIZE = 8
 
 #: What the world may know of a vehicle, in the order of :func:`observe`.
 OBSERVED = (
@@ -89,6 +96,20 @@ OBSERVED = (
     *(f"fy_{w}_n" for w in ("fl", "fr", "rl", "rr")),
     *(f"fz_{w}_n" for w in ("fl", "fr", "rl", "rr")),
     *(f"slip_angle_{w}_rad" for w in ("fl", "fr", "rl", "rr")),
+    "z_m",
+    "heave_m",
+    "bank_rad",
+    "grade_rad",
+    "roll_acceleration_rad_s2",
+    "pitch_acceleration_rad_s2",
+    "specific_force_x_m_s2",
+    "specific_force_y_m_s2",
+    "specific_force_z_m_s2",
+    "gyro_x_rad_s",
+    "gyro_y_rad_s",
+    "gyro_z_rad_s",
+    *(f"friction_{w}" for w in ("fl", "fr", "rl", "rr")),
+    *(f"suspension_{w}_m" for w in ("fl", "fr", "rl", "rr")),
 )
 OBSERVED_SIZE = len(OBSERVED)
 _FORCES = 18
@@ -156,7 +177,7 @@ def _motion(
     steer_rad: float,
     drive_n_m: float,
     brake_n_m: float,
-    friction: float,
+    road: FloatArray,
     vehicle: Vehicle,
     rate: FloatArray,
     observed: FloatArray,
@@ -186,7 +207,7 @@ def _motion(
         spin = state[SPIN + wheel]
         slip_x, slip_y = state[SLIP_X + wheel], state[SLIP_Y + wheel]
         used_x, used_y = damped_slips(vehicle.tyre, slip_x, slip_y, forward, left, spin * radius)
-        fx, fy, scaled = forces_n(vehicle.tyre, used_x, used_y, loads[wheel], friction)
+        fx, fy, scaled = forces_n(vehicle.tyre, used_x, used_y, loads[wheel], road[wheel])
         rate[SLIP_X + wheel], rate[SLIP_Y + wheel] = slip_rates(
             vehicle.tyre, slip_x, slip_y, scaled, forward, left, spin * radius
         )
@@ -256,16 +277,25 @@ def derivative(
     steer_rad: float,
     drive_n_m: float,
     brake_n_m: float,
-    friction: float,
+    road: FloatArray,
     vehicle: Vehicle,
     rate: FloatArray,
     scratch: FloatArray,
 ) -> None:
     """Write the rate [STATE_SIZE] of a state under a mean road-wheel angle and total drive and brake torques.
 
+    ``steer_rad`` is the mean angle of the front wheels as the rack has it; compliance comes on top in the vehicle.
+    ``road`` [ROAD_SIZE] holds the friction of the wheels, bank and grade (see ``FRICTION`` and below).
     ``scratch`` [OBSERVED_SIZE] is overwritten.
     """
-    _motion(state, steer_rad, drive_n_m, brake_n_m, friction, vehicle, rate, scratch)
+    _motion(state, steer_rad, drive_n_m, brake_n_m, road, vehicle, rate, scratch)
+
+
+@register_jitable
+def see(state: FloatArray, observed: FloatArray) -> None:
+    """Write the first six columns of ``OBSERVED`` only: pose, velocities and yaw rate, all that a driver looks at."""
+    for i in range(6):
+        observed[i] = state[i]
 
 
 @register_jitable
@@ -274,7 +304,7 @@ def observe(
     steer_rad: float,
     drive_n_m: float,
     brake_n_m: float,
-    friction: float,
+    road: FloatArray,
     vehicle: Vehicle,
     scratch: FloatArray,
     observed: FloatArray,
@@ -283,11 +313,27 @@ def observe(
 
     ``ax_m_s2`` and ``ay_m_s2`` are planar (ΣF/m, no gravity); forces are in the wheels' own frames.
     """
-    _motion(state, steer_rad, drive_n_m, brake_n_m, friction, vehicle, scratch, observed)
-    for i in range(6):
-        observed[i] = state[i]
+    _motion(state, steer_rad, drive_n_m, brake_n_m, road, vehicle, scratch, observed)
+    see(state, observed)
     observed[9], observed[10] = state[ROLL], state[ROLL_RATE]
     observed[11], observed[12] = state[PITCH], state[PITCH_RATE]
     observed[13] = steer_rad
     for wheel in range(4):
         observed[14 + wheel] = state[SPIN + wheel]
+    roll, pitch = state[ROLL], state[PITCH]
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    up = sp * observed[6] + cp * GRAVITY_M_S2
+    place = _FORCES + 16
+    observed[place], observed[place + 1] = 0.0, 0.0
+    observed[place + 2], observed[place + 3] = road[BANK], road[GRADE]
+    observed[place + 4], observed[place + 5] = scratch[ROLL_RATE], scratch[PITCH_RATE]
+    observed[place + 6] = cp * observed[6] - sp * GRAVITY_M_S2
+    observed[place + 7] = cr * observed[7] + sr * up
+    observed[place + 8] = -sr * observed[7] + cr * up
+    level = state[YAW_RATE] * cp
+    observed[place + 9] = state[ROLL_RATE] - state[YAW_RATE] * sp
+    observed[place + 10] = state[PITCH_RATE] * cr + level * sr
+    observed[place + 11] = level * cr - state[PITCH_RATE] * sr
+    for wheel in range(4):
+        observed[place + 12 + wheel] = road[FRICTION + wheel]
+        observed[place + 16 + wheel] = 0.0

@@ -9,7 +9,7 @@ import pytest
 
 from truthsim.manoeuvres import MANOEUVRES, Plan, Request
 from truthsim.motion import Motion, simulate_motion
-from truthsim.vehicle import OBSERVED, Vehicle, observe, standing_state
+from truthsim.vehicle import OBSERVED, STATE_SIZE, Vehicle, observe, standing_state
 
 G = 9.80665
 CAR = Vehicle()
@@ -74,7 +74,8 @@ def test_geometry_is_table_3() -> None:
 
 def test_loads_at_rest_are_static() -> None:
     out = np.zeros(len(OBSERVED))
-    observe(standing_state(CAR, 0.0), 0.0, 0.0, 0.0, 0.85, CAR, np.zeros(26), out)
+    road = np.array([0.85] * 4 + [0.0] * 4)
+    observe(standing_state(CAR, 0.0), 0.0, 0.0, 0.0, road, CAR, np.zeros(STATE_SIZE), out)
     fz = dict(zip(OBSERVED, out, strict=True))
     assert fz["fz_fl_n"] == fz["fz_fr_n"] == pytest.approx(0.5 * M * G * LR / L)
     assert fz["fz_rl_n"] == fz["fz_rr_n"] == pytest.approx(0.5 * M * G * LF / L)
