@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -101,10 +102,15 @@ class Drive:
             "peak_sideslip_rad": repr(self.peak_sideslip_rad),
             "spun": json.dumps(self.spun),
             "notes": json.dumps(list(self.notes)),
-            "vehicle": json.dumps({**self.vehicle._asdict(), "tyre": self.vehicle.tyre._asdict()}),
+            "vehicle": json.dumps(_plain(self.vehicle._asdict())),
             "noise": json.dumps(self.noise._asdict()),
             "versions": json.dumps({"pdhef-logtool": __version__, "numpy": np.__version__, "numba": numba.__version__}),
         }
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """Turn the tyres inside a vehicle's values into dictionaries too, by name and not by place."""
+    return {name: _plain(value._asdict()) if hasattr(value, "_asdict") else value for name, value in values.items()}
 
 
 def simulate_drive(
