@@ -313,7 +313,8 @@ def _motion(
 
     rate[X] = v_x * cos_grade * math.cos(state[YAW]) - v_y * cos_bank * math.sin(state[YAW])
     rate[Y] = v_x * cos_grade * math.sin(state[YAW]) + v_y * cos_bank * math.cos(state[YAW])
-    rate[ALTITUDE] = v_x * math.sin(road[GRADE]) + v_y * math.sin(road[BANK])
+    # The height of the road's middle: a car that crabs through a banked bend does not climb.
+    rate[ALTITUDE] = v_x * math.sin(road[GRADE])
     rate[YAW] = heading_rate
     rate[V_X] = a_x + v_y * yaw_rate
     rate[V_Y] = a_y - v_x * yaw_rate
