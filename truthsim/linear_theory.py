@@ -19,12 +19,8 @@ _G = 9.80665
 def tyre_stiffness_n_per_rad(tyre: Tyre, load_n: float, friction: float) -> float:
     """Pacejka's K = p1 F_z0 sin(2 atan(F_z / (p2 F_z0))), times the small power of friction."""
     grip = (friction / tyre.stiffness_friction) ** tyre.stiffness_friction_power
-    return (
-        grip
-        * tyre.stiffness_peak
-        * tyre.nominal_load_n
-        * math.sin(2.0 * math.atan(load_n / (tyre.stiffness_load * tyre.nominal_load_n)))
-    )
+    sine = math.sin(2.0 * math.atan(load_n / (tyre.stiffness_load * tyre.nominal_load_n)))
+    return float(grip * tyre.stiffness_peak * tyre.nominal_load_n * sine)
 
 
 def axle_stiffness_n_per_rad(vehicle: Vehicle, friction: float) -> tuple[float, float]:

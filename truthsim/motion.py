@@ -91,7 +91,7 @@ def _compiled_loop() -> Callable[..., None]:
     ) -> str:
         follows = path.shape[0] > 0
         memory = np.zeros(MEMORY_SIZE)
-        scratch, view = np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
+        scratch, stage, view = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
         k1, k2, k3, k4 = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
         road = np.zeros(ROAD_SIZE)
         dt = CONTROL_STEP_S / substeps
@@ -142,10 +142,17 @@ def _compiled_loop() -> Callable[..., None]:
                 c = steer + (next_steer - steer) * (i + 1) / substeps
                 b = 0.5 * (a + c)
                 derivative(state, a, drive, brake, road, vehicle, k1, view)
-                derivative(state + 0.5 * dt * k1, b, drive, brake, road, vehicle, k2, view)
-                derivative(state + 0.5 * dt * k2, b, drive, brake, road, vehicle, k3, view)
-                derivative(state + dt * k3, c, drive, brake, road, vehicle, k4, view)
-                state += dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+                for n in range(STATE_SIZE):
+                    stage[n] = state[n] + 0.5 * dt * k1[n]
+                derivative(stage, b, drive, brake, road, vehicle, k2, view)
+                for n in range(STATE_SIZE):
+                    stage[n] = state[n] + 0.5 * dt * k2[n]
+                derivative(stage, b, drive, brake, road, vehicle, k3, view)
+                for n in range(STATE_SIZE):
+                    stage[n] = state[n] + dt * k3[n]
+                derivative(stage, c, drive, brake, road, vehicle, k4, view)
+                for n in range(STATE_SIZE):
+                    state[n] += dt / 6.0 * (k1[n] + 2.0 * k2[n] + 2.0 * k3[n] + k4[n])
         return sources
 
     return loop  # type: ignore[no-any-return]

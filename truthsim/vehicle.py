@@ -86,8 +86,13 @@ class Vehicle(NamedTuple):
 X, Y, YAW, V_X, V_Y, YAW_RATE = range(6)
 HEAVE, HEAVE_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE = range(6, 12)
 ALTITUDE, COMPLIANCE_FRONT, COMPLIANCE_REAR = range(12, 15)
-WHEEL_HEIGHT, WHEEL_RATE, SPIN, SLIP_X, SLIP_Y = 15, 19, 23, 27, 31
-STATE_SIZE = 35
+WHEEL_HEIGHT, WHEEL_RATE, SPIN, SLIP_X, SLIP_Y, BRAKE = 15, 19, 23, 27, 31, 35
+STATE_SIZE = 39
+
+#: Pads and callipers give this much before a standing wheel slips in its brake, rad; the build-up of a turning one, s.
+BRAKE_GIVE_RAD = 0.01
+BRAKE_LAG_S = 0.005
+BRAKE_DAMPING_S = 0.002
 
 #: What the vehicle is told of the road where it stands: friction under the four wheels, bank (rad, positive to the
 #: right), grade (rad, positive uphill), and how both change per metre driven (rad/m).
@@ -140,6 +145,7 @@ def standing_state(vehicle: Vehicle, speed_m_s: float) -> FloatArray:
     state = np.zeros(STATE_SIZE)
     state[V_X] = speed_m_s
     state[SPIN : SPIN + 4] = speed_m_s / vehicle.wheel_radius_m
+    state[BRAKE : BRAKE + 4] = np.sign(speed_m_s)
     return state
 
 
@@ -190,6 +196,16 @@ def wheel_steer_rad(state: FloatArray, steer_rad: float, vehicle: Vehicle, wheel
     inner = vehicle.ackermann * vehicle.track_m / (2.0 * wheelbase) * steer_rad * steer_rad
     side = 1.0 if wheel == 0 else -1.0
     return float(steer_rad + side * inner - state[COMPLIANCE_FRONT])
+
+
+@register_jitable
+def brake_grip_rate(grip: float, spin_rad_s: float) -> float:
+    """Rate of the share of its torque that a brake opposes turning with, -1 to 1 (Dahl's model of dry friction).
+
+    A turning wheel has it all; a standing one as much as holds it, so that a car on a hill does not creep.
+    """
+    turning = abs(spin_rad_s)
+    return (spin_rad_s - turning * grip) / (BRAKE_GIVE_RAD + turning * BRAKE_LAG_S)
 
 
 @register_jitable
@@ -274,11 +290,13 @@ def _motion(
         drive_share = vehicle.front_drive_share if front else 1.0 - vehicle.front_drive_share
         brake_share = vehicle.front_brake_share if front else 1.0 - vehicle.front_brake_share
         brake = 0.5 * brake_share * brake_n_m
-        # A brake only opposes turning. The width of the transition keeps its slope within what the step can follow.
-        brake_sign = math.tanh(spin / max(0.5, brake / (inertia * 1000.0)))
+        grip, grip_rate = state[BRAKE + wheel], brake_grip_rate(state[BRAKE + wheel], spin)
+        rate[BRAKE + wheel] = grip_rate
         resistance = vehicle.rolling_resistance * load * radius * math.tanh(spin / 0.5)
-        torque = 0.5 * drive_share * drive_n_m - brake * brake_sign - resistance - radius * fx
-        rate[SPIN + wheel] = torque / inertia
+        braking = brake * (grip + BRAKE_DAMPING_S * grip_rate)
+        driving = 0.5 * drive_share * drive_n_m
+        spinning_up = driving - braking - resistance - radius * fx
+        rate[SPIN + wheel] = spinning_up / inertia
 
         body_x = fx * cos - fy * sin
         body_y = fx * sin + fy * cos
@@ -294,10 +312,11 @@ def _motion(
         roll_centre = vehicle.front_roll_centre_height_m if front else vehicle.rear_roll_centre_height_m
         spring = suspension_force_n(travel, travel_rate, other, vehicle, front)
         pivot_y = -roll_centre * body_y / arm_y
-        pivot_x = -vehicle.pitch_centre_height_m * body_x / arm_x
+        # Brakes act within the wheel's own assembly; the drive shafts' torque comes from the body and pushes back on it.
+        pivot_x = -(vehicle.pitch_centre_height_m * body_x + spinning_up - driving) / arm_x
         lift += spring + pivot_x + pivot_y
         roll_moment += arm_y * (spring + pivot_x)
-        pitch_moment -= (arm_x - sprung_x) * (spring + pivot_y) - sprung_x * pivot_x
+        pitch_moment -= (arm_x - sprung_x) * (spring + pivot_y) - sprung_x * pivot_x + driving
         rate[WHEEL_RATE + wheel] = load - static - spring - pivot_x - pivot_y
         observed[_FORCES + wheel] = fx
         observed[_FORCES + 4 + wheel] = fy
@@ -305,7 +324,8 @@ def _motion(
         observed[_FORCES + 12 + wheel] = -math.atan2(left, forward) if abs(forward) > 0.5 else 0.0
         observed[_FEEL + 16 + wheel] = travel
 
-    force_x -= 0.5 * AIR_DENSITY_KG_M3 * vehicle.drag_area_m2 * v_x * abs(v_x)
+    drag = 0.5 * AIR_DENSITY_KG_M3 * vehicle.drag_area_m2 * v_x * abs(v_x)  # at the sprung mass's CG
+    force_x -= drag
     # Accelerations in the plane of the road, and what of them the car feels: less the weight along it.
     a_x, a_y = force_x / mass + weight_x, force_y / mass + weight_y
     felt_x, felt_y = a_x - weight_x, a_y - weight_y
@@ -330,7 +350,7 @@ def _motion(
     roll_inertia = vehicle.roll_inertia_kg_m2 + sprung * roll_arm * roll_arm * unsprung / mass
     pitch_inertia = vehicle.pitch_inertia_kg_m2 + sprung * pitch_arm * pitch_arm * unsprung / mass
     roll_moment += roll_arm * (sprung * (felt_y + sprung_x * yaw_acceleration) + supporting * state[ROLL])
-    pitch_moment += pitch_arm * (-sprung * felt_x + supporting * state[PITCH])
+    pitch_moment += pitch_arm * (-sprung * felt_x - drag + supporting * state[PITCH])
     roll_acceleration = roll_moment / roll_inertia
     pitch_acceleration = pitch_moment / pitch_inertia
     heave_acceleration = lift / sprung + GRAVITY_M_S2 - pressing

@@ -32,7 +32,7 @@ def test_shipped_vehicles_handle_like_cars_of_their_kind(name: str) -> None:
     angle, (front, rear) = steady_roll(car)
     assert 3.0 < angle * DEG_PER_G < 6.0
     assert 0.5 < front / (front + rear) < 0.65
-    motion = simulate_motion(Plan(25.0, 4.0, steer_rad=np.linspace(0.0, 0.06, 4001)), 0.85, vehicle=car)
+    motion = simulate_motion(Plan(25.0, 4.0, steer_rad=np.linspace(0.0, 0.10, 4001)), 0.85, vehicle=car)
     assert np.isfinite(motion.observed).all()
     assert 0.6 < motion.column("ay_m_s2").max() / 9.80665 < 0.88
 
@@ -55,7 +55,7 @@ def test_vehicles_differ_in_what_they_are() -> None:
         ("[rear_tyre]", "[rear_tire]", ("rear_tyre",)),
         ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 400.0", ("unsprung",)),
         ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 1.0", ("300 rad/s",)),
-        ("track_m = 1.57", "track_m = 0.2", ("upright",)),
+        ("cg_height_m = 0.64", "cg_height_m = 6.4", ("upright",)),
         ("front_roll_centre_height_m = 0.1", "front_roll_centre_height_m = 0.9", ("roll and pitch centres",)),
         ("lateral_relaxation_min_m = 0.3", "lateral_relaxation_min_m = 0.9", ("front_tyre", "lateral_relaxation")),
         ("track_m = 1.57", "track_m = = 2", ("TOML",)),
