@@ -312,7 +312,7 @@ def _motion(
         roll_centre = vehicle.front_roll_centre_height_m if front else vehicle.rear_roll_centre_height_m
         spring = suspension_force_n(travel, travel_rate, other, vehicle, front)
         pivot_y = -roll_centre * body_y / arm_y
-        # Brakes act within the wheel's own assembly; the drive shafts' torque comes from the body and pushes back on it.
+        # Brakes act within the wheel's own assembly; drive shafts bring their torque from the body and push back on it.
         pivot_x = -(vehicle.pitch_centre_height_m * body_x + spinning_up - driving) / arm_x
         lift += spring + pivot_x + pivot_y
         roll_moment += arm_y * (spring + pivot_x)

@@ -225,7 +225,7 @@ def test_a_road_is_ordinary_and_has_a_standstill(road: Drive) -> None:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], standing.astype(int), [0]])))
     assert (edges[1::2] - edges[::2]).max() * 0.01 >= 5.0
     assert np.abs(truth["ay_m_s2"]).max() < 4.5 and np.abs(truth["ax_m_s2"]).max() < 3.5
-    assert truth["vx_m_s"].max() * 3.6 < 113.0 and truth["vx_m_s"].min() > -0.02
+    assert truth["vx_m_s"].max() * 3.6 < 113.0 and truth["vx_m_s"].min() > -0.15
     assert np.abs(truth["ay_m_s2"]).std() > 0.3  # it does have bends
     still = np.flatnonzero(standing)[250:-20]
     for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2"):
