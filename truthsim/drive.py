@@ -428,7 +428,7 @@ def search_scale(goal: Goal, request: Request, vehicle: Vehicle, notes: list[str
         )
     asked = goal.a_y_m_s2 / (request.friction * GRAVITY_M_S2)
     least = goal.chosen.least_share / goal.chosen.peak_share if goal.chosen.peak_share else 0.0
-    if best_value < least * goal.a_y_m_s2:
+    if best_value < min(least, 1.0 - goal.tolerance) * goal.a_y_m_s2:
         got = best_value / (request.friction * GRAVITY_M_S2)
         notes.append(f"|a_y| reaches only {got:.2f} mu g of the {asked:.2f} that was asked for")
     return best_scale
