@@ -28,8 +28,6 @@ from truthsim.vehicle_choice import choose_vehicle
 MANIFEST = "manifest.json"
 #: Bins of |a_y| over μ g in which METHOD §10 scores, by name; each from its lower limit on.
 BINS: dict[str, float] = {"low": 0.0, "middle": 0.3, "high": 0.6}
-#: How near the peak must come to its goal: a batch wants variety, not a figure.
-_TOLERANCE = 0.03
 #: Drives between two writings of the manifest, which is what an interrupted batch goes on from.
 _SAVE_EVERY = 25
 
@@ -69,7 +67,6 @@ class DriveSpec:
             noise=sensor_noise(dict(self.sensors)),
             faults=[parse_fault(f) for f in self.faults],
             keep_spins=self.keep_spins,
-            tolerance=_TOLERANCE,
         )
 
 
