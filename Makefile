@@ -7,7 +7,7 @@ OUT ?= out/demo
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: help demo test check lint format bench samples clean
+.PHONY: help demo test check lint format bench samples docs-truthsim clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -15,6 +15,7 @@ help:
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make bench    speed against peers, and the tuning tables"
 	@echo "make samples  write sample_logs/ anew with the simulator"
+	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make clean    remove the virtual environment and everything that was built"
 
 $(BIN)/python:
@@ -66,6 +67,9 @@ bench: $(VENV)/installed-dev $(VENV)/compiled
 
 samples: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/python -m truthsim.samples sample_logs
+
+docs-truthsim: $(VENV)/installed
+	$(BIN)/python -m benchmarks.truthsim_docs
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -7,7 +7,7 @@ setup(
     package_dir={"pdhef_logtool.schemas": "schemas"},
     package_data={
         "pdhef_logtool": ["py.typed"],
-        "truthsim": ["py.typed"],
+        "truthsim": ["py.typed", "vehicles/*.toml"],
         "pdhef_logtool.schemas": ["*.json", "*/msg/*.msg"],
     },
 )

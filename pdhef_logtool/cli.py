@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -254,19 +254,69 @@ def metrics(
 
   pdhef simulate dlc --speed 100 --mu 0.85 --seed 1 -o dlc.mcap
 
-  pdhef simulate road --duration 300 --seed 3 -o road.mcap"""
+  pdhef simulate road --duration 300 --seed 3 --sensor rtk_outages_per_h=30 -o road.mcap
+
+  pdhef simulate dlc --vehicle suv --fault burst20:yaw_rate:3:5 --fault dropout:wheels:6:end -o faulty.mcap
+
+  pdhef simulate suite --count 200 --seed 1 --jobs 2 -o logs/
+
+  pdhef simulate conditions --drives 30 --jobs 2 -o table/
+
+Faults: KIND:WHAT:START:END in seconds (END may be end). Kinds: burst<FACTOR>, stuck, dead, flip, bias<SI>, dropout,
+delay<MS>, jump<S> (of the stamps), float, lost (the RTK's fix). What: imu, steering, wheels, rtk, all (sensors), or one
+field: ax, ay, az, roll_rate, pitch_rate, yaw_rate, steer, wheel_fl, wheel_fr, wheel_rl, wheel_rr. delay and jump take
+whole messages.
+
+Vehicles: sedan, suv, hatchback or a TOML file; NAME~SEED is another car of its kind; changes follow commas: mass=1.2,
+cg=0.1 (m to the rear), height=1.1, stiffness=0.85, tyres=suv.
+
+suite writes a training set, conditions the drives of the condition table, both with a manifest.json; what is there
+already is kept."""
 )
 def simulate(
-    manoeuvre: Annotated[str | None, typer.Argument(help="Name of a manoeuvre; --list shows them.")] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="MCAP file to write.")] = None,
+    manoeuvre: Annotated[
+        str | None, typer.Argument(help="Name of a manoeuvre (--list shows them), or suite, or conditions.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="MCAP file to write; a folder for suite and conditions.")
+    ] = None,
     speed_km_h: Annotated[float | None, typer.Option("--speed", help="km/h; default: the manoeuvre's.")] = None,
     friction: Annotated[float | None, typer.Option("--mu", help="Friction; default: the manoeuvre's.")] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of noise and of random profiles.")] = 0,
+    seed: Annotated[int | None, typer.Option("--seed", help="Seed of noise and of random profiles; default 0.")] = None,
     duration_s: Annotated[float | None, typer.Option("--duration", help="s; default: the manoeuvre's.")] = None,
+    amplitude: Annotated[
+        float | None, typer.Option("--amplitude", help="Factor on the manoeuvre's own amplitude; default 1.")
+    ] = None,
+    vehicle: Annotated[str | None, typer.Option("--vehicle", "-v", help="See Vehicles; default sedan.")] = None,
+    faults: Annotated[list[str] | None, typer.Option("--fault", help="See Faults; repeatable.")] = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option("--sensor", help="NAME=VALUE of a sensor's error, repeatable; docs/simulate.md lists them."),
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option("--without", help="Do not record imu, steering, wheels, rtk, perfect or events; repeatable."),
+    ] = None,
+    steering_wheel: Annotated[
+        bool, typer.Option("--steering-wheel", help="Record the angle at the steering wheel too.")
+    ] = False,
+    rtk_rate_hz: Annotated[
+        int | None, typer.Option("--rtk-rate", help="Hz of the truth: 10, 20, 50 or 100; default: the manoeuvre's.")
+    ] = None,
+    keep_spins: Annotated[
+        bool, typer.Option("--keep-spins", help="Keep a drive with |sideslip| > 20 degrees or a lifted wheel.")
+    ] = False,
+    count: Annotated[int | None, typer.Option("--count", help="suite: number of drives; default 200.")] = None,
+    vehicles: Annotated[
+        str | None, typer.Option("--vehicles", help="suite: default, or randomised (another car each drive).")
+    ] = None,
+    drives: Annotated[int | None, typer.Option("--drives", help="conditions: drives a row; default 30.")] = None,
+    rows: Annotated[str | None, typer.Option("--rows", help="conditions: comma-separated rows; default: all.")] = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", help="suite, conditions: processes; default 1.")] = None,
     list_all: Annotated[bool, typer.Option("--list", help="List the manoeuvres and their defaults.")] = False,
     as_json: JsonFlag = False,
 ) -> None:
-    """Write a drive of the simulator truthsim as ROS 2 MCAP: noisy sensors, RTK truth and perfect truth."""
+    """Write drives of the simulator truthsim as ROS 2 MCAP: noisy sensors, RTK truth and perfect truth."""
     from truthsim.manoeuvres import MANOEUVRES
 
     if list_all:
@@ -279,16 +329,116 @@ def simulate(
             where="pdhef simulate",
             remedy="pdhef simulate --list shows the manoeuvres",
         )
-    from truthsim.drive import simulate_drive, write_drive
+    single = {
+        "--speed": speed_km_h,
+        "--mu": friction,
+        "--amplitude": amplitude,
+        "--vehicle": vehicle,
+        "--fault": faults,
+        "--sensor": sensors,
+        "--without": without,
+        "--steering-wheel": steering_wheel or None,
+        "--rtk-rate": rtk_rate_hz,
+        "--keep-spins": keep_spins or None,
+    }
+    if manoeuvre == "suite":
+        from truthsim.suite import write_suite
 
-    drive = simulate_drive(manoeuvre, speed_km_h=speed_km_h, friction=friction, seed=seed, duration_s=duration_s)
-    write_drive(drive, output)
+        _refuse(manoeuvre, {**single, "--drives": drives, "--rows": rows})
+        with _progress() as progress:
+            manifest = write_suite(
+                output,
+                count=200 if count is None else count,
+                seed=0 if seed is None else seed,
+                vehicles=vehicles or "default",
+                duration_s=12.5 if duration_s is None else duration_s,
+                processes=1 if jobs is None else jobs,
+                progress=progress,
+            )
+        _print_batch(manifest, output, ("splits", "written", "dropped_draws"), as_json)
+        return
+    if manoeuvre == "conditions":
+        from truthsim.conditions import write_conditions
+
+        _refuse(manoeuvre, {**single, "--duration": duration_s, "--count": count, "--vehicles": vehicles})
+        with _progress() as progress:
+            manifest = write_conditions(
+                output,
+                drives=30 if drives is None else drives,
+                seed=0 if seed is None else seed,
+                rows=None if rows is None else [name.strip() for name in rows.split(",") if name.strip()],
+                processes=1 if jobs is None else jobs,
+                progress=progress,
+            )
+        _print_batch(manifest, output, ("rows",), as_json)
+        return
+    _refuse(manoeuvre, {"--count": count, "--vehicles": vehicles, "--drives": drives, "--rows": rows, "--jobs": jobs})
+    from truthsim.batch import sensor_noise
+    from truthsim.drive import DEFAULT_VEHICLE, simulate_drive, write_drive
+    from truthsim.faults import parse_fault
+    from truthsim.vehicle_choice import choose_vehicle
+
+    name = vehicle or DEFAULT_VEHICLE
+    drive = simulate_drive(
+        manoeuvre,
+        speed_km_h=speed_km_h,
+        friction=friction,
+        seed=0 if seed is None else seed,
+        duration_s=duration_s,
+        amplitude=1.0 if amplitude is None else amplitude,
+        vehicle=choose_vehicle(name),
+        vehicle_name=name,
+        noise=sensor_noise(_numbers(sensors or (), "--sensor")),
+        faults=[parse_fault(text) for text in faults or ()],
+        rtk_rate_hz=rtk_rate_hz,
+        keep_spins=keep_spins,
+    )
+    write_drive(drive, output, without=without or (), steering_wheel=steering_wheel)
     facts = {"output": str(output), **drive.facts()}
     if as_json:
         _print_json(facts)
     else:
         for key, value in facts.items():
             print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}")  # noqa: T201
+
+
+def _refuse(what: str, options: dict[str, object]) -> None:
+    """Refuse options that mean nothing here, so that none is silently ignored."""
+    given = [name for name, value in options.items() if value is not None]
+    if given:
+        raise UsageError(expected=f"options of {what}", got=", ".join(given), where="pdhef simulate")
+
+
+def _numbers(pairs: Sequence[str], option: str) -> dict[str, float]:
+    values = {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        try:
+            values[name] = float(text)
+        except ValueError:
+            raise UsageError(expected="NAME=NUMBER", got=repr(pair), where=option) from None
+    return values
+
+
+def _print_batch(manifest: dict[str, Any], folder: Path, keys: Sequence[str], as_json: bool) -> None:
+    summary = {"output": str(folder), "command": manifest["command"], **{key: manifest[key] for key in keys}}
+    if as_json:
+        _print_json(summary)
+    elif "rows" in summary:
+        from rich.table import Table
+
+        bins = list(summary["rows"][0]["drives_in_bin"])
+        table = Table("row", "drives", *bins, "what is wrong", box=None, header_style="bold")
+        for row in summary["rows"]:
+            counts = [str(row["drives_in_bin"][b]) for b in bins]
+            table.add_row(row["name"], str(len(row["files"])), *counts, row["description"])
+        _stdout().print(table)
+    else:
+        for key, value in summary.items():
+            print(f"{key}: {value}")  # noqa: T201
+    for entry in manifest["drives"]:
+        if "sha256" not in entry:
+            _warn(f"{entry['file']}: no drive: {entry['dropped'][-1]['reason']}")
 
 
 def _list_manoeuvres(manoeuvres: Any, as_json: bool) -> None:

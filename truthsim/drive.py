@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,20 +13,38 @@ from pdhef_logtool import __version__
 from pdhef_logtool.errors import SimulationError
 from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.writer import McapLogWriter
-from pdhef_logtool.signals import FloatArray
-from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Manoeuvre, Plan, Request
+from pdhef_logtool.signals import WHEELS, FloatArray
+from truthsim.faults import Fault, apply_faults, rtk_outages
+from truthsim.manoeuvres import (
+    CONTROL_STEP_S,
+    GRAVITY_M_S2,
+    MANOEUVRES,
+    STEERING_RATIO,
+    Manoeuvre,
+    Plan,
+    Request,
+    reference_a_y_m_s2,
+    steer_for,
+)
 from truthsim.motion import Motion, simulate_motion
-from truthsim.recording import topics_of
+from truthsim.recording import PARTS, topics_of
 from truthsim.sensors import IMU_PERIOD_S, STEER_PHASE_S, WHEEL_PHASE_S, SensorChannel, SensorNoise, sense
 from truthsim.vehicle import OBSERVED, Vehicle
 
 #: 2026-01-01T00:00:00Z, when every simulated drive begins.
 START_NS = 1_767_225_600_000_000_000
 
+#: What the default vehicle is called.
+DEFAULT_VEHICLE = "sedan"
+
 SPIN_RAD = math.radians(20.0)
 #: Sideslip of a car that hardly moves says nothing about a spin.
 _SPIN_MIN_SPEED_M_S = 3.0
 _STEER_LIMIT_RAD = 0.6
+
+
+#: A wheel without load for this long has left the road; shorter than that it bounced.
+_LIFT_S = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,15 +53,17 @@ class Drive:
 
     Attributes
     ----------
-    manoeuvre, speed_km_h, friction, seed, duration_s, scale : what was driven; ``scale`` is the amplitude found.
+    manoeuvre, speed_km_h, friction, seed, duration_s, amplitude : what was asked for.
+    scale : the amplitude found, in the manoeuvre's own unit.
     start_ns : time 0 of the log.
     times_s : [N], 100 Hz.
-    truth : by the names of ``truthsim.vehicle.OBSERVED`` and ``sideslip_rad``, each [N].
-    channels : ``imu``, ``steering``, ``wheels``, ``rtk``, ``fix``.
-    vehicle, noise : what they were made with.
+    truth : by the names of ``truthsim.vehicle.OBSERVED``, ``sideslip_rad`` and ``friction`` (mean of the wheels), [N].
+    channels : ``imu``, ``steering``, ``wheels``, ``rtk``, ``fix``, with the faults in them.
+    vehicle, vehicle_name, noise, faults : what they were made with.
     rtk_rate_hz : rate of ``rtk`` and of the perfect truth in a written log.
     peak_ay_m_s2, peak_sideslip_rad : largest absolute values; sideslip where the car moves faster than 3 m/s.
     spun : the peak sideslip went beyond 20 degrees.
+    lifted : a wheel left the road for 50 ms or longer.
     notes : what a user must know of this drive, one sentence each.
     """
 
@@ -51,25 +72,48 @@ class Drive:
     friction: float
     seed: int
     duration_s: float
+    amplitude: float
     scale: float
     start_ns: int
     times_s: FloatArray
     truth: dict[str, FloatArray]
     channels: dict[str, SensorChannel]
     vehicle: Vehicle
+    vehicle_name: str
     noise: SensorNoise
+    faults: tuple[Fault, ...]
     rtk_rate_hz: int
     peak_ay_m_s2: float
     peak_sideslip_rad: float
     spun: bool
+    lifted: bool
     notes: tuple[str, ...] = field(default=())
 
     @property
     def command(self) -> str:
         """The command line that makes this drive again."""
-        text = f"pdhef simulate {self.manoeuvre} --speed {self.speed_km_h:g} --mu {self.friction:g} --seed {self.seed}"
-        default = MANOEUVRES[self.manoeuvre].default_duration_s(self.speed_km_h / 3.6)
-        return text if self.duration_s == default else f"{text} --duration {self.duration_s:g}"
+        chosen = MANOEUVRES[self.manoeuvre]
+        words = [
+            f"pdhef simulate {self.manoeuvre} --speed {_exact(self.speed_km_h)} --mu {_exact(self.friction)}",
+            f"--seed {self.seed}",
+        ]
+        if self.duration_s != chosen.default_duration_s(self.speed_km_h / 3.6):
+            words.append(f"--duration {_exact(self.duration_s)}")
+        if self.amplitude != 1.0:
+            words.append(f"--amplitude {_exact(self.amplitude)}")
+        if self.vehicle_name != DEFAULT_VEHICLE:
+            words.append(f"--vehicle {self.vehicle_name}")
+        if self.rtk_rate_hz != chosen.rtk_rate_hz:
+            words.append(f"--rtk-rate {self.rtk_rate_hz}")
+        words += [f"--fault {fault}" for fault in self.faults]
+        words += [
+            f"--sensor {name}={_exact(value)}"
+            for name, value in self.noise._asdict().items()
+            if value != SensorNoise._field_defaults[name]
+        ]
+        if self.spun or self.lifted:
+            words.append("--keep-spins")
+        return " ".join(words)
 
     def facts(self) -> dict[str, float | int | str | bool | list[str]]:
         """What to tell who asked for the drive."""
@@ -80,6 +124,7 @@ class Drive:
             "peak_ay_m_s2": self.peak_ay_m_s2,
             "peak_sideslip_deg": math.degrees(self.peak_sideslip_rad),
             "spun": self.spun,
+            "lifted": self.lifted,
             "notes": list(self.notes),
         }
 
@@ -89,6 +134,12 @@ class Drive:
 
         import numba
 
+        vehicle = {k: v._asdict() if hasattr(v, "_asdict") else v for k, v in self.vehicle._asdict().items()}
+        end_s = float(self.times_s[-1])
+        faults = [
+            {"fault": str(f), "start_s": f.start_s, "end_s": min(f.end_s, end_s), "kind": f.kind, "target": f.target}
+            for f in self.faults
+        ]
         return {
             "command": self.command,
             "manoeuvre": self.manoeuvre,
@@ -96,15 +147,24 @@ class Drive:
             "friction": repr(self.friction),
             "seed": str(self.seed),
             "duration_s": repr(self.duration_s),
+            "amplitude": repr(self.amplitude),
             "scale": repr(self.scale),
             "peak_ay_m_s2": repr(self.peak_ay_m_s2),
             "peak_sideslip_rad": repr(self.peak_sideslip_rad),
             "spun": json.dumps(self.spun),
+            "lifted": json.dumps(self.lifted),
             "notes": json.dumps(list(self.notes)),
-            "vehicle": json.dumps({**self.vehicle._asdict(), "tyre": self.vehicle.tyre._asdict()}),
+            "vehicle_name": self.vehicle_name,
+            "vehicle": json.dumps(vehicle),
             "noise": json.dumps(self.noise._asdict()),
+            "faults": json.dumps(faults),
             "versions": json.dumps({"pdhef-logtool": __version__, "numpy": np.__version__, "numba": numba.__version__}),
         }
+
+
+def _exact(value: float) -> str:
+    """Shortest text that reads back as the same number, without a needless fraction."""
+    return str(int(value)) if value == int(value) else repr(float(value))
 
 
 def simulate_drive(
@@ -114,16 +174,30 @@ def simulate_drive(
     friction: float | None = None,
     seed: int = 0,
     duration_s: float | None = None,
+    amplitude: float = 1.0,
     vehicle: Vehicle | None = None,
+    vehicle_name: str = DEFAULT_VEHICLE,
     noise: SensorNoise | None = None,
+    faults: Sequence[Fault] = (),
     rtk_rate_hz: int | None = None,
+    keep_spins: bool = False,
+    tolerance: float = 0.002,
 ) -> Drive:
     """Simulate a manoeuvre of ``truthsim.manoeuvres.MANOEUVRES``; what is None takes the manoeuvre's default.
+
+    Parameters
+    ----------
+    amplitude : factor on the manoeuvre's own: of its share of μ g, of its standard's angle, or of its course.
+    vehicle, vehicle_name : what drives, and what the command line calls it.
+    keep_spins : keep a drive whose sideslip exceeds 20 degrees or in which a wheel lifts. Else the amplitude of a
+        manoeuvre that is measured by an angle is lowered until it does not (a note says so), one that is scaled to
+        μ g stays below such an amplitude, and one with a course of its own is an error.
+    tolerance : how near the peak must come to its share of μ g.
 
     Raises
     ------
     SimulationError
-        The manoeuvre is unknown, or a value is outside what the simulator can do.
+        The manoeuvre is unknown, a value is outside what the simulator can do, or the car spun.
     """
     chosen = MANOEUVRES.get(manoeuvre)
     if chosen is None:
@@ -136,148 +210,290 @@ def simulate_drive(
     speed_km_h = chosen.speed_km_h if speed_km_h is None else float(speed_km_h)
     friction = chosen.friction if friction is None else float(friction)
     rtk_rate_hz = chosen.rtk_rate_hz if rtk_rate_hz is None else rtk_rate_hz
-    _check(speed_km_h, friction, seed, duration_s, rtk_rate_hz)
+    _check(chosen, speed_km_h, friction, seed, duration_s, amplitude, rtk_rate_hz)
     speed_m_s = speed_km_h / 3.6
     duration_s = chosen.default_duration_s(speed_m_s) if duration_s is None else float(duration_s)
     vehicle = Vehicle() if vehicle is None else vehicle
     noise = SensorNoise() if noise is None else noise
 
     notes: list[str] = []
-    scale = 1.0
+    request = Request(speed_m_s, friction, seed, duration_s, amplitude)
+    if chosen.uses_reference:
+        request = replace(request, reference_rad=reference_steer_rad(speed_m_s, friction, vehicle))
     if chosen.peak_share is not None:
-        scale = _search_scale(chosen, Request(speed_m_s, friction, seed, duration_s, 1.0), vehicle, notes)
-    plan = chosen.plan(Request(speed_m_s, friction, seed, duration_s, scale))
+        goal = Goal(chosen, amplitude * chosen.peak_share * friction * GRAVITY_M_S2, tolerance, keep_spins)
+        request = replace(request, scale=search_scale(goal, request, vehicle, notes))
+    elif chosen.uses_reference and not keep_spins:
+        request = replace(request, scale=_largest_safe_scale(chosen, request, vehicle, notes))
     motion = simulate_motion(
-        plan, friction, vehicle=vehicle, period_s=IMU_PERIOD_S, phases_s=(0.0, STEER_PHASE_S, WHEEL_PHASE_S)
+        chosen.plan(request),
+        friction,
+        vehicle=vehicle,
+        period_s=IMU_PERIOD_S,
+        phases_s=(0.0, STEER_PHASE_S, WHEEL_PHASE_S),
     )
-    if not np.isfinite(motion.observed).all():
+    outcome = judge(motion)
+    if outcome.lost and not keep_spins:
         raise SimulationError(
-            expected="finite motion", got="NaN or infinity", where=manoeuvre, remedy="try a lower speed"
+            expected="a drive without a spin and with all wheels on the road",
+            got=outcome.describe(),
+            where=manoeuvre,
+            remedy="lower --speed or --amplitude, or keep it with --keep-spins",
         )
-    peak_ay, peak_sideslip = _peaks(motion)
-    spun = peak_sideslip > SPIN_RAD
-    if spun:
-        notes.append(f"the car spun: sideslip reached {math.degrees(peak_sideslip):.0f} degrees")
+    if outcome.lost:
+        notes.append(outcome.describe())
     truth = {name: motion.column(name) for name in OBSERVED}
     truth["sideslip_rad"] = np.arctan2(truth["vy_m_s"], truth["vx_m_s"])
+    truth["friction"] = np.mean([truth[f"friction_{w}"] for w in WHEELS], axis=0)
+    channels = sense(motion, vehicle, noise, seed, rtk_rate_hz, rtk_outages(faults))
     return Drive(
         manoeuvre=manoeuvre,
         speed_km_h=speed_km_h,
         friction=friction,
         seed=seed,
         duration_s=duration_s,
-        scale=scale,
+        amplitude=amplitude,
+        scale=request.scale,
         start_ns=START_NS,
         times_s=motion.times_s,
         truth=truth,
-        channels=sense(motion, vehicle, noise, seed, rtk_rate_hz),
+        channels=apply_faults(channels, faults, noise, seed),
         vehicle=vehicle,
+        vehicle_name=vehicle_name,
         noise=noise,
+        faults=tuple(faults),
         rtk_rate_hz=rtk_rate_hz,
-        peak_ay_m_s2=peak_ay,
-        peak_sideslip_rad=peak_sideslip,
-        spun=spun,
+        peak_ay_m_s2=outcome.peak_ay_m_s2,
+        peak_sideslip_rad=outcome.peak_sideslip_rad,
+        spun=outcome.spun,
+        lifted=outcome.lifted,
         notes=tuple(notes),
     )
 
 
-def _check(speed_km_h: float, friction: float, seed: int, duration_s: float | None, rtk_rate_hz: int) -> None:
+def _check(
+    chosen: Manoeuvre,
+    speed_km_h: float,
+    friction: float,
+    seed: int,
+    duration_s: float | None,
+    amplitude: float,
+    rtk_rate_hz: int,
+) -> None:
     def require(holds: bool, where: str, expected: str, got: float) -> None:
         if not holds:
             raise SimulationError(expected=expected, got=f"{got:g}", where=where)
 
-    require(10.0 <= speed_km_h <= 250.0, "speed", "10 to 250 km/h", speed_km_h)
+    top = min(250.0, chosen.top_speed_km_h)
+    require(10.0 <= speed_km_h <= top, f"speed of {chosen.name}", f"10 to {top:g} km/h", speed_km_h)
     require(0.05 <= friction <= 1.5, "friction", "0.05 to 1.5", friction)
     require(seed >= 0, "seed", "a number of at least 0", seed)
+    require(0.01 <= amplitude <= 10.0, "amplitude", "0.01 to 10", amplitude)
     if duration_s is not None:
         require(1.0 <= duration_s <= 36_000.0, "duration", "1 to 36000 s", duration_s)
     require(rtk_rate_hz in (10, 20, 50, 100), "RTK rate", "10, 20, 50 or 100 Hz", rtk_rate_hz)
 
 
-def _peaks(motion: Motion) -> tuple[float, float]:
-    """Largest |a_y| (m/s²) and, where the car moves, largest |β| (rad)."""
-    v_x, v_y = motion.column("vx_m_s"), motion.column("vy_m_s")
-    sideslip = np.where(np.hypot(v_x, v_y) > _SPIN_MIN_SPEED_M_S, np.abs(np.arctan2(v_y, v_x)), 0.0)
-    return float(np.abs(motion.column("ay_m_s2")).max()), float(sideslip.max())
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a motion went: peaks, and whether the car was lost."""
+
+    peak_ay_m_s2: float
+    peak_sideslip_rad: float
+    spun: bool
+    lifted: bool
+
+    @property
+    def lost(self) -> bool:
+        """The car spun or a wheel left the road."""
+        return self.spun or self.lifted
+
+    def describe(self) -> str:
+        """Say it in words."""
+        words = []
+        if self.spun:
+            words.append(f"the car spun: sideslip reached {math.degrees(self.peak_sideslip_rad):.0f} degrees")
+        if self.lifted:
+            words.append("a wheel left the road")
+        return " and ".join(words)
 
 
-def _search_scale(chosen: Manoeuvre, request: Request, vehicle: Vehicle, notes: list[str]) -> float:
-    """Find the scale at which the peak |a_y| reaches the manoeuvre's share of μ g without a spin.
+def judge(motion: Motion) -> Outcome:
+    """Tell how a motion went.
 
-    Doubling by parts up to the target, then bisection to 0.2 %. Where the target cannot be had, the scale with the
-    highest peak is taken and a note says so.
+    Raises
+    ------
+    SimulationError
+        It left the finite numbers.
     """
-    assert chosen.peak_share is not None
-    unit = request.friction * GRAVITY_M_S2
-    target = chosen.peak_share * unit
+    if not np.isfinite(motion.observed[:, 0]).all():
+        raise SimulationError(
+            expected="finite motion", got="NaN or infinity", where="the vehicle", remedy="try a lower speed"
+        )
+    v_x, v_y = motion.column("vx_m_s"), motion.column("vy_m_s")
+    moves = np.hypot(v_x, v_y) > _SPIN_MIN_SPEED_M_S
+    sideslip = float(np.where(moves, np.abs(np.arctan2(v_y, v_x)), 0.0).max())
+    step_s = float(motion.times_s[1] - motion.times_s[0])
+    rows = max(1, math.ceil(_LIFT_S / step_s - 1e-9))
+    lifted = False
+    for wheel in WHEELS:
+        off = (motion.column(f"fz_{wheel}_n") <= 0.0) & moves
+        lifted |= bool(off.any()) and bool((np.convolve(off, np.ones(rows), mode="valid") >= rows - 0.5).any())
+    return Outcome(float(np.abs(motion.column("ay_m_s2")).max()), sideslip, sideslip > SPIN_RAD, lifted)
 
-    def peak(scale: float) -> float:
-        """Peak |a_y| at a scale; infinite for a spin, so that the search stays below it."""
-        plan: Plan = chosen.plan(Request(request.speed_m_s, request.friction, request.seed, request.duration_s, scale))
-        if plan.steer_rad.size and np.abs(plan.steer_rad).max() > _STEER_LIMIT_RAD:
-            return math.inf
-        a_y, sideslip = _peaks(simulate_motion(plan, request.friction, vehicle=vehicle))
-        return math.inf if not math.isfinite(a_y) or sideslip > SPIN_RAD else a_y
 
-    low, high = 0.0, 0.25
-    best_scale, best_peak = 0.0, 0.0
-    for _ in range(14):
-        value = peak(high)
-        if math.isfinite(value) and value > best_peak:
-            best_scale, best_peak = high, value
-        if value >= target:
+def reference_steer_rad(speed_m_s: float, friction: float, vehicle: Vehicle) -> float:
+    """Road-wheel angle at which a slow ramp (13.5 degrees a second at the steering wheel) reaches 0.3 g (FMVSS 126).
+
+    Raises
+    ------
+    SimulationError
+        The car does not reach it at this speed.
+    """
+    wanted = reference_a_y_m_s2(friction)
+    rate = math.radians(13.5) / STEERING_RATIO
+    duration_s = 2.0 * steer_for(wanted, speed_m_s) / rate + 1.0
+    steer = rate * CONTROL_STEP_S * np.arange(round(duration_s / CONTROL_STEP_S) + 1, dtype=np.float64)
+    motion = simulate_motion(Plan(speed_m_s, duration_s, steer_rad=steer), friction, vehicle=vehicle)
+    a_y = motion.column("ay_m_s2")
+    above = np.flatnonzero(a_y >= wanted)
+    if above.size == 0 or above[0] == 0:
+        raise SimulationError(
+            expected=f"a speed at which the car reaches {wanted:.2g} m/s^2",
+            got=f"{speed_m_s * 3.6:g} km/h",
+            where="speed",
+            remedy="choose a higher speed",
+        )
+    i = int(above[0])
+    return float(np.interp(wanted, a_y[i - 1 : i + 1], motion.column("steer_rad")[i - 1 : i + 1]))
+
+
+def _largest_safe_scale(chosen: Manoeuvre, request: Request, vehicle: Vehicle, notes: list[str]) -> float:
+    """Lower the amplitude by tenths until the car keeps its course and its wheels on the road."""
+    scale = request.scale
+    for _ in range(20):
+        outcome = judge(simulate_motion(chosen.plan(replace(request, scale=scale)), request.friction, vehicle=vehicle))
+        if not outcome.lost:
             break
-        low, high = high, high * 1.35
-    for _ in range(24):
-        if abs(best_peak / target - 1.0) < 0.002:
+        if scale == request.scale:
+            notes.append(f"{outcome.describe()} at the amplitude asked for; it was lowered until not")
+        scale *= 0.9
+    return scale
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """The |a_y| (m/s²) that a manoeuvre is scaled to, how near to come, and whether a spin may count."""
+
+    chosen: Manoeuvre
+    a_y_m_s2: float
+    tolerance: float
+    keep_spins: bool
+
+
+def search_scale(goal: Goal, request: Request, vehicle: Vehicle, notes: list[str]) -> float:
+    """Find the scale at which the |a_y| reaches its goal, without a spin or a lifted wheel unless they may be kept.
+
+    From a guess, by proportion while all results lie on one side, then by interpolation within the bracket. Where the
+    goal cannot be had, the scale that comes nearest is taken and a note says so.
+    """
+    low, high = (0.0, 0.0), (math.inf, math.nan)
+    best_scale, best_value = 0.0, 0.0
+    scale = request.scale
+    for _ in range(30):
+        value = _achieved(goal, replace(request, scale=scale), vehicle)
+        if math.isfinite(value) and abs(value - goal.a_y_m_s2) < abs(best_value - goal.a_y_m_s2):
+            best_scale, best_value = scale, value
+        if abs(value / goal.a_y_m_s2 - 1.0) < goal.tolerance:
             break
-        middle = 0.5 * (low + high)
-        value = peak(middle)
-        if math.isfinite(value) and abs(value - target) < abs(best_peak - target):
-            best_scale, best_peak = middle, value
-        low, high = (low, middle) if value >= target else (middle, high)
+        if value < goal.a_y_m_s2:
+            low = (scale, value)
+        else:
+            high = (scale, value)
+        if math.isinf(high[0]):
+            if scale > 8.0 * max(best_scale, 0.1) or scale > 100.0:
+                break
+            scale *= min(max(1.02 * goal.a_y_m_s2 / max(value, 1e-9), 1.1), 2.0)
+        elif high[0] - low[0] < 0.25 * goal.tolerance * high[0]:
+            break
+        else:
+            share = (goal.a_y_m_s2 - low[1]) / (high[1] - low[1]) if math.isfinite(high[1]) else 0.5
+            scale = low[0] + min(max(share, 0.1), 0.9) * (high[0] - low[0])
     if best_scale == 0.0:
         raise SimulationError(
-            expected=f"a speed at which the car can do {chosen.name}",
+            expected=f"a speed at which the car can do {goal.chosen.name}",
             got=f"{request.speed_m_s * 3.6:g} km/h",
             where="speed",
             remedy="choose another speed",
         )
-    if best_peak < chosen.least_share * unit:
-        notes.append(
-            f"|a_y| reaches only {best_peak / unit:.2f} mu g of the {chosen.peak_share:.2f} that {chosen.name} asks for"
-        )
+    asked = goal.a_y_m_s2 / (request.friction * GRAVITY_M_S2)
+    least = goal.chosen.least_share / goal.chosen.peak_share if goal.chosen.peak_share else 0.0
+    if best_value < min(least, 1.0 - goal.tolerance) * goal.a_y_m_s2:
+        got = best_value / (request.friction * GRAVITY_M_S2)
+        notes.append(f"|a_y| reaches only {got:.2f} mu g of the {asked:.2f} that was asked for")
     return best_scale
+
+
+def _achieved(goal: Goal, request: Request, vehicle: Vehicle) -> float:
+    """|a_y| at a scale; infinite where the car is lost and may not be, so that the search stays below it."""
+    plan = goal.chosen.plan(request)
+    if plan.steer_rad.size and np.abs(plan.steer_rad).max() > _STEER_LIMIT_RAD:
+        return math.inf
+    motion = simulate_motion(plan, request.friction, vehicle=vehicle)
+    outcome = judge(motion)
+    if outcome.lost and not goal.keep_spins:
+        return math.inf
+    if plan.goal_window_s is None:
+        return outcome.peak_ay_m_s2
+    start, end = plan.goal_window_s
+    inside = (motion.times_s >= start) & (motion.times_s <= end)
+    return float(np.abs(motion.column("ay_m_s2")[inside]).mean())
 
 
 #: Length of the pieces that a log is written in, so that the messages of a long drive never stand in memory at once.
 _WRITE_NS = 60_000_000_000
 
 
-def write_drive(drive: Drive, path: Path) -> None:
-    """Write a drive as ROS 2 MCAP: sensors, RTK truth, perfect truth, and how it was made as metadata ``truthsim``.
+def write_drive(drive: Drive, path: Path, *, without: Sequence[str] = (), steering_wheel: bool = False) -> None:
+    """Write a drive as ROS 2 MCAP: sensors, RTK truth, perfect truth, faults, and how it was made.
 
-    ``header.stamp`` and publish time are the measurement time, log time is the arrival.
+    ``header.stamp`` and publish time are the measurement time, log time is the arrival. The metadata record
+    ``truthsim`` says how the drive was made.
+
+    Parameters
+    ----------
+    without : parts (keys of ``truthsim.recording.PARTS``) that the recorder did not record.
+    steering_wheel : record the angle at the steering wheel too.
 
     Raises
     ------
+    SimulationError : a part is unknown.
     OutputError : the file cannot be written.
     """
-    topics = list(
-        topics_of(
+    unknown = [part for part in without if part not in PARTS]
+    if unknown:
+        raise SimulationError(expected=f"parts of {', '.join(PARTS)}", got=", ".join(unknown), where="--without")
+    left_out = {name for part in without for name in PARTS[part]}
+    topics = [
+        topic
+        for topic in topics_of(
             drive.channels,
             drive.times_s,
             drive.truth,
-            friction=drive.friction,
             noise=drive.noise,
+            faults=drive.faults,
             rtk_rate_hz=drive.rtk_rate_hz,
             start_ns=drive.start_ns,
+            steering_wheel=steering_wheel,
         )
-    )
+        if topic.name not in left_out
+    ]
     with McapLogWriter(path) as writer:
         for topic in topics:
             writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=topic.definition)
         writer.metadata("truthsim", drive.metadata())
-        end_ns = 1 + max(int(topic.arrival_ns[-1]) for topic in topics)
+        end_ns = 1 + max(
+            (int(topic.arrival_ns[-1]) for topic in topics if topic.arrival_ns.size), default=drive.start_ns
+        )
         for start, end in windows(drive.start_ns, end_ns, _WRITE_NS):
             writer.write([topic.between(start, end) for topic in topics])

@@ -1,36 +1,62 @@
-"""The manoeuvres: what the driver is asked to do, as steering tables or as paths with speeds and stops.
+"""The manoeuvres: what the driver is asked to do, as steering tables or as paths with speeds, stops and roads.
 
-A manoeuvre is planned for a speed, a friction, a seed, a duration and a scale. Where it names a share of μ g for its
-peak lateral acceleration, ``truthsim.drive`` searches the scale that reaches it; scale 1 is a plain guess.
+A manoeuvre is planned for a speed, a friction, a seed, a duration and a scale. Its amplitude is one of three things:
+``peak_share`` of μ g, for which ``truthsim.drive`` searches the scale; a multiple of the angle at which a slow ramp
+reaches 0.3 g (FMVSS 126 and NHTSA's fishhook), which is measured first; or the course itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
 from pdhef_logtool.signals import FloatArray
+from truthsim.road_course import (
+    CROSSFALL_RAD,
+    LANE_M,
+    TOUR,
+    clothoid_bend,
+    draw_course,
+    integrate_course,
+    speed_profile,
+)
 
 GRAVITY_M_S2 = 9.80665
 CONTROL_STEP_S = 0.001
 PATH_STEP_M = 0.5
+#: Columns of a road table.
+ROAD_FRICTION_LEFT, ROAD_FRICTION_RIGHT, ROAD_BANK, ROAD_GRADE = range(4)
 
 WHEELBASE_M = 2.87
+#: Steering wheel to road wheels, for the rates that the standards give at the steering wheel.
+STEERING_RATIO = 16.0
+#: Brake torque that slows the default car by 1 m/s²: 1440 kg · 0.30 m.
+TORQUE_PER_BRAKING = 432.0
 #: Understeer that the guesses of scale 1 assume, rad per m/s².
 _GUESSED_UNDERSTEER = 0.0035
+#: The friction of a dry test track, for which the standards' angles are meant.
+_TRACK_FRICTION = 0.9
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a plan is made for. ``scale`` multiplies the amplitude."""
+    """What a plan is made for.
+
+    Attributes
+    ----------
+    scale : multiplies the amplitude.
+    reference_rad : road-wheel angle at which a slow ramp reaches :func:`reference_a_y_m_s2`; 0 where not needed.
+    """
 
     speed_m_s: float
     friction: float
     seed: int
     duration_s: float
     scale: float
+    reference_rad: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +69,13 @@ class Plan:
     steer_rad : mean road-wheel angle every 1 ms, [duration / 1 ms + 1]; empty when a path is followed.
     path : x, y (m), yaw (rad), speed (m/s) every ``PATH_STEP_M``, [P, 4]; empty when the steering is given.
     stops : arc length (m) and dwell (s) of the places to stand still at, [K, 2].
+    torque_n_m : drive and brake torque (N m, all wheels, at least 0) every 1 ms, [duration / 1 ms + 1, 2]; rows of NaN
+        leave the pedals to the driver, who holds the speed. Empty: the driver's throughout.
+    road : friction under the left and the right wheels, bank (rad) and grade (rad) every ``PATH_STEP_M`` of the
+        distance driven (along the path where one is followed), [R, 4]; beyond its end the last row holds. Empty: level,
+        the same friction everywhere. Bank is positive where the road leans to the right (its left edge higher), as a
+        car's roll; grade is positive uphill.
+    goal_window_s : where the mean |a_y| is what the scale is searched for; None: the peak over the whole drive.
     """
 
     start_speed_m_s: float
@@ -50,6 +83,9 @@ class Plan:
     steer_rad: FloatArray = field(default_factory=lambda: np.empty(0))
     path: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
     stops: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    torque_n_m: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    road: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+    goal_window_s: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,8 +96,10 @@ class Manoeuvre:
     ----------
     default_duration_s : duration in s by speed in m/s.
     rtk_rate_hz : default rate of the truth; long drives take less.
-    peak_share : peak |a_y| over μ g that the scale is searched for; None where nothing is scaled.
+    peak_share : goal |a_y| over μ g that the scale is searched for; None where nothing is searched.
     least_share : peak |a_y| over μ g below which the manoeuvre has failed its purpose.
+    uses_reference : the amplitude is a multiple of the angle at 0.3 g.
+    top_speed_km_h : above it the course cannot be driven.
     """
 
     name: str
@@ -73,6 +111,8 @@ class Manoeuvre:
     default_duration_s: Callable[[float], float]
     plan: Callable[[Request], Plan]
     rtk_rate_hz: int = 100
+    uses_reference: bool = False
+    top_speed_km_h: float = 250.0
 
     @property
     def duration_s(self) -> float:
@@ -80,13 +120,24 @@ class Manoeuvre:
         return self.default_duration_s(self.speed_km_h / 3.6)
 
 
-def _steer_for(a_y_m_s2: float, speed_m_s: float) -> float:
+def reference_a_y_m_s2(friction: float) -> float:
+    """Lateral acceleration of the slow ramp at which FMVSS 126 reads its angle: 0.3 g, less on a slippery road."""
+    return 0.3 * GRAVITY_M_S2 * min(1.0, friction / _TRACK_FRICTION)
+
+
+def steer_for(a_y_m_s2: float, speed_m_s: float) -> float:
     """Road-wheel angle (rad) that a linear car with a guessed understeer needs for a lateral acceleration."""
     return a_y_m_s2 * (WHEELBASE_M / speed_m_s**2 + _GUESSED_UNDERSTEER)
 
 
 def _times_s(duration_s: float) -> FloatArray:
     return np.arange(round(duration_s / CONTROL_STEP_S) + 1, dtype=np.float64) * CONTROL_STEP_S
+
+
+def _coasting_from(start_s: float, duration_s: float) -> FloatArray:
+    """Pedal torques of a driver who takes the foot off the throttle at a time."""
+    late = _times_s(duration_s) >= start_s
+    return np.where(late[:, None], 0.0, np.full((1, 2), np.nan))
 
 
 def _smooth_step(u: FloatArray) -> FloatArray:
@@ -102,9 +153,11 @@ def _path_from_offset(offset_m: FloatArray, speed_m_s: float) -> FloatArray:
     return np.stack([x, offset_m, yaw, np.full_like(x, speed_m_s)], axis=1)
 
 
+# ---- lane changes ----
+
 #: ISO 3888-1: entry lane, first change, side lane, second change, exit lane, run-out, in metres.
 ISO_3888_1_M = (15.0, 30.0, 25.0, 25.0, 15.0, 15.0)
-ISO_3888_1_OFFSET_M = 3.5
+ISO_3888_1_OFFSET_M = LANE_M
 _RUN_IN_S = 2.0
 _RUN_OUT_S = 3.0
 
@@ -125,122 +178,359 @@ def _dlc_duration_s(speed_m_s: float) -> float:
     return round(_RUN_IN_S + sum(ISO_3888_1_M) / speed_m_s + _RUN_OUT_S, 2)
 
 
+#: ISO 3888-2: entry lane, first change, side lane, second change, exit lane, in metres.
+ISO_3888_2_M = (12.0, 13.5, 11.0, 12.5, 12.0)
+CAR_WIDTH_M = 1.80
+#: Lane widths of ISO 3888-2 by the car's width; 1 m lies between the entry lane and the side lane.
+ISO_3888_2_WIDTHS_M = (1.1 * CAR_WIDTH_M + 0.25, CAR_WIDTH_M + 1.0, max(3.0, 1.3 * CAR_WIDTH_M + 0.25))
+ISO_3888_2_GAP_M = 1.0
+_LINE_RUN_M = 20.0
+
+
+def iso_3888_2_corridor_m(along_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lowest and highest lateral place [N] of the middle of a car in the lanes, by the distance along the course.
+
+    The entry lane's middle is 0; between the lanes there is no bound, which is ±infinity.
+    """
+    entry, side, leave = ISO_3888_2_WIDTHS_M
+    edges = np.cumsum([0.0, *ISO_3888_2_M])
+    low, high = np.full(along_m.shape, -np.inf), np.full(along_m.shape, np.inf)
+    for start, end, right, width in (
+        (edges[0], edges[1], -0.5 * entry, entry),
+        (edges[2], edges[3], 0.5 * entry + ISO_3888_2_GAP_M, side),
+        (edges[4], edges[5], -0.5 * entry, leave),
+    ):
+        inside = (along_m >= start) & (along_m <= end)
+        low[inside] = right + 0.5 * CAR_WIDTH_M
+        high[inside] = right + width - 0.5 * CAR_WIDTH_M
+    return low, high
+
+
+@cache
+def iso_3888_2_line_m() -> tuple[float, ...]:
+    """Lateral place every ``PATH_STEP_M`` of the line through the lanes whose largest curvature is least.
+
+    A practised driver uses the lanes' whole width. Linear programme: the largest second derivative, and with it some of
+    the largest third, which is how fast the steering must be turned.
+    """
+    from scipy.optimize import linprog
+
+    margin_m, settle_m = 0.10, 10.0
+    total = sum(ISO_3888_2_M)
+    x = np.arange(-_LINE_RUN_M, total + _LINE_RUN_M + 0.5 * PATH_STEP_M, PATH_STEP_M)
+    n = x.shape[0]
+    low, high = iso_3888_2_corridor_m(x)
+    second = (np.eye(n, k=1) - 2.0 * np.eye(n) + np.eye(n, k=-1))[1:-1] / PATH_STEP_M**2
+    third = np.diff(second, axis=0) / PATH_STEP_M
+    blocks = []
+    for column, matrix in enumerate((second, third)):
+        bound = np.zeros((2 * matrix.shape[0], 2))
+        bound[:, column] = -1.0
+        blocks.append(np.hstack([np.vstack([matrix, -matrix]), bound]))
+    rows = np.vstack(blocks)
+    middle = 0.5 * (ISO_3888_2_WIDTHS_M[2] - ISO_3888_2_WIDTHS_M[0])
+    low, high = low + margin_m, high - margin_m
+    before, after = x <= -settle_m, x >= total + settle_m
+    low[before], high[before] = 0.0, 0.0
+    low[after], high[after] = middle, middle
+    found = linprog(
+        np.concatenate([np.zeros(n), [1.0, 3.0]]),
+        A_ub=rows,
+        b_ub=np.zeros(rows.shape[0]),
+        bounds=[*zip(low.tolist(), high.tolist(), strict=True), (0.0, None), (0.0, None)],
+    )
+    return tuple(found.x[:n].tolist())
+
+
+def iso_3888_2_start_m(speed_m_s: float) -> float:
+    """Distance at which the entry lane begins, on the path's grid."""
+    return max(_LINE_RUN_M, round(_RUN_IN_S * speed_m_s / PATH_STEP_M) * PATH_STEP_M)
+
+
+def _severe_lane_change(request: Request) -> Plan:
+    """ISO 3888-2 course, driven closed loop; the throttle is released two metres into the entry lane."""
+    line = np.array(iso_3888_2_line_m())
+    start_m = iso_3888_2_start_m(request.speed_m_s)
+    before = np.zeros(round((start_m - _LINE_RUN_M) / PATH_STEP_M))
+    after = np.full(int(request.speed_m_s * request.duration_s / PATH_STEP_M), line[-1])
+    offset = request.scale * np.concatenate([before, line, after])
+    return Plan(
+        request.speed_m_s,
+        request.duration_s,
+        path=_path_from_offset(offset, request.speed_m_s),
+        torque_n_m=_coasting_from((start_m + 2.0) / request.speed_m_s, request.duration_s),
+    )
+
+
+# ---- open loop ----
+
+
+def _sweep_phase(t_s: FloatArray, span_s: float, low_hz: float, high_hz: float) -> FloatArray:
+    """Phase (rad) of a sine whose frequency grows linearly over a span."""
+    return np.asarray(2.0 * np.pi * (low_hz * t_s + 0.5 * (high_hz - low_hz) / span_s * t_s**2))
+
+
 def _sine_sweep(request: Request) -> Plan:
     """Open-loop sine after one second straight, its frequency growing from 0.6 to 1 Hz and its amplitude with it."""
-    quiet_s = 1.0
-    t = np.maximum(_times_s(request.duration_s) - quiet_s, 0.0)
-    span = max(request.duration_s - quiet_s, CONTROL_STEP_S)
-    phase = 2.0 * np.pi * (0.6 * t + 0.5 * (1.0 - 0.6) / span * t**2)
-    top = _steer_for(request.friction * GRAVITY_M_S2, request.speed_m_s)
-    steer = request.scale * top * (0.1 + 0.9 * t / span) * np.sin(phase)
+    t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
+    span = max(request.duration_s - 1.0, CONTROL_STEP_S)
+    top = steer_for(request.friction * GRAVITY_M_S2, request.speed_m_s)
+    steer = request.scale * top * (0.1 + 0.9 * t / span) * np.sin(_sweep_phase(t, span, 0.6, 1.0))
     return Plan(request.speed_m_s, request.duration_s, steer_rad=steer)
+
+
+def _sine_sweep_wide(request: Request) -> Plan:
+    """Open-loop sine of one amplitude after one second straight, from 0.5 to 2 Hz."""
+    t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
+    span = max(request.duration_s - 1.0, CONTROL_STEP_S)
+    top = steer_for(0.4 * request.friction * GRAVITY_M_S2, request.speed_m_s)
+    steer = request.scale * top * np.sin(_sweep_phase(t, span, 0.5, 2.0))
+    return Plan(request.speed_m_s, request.duration_s, steer_rad=steer)
+
+
+SINE_WITH_DWELL_HZ = 0.7
+SINE_DWELL_S = 0.5
+SINE_FACTOR = 4.0
+
+
+def sine_with_dwell(t_s: FloatArray) -> FloatArray:
+    """FMVSS 126's steering over its amplitude: 0.7 Hz, held for 500 ms at the second peak; 0 before and after."""
+    hold_at_s = 0.75 / SINE_WITH_DWELL_HZ
+    sine_s = np.where(t_s < hold_at_s, t_s, np.maximum(hold_at_s, t_s - SINE_DWELL_S))
+    steer = np.sin(2.0 * np.pi * SINE_WITH_DWELL_HZ * sine_s)
+    return np.where((t_s >= 0.0) & (sine_s <= 1.0 / SINE_WITH_DWELL_HZ), steer, 0.0)
+
+
+def _sine_with_dwell(request: Request) -> Plan:
+    t = _times_s(request.duration_s)
+    top = request.scale * SINE_FACTOR * request.reference_rad
+    return Plan(
+        request.speed_m_s,
+        request.duration_s,
+        steer_rad=top * sine_with_dwell(t - 1.0),
+        torque_n_m=_coasting_from(1.0, request.duration_s),
+    )
+
+
+FISHHOOK_FACTOR = 6.5
+#: NHTSA's fishhook with fixed timing: rate at the road wheels, first and second dwell, return.
+FISHHOOK_RATE_RAD_S = float(np.deg2rad(720.0)) / STEERING_RATIO
+FISHHOOK_DWELLS_S = (0.25, 3.0)
+FISHHOOK_RETURN_S = 2.0
+
+
+def fishhook(t_s: FloatArray, amplitude_rad: float) -> FloatArray:
+    """Road-wheel angle of NHTSA's fishhook: ramp, 250 ms, ramp to the other side, 3 s, back within 2 s."""
+    ramp = abs(amplitude_rad) / FISHHOOK_RATE_RAD_S
+    first, second = FISHHOOK_DWELLS_S
+    knots = np.cumsum([0.0, ramp, first, 2.0 * ramp, second, FISHHOOK_RETURN_S])
+    return np.interp(t_s, knots, amplitude_rad * np.array([0.0, 1.0, 1.0, -1.0, -1.0, 0.0]))
+
+
+def _fishhook(request: Request) -> Plan:
+    top = request.scale * FISHHOOK_FACTOR * request.reference_rad
+    return Plan(
+        request.speed_m_s,
+        request.duration_s,
+        steer_rad=fishhook(_times_s(request.duration_s) - 1.0, top),
+        torque_n_m=_coasting_from(1.0, request.duration_s),
+    )
+
+
+STEP_RISE_S = 0.15
 
 
 def _step_steer(request: Request) -> Plan:
     """ISO 7401 step input: one second straight, then to a constant angle within 0.15 s."""
-    t = _times_s(request.duration_s)
-    top = _steer_for(0.48 * request.friction * GRAVITY_M_S2, request.speed_m_s)
+    top = steer_for(0.48 * request.friction * GRAVITY_M_S2, request.speed_m_s)
+    rise = np.clip((_times_s(request.duration_s) - 1.0) / STEP_RISE_S, 0.0, 1.0)
     return Plan(
-        request.speed_m_s, request.duration_s, steer_rad=request.scale * top * np.clip((t - 1.0) / 0.15, 0.0, 1.0)
+        request.speed_m_s,
+        request.duration_s,
+        steer_rad=request.scale * top * rise,
+        goal_window_s=(max(request.duration_s - 1.0, 0.5 * request.duration_s), request.duration_s),
     )
 
 
 def _ramp_steer(request: Request) -> Plan:
     """Steering angle growing linearly after one second straight, slow enough to count as steady state."""
     t = _times_s(request.duration_s)
-    top = _steer_for(request.friction * GRAVITY_M_S2, request.speed_m_s)
+    top = steer_for(request.friction * GRAVITY_M_S2, request.speed_m_s)
     rise = np.clip((t - 1.0) / max(request.duration_s - 1.0, CONTROL_STEP_S), 0.0, 1.0)
     return Plan(request.speed_m_s, request.duration_s, steer_rad=request.scale * top * rise)
 
 
-def _road(request: Request) -> Plan:
-    """Ordinary driving: town corners, country bends and lane changes by the seed, with stops of six to nine seconds."""
-    rng = np.random.default_rng(np.random.SeedSequence(entropy=request.seed, spawn_key=(100,)))
-    curvature, limit = _road_course(rng, request)
-    yaw = np.concatenate([[0.0], np.cumsum(0.5 * (curvature[1:] + curvature[:-1]) * PATH_STEP_M)])
-    middle = 0.5 * (yaw[1:] + yaw[:-1])
-    x = np.concatenate([[0.0], np.cumsum(np.cos(middle) * PATH_STEP_M)])
-    y = np.concatenate([[0.0], np.cumsum(np.sin(middle) * PATH_STEP_M)])
+#: ISO 7975: when the brake is pressed, how long its pressure rises, and the deceleration on a dry road.
+BRAKE_AT_S = 5.0
+BRAKE_RISE_S = 0.2
+BRAKING_M_S2 = 3.0
 
-    grip = min(1.0, request.friction / 0.6)
-    free = _speed_profile(limit, grip)
-    time = np.concatenate([[0.0], np.cumsum(PATH_STEP_M / np.maximum(0.5 * (free[1:] + free[:-1]), 0.5))])
-    stop_times = [min(0.3 * request.duration_s, 55.0)]
-    while stop_times[-1] < request.duration_s:
-        stop_times.append(stop_times[-1] + rng.uniform(80.0, 140.0))
-    rows = np.searchsorted(time, np.array(stop_times[:-1]))
-    rows = rows[rows < limit.shape[0] - 1]
-    limit = limit.copy()
-    limit[rows] = 0.0
-    stops = np.stack([rows * PATH_STEP_M, rng.uniform(6.5, 9.5, rows.shape[0])], axis=1)
-    speed = _speed_profile(limit, grip)
+
+def _brake_in_turn(request: Request) -> Plan:
+    """ISO 7975: a steady bend, the steering held, then the throttle released and the brake pressed at once."""
+    t = _times_s(request.duration_s)
+    top = steer_for(0.5 * request.friction * GRAVITY_M_S2, request.speed_m_s)
+    press = np.clip((t - BRAKE_AT_S) / BRAKE_RISE_S, 0.0, 1.0)
+    brake = BRAKING_M_S2 * min(1.0, request.friction / 0.85) * TORQUE_PER_BRAKING
+    torque = np.stack([np.zeros_like(t), brake * press], axis=1)
+    torque[t < BRAKE_AT_S] = np.nan
     return Plan(
-        float(speed[0]), request.duration_s, path=np.stack([x, y, yaw, speed], axis=1), stops=stops.astype(np.float64)
+        request.speed_m_s,
+        request.duration_s,
+        steer_rad=request.scale * top * _smooth_step(t - 1.0),
+        torque_n_m=torque,
+        goal_window_s=(BRAKE_AT_S - 1.0, BRAKE_AT_S),
     )
 
 
-def _road_course(rng: np.random.Generator, request: Request) -> tuple[FloatArray, FloatArray]:
-    """Curvature (1/m) and speed limit (m/s) every ``PATH_STEP_M`` of a course long enough for the duration."""
-    curvature: list[FloatArray] = [np.zeros(60)]
-    limit: list[FloatArray] = [np.full(60, min(request.speed_m_s, 50.0 / 3.6))]
-    length = 0.0
-    town = True
-    until_m = rng.uniform(350.0, 700.0)
-    comfort = min(1.0, request.friction / 0.6)
-    while length < request.speed_m_s * request.duration_s + 200.0:
-        if length > until_m:
-            town = not town
-            until_m = length + (rng.uniform(400.0, 900.0) if town else rng.uniform(1200.0, 2500.0))
-        allowed = min(request.speed_m_s, rng.uniform(40.0, 55.0) / 3.6 if town else rng.uniform(70.0, 110.0) / 3.6)
-        straight_m = rng.uniform(30.0, 150.0) if town else rng.uniform(40.0, 250.0)
-        kind = rng.uniform()
-        side = 1.0 if rng.uniform() < 0.5 else -1.0
-        a_y = comfort * rng.uniform(1.2, 3.2)
-        if kind < 0.2:
-            bend = _lane_change(side, allowed, rng.uniform(3.0, 4.5))
-            pace = allowed
-        else:
-            if town:
-                radius, turn = rng.uniform(10.0, 40.0), rng.uniform(0.6, 1.6)
-            else:
-                radius, turn = rng.uniform(70.0, 450.0), rng.uniform(0.25, 1.2)
-            pace = min(allowed, float(np.sqrt(a_y * radius)))
-            bend = _clothoid_bend(side / radius, turn, max(6.0, 1.1 * pace))
-        piece = np.concatenate([np.zeros(int(straight_m / PATH_STEP_M)), bend])
-        speeds = np.full(piece.shape[0], allowed)
-        speeds[-bend.shape[0] :] = pace
+#: Friction of the slippery part of a friction jump, over the rest's.
+JUMP_SHARE = 0.5
+
+
+def _friction_jump(request: Request) -> Plan:
+    """A slalom of 0.5 Hz over a road whose second third has half the friction."""
+    t = np.maximum(_times_s(request.duration_s) - 1.0, 0.0)
+    top = steer_for(0.6 * request.friction * GRAVITY_M_S2, request.speed_m_s)
+    third_m = request.speed_m_s * request.duration_s / 3.0
+    at = np.arange(int(3.0 * third_m / PATH_STEP_M) + 1) * PATH_STEP_M
+    friction = request.friction * np.where((at >= third_m) & (at < 2.0 * third_m), JUMP_SHARE, 1.0)
+    flat = np.zeros_like(at)
+    return Plan(
+        request.speed_m_s,
+        request.duration_s,
+        steer_rad=request.scale * top * np.minimum(t, 1.0) * np.sin(2.0 * np.pi * 0.5 * t),
+        road=np.stack([friction, friction, flat, flat], axis=1),
+    )
+
+
+# ---- roads ----
+
+
+def _plan_of_course(
+    request: Request,
+    curvature_1_m: FloatArray,
+    speed_m_s: FloatArray,
+    *,
+    bank_rad: FloatArray,
+    grade_rad: FloatArray,
+    stops: FloatArray,
+) -> Plan:
+    friction = np.full(curvature_1_m.shape[0], request.friction)
+    return Plan(
+        float(speed_m_s[0]),
+        request.duration_s,
+        path=np.concatenate([integrate_course(curvature_1_m, PATH_STEP_M), speed_m_s[:, None]], axis=1),
+        stops=stops,
+        road=np.stack([friction, friction, bank_rad, grade_rad], axis=1),
+    )
+
+
+#: Lean of the bends of a banked road, positive outward (adverse camber), and the grade under them; in turn.
+BANKED_BENDS = ((-0.10, 0.06), (0.0, 0.0), (0.06, -0.06))
+
+
+def _banked_road(request: Request) -> Plan:
+    """Bends to both sides, banked inward, level and outward, up and down; driven closed loop at one speed."""
+    rng = np.random.default_rng(np.random.SeedSequence(entropy=request.seed, spawn_key=(101,)))
+    speed = request.speed_m_s
+    straight = np.zeros(int(1.5 * speed / PATH_STEP_M))
+    curvature, bank, grade = [straight], [np.full_like(straight, CROSSFALL_RAD)], [np.zeros_like(straight)]
+    first_side = 1.0 if rng.uniform() < 0.5 else -1.0
+    length, bends = PATH_STEP_M * straight.shape[0], 0
+    while length < speed * request.duration_s + 100.0:
+        outward, slope = BANKED_BENDS[bends % len(BANKED_BENDS)]
+        side = first_side * (1.0 if bends % 2 == 0 else -1.0)
+        a_y = request.scale * rng.uniform(0.35, 0.5) * request.friction * GRAVITY_M_S2
+        bend = clothoid_bend(side * a_y / speed**2, 4.0 * a_y / speed, 1.2 * speed, PATH_STEP_M)
+        # Leaning outward of a left-hand bend is leaning to the right, which is positive.
+        lean = side * outward * np.abs(bend) / np.abs(bend).max()
+        curvature += [bend, straight]
+        bank += [lean, np.full_like(straight, CROSSFALL_RAD)]
+        grade += [np.full_like(bend, slope), np.zeros_like(straight)]
+        length += PATH_STEP_M * (bend.shape[0] + straight.shape[0])
+        bends += 1
+    return _plan_of_course(
+        request,
+        np.concatenate(curvature),
+        np.full(sum(c.shape[0] for c in curvature), speed),
+        bank_rad=_eased(np.concatenate(bank)),
+        grade_rad=_eased(np.concatenate(grade)),
+        stops=np.empty((0, 2)),
+    )
+
+
+def _eased(values: FloatArray) -> FloatArray:
+    """Moving average over 30 m, so that no bank or grade begins at once."""
+    width = int(30.0 / PATH_STEP_M)
+    padded = np.concatenate([np.full(width // 2, values[0]), values, np.full(width - width // 2 - 1, values[-1])])
+    return np.convolve(padded, np.full(width, 1.0 / width), mode="valid")
+
+
+def _stop_and_go(request: Request) -> Plan:
+    """Standstill, drive, standstill, again and again, on a road with gentle bends; the first stand lasts 3 s."""
+    rng = np.random.default_rng(np.random.SeedSequence(entropy=request.seed, spawn_key=(102,)))
+    grip = min(1.0, request.friction / 0.6)
+    curvature, limit, stops = [np.zeros(10)], [np.full(10, request.speed_m_s)], [(0.0, 3.0)]
+    left_s, at = request.duration_s, 10 * PATH_STEP_M
+    while left_s > 0.0:
+        top = request.speed_m_s * rng.uniform(0.4, 1.0)
+        a_y, side = grip * rng.uniform(0.5, 2.0), 1.0 if rng.uniform() < 0.5 else -1.0
+        bend = clothoid_bend(side * a_y / top**2, rng.uniform(0.1, 0.5), top, PATH_STEP_M)
+        straight = np.zeros(int(rng.uniform(0.3, 1.0) * top / PATH_STEP_M) + 4)
+        piece = np.concatenate([straight, bend, straight])
         curvature.append(piece)
-        limit.append(speeds)
-        length += piece.shape[0] * PATH_STEP_M
-    return np.concatenate(curvature), np.concatenate(limit)
+        limit.append(np.full(piece.shape[0], top))
+        at += piece.shape[0] * PATH_STEP_M
+        stops.append((at, float(rng.uniform(2.0, 6.0))))
+        left_s -= piece.shape[0] * PATH_STEP_M / top + top / (1.8 * grip) + stops[-1][1]
+    curvature.append(np.zeros(40))
+    limit.append(np.full(40, request.speed_m_s))
+    speeds, halts = np.concatenate(limit), np.array(stops, dtype=np.float64)
+    speeds[np.round(halts[:, 0] / PATH_STEP_M).astype(np.int64)] = 0.0
+    flat = np.zeros(speeds.shape[0])
+    return _plan_of_course(
+        request,
+        np.concatenate(curvature),
+        speed_profile(speeds, grip, PATH_STEP_M),
+        bank_rad=flat,
+        grade_rad=flat,
+        stops=halts,
+    )
 
 
-def _clothoid_bend(curvature_1_m: float, turn_rad: float, transition_m: float) -> FloatArray:
-    """Curvature of a bend with a transition at each end, every ``PATH_STEP_M``."""
-    transition_m = min(transition_m, turn_rad / abs(curvature_1_m))
-    arc_m = max(turn_rad / abs(curvature_1_m) - transition_m, 0.0)
-    s = np.arange(0.0, 2.0 * transition_m + arc_m, PATH_STEP_M)
-    up = np.clip(s / transition_m, 0.0, 1.0)
-    down = np.clip((2.0 * transition_m + arc_m - s) / transition_m, 0.0, 1.0)
-    return np.asarray(curvature_1_m * np.minimum(up, down), dtype=np.float64)
+#: A drive shorter than this may begin anywhere; a longer one begins in town and has its first stop within a minute.
+_LONG_ROAD_S = 60.0
 
 
-def _lane_change(side: float, speed_m_s: float, seconds: float) -> FloatArray:
-    """Curvature of a lane change of 3.5 m, every ``PATH_STEP_M``."""
-    length = speed_m_s * seconds
-    u = np.arange(0.0, length, PATH_STEP_M) / length
-    second_derivative = 60.0 * u - 180.0 * u**2 + 120.0 * u**3
-    return np.asarray(side * 3.5 / length**2 * second_derivative, dtype=np.float64)
-
-
-def _speed_profile(limit_m_s: FloatArray, grip: float) -> FloatArray:
-    """Fastest speed under a limit with 1.7 m/s² of acceleration and 1.9 m/s² of braking, times ``grip``."""
-    speed = limit_m_s.copy()
-    for i in range(1, speed.shape[0]):
-        speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2.0 * 1.7 * grip * PATH_STEP_M))
-    for i in range(speed.shape[0] - 2, -1, -1):
-        speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2.0 * 1.9 * grip * PATH_STEP_M))
-    return speed
+def _road(request: Request) -> Plan:
+    """Ordinary driving by the seed: town, country, motorway, country, and again, with stops where towns have them."""
+    rng = np.random.default_rng(np.random.SeedSequence(entropy=request.seed, spawn_key=(100,)))
+    long = request.duration_s >= _LONG_ROAD_S
+    course = draw_course(
+        rng,
+        length_m=request.speed_m_s * request.duration_s + 200.0,
+        step_m=PATH_STEP_M,
+        top_speed_m_s=request.speed_m_s,
+        friction=request.friction,
+        first=0 if long else int(rng.integers(len(TOUR))),
+    )
+    grip = min(1.0, request.friction / 0.6)
+    limit, stops = course.limit_m_s.copy(), course.stops
+    if long:
+        free = speed_profile(limit, grip, PATH_STEP_M)
+        time = np.concatenate([[0.0], np.cumsum(PATH_STEP_M / np.maximum(0.5 * (free[1:] + free[:-1]), 0.5))])
+        row = int(np.searchsorted(time, min(0.3 * request.duration_s, 55.0)))
+        early = np.array([[row * PATH_STEP_M, rng.uniform(6.5, 9.5)]])
+        stops = np.concatenate([early, stops[stops[:, 0] > early[0, 0] + 40.0]])
+    limit[np.round(stops[:, 0] / PATH_STEP_M).astype(np.int64)] = 0.0
+    return _plan_of_course(
+        request,
+        course.curvature_1_m,
+        speed_profile(limit, grip, PATH_STEP_M),
+        bank_rad=course.bank_rad,
+        grade_rad=course.grade_rad,
+        stops=stops,
+    )
 
 
 _CATALOGUE = (
@@ -255,6 +545,17 @@ _CATALOGUE = (
         plan=_double_lane_change,
     ),
     Manoeuvre(
+        name="dlc-3888-2",
+        description="severe lane change on the ISO 3888-2 course at up to 70 km/h, throttle released at its entry",
+        speed_km_h=60.0,
+        friction=0.85,
+        peak_share=None,
+        least_share=0.45,
+        default_duration_s=lambda speed_m_s: round(_RUN_IN_S + sum(ISO_3888_2_M) / speed_m_s + _RUN_OUT_S, 2),
+        plan=_severe_lane_change,
+        top_speed_km_h=70.0,
+    ),
+    Manoeuvre(
         name="sine-sweep",
         description="open-loop steering sine, 0.6 to 1 Hz, growing until |a_y| reaches 0.92 mu g",
         speed_km_h=60.0,
@@ -265,8 +566,40 @@ _CATALOGUE = (
         plan=_sine_sweep,
     ),
     Manoeuvre(
+        name="sine-sweep-wide",
+        description="open-loop steering sine of one amplitude, 0.5 to 2 Hz, |a_y| to 0.4 mu g",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=0.40,
+        least_share=0.38,
+        default_duration_s=lambda _: 20.0,
+        plan=_sine_sweep_wide,
+    ),
+    Manoeuvre(
+        name="sine-with-dwell",
+        description="FMVSS 126: a sine of 0.7 Hz, 500 ms at its second peak, 4 times the angle at 0.3 g, coasting",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=None,
+        least_share=0.5,
+        default_duration_s=lambda _: 6.0,
+        plan=_sine_with_dwell,
+        uses_reference=True,
+    ),
+    Manoeuvre(
+        name="fishhook",
+        description="NHTSA fishhook, 6.5 times the angle at 0.3 g to one side and then to the other, coasting",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=None,
+        least_share=0.6,
+        default_duration_s=lambda _: 8.0,
+        plan=_fishhook,
+        uses_reference=True,
+    ),
+    Manoeuvre(
         name="step-steer",
-        description="ISO 7401 step of the steering, scaled so that |a_y| peaks at 0.48 mu g (4 m/s^2 at mu 0.85)",
+        description="ISO 7401 step of the steering to a steady |a_y| of 0.48 mu g (4 m/s^2 at mu 0.85)",
         speed_km_h=100.0,
         friction=0.85,
         peak_share=4.0 / (0.85 * GRAVITY_M_S2),
@@ -285,9 +618,49 @@ _CATALOGUE = (
         plan=_ramp_steer,
     ),
     Manoeuvre(
+        name="brake-in-turn",
+        description="ISO 7975: steady bend at 0.5 mu g, steering held, braking with 3 m/s^2 (scaled to mu) after 5 s",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=0.50,
+        least_share=0.45,
+        default_duration_s=lambda _: 10.0,
+        plan=_brake_in_turn,
+    ),
+    Manoeuvre(
+        name="mu-jump",
+        description="slalom of 0.5 Hz over a road that has half the friction in its second third",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=0.60,
+        least_share=0.55,
+        default_duration_s=lambda _: 12.0,
+        plan=_friction_jump,
+    ),
+    Manoeuvre(
+        name="banked-road",
+        description="bends banked inward, level and outward, uphill and down, at one speed",
+        speed_km_h=80.0,
+        friction=0.85,
+        peak_share=None,
+        least_share=0.25,
+        default_duration_s=lambda _: 40.0,
+        plan=_banked_road,
+    ),
+    Manoeuvre(
+        name="stop-and-go",
+        description="standstill, drive, standstill by the seed; speed is the highest driven",
+        speed_km_h=50.0,
+        friction=0.85,
+        peak_share=None,
+        least_share=0.0,
+        default_duration_s=lambda _: 60.0,
+        plan=_stop_and_go,
+    ),
+    Manoeuvre(
         name="road",
-        description="ordinary driving in town and country by the seed, with stops; speed is the highest driven",
-        speed_km_h=90.0,
+        description="ordinary driving in town, country and motorway by the seed, with stops; speed is the highest",
+        speed_km_h=110.0,
         friction=0.85,
         peak_share=None,
         least_share=0.0,

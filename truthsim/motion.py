@@ -24,7 +24,18 @@ from truthsim.driver import (
     track_progress_m,
 )
 from truthsim.manoeuvres import CONTROL_STEP_S, PATH_STEP_M, Plan
-from truthsim.vehicle import OBSERVED, OBSERVED_SIZE, STATE_SIZE, Vehicle, derivative, observe, standing_state
+from truthsim.road import read_road
+from truthsim.vehicle import (
+    OBSERVED,
+    OBSERVED_SIZE,
+    ROAD_SIZE,
+    STATE_SIZE,
+    Vehicle,
+    derivative,
+    observe,
+    see,
+    standing_state,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +67,7 @@ def _compiled_loop() -> Callable[..., None]:
     """
     folder = Path(__file__).parent
     digest = hashlib.sha256()
-    for name in ("motion.py", "driver.py", "vehicle.py", "tyres.py", "manoeuvres.py"):
+    for name in ("motion.py", "driver.py", "vehicle.py", "tyres.py", "road.py", "manoeuvres.py"):
         digest.update((folder / name).read_bytes())
     sources = digest.hexdigest()
 
@@ -66,6 +77,8 @@ def _compiled_loop() -> Callable[..., None]:
         steer_table: FloatArray,
         path: FloatArray,
         stops: FloatArray,
+        torque_table: FloatArray,
+        road_table: FloatArray,
         friction: float,
         vehicle: Vehicle,
         driver: Driver,
@@ -78,15 +91,17 @@ def _compiled_loop() -> Callable[..., None]:
     ) -> str:
         follows = path.shape[0] > 0
         memory = np.zeros(MEMORY_SIZE)
-        scratch, view = np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
+        scratch, stage, view = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(OBSERVED_SIZE)
         k1, k2, k3, k4 = np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE), np.zeros(STATE_SIZE)
+        road = np.zeros(ROAD_SIZE)
         dt = CONTROL_STEP_S / substeps
+        distance = 0.0
         steer, next_steer = 0.0, 0.0
         if not follows:
             next_steer = steer_table[0]
         for k in range((rows - 1) * period + int(phases[-1]) + 1):
             steer = next_steer
-            observe(state, steer, 0.0, 0.0, friction, vehicle, scratch, view)
+            see(state, view)
             speed = view[3]
             brake_hold = False
             if follows:
@@ -103,20 +118,41 @@ def _compiled_loop() -> Callable[..., None]:
             if brake_hold:
                 drive, brake = 0.0, driver.hold_brake_n_m
 
+            if k < torque_table.shape[0] and torque_table[k, 0] == torque_table[k, 0]:
+                drive, brake = torque_table[k, 0], torque_table[k, 1]
+            at_m = memory[PROGRESS] if follows else distance
+            distance += speed * CONTROL_STEP_S
+            read_road(
+                road_table,
+                PATH_STEP_M,
+                at_m,
+                vehicle.cg_to_front_axle_m,
+                vehicle.cg_to_rear_axle_m,
+                friction,
+                road,
+            )
+
             row = k // period
             for j in range(phases.shape[0]):
                 if k - row * period == int(phases[j]) and row < rows:
-                    observe(state, steer, drive, brake, friction, vehicle, scratch, observed[row, j])
+                    observe(state, steer, drive, brake, road, vehicle, scratch, observed[row, j])
 
             for i in range(substeps):
                 a = steer + (next_steer - steer) * i / substeps
                 c = steer + (next_steer - steer) * (i + 1) / substeps
                 b = 0.5 * (a + c)
-                derivative(state, a, drive, brake, friction, vehicle, k1, view)
-                derivative(state + 0.5 * dt * k1, b, drive, brake, friction, vehicle, k2, view)
-                derivative(state + 0.5 * dt * k2, b, drive, brake, friction, vehicle, k3, view)
-                derivative(state + dt * k3, c, drive, brake, friction, vehicle, k4, view)
-                state += dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+                derivative(state, a, drive, brake, road, vehicle, k1, view)
+                for n in range(STATE_SIZE):
+                    stage[n] = state[n] + 0.5 * dt * k1[n]
+                derivative(stage, b, drive, brake, road, vehicle, k2, view)
+                for n in range(STATE_SIZE):
+                    stage[n] = state[n] + 0.5 * dt * k2[n]
+                derivative(stage, b, drive, brake, road, vehicle, k3, view)
+                for n in range(STATE_SIZE):
+                    stage[n] = state[n] + dt * k3[n]
+                derivative(stage, c, drive, brake, road, vehicle, k4, view)
+                for n in range(STATE_SIZE):
+                    state[n] += dt / 6.0 * (k1[n] + 2.0 * k2[n] + 2.0 * k3[n] + k4[n])
         return sources
 
     return loop  # type: ignore[no-any-return]
@@ -136,7 +172,7 @@ def simulate_motion(
 
     Parameters
     ----------
-    friction : of the road under all wheels.
+    friction : of the road under all wheels, unless the plan brings a road of its own.
     period_s, phases_s : when to record, in whole milliseconds; phases ascend and lie in [0, period).
     """
     vehicle = Vehicle() if vehicle is None else vehicle
@@ -150,6 +186,8 @@ def simulate_motion(
         plan.steer_rad,
         plan.path,
         plan.stops,
+        plan.torque_n_m,
+        plan.road,
         friction,
         vehicle,
         driver,

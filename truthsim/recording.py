@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.writer import TopicBatch
 from pdhef_logtool.signals import WHEELS, FloatArray, IntArray
-from truthsim.sensors import IMU_PERIOD_S, SensorChannel, SensorNoise
+from truthsim.faults import KINDS, TARGETS, Fault
+from truthsim.sensors import IMU_PERIOD_S, RTK_FIXED, RTK_LOST, SensorChannel, SensorNoise
 
 #: Steering has no header there, only a stamp.
 STEERING_REPORT = """builtin_interfaces/Time stamp
@@ -28,6 +29,16 @@ uint32 nanosec
 RTK_STEP = 2.0**-16
 PERFECT_STEP = 2.0**-24
 
+#: Topics that a log may be written without, by what they are called on the command line.
+PARTS: dict[str, tuple[str, ...]] = {
+    "imu": ("/imu/data",),
+    "steering": ("/vehicle/status/steering_status",),
+    "wheels": ("/vehicle/wheel_speeds",),
+    "rtk": ("/rtk/odometry", "/rtk/fix", "/rtk/quality"),
+    "perfect": ("/truth/perfect/odometry", "/truth/perfect/state"),
+    "events": ("/truthsim/events",),
+}
+
 _EXACT = (
     "vx_m_s",
     "vy_m_s",
@@ -39,6 +50,9 @@ _EXACT = (
     "roll_rate_rad_s",
     "pitch_rad",
     "steer_rad",
+    "friction",
+    "bank_rad",
+    "grade_rad",
 )
 
 
@@ -89,12 +103,16 @@ def topics_of(
     times_s: FloatArray,
     truth: Mapping[str, FloatArray],
     *,
-    friction: float,
     noise: SensorNoise,
+    faults: Sequence[Fault],
     rtk_rate_hz: int,
     start_ns: int,
+    steering_wheel: bool,
 ) -> Iterator[Topic]:
-    """Yield the topics of a log: sensors, RTK truth, perfect truth."""
+    """Yield the topics of a log: sensors, RTK truth, perfect truth, and the faults where there are any.
+
+    ``steering_wheel`` adds the angle at the steering wheel, which is what the steering sensor measures.
+    """
     imu, steering, wheels = (channels[k] for k in ("imu", "steering", "wheels"))
 
     def topic(
@@ -138,6 +156,14 @@ def topics_of(
         {"stamp": stamps, "steering_tire_angle": steering.fields["steer_rad"]},
         definition=STEERING_REPORT,
     )
+    if steering_wheel:
+        yield topic(
+            "/vehicle/steering_wheel",
+            "truthsim_msgs/msg/SteeringWheel",
+            steering,
+            constants={"header.frame_id": "base_link"},
+            fields={"angle_rad": steering.fields["steering_wheel_rad"]},
+        )
     yield topic(
         "/vehicle/wheel_speeds",
         "truthsim_msgs/msg/WheelSpeeds",
@@ -147,6 +173,7 @@ def topics_of(
     )
 
     rtk, fix = channels["rtk"], channels["fix"]
+    held = not np.all(rtk.fields["quality"] == RTK_FIXED)
     place, tilt = noise.rtk_position_m**2, noise.rtk_tilt_rad**2
     # A body velocity also carries the heading's error across the speed; 0.015 m/s is that of 30 m/s.
     speed = noise.rtk_velocity_m_s**2 + (30.0 * noise.rtk_heading_rad) ** 2
@@ -160,7 +187,7 @@ def topics_of(
             "pose.covariance": _diagonal(place, place, 4.0 * place, tilt, tilt, noise.rtk_heading_rad**2),
             "twist.covariance": _diagonal(speed, speed, speed, rate, rate, noise.rtk_yaw_rate_rad_s**2),
         },
-        fields=_rounded(_odometry(rtk.fields), RTK_STEP),
+        fields=_rounded(_odometry(rtk.fields), RTK_STEP) | (_pose_covariance(rtk, noise) if held else {}),
     )
     yield topic(
         "/rtk/fix",
@@ -168,34 +195,43 @@ def topics_of(
         fix,
         constants={
             "header.frame_id": "base_link",
-            "status.status": 2.0,
             "status.service": 1.0,
-            "position_covariance": _diagonal(place, place, 4.0 * place),
             "position_covariance_type": 2.0,
         },
         fields={
             "latitude": fix.fields["lat_deg"],
             "longitude": fix.fields["lon_deg"],
             "altitude": fix.fields["alt_m"],
+            # sensor_msgs/NavSatStatus: ground-based augmentation, a plain fix, none.
+            "status.status": np.select(
+                [fix.fields["quality"] == RTK_FIXED, fix.fields["quality"] == RTK_LOST], [2, -1], 0
+            ),
+            "position_covariance": _diagonals(fix.fields["position_std_m"][:, None] ** 2 * np.array([1.0, 1.0, 4.0])),
         },
+    )
+    yield topic(
+        "/rtk/quality",
+        "truthsim_msgs/msg/RtkQuality",
+        fix,
+        constants={"header.frame_id": "base_link"},
+        fields={"quality": fix.fields["quality"], "position_std_m": fix.fields["position_std_m"]},
     )
 
     every = max(1, round(1.0 / (rtk_rate_hz * IMU_PERIOD_S)))
     exact = {name: column[::every] for name, column in truth.items()}
     perfect = SensorChannel(times_s[::every], times_s[::every], exact)
-    zero = np.zeros(perfect.times_s.shape[0])
     yield topic(
         "/truth/perfect/odometry",
         "nav_msgs/msg/Odometry",
         perfect,
         constants={"header.frame_id": "map", "child_frame_id": "base_link"},
-        fields=_rounded(_odometry({**exact, "z_m": zero}), PERFECT_STEP),
+        fields=_rounded(_odometry(exact), PERFECT_STEP),
     )
     yield topic(
         "/truth/perfect/state",
         "truthsim_msgs/msg/VehicleTruth",
         perfect,
-        constants={"header.frame_id": "base_link", "friction": friction},
+        constants={"header.frame_id": "base_link"},
         fields={
             **_rounded({name: exact[name] for name in _EXACT}, PERFECT_STEP),
             "longitudinal_force_n": np.stack([exact[f"fx_{w}_n"] for w in WHEELS], axis=1),
@@ -204,6 +240,52 @@ def topics_of(
             "slip_angle_rad": np.stack([exact[f"slip_angle_{w}_rad"] for w in WHEELS], axis=1),
         },
     )
+    if faults:
+        yield _events(faults, float(times_s[-1]), start_ns)
+
+
+def _events(faults: Sequence[Fault], end_s: float, start_ns: int) -> Topic:
+    """Two messages a fault: when it begins and when it ends, at the latest with the drive."""
+    rows = [
+        (
+            min(at_s, end_s),
+            KINDS.index(f.kind),
+            TARGETS.index(f.target),
+            active,
+            f.value,
+            f.start_s,
+            min(f.end_s, end_s),
+        )
+        for f in faults
+        for at_s, active in ((f.start_s, 1.0), (f.end_s, 0.0))
+        if f.start_s <= end_s
+    ]
+    table = np.array(sorted(rows), dtype=np.float64).reshape(-1, 7)
+    stamps = start_ns + np.round(table[:, 0] * 1e6).astype(np.int64) * 1000
+    names = ("kind", "target", "active", "value", "start_s", "end_s")
+    return Topic(
+        "/truthsim/events",
+        "truthsim_msgs/msg/SensorFault",
+        {"header.frame_id": "base_link"},
+        stamps,
+        stamps,
+        {"header.stamp": stamps, **{name: table[:, i] for i, name in enumerate(names, start=1)}},
+    )
+
+
+def _pose_covariance(rtk: SensorChannel, noise: SensorNoise) -> dict[str, FloatArray]:
+    place = rtk.fields["position_std_m"] ** 2
+    angle = np.full_like(place, noise.rtk_tilt_rad**2)
+    heading = np.full_like(place, noise.rtk_heading_rad**2)
+    return {"pose.covariance": _diagonals(np.stack([place, place, 4.0 * place, angle, angle, heading], axis=1))}
+
+
+def _diagonals(values: FloatArray) -> FloatArray:
+    """Diagonal matrices [N, k * k], row-major, of their diagonals [N, k]."""
+    n, k = values.shape
+    out = np.zeros((n, k * k))
+    out[:, :: k + 1] = values
+    return out
 
 
 def _diagonal(*values: float) -> list[float]:

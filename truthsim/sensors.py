@@ -1,4 +1,4 @@
-"""Sensors of the simulated car: what a recorder would have got, with noise, bias, drift, delay and tilt.
+"""Sensors of the simulated car: what a recorder would have got, with noise, bias, drift, delay, tilt and outages.
 
 Numbers are the paper experiment's (METHOD §9). Every error source draws from a stream of its own, so that changing one
 leaves the others as they were.
@@ -6,6 +6,7 @@ leaves the others as they were.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 from pdhef_logtool.geometry import ecef_from_geodetic, enu_from_ecef_rotation, geodetic_from_ecef
 from pdhef_logtool.signals import WHEELS, FloatArray, IntArray
 from truthsim.motion import Motion
-from truthsim.vehicle import GRAVITY_M_S2, Vehicle
+from truthsim.vehicle import Vehicle
 
 #: Local ENU origin of the positions: latitude, longitude (deg), ellipsoidal height (m).
 ORIGIN_GEODETIC = (48.0, 11.0, 500.0)
@@ -53,6 +54,21 @@ class SensorNoise(NamedTuple):
     rtk_delay_s: float = 0.020
     #: A toothed wheel with 48 teeth gives no pulse in time below this speed, and the sensor reads zero.
     wheel_dead_m_s: float = 0.15
+    #: Full scale of the 16-bit accelerometers and gyros; beyond it they read full scale.
+    acceleration_range_m_s2: float = 16.0
+    rate_range_rad_s: float = 4.0
+    #: Place of the IMU from the CG: forward, left, up.
+    imu_x_m: float = 0.0
+    imu_y_m: float = 0.0
+    imu_z_m: float = 0.0
+    #: The angle is measured at the steering wheel in steps of 0.1 degrees; the ratio is known to this share.
+    steering_wheel_step_rad: float = 0.1 * np.pi / 180.0
+    steer_gain: float = 0.0
+    #: Share of the messages of IMU, steering and wheel speeds that the bus loses.
+    message_loss: float = 0.0
+    #: Outages of the RTK fix: how often, and how long on average (exponential); half of them leave a float solution.
+    rtk_outages_per_h: float = 0.0
+    rtk_outage_s: float = 8.0
 
 
 #: Sensors that err in nothing but delay, tilt, wheel slip and quantisation.
@@ -73,6 +89,18 @@ NO_NOISE = SensorNoise(
     rtk_yaw_rate_rad_s=0.0,
     rtk_tilt_rad=0.0,
 )
+
+
+#: Quality of a satellite fix, as NMEA GGA counts it.
+RTK_FIXED, RTK_FLOAT, RTK_LOST = 4, 5, 0
+
+
+class Outage(NamedTuple):
+    """From ``start_s`` until ``end_s`` the RTK has ``quality`` only."""
+
+    start_s: float
+    end_s: float
+    quality: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,65 +145,74 @@ def slow_walk(rng: np.random.Generator, sigma: float, time_constant_s: float, st
 
 
 def sense(
-    motion: Motion, vehicle: Vehicle, noise: SensorNoise, seed: int, rtk_rate_hz: int
+    motion: Motion,
+    vehicle: Vehicle,
+    noise: SensorNoise,
+    seed: int,
+    rtk_rate_hz: int,
+    outages: Sequence[Outage] = (),
 ) -> dict[str, SensorChannel]:
     """Turn a motion recorded at ``IMU_PERIOD_S`` with the phases 0, steering, wheels into sensor channels.
 
-    Returns ``imu``, ``steering``, ``wheels``, ``rtk`` and ``fix``.
+    ``outages`` of the RTK come on top of those that the noise draws. Returns ``imu``, ``steering``, ``wheels``, ``rtk``
+    (with the ``quality`` of every sample) and ``fix``.
     """
-    names = ("ax", "ay", "yaw_rate", "other", "steer", *WHEELS, "rtk", "arrival", "fix")
+    names = ("ax", "ay", "yaw_rate", "other", "steer", *WHEELS, "rtk", "arrival", "fix", "gain", "loss", "outages")
     streams = {
         name: np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(i,)))
         for i, name in enumerate(names)
     }
     channels = {
         "imu": _imu(motion, noise, streams),
-        "steering": _steering(motion, noise, streams["steer"]),
+        "steering": _steering(motion, vehicle, noise, streams),
         "wheels": _wheels(motion, vehicle, noise, streams),
     }
-    rtk = _rtk(motion, noise, streams["rtk"], max(1, round(1.0 / (rtk_rate_hz * IMU_PERIOD_S))))
+    every = max(1, round(1.0 / (rtk_rate_hz * IMU_PERIOD_S)))
+    drawn = _draw_outages(float(motion.times_s[-1]), noise, streams["outages"])
+    rtk = _rtk(motion, noise, streams, every, [*drawn, *outages])
     channels["rtk"] = rtk
     channels["fix"] = _fix(rtk, rtk_rate_hz)
     for name in ("imu", "steering", "wheels"):
-        channels[name] = _with_jitter(channels[name], noise, streams["arrival"])
+        channels[name] = _through_the_bus(channels[name], noise, streams)
     return channels
 
 
-def _with_jitter(channel: SensorChannel, noise: SensorNoise, rng: np.random.Generator) -> SensorChannel:
-    late = rng.uniform(0.0, 1.0, channel.times_s.shape[0]) * noise.jitter_s
+def _through_the_bus(
+    channel: SensorChannel, noise: SensorNoise, streams: dict[str, np.random.Generator]
+) -> SensorChannel:
+    late = streams["arrival"].uniform(0.0, 1.0, channel.times_s.shape[0]) * noise.jitter_s
     arrival = np.maximum.accumulate(channel.arrival_s + late)
-    return SensorChannel(channel.times_s, arrival, channel.fields)
+    kept = streams["loss"].uniform(0.0, 1.0, channel.times_s.shape[0]) >= noise.message_loss
+    return SensorChannel(channel.times_s[kept], arrival[kept], {k: v[kept] for k, v in channel.fields.items()})
 
 
-def specific_force_m_s2(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What a perfect accelerometer fixed to the body at the CG reads on its x, y, z axes, each [N].
+def _columns(motion: Motion, *names: str) -> FloatArray:
+    return np.stack([motion.column(name) for name in names], axis=1)
 
-    The planar acceleration and gravity's reaction seen from a body rolled by φ (positive to the right) and pitched by
-    θ (positive nose down): to first order a_y + g φ and a_x − g θ.
+
+def imu_without_error(motion: Motion, noise: SensorNoise) -> tuple[FloatArray, FloatArray]:
+    """Specific force (m/s²) and rates (rad/s) that perfect sensors read at the IMU's place, each [N, 3].
+
+    A place away from the CG adds ω̇ × p + ω × (ω × p).
     """
-    a_x, a_y = motion.column("ax_m_s2"), motion.column("ay_m_s2")
-    roll, pitch = motion.column("roll_rad"), motion.column("pitch_rad")
-    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    # Rows of Rx(roll)ᵀ Ry(pitch)ᵀ on (a_x, a_y, g).
-    x = cp * a_x - sp * GRAVITY_M_S2
-    up = sp * a_x + cp * GRAVITY_M_S2
-    return x, cr * a_y + sr * up, -sr * a_y + cr * up
+    force = _columns(motion, "specific_force_x_m_s2", "specific_force_y_m_s2", "specific_force_z_m_s2")
+    rates = _columns(motion, "gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s")
+    place = np.array([noise.imu_x_m, noise.imu_y_m, noise.imu_z_m])
+    if place.any():
+        turning = _columns(motion, "roll_acceleration_rad_s2", "pitch_acceleration_rad_s2", "yaw_acceleration_rad_s2")
+        force = force + np.cross(turning, place) + np.cross(rates, np.cross(rates, place))
+    return force, rates
 
 
-def body_rates_rad_s(motion: Motion) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What perfect gyros fixed to the body read on its x, y, z axes, each [N]."""
-    roll, pitch = motion.column("roll_rad"), motion.column("pitch_rad")
-    roll_rate, pitch_rate = motion.column("roll_rate_rad_s"), motion.column("pitch_rate_rad_s")
-    yaw_rate = motion.column("yaw_rate_rad_s")
-    cr, sr = np.cos(roll), np.sin(roll)
-    level = yaw_rate * np.cos(pitch)
-    return roll_rate - yaw_rate * np.sin(pitch), pitch_rate * cr + level * sr, level * cr - pitch_rate * sr
+def quantised(values: FloatArray, full_scale: float) -> FloatArray:
+    """What a 16-bit sensor with a full scale to both sides gives for values."""
+    step = full_scale / 2.0**15
+    return np.asarray(np.clip(np.round(values / step), -(2.0**15), 2.0**15 - 1.0) * step)
 
 
 def _imu(motion: Motion, noise: SensorNoise, streams: dict[str, np.random.Generator]) -> SensorChannel:
     n = motion.times_s.shape[0]
-    clean_x, clean_y, clean_z = specific_force_m_s2(motion)
-    rate_x, rate_y, rate_z = body_rates_rad_s(motion)
+    force, rates = imu_without_error(motion, noise)
 
     def spoilt(clean: FloatArray, stream: str, white: float, bias: float, walk: float) -> FloatArray:
         rng = streams[stream]
@@ -186,28 +223,35 @@ def _imu(motion: Motion, noise: SensorNoise, streams: dict[str, np.random.Genera
     acceleration = (noise.acceleration_m_s2, noise.acceleration_bias_m_s2, noise.acceleration_walk_m_s2)
     rate = (noise.yaw_rate_rad_s, noise.yaw_rate_bias_rad_s, noise.yaw_rate_walk_rad_s)
     fields = {
-        "ax_m_s2": spoilt(clean_x, "ax", *acceleration),
-        "ay_m_s2": spoilt(clean_y, "ay", *acceleration),
-        "az_m_s2": spoilt(clean_z, "other", *acceleration),
-        "roll_rate_rad_s": spoilt(rate_x, "other", *rate),
-        "pitch_rate_rad_s": spoilt(rate_y, "other", *rate),
-        "yaw_rate_rad_s": spoilt(rate_z, "yaw_rate", *rate),
+        "ax_m_s2": spoilt(force[:, 0], "ax", *acceleration),
+        "ay_m_s2": spoilt(force[:, 1], "ay", *acceleration),
+        "az_m_s2": spoilt(force[:, 2], "other", *acceleration),
+        "roll_rate_rad_s": spoilt(rates[:, 0], "other", *rate),
+        "pitch_rate_rad_s": spoilt(rates[:, 1], "other", *rate),
+        "yaw_rate_rad_s": spoilt(rates[:, 2], "yaw_rate", *rate),
     }
-    # Steps of a 16-bit sensor of ±16 m/s² and ±4 rad/s.
     for name in fields:
-        step = 2.0**-11 if name.endswith("m_s2") else 2.0**-13
-        fields[name] = np.round(fields[name] / step) * step
+        full_scale = noise.acceleration_range_m_s2 if name.endswith("m_s2") else noise.rate_range_rad_s
+        fields[name] = quantised(fields[name], full_scale)
     return SensorChannel(motion.times_s, motion.times_s + noise.can_delay_s, fields)
 
 
-def _steering(motion: Motion, noise: SensorNoise, rng: np.random.Generator) -> SensorChannel:
+def _steering(
+    motion: Motion, vehicle: Vehicle, noise: SensorNoise, streams: dict[str, np.random.Generator]
+) -> SensorChannel:
+    """The sensor sits at the steering wheel; noise and bias are those of the road-wheel angle, times the ratio."""
+    rng = streams["steer"]
     clean = motion.column("steer_rad", 1)
     offset = noise.steer_bias_rad * rng.standard_normal()
+    gain = 1.0 + noise.steer_gain * streams["gain"].standard_normal()
+    read = gain * clean + offset + student_t(rng, noise.steer_rad, clean.shape[0])
+    step = noise.steering_wheel_step_rad
+    wheel = np.round(vehicle.steering_ratio * read / step) * step
     times = motion.times_s + motion.phases_s[1]
     return SensorChannel(
         times,
         times + noise.can_delay_s,
-        {"steer_rad": clean + offset + student_t(rng, noise.steer_rad, clean.shape[0])},
+        {"steer_rad": wheel / vehicle.steering_ratio, "steering_wheel_rad": wheel},
     )
 
 
@@ -226,41 +270,87 @@ def _wheels(
     return SensorChannel(times, times + noise.can_delay_s, fields)
 
 
-def _rtk(motion: Motion, noise: SensorNoise, rng: np.random.Generator, every: int) -> SensorChannel:
-    """GNSS/INS at the CG: ENU position and velocity, attitude, and the body velocity that follows from them."""
-    rows = slice(None, None, every)
-    n = motion.times_s[rows].shape[0]
+def _draw_outages(end_s: float, noise: SensorNoise, rng: np.random.Generator) -> list[Outage]:
+    outages: list[Outage] = []
+    at = 0.0
+    while noise.rtk_outages_per_h > 0.0:
+        at += rng.exponential(3600.0 / noise.rtk_outages_per_h)
+        if at >= end_s:
+            break
+        length = rng.exponential(noise.rtk_outage_s)
+        outages.append(Outage(at, at + length, RTK_FLOAT if rng.uniform() < 0.5 else RTK_LOST))
+        at += length
+    return outages
 
-    def error(sigma: float) -> FloatArray:
+
+#: Errors of a float solution over those of a fixed one: decimetres for centimetres.
+_FLOAT_POSITION, _FLOAT_VELOCITY, _FLOAT_ANGLE = 30.0, 4.0, 4.0
+#: 1-sigma errors with which an INS of this class coasts without satellites: acceleration and turning of the heading.
+_COAST_M_S2, _COAST_RAD_S = 0.02, 0.0003
+
+
+def _rtk(
+    motion: Motion,
+    noise: SensorNoise,
+    streams: dict[str, np.random.Generator],
+    every: int,
+    outages: Sequence[Outage],
+) -> SensorChannel:
+    """GNSS/INS at the CG: ENU position and velocity, attitude, and the body velocity that follows from them."""
+    rng = streams["rtk"]
+    rows = slice(None, None, every)
+    times = motion.times_s[rows]
+    n = times.shape[0]
+    quality = np.full(n, float(RTK_FIXED))
+    coast_s = np.zeros(n)
+    drift = np.zeros((n, 4))
+    for outage in outages:
+        inside = (times >= outage.start_s) & (times < outage.end_s)
+        quality[inside] = outage.quality
+        if outage.quality == RTK_LOST:
+            coast_s[inside] = times[inside] - outage.start_s
+            drift[inside] = streams["outages"].standard_normal(4)
+    loose = quality == RTK_FLOAT
+
+    def error(sigma: float, in_float: float) -> FloatArray:
         slow = slow_walk(rng, sigma * np.sqrt(8.0) / 3.0, noise.rtk_time_s, every * IMU_PERIOD_S, n)
-        return np.asarray(slow + sigma / 3.0 * rng.standard_normal(n))
+        return np.asarray((slow + sigma / 3.0 * rng.standard_normal(n)) * np.where(loose, in_float, 1.0))
 
     yaw = motion.column("yaw_rad")[rows]
     v_x, v_y = motion.column("vx_m_s")[rows], motion.column("vy_m_s")[rows]
-    east = v_x * np.cos(yaw) - v_y * np.sin(yaw) + error(noise.rtk_velocity_m_s)
-    north = v_x * np.sin(yaw) + v_y * np.cos(yaw) + error(noise.rtk_velocity_m_s)
-    heading = yaw + error(noise.rtk_heading_rad)
+    speed_drift, place_drift = _COAST_M_S2 * coast_s, 0.5 * _COAST_M_S2 * coast_s**2
+    east = v_x * np.cos(yaw) - v_y * np.sin(yaw) + error(noise.rtk_velocity_m_s, _FLOAT_VELOCITY)
+    north = v_x * np.sin(yaw) + v_y * np.cos(yaw) + error(noise.rtk_velocity_m_s, _FLOAT_VELOCITY)
+    east, north = east + speed_drift * drift[:, 0], north + speed_drift * drift[:, 1]
+    heading = yaw + error(noise.rtk_heading_rad, _FLOAT_ANGLE) + _COAST_RAD_S * coast_s * drift[:, 3]
+    place = noise.rtk_position_m
     fields = {
-        "x_m": motion.column("x_m")[rows] + error(noise.rtk_position_m),
-        "y_m": motion.column("y_m")[rows] + error(noise.rtk_position_m),
-        "z_m": error(2.0 * noise.rtk_position_m),
-        "roll_rad": motion.column("roll_rad")[rows] + error(noise.rtk_tilt_rad),
-        "pitch_rad": motion.column("pitch_rad")[rows] + error(noise.rtk_tilt_rad),
+        "x_m": motion.column("x_m")[rows] + error(place, _FLOAT_POSITION) + place_drift * drift[:, 0],
+        "y_m": motion.column("y_m")[rows] + error(place, _FLOAT_POSITION) + place_drift * drift[:, 1],
+        "z_m": motion.column("z_m")[rows] + error(2.0 * place, _FLOAT_POSITION) + place_drift * drift[:, 2],
+        "roll_rad": motion.column("roll_rad")[rows] + error(noise.rtk_tilt_rad, 1.0),
+        "pitch_rad": motion.column("pitch_rad")[rows] + error(noise.rtk_tilt_rad, 1.0),
         "yaw_rad": heading,
         "vx_m_s": east * np.cos(heading) + north * np.sin(heading),
         "vy_m_s": -east * np.sin(heading) + north * np.cos(heading),
         "yaw_rate_rad_s": motion.column("yaw_rate_rad_s")[rows] + noise.rtk_yaw_rate_rad_s * rng.standard_normal(n),
+        "quality": quality,
+        "position_std_m": np.where(loose, _FLOAT_POSITION, 1.0) * place + place_drift,
     }
-    times = motion.times_s[rows]
     return SensorChannel(times, times + noise.rtk_delay_s, fields)
 
 
 def _fix(rtk: SensorChannel, rtk_rate_hz: int) -> SensorChannel:
-    """The receiver's own fix at 10 Hz: geodetic position of the CG."""
+    """The receiver's own fix at 10 Hz: geodetic position of the CG, NaN without satellites."""
     rows = slice(None, None, max(1, rtk_rate_hz // 10))
     x, y, z = (rtk.fields[k][rows] for k in ("x_m", "y_m", "z_m"))
     lat, lon, alt = geodetic_from_enu(x, y, z)
-    return SensorChannel(rtk.times_s[rows], rtk.arrival_s[rows], {"lat_deg": lat, "lon_deg": lon, "alt_m": alt})
+    quality = rtk.fields["quality"][rows]
+    none = quality == RTK_LOST
+    fields = {"lat_deg": lat, "lon_deg": lon, "alt_m": alt}
+    fields = {name: np.where(none, np.nan, column) for name, column in fields.items()}
+    fields |= {"quality": quality, "position_std_m": rtk.fields["position_std_m"][rows]}
+    return SensorChannel(rtk.times_s[rows], rtk.arrival_s[rows], fields)
 
 
 def geodetic_from_enu(

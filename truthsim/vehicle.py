@@ -1,9 +1,13 @@
-"""The truth vehicle: a planar two-track car with roll, pitch, load transfer, wheel spin and tyre relaxation.
+"""The truth vehicle: a body with six degrees of freedom on four unsprung masses and four turning wheels.
 
-Axes are ISO 8855. ``v_x, v_y`` are the velocity of the CG in the horizontal frame that turns with the yaw angle, so
-that a_y = v̇_y + v_x r = ΣF_y/m holds exactly. The sprung mass rolls about the roll axis: the contact points move
-sideways against the CG by the roll rate. Loads follow the springs, and where the suspension links carry force
-directly (roll centre, anti-dive) they follow the accelerations with the lag of the wheels' own bounce.
+Axes are ISO 8855. The car moves in the plane of the road: ``v_x, v_y`` are the velocity of the whole car's CG along
+and across its heading, so that a_y = v̇_y + v_x r = (ΣF_y + weight across the road)/m holds exactly. On top of that
+plane the sprung mass heaves, rolls (positive to the right) and pitches (positive nose down) on springs, dampers and
+anti-roll bars; each unsprung mass moves up and down between them and its tyre's vertical spring, and may leave the
+road. The links are swing arms from each wheel to the roll centre (across) and to the pitch centre (along): what they
+carry reaches the wheel at once, while the springs' share waits for the body to move. Tilts are small, so the sprung
+mass is linear in them; yaw, tyres, steering and the attitude of the road are not. Each mass is where it is: as the
+body leans, the wheels move sideways against the CG of the whole car.
 
 What another vehicle must offer to take this one's place is the lower half of the file: ``STATE_SIZE``,
 :func:`standing_state`, :func:`derivative`, :func:`observe` with ``OBSERVED``. Nothing else reads the state vector.
@@ -25,48 +29,75 @@ AIR_DENSITY_KG_M3 = 1.204
 
 
 class Vehicle(NamedTuple):
-    """A mid-size saloon with the paper's Table 3 mass and geometry; the rest are typical values (METHOD §13)."""
+    """A mid-size saloon with the paper's Table 3 mass and geometry; the rest are typical values (METHOD §13).
+
+    ``truthsim/vehicles/`` holds this one and others as files.
+    """
 
     mass_kg: float = 1440.0
-    sprung_mass_kg: float = 1300.0
+    #: One wheel with hub, brake and its share of the links.
+    front_unsprung_mass_kg: float = 35.0
+    rear_unsprung_mass_kg: float = 35.0
+    #: Of the whole car about its CG.
     yaw_inertia_kg_m2: float = 1523.0
+    #: Of the sprung mass about its own CG.
     roll_inertia_kg_m2: float = 480.0
     pitch_inertia_kg_m2: float = 1500.0
     cg_to_front_axle_m: float = 1.16
     cg_to_rear_axle_m: float = 1.71
     track_m: float = 1.57
     cg_height_m: float = 0.64
-    roll_centre_height_m: float = 0.10
     wheel_radius_m: float = 0.30
     #: One wheel with hub and brake disc; in front with its share of the drive train.
     front_wheel_inertia_kg_m2: float = 1.6
     rear_wheel_inertia_kg_m2: float = 1.2
-    roll_stiffness_n_m_per_rad: float = 92000.0
-    roll_damping_n_m_s_per_rad: float = 4300.0
-    front_roll_share: float = 0.57
-    pitch_stiffness_n_m_per_rad: float = 160000.0
-    pitch_damping_n_m_s_per_rad: float = 10000.0
+    #: Springs and dampers by travel of the wheel.
+    front_spring_n_per_m: float = 42_000.0
+    rear_spring_n_per_m: float = 32_000.0
+    front_damper_n_s_per_m: float = 3000.0
+    rear_damper_n_s_per_m: float = 2600.0
+    #: Roll moment of the axle's bar per angle between body and axle.
+    front_anti_roll_n_m_per_rad: float = 16_000.0
+    rear_anti_roll_n_m_per_rad: float = 10_000.0
+    tyre_vertical_n_per_m: float = 220_000.0
+    tyre_vertical_n_s_per_m: float = 150.0
+    front_roll_centre_height_m: float = 0.10
+    rear_roll_centre_height_m: float = 0.10
     #: Height at which the links take the longitudinal force (anti-dive and anti-squat), m.
     pitch_centre_height_m: float = 0.15
-    #: Lag of link forces and compliances: a 35 kg wheel on a 220 kN/m tyre.
-    link_lag_s: float = 0.0126
+    #: Steering-wheel angle per road-wheel angle; the vehicle is steered by the latter, as the rack has it.
+    steering_ratio: float = 16.0
     #: Steering out of the bend under lateral force, per axle (front) and toe-in of the rear axle, rad/N.
     front_compliance_rad_per_n: float = 1.87e-6
     rear_compliance_rad_per_n: float = 1.07e-6
+    #: Lag of these compliances: the wheel's inertia on its bushes.
+    compliance_lag_s: float = 0.0126
     #: 0 parallel steering, 1 both wheels on one turning centre.
     ackermann: float = 0.5
     front_drive_share: float = 1.0
     front_brake_share: float = 0.66
     rolling_resistance: float = 0.012
     drag_area_m2: float = 0.66
-    tyre: Tyre = Tyre()
+    front_tyre: Tyre = Tyre()
+    rear_tyre: Tyre = Tyre()
 
 
 #: Wheels are in the order front left, front right, rear left, rear right.
-X, Y, YAW, V_X, V_Y, YAW_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE = range(10)
-LINK_A_X, LINK_A_Y, COMPLIANCE_FRONT, COMPLIANCE_REAR = range(10, 14)
-SPIN, SLIP_X, SLIP_Y = 14, 18, 22
-STATE_SIZE = 26
+X, Y, YAW, V_X, V_Y, YAW_RATE = range(6)
+HEAVE, HEAVE_RATE, ROLL, ROLL_RATE, PITCH, PITCH_RATE = range(6, 12)
+ALTITUDE, COMPLIANCE_FRONT, COMPLIANCE_REAR = range(12, 15)
+WHEEL_HEIGHT, WHEEL_RATE, SPIN, SLIP_X, SLIP_Y, BRAKE = 15, 19, 23, 27, 31, 35
+STATE_SIZE = 39
+
+#: Pads and callipers give this much before a standing wheel slips in its brake, rad; the build-up of a turning one, s.
+BRAKE_GIVE_RAD = 0.01
+BRAKE_LAG_S = 0.005
+BRAKE_DAMPING_S = 0.002
+
+#: What the vehicle is told of the road where it stands: friction under the four wheels, bank (rad, positive to the
+#: right), grade (rad, positive uphill), and how both change per metre driven (rad/m).
+FRICTION, BANK, GRADE, BANK_PER_M, GRADE_PER_M = 0, 4, 5, 6, 7
+ROAD_SIZE = 8
 
 #: What the world may know of a vehicle, in the order of :func:`observe`.
 OBSERVED = (
@@ -89,9 +120,24 @@ OBSERVED = (
     *(f"fy_{w}_n" for w in ("fl", "fr", "rl", "rr")),
     *(f"fz_{w}_n" for w in ("fl", "fr", "rl", "rr")),
     *(f"slip_angle_{w}_rad" for w in ("fl", "fr", "rl", "rr")),
+    "z_m",
+    "heave_m",
+    "bank_rad",
+    "grade_rad",
+    "roll_acceleration_rad_s2",
+    "pitch_acceleration_rad_s2",
+    "specific_force_x_m_s2",
+    "specific_force_y_m_s2",
+    "specific_force_z_m_s2",
+    "gyro_x_rad_s",
+    "gyro_y_rad_s",
+    "gyro_z_rad_s",
+    *(f"friction_{w}" for w in ("fl", "fr", "rl", "rr")),
+    *(f"suspension_{w}_m" for w in ("fl", "fr", "rl", "rr")),
 )
 OBSERVED_SIZE = len(OBSERVED)
 _FORCES = 18
+_FEEL = _FORCES + 16
 
 
 def standing_state(vehicle: Vehicle, speed_m_s: float) -> FloatArray:
@@ -99,44 +145,46 @@ def standing_state(vehicle: Vehicle, speed_m_s: float) -> FloatArray:
     state = np.zeros(STATE_SIZE)
     state[V_X] = speed_m_s
     state[SPIN : SPIN + 4] = speed_m_s / vehicle.wheel_radius_m
+    state[BRAKE : BRAKE + 4] = np.sign(speed_m_s)
     return state
 
 
 @register_jitable
-def wheel_loads_n(state: FloatArray, vehicle: Vehicle, loads_n: FloatArray) -> None:
-    """Write the vertical loads [4] in N; they always add up to m g, and a wheel that lifts hands all to its partner."""
+def static_load_n(vehicle: Vehicle, wheel: int) -> float:
+    """Vertical load (N) of one wheel of the car at rest on a level road."""
     wheelbase = vehicle.cg_to_front_axle_m + vehicle.cg_to_rear_axle_m
-    weight = vehicle.mass_kg * GRAVITY_M_S2
-    unsprung_kg = vehicle.mass_kg - vehicle.sprung_mass_kg
-    above_pitch_centre = vehicle.wheel_radius_m - vehicle.pitch_centre_height_m
-    above_roll_centre = vehicle.wheel_radius_m - vehicle.roll_centre_height_m
-    pitch_moment = (
-        (vehicle.mass_kg * vehicle.pitch_centre_height_m + unsprung_kg * above_pitch_centre) * state[LINK_A_X]
-        - vehicle.pitch_stiffness_n_m_per_rad * state[PITCH]
-        - vehicle.pitch_damping_n_m_s_per_rad * state[PITCH_RATE]
-    )
-    spring_moment = (
-        vehicle.roll_stiffness_n_m_per_rad * state[ROLL] + vehicle.roll_damping_n_m_s_per_rad * state[ROLL_RATE]
-    )
-    unsprung_moment = 0.5 * unsprung_kg * above_roll_centre * state[LINK_A_Y]
-    link_moment = vehicle.mass_kg * vehicle.roll_centre_height_m * state[LINK_A_Y]
-    front = weight * vehicle.cg_to_rear_axle_m / wheelbase - pitch_moment / wheelbase
-    front = min(max(front, 0.0), weight)
-    rear = weight - front
-    to_right_front = (
-        vehicle.front_roll_share * spring_moment + link_moment * vehicle.cg_to_rear_axle_m / wheelbase + unsprung_moment
-    ) / vehicle.track_m
-    to_right_rear = (
-        (1.0 - vehicle.front_roll_share) * spring_moment
-        + link_moment * vehicle.cg_to_front_axle_m / wheelbase
-        + unsprung_moment
-    ) / vehicle.track_m
-    to_right_front = min(max(to_right_front, -0.5 * front), 0.5 * front)
-    to_right_rear = min(max(to_right_rear, -0.5 * rear), 0.5 * rear)
-    loads_n[0] = 0.5 * front - to_right_front
-    loads_n[1] = 0.5 * front + to_right_front
-    loads_n[2] = 0.5 * rear - to_right_rear
-    loads_n[3] = 0.5 * rear + to_right_rear
+    arm = vehicle.cg_to_rear_axle_m if wheel < 2 else vehicle.cg_to_front_axle_m
+    return float(0.5 * vehicle.mass_kg * GRAVITY_M_S2 * arm / wheelbase)
+
+
+@register_jitable
+def wheel_load_n(static_n: float, height_m: float, rate_m_s: float, vehicle: Vehicle) -> float:
+    """Vertical load (N) by the height of the wheel above its place at rest; none once the tyre leaves the road."""
+    load = static_n - vehicle.tyre_vertical_n_per_m * height_m - vehicle.tyre_vertical_n_s_per_m * rate_m_s
+    return float(max(load, 0.0))
+
+
+@register_jitable
+def compression(state: FloatArray, sprung_x_m: float, vehicle: Vehicle, wheel: int) -> tuple[float, float]:
+    """How far the suspension of a wheel is compressed beyond its place at rest (m), and how fast (m/s)."""
+    x = (vehicle.cg_to_front_axle_m if wheel < 2 else -vehicle.cg_to_rear_axle_m) - sprung_x_m
+    y = 0.5 * vehicle.track_m if wheel % 2 == 0 else -0.5 * vehicle.track_m
+    corner = state[HEAVE] + y * state[ROLL] - x * state[PITCH]
+    corner_rate = state[HEAVE_RATE] + y * state[ROLL_RATE] - x * state[PITCH_RATE]
+    return state[WHEEL_HEIGHT + wheel] - corner, state[WHEEL_RATE + wheel] - corner_rate
+
+
+@register_jitable
+def suspension_force_n(travel_m: float, rate_m_s: float, other_m: float, vehicle: Vehicle, front: bool) -> float:
+    """Force of spring, damper and anti-roll bar on the body beyond that at rest, N; ``other_m``: the axle's other side.
+
+    The bar twists by the difference of both compressions over the track.
+    """
+    spring = vehicle.front_spring_n_per_m if front else vehicle.rear_spring_n_per_m
+    damper = vehicle.front_damper_n_s_per_m if front else vehicle.rear_damper_n_s_per_m
+    bar = vehicle.front_anti_roll_n_m_per_rad if front else vehicle.rear_anti_roll_n_m_per_rad
+    twist = bar * (travel_m - other_m) / (vehicle.track_m * vehicle.track_m)
+    return float(spring * travel_m + damper * rate_m_s + twist)
 
 
 @register_jitable
@@ -151,55 +199,104 @@ def wheel_steer_rad(state: FloatArray, steer_rad: float, vehicle: Vehicle, wheel
 
 
 @register_jitable
+def brake_grip_rate(grip: float, spin_rad_s: float) -> float:
+    """Rate of the share of its torque that a brake opposes turning with, -1 to 1 (Dahl's model of dry friction).
+
+    A turning wheel has it all; a standing one as much as holds it, so that a car on a hill does not creep.
+    """
+    turning = abs(spin_rad_s)
+    return (spin_rad_s - turning * grip) / (BRAKE_GIVE_RAD + turning * BRAKE_LAG_S)
+
+
+@register_jitable
+def road_rates_rad_s(state: FloatArray, road: FloatArray) -> tuple[float, float, float]:
+    """How the road's plane turns under the moving car, rad/s: about its x and y axes, and the heading's rate.
+
+    Turning on a bank tips the plane too: the heading turns about the vertical, which is not the road's normal.
+    """
+    heading_rate = state[YAW_RATE] / (math.cos(road[BANK]) * math.cos(road[GRADE]))
+    about_x = state[V_X] * road[BANK_PER_M] + heading_rate * math.sin(road[GRADE])
+    about_y = -state[V_X] * road[GRADE_PER_M] + heading_rate * math.sin(road[BANK])
+    return about_x, about_y, heading_rate
+
+
+@register_jitable
 def _motion(
     state: FloatArray,
     steer_rad: float,
     drive_n_m: float,
     brake_n_m: float,
-    friction: float,
+    road: FloatArray,
     vehicle: Vehicle,
     rate: FloatArray,
     observed: FloatArray,
 ) -> None:
     """Fill the state's rate and what forces say about it; the one place where the equations of motion stand."""
     v_x, v_y, yaw_rate = state[V_X], state[V_Y], state[YAW_RATE]
-    radius = vehicle.wheel_radius_m
-    unsprung_kg = vehicle.mass_kg - vehicle.sprung_mass_kg
-    sprung_height = (vehicle.mass_kg * vehicle.cg_height_m - unsprung_kg * radius) / vehicle.sprung_mass_kg
-    roll_arm = sprung_height - vehicle.roll_centre_height_m
+    lf, lr, radius = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m, vehicle.wheel_radius_m
+    mass = vehicle.mass_kg
+    front_unsprung, rear_unsprung = vehicle.front_unsprung_mass_kg, vehicle.rear_unsprung_mass_kg
+    unsprung = 2.0 * (front_unsprung + rear_unsprung)
+    sprung = mass - unsprung
+    sprung_x = 2.0 * (rear_unsprung * lr - front_unsprung * lf) / sprung
+    sprung_height = (mass * vehicle.cg_height_m - unsprung * radius) / sprung
+    front_share = (lr + sprung_x) / (lf + lr)
+    roll_axis_height = (
+        front_share * vehicle.front_roll_centre_height_m + (1.0 - front_share) * vehicle.rear_roll_centre_height_m
+    )
+    roll_arm = sprung_height - roll_axis_height
     pitch_arm = sprung_height - vehicle.pitch_centre_height_m
-    contact_left_m_s = vehicle.sprung_mass_kg / vehicle.mass_kg * roll_arm * state[ROLL_RATE]
-    loads = observed[_FORCES + 8 : _FORCES + 12]
-    wheel_loads_n(state, vehicle, loads)
+    # The body leans over its roll and pitch centres, so the CG of the whole car moves against the wheels.
+    lean, dive = sprung / mass * roll_arm, sprung / mass * pitch_arm
+    wheels_left_m, wheels_left_m_s = lean * state[ROLL], lean * state[ROLL_RATE]
+    wheels_back_m, wheels_back_m_s = dive * state[PITCH], dive * state[PITCH_RATE]
+
+    road_x, road_y, heading_rate = road_rates_rad_s(state, road)
+    cos_bank, cos_grade = math.cos(road[BANK]), math.cos(road[GRADE])
+    weight_x = -GRAVITY_M_S2 * math.sin(road[GRADE])
+    weight_y = -GRAVITY_M_S2 * math.sin(road[BANK]) * cos_grade
+    # What presses the car on the road per mass: gravity, and the road that bends up under it.
+    pressing = GRAVITY_M_S2 * cos_bank * cos_grade + road_x * v_y - road_y * v_x
+
     force_x, force_y, moment = 0.0, 0.0, 0.0
     axle_front, axle_rear = 0.0, 0.0
+    lift, roll_moment, pitch_moment = 0.0, 0.0, 0.0
     for wheel in range(4):
         front = wheel < 2
-        at_x = vehicle.cg_to_front_axle_m if front else -vehicle.cg_to_rear_axle_m
-        at_y = 0.5 * vehicle.track_m if wheel % 2 == 0 else -0.5 * vehicle.track_m
+        tyre = vehicle.front_tyre if front else vehicle.rear_tyre
+        arm_x = lf if front else -lr
+        arm_y = 0.5 * vehicle.track_m if wheel % 2 == 0 else -0.5 * vehicle.track_m
+        at_x, at_y = arm_x - wheels_back_m, arm_y + wheels_left_m
+        travel, travel_rate = compression(state, sprung_x, vehicle, wheel)
+        other, _ = compression(state, sprung_x, vehicle, wheel ^ 1)
+        static = static_load_n(vehicle, wheel)
+        load = wheel_load_n(static, state[WHEEL_HEIGHT + wheel], state[WHEEL_RATE + wheel], vehicle)
+
         angle = wheel_steer_rad(state, steer_rad, vehicle, wheel)
         cos, sin = math.cos(angle), math.sin(angle)
-        point_x = v_x - yaw_rate * at_y
-        point_y = v_y + yaw_rate * at_x + contact_left_m_s
+        point_x = v_x - yaw_rate * at_y - wheels_back_m_s
+        point_y = v_y + yaw_rate * at_x + wheels_left_m_s
         forward = point_x * cos + point_y * sin
         left = -point_x * sin + point_y * cos
         spin = state[SPIN + wheel]
         slip_x, slip_y = state[SLIP_X + wheel], state[SLIP_Y + wheel]
-        used_x, used_y = damped_slips(vehicle.tyre, slip_x, slip_y, forward, left, spin * radius)
-        fx, fy, scaled = forces_n(vehicle.tyre, used_x, used_y, loads[wheel], friction)
+        used_x, used_y = damped_slips(tyre, slip_x, slip_y, forward, left, spin * radius)
+        fx, fy, scaled = forces_n(tyre, used_x, used_y, load, road[FRICTION + wheel])
         rate[SLIP_X + wheel], rate[SLIP_Y + wheel] = slip_rates(
-            vehicle.tyre, slip_x, slip_y, scaled, forward, left, spin * radius
+            tyre, slip_x, slip_y, scaled, forward, left, spin * radius
         )
 
         inertia = vehicle.front_wheel_inertia_kg_m2 if front else vehicle.rear_wheel_inertia_kg_m2
         drive_share = vehicle.front_drive_share if front else 1.0 - vehicle.front_drive_share
         brake_share = vehicle.front_brake_share if front else 1.0 - vehicle.front_brake_share
         brake = 0.5 * brake_share * brake_n_m
-        # A brake only opposes turning. The width of the transition keeps its slope within what the step can follow.
-        brake_sign = math.tanh(spin / max(0.5, brake / (inertia * 1000.0)))
-        resistance = vehicle.rolling_resistance * loads[wheel] * radius * math.tanh(spin / 0.5)
-        torque = 0.5 * drive_share * drive_n_m - brake * brake_sign - resistance - radius * fx
-        rate[SPIN + wheel] = torque / inertia
+        grip, grip_rate = state[BRAKE + wheel], brake_grip_rate(state[BRAKE + wheel], spin)
+        rate[BRAKE + wheel] = grip_rate
+        resistance = vehicle.rolling_resistance * load * radius * math.tanh(spin / 0.5)
+        braking = brake * (grip + BRAKE_DAMPING_S * grip_rate)
+        driving = 0.5 * drive_share * drive_n_m
+        spinning_up = driving - braking - resistance - radius * fx
+        rate[SPIN + wheel] = spinning_up / inertia
 
         body_x = fx * cos - fy * sin
         body_y = fx * sin + fy * cos
@@ -210,44 +307,75 @@ def _motion(
             axle_front += fy
         else:
             axle_rear += fy
+
+        # The body stands on the springs at the wheel, on the swing arms at their pivots.
+        roll_centre = vehicle.front_roll_centre_height_m if front else vehicle.rear_roll_centre_height_m
+        spring = suspension_force_n(travel, travel_rate, other, vehicle, front)
+        pivot_y = -roll_centre * body_y / arm_y
+        # Brakes act within the wheel's own assembly; drive shafts bring their torque from the body and push back on it.
+        pivot_x = -(vehicle.pitch_centre_height_m * body_x + spinning_up - driving) / arm_x
+        lift += spring + pivot_x + pivot_y
+        roll_moment += arm_y * (spring + pivot_x)
+        pitch_moment -= (arm_x - sprung_x) * (spring + pivot_y) - sprung_x * pivot_x + driving
+        rate[WHEEL_RATE + wheel] = load - static - spring - pivot_x - pivot_y
         observed[_FORCES + wheel] = fx
         observed[_FORCES + 4 + wheel] = fy
+        observed[_FORCES + 8 + wheel] = load
         observed[_FORCES + 12 + wheel] = -math.atan2(left, forward) if abs(forward) > 0.5 else 0.0
+        observed[_FEEL + 16 + wheel] = travel
 
-    force_x -= 0.5 * AIR_DENSITY_KG_M3 * vehicle.drag_area_m2 * v_x * abs(v_x)
-    a_x, a_y = force_x / vehicle.mass_kg, force_y / vehicle.mass_kg
+    drag = 0.5 * AIR_DENSITY_KG_M3 * vehicle.drag_area_m2 * v_x * abs(v_x)  # at the sprung mass's CG
+    force_x -= drag
+    # Accelerations in the plane of the road, and what of them the car feels: less the weight along it.
+    a_x, a_y = force_x / mass + weight_x, force_y / mass + weight_y
+    felt_x, felt_y = a_x - weight_x, a_y - weight_y
     yaw_acceleration = moment / vehicle.yaw_inertia_kg_m2
 
-    cos, sin = math.cos(state[YAW]), math.sin(state[YAW])
-    rate[X] = v_x * cos - v_y * sin
-    rate[Y] = v_x * sin + v_y * cos
-    rate[YAW] = yaw_rate
+    rate[X] = v_x * cos_grade * math.cos(state[YAW]) - v_y * cos_bank * math.sin(state[YAW])
+    rate[Y] = v_x * cos_grade * math.sin(state[YAW]) + v_y * cos_bank * math.cos(state[YAW])
+    # The height of the road's middle: a car that crabs through a banked bend does not climb.
+    rate[ALTITUDE] = v_x * math.sin(road[GRADE])
+    rate[YAW] = heading_rate
     rate[V_X] = a_x + v_y * yaw_rate
     rate[V_Y] = a_y - v_x * yaw_rate
     rate[YAW_RATE] = yaw_acceleration
-    # About the sprung mass's own CG, which moves against the whole car's by the unsprung share of the roll.
-    roll_inertia = vehicle.roll_inertia_kg_m2 + vehicle.sprung_mass_kg * roll_arm * roll_arm * (
-        unsprung_kg / vehicle.mass_kg
-    )
-    rate[ROLL] = state[ROLL_RATE]
-    rate[ROLL_RATE] = (
-        vehicle.sprung_mass_kg * roll_arm * (a_y + GRAVITY_M_S2 * state[ROLL])
-        - vehicle.roll_stiffness_n_m_per_rad * state[ROLL]
-        - vehicle.roll_damping_n_m_s_per_rad * state[ROLL_RATE]
-    ) / roll_inertia
-    rate[PITCH] = state[PITCH_RATE]
-    rate[PITCH_RATE] = (
-        vehicle.sprung_mass_kg * pitch_arm * (-a_x + GRAVITY_M_S2 * state[PITCH])
-        - vehicle.pitch_stiffness_n_m_per_rad * state[PITCH]
-        - vehicle.pitch_damping_n_m_s_per_rad * state[PITCH_RATE]
-    ) / vehicle.pitch_inertia_kg_m2
-    lag = vehicle.link_lag_s
-    rate[LINK_A_X] = (a_x - state[LINK_A_X]) / lag
-    rate[LINK_A_Y] = (a_y - state[LINK_A_Y]) / lag
+
+    # Pitching arms push the axles as the unsprung masses are pulled along; across, both sides of an axle cancel.
+    arm_pull = (radius - vehicle.pitch_centre_height_m) * felt_x
+    inertia_lift = -2.0 * arm_pull * (front_unsprung / lf - rear_unsprung / lr)
+    lift += inertia_lift
+    pitch_moment += sprung_x * inertia_lift
+    supporting = sprung * GRAVITY_M_S2 + lift
+    # About the sprung mass's own CG, which moves against the whole car's by the unsprung share of the lean.
+    roll_inertia = vehicle.roll_inertia_kg_m2 + sprung * roll_arm * roll_arm * unsprung / mass
+    pitch_inertia = vehicle.pitch_inertia_kg_m2 + sprung * pitch_arm * pitch_arm * unsprung / mass
+    roll_moment += roll_arm * (sprung * (felt_y + sprung_x * yaw_acceleration) + supporting * state[ROLL])
+    pitch_moment += pitch_arm * (-sprung * felt_x - drag + supporting * state[PITCH])
+    roll_acceleration = roll_moment / roll_inertia
+    pitch_acceleration = pitch_moment / pitch_inertia
+    heave_acceleration = lift / sprung + GRAVITY_M_S2 - pressing
+    rate[HEAVE], rate[HEAVE_RATE] = state[HEAVE_RATE], heave_acceleration
+    rate[ROLL], rate[ROLL_RATE] = state[ROLL_RATE], roll_acceleration
+    rate[PITCH], rate[PITCH_RATE] = state[PITCH_RATE], pitch_acceleration
+
+    for wheel in range(4):
+        front = wheel < 2
+        unsprung_mass = front_unsprung if front else rear_unsprung
+        roll_centre = vehicle.front_roll_centre_height_m if front else vehicle.rear_roll_centre_height_m
+        arm_x = lf if front else -lr
+        arm_y = 0.5 * vehicle.track_m if wheel % 2 == 0 else -0.5 * vehicle.track_m
+        across = (radius - roll_centre) * (felt_y + lean * roll_acceleration + arm_x * yaw_acceleration)
+        rate[WHEEL_HEIGHT + wheel] = state[WHEEL_RATE + wheel]
+        rate[WHEEL_RATE + wheel] = (
+            rate[WHEEL_RATE + wheel] / unsprung_mass + across / arm_y + arm_pull / arm_x + GRAVITY_M_S2 - pressing
+        )
+    lag = vehicle.compliance_lag_s
     rate[COMPLIANCE_FRONT] = (vehicle.front_compliance_rad_per_n * axle_front - state[COMPLIANCE_FRONT]) / lag
     rate[COMPLIANCE_REAR] = (vehicle.rear_compliance_rad_per_n * axle_rear - state[COMPLIANCE_REAR]) / lag
 
     observed[6], observed[7], observed[8] = a_x, a_y, yaw_acceleration
+    observed[_FEEL + 6], observed[_FEEL + 7] = felt_x, felt_y
+    observed[_FEEL + 8] = pressing + heave_acceleration
 
 
 @register_jitable
@@ -256,16 +384,25 @@ def derivative(
     steer_rad: float,
     drive_n_m: float,
     brake_n_m: float,
-    friction: float,
+    road: FloatArray,
     vehicle: Vehicle,
     rate: FloatArray,
     scratch: FloatArray,
 ) -> None:
     """Write the rate [STATE_SIZE] of a state under a mean road-wheel angle and total drive and brake torques.
 
+    ``steer_rad`` is the mean angle of the front wheels as the rack has it; compliance comes on top in the vehicle.
+    ``road`` [ROAD_SIZE] holds the friction of the wheels, bank and grade (see ``FRICTION`` and below).
     ``scratch`` [OBSERVED_SIZE] is overwritten.
     """
-    _motion(state, steer_rad, drive_n_m, brake_n_m, friction, vehicle, rate, scratch)
+    _motion(state, steer_rad, drive_n_m, brake_n_m, road, vehicle, rate, scratch)
+
+
+@register_jitable
+def see(state: FloatArray, observed: FloatArray) -> None:
+    """Write the first six columns of ``OBSERVED`` only: pose, velocities and yaw rate, all that a driver looks at."""
+    for i in range(6):
+        observed[i] = state[i]
 
 
 @register_jitable
@@ -274,20 +411,39 @@ def observe(
     steer_rad: float,
     drive_n_m: float,
     brake_n_m: float,
-    friction: float,
+    road: FloatArray,
     vehicle: Vehicle,
     scratch: FloatArray,
     observed: FloatArray,
 ) -> None:
     """Write what ``OBSERVED`` names [OBSERVED_SIZE]; ``scratch`` [STATE_SIZE] is overwritten.
 
-    ``ax_m_s2`` and ``ay_m_s2`` are planar (ΣF/m, no gravity); forces are in the wheels' own frames.
+    ``ax_m_s2`` and ``ay_m_s2`` are those of the CG in the plane of the road (no gravity felt), ``yaw_rate_rad_s`` is
+    about the road's normal; forces are in the wheels' own frames. Roll, pitch and their rates are against the horizon:
+    body and road together. ``specific_force`` and ``gyro`` are what perfect sensors fixed to the body read at the CG.
     """
-    _motion(state, steer_rad, drive_n_m, brake_n_m, friction, vehicle, scratch, observed)
-    for i in range(6):
-        observed[i] = state[i]
-    observed[9], observed[10] = state[ROLL], state[ROLL_RATE]
-    observed[11], observed[12] = state[PITCH], state[PITCH_RATE]
+    _motion(state, steer_rad, drive_n_m, brake_n_m, road, vehicle, scratch, observed)
+    see(state, observed)
+    road_x, road_y, _ = road_rates_rad_s(state, road)
+    roll, pitch = state[ROLL], state[PITCH]
+    observed[9], observed[10] = road[BANK] + roll, state[V_X] * road[BANK_PER_M] + state[ROLL_RATE]
+    observed[11], observed[12] = pitch - road[GRADE], state[PITCH_RATE] - state[V_X] * road[GRADE_PER_M]
     observed[13] = steer_rad
     for wheel in range(4):
         observed[14 + wheel] = state[SPIN + wheel]
+        observed[_FEEL + 12 + wheel] = road[FRICTION + wheel]
+    observed[_FEEL], observed[_FEEL + 1] = state[ALTITUDE], state[HEAVE]
+    observed[_FEEL + 2], observed[_FEEL + 3] = road[BANK], road[GRADE]
+    observed[_FEEL + 4], observed[_FEEL + 5] = scratch[ROLL_RATE], scratch[PITCH_RATE]
+    # From the road's plane into the body: Rx(roll)ᵀ Ry(pitch)ᵀ.
+    cr, sr, cp, sp = math.cos(roll), math.sin(roll), math.cos(pitch), math.sin(pitch)
+    felt_x, felt_y, felt_z = observed[_FEEL + 6], observed[_FEEL + 7], observed[_FEEL + 8]
+    up = sp * felt_x + cp * felt_z
+    observed[_FEEL + 6] = cp * felt_x - sp * felt_z
+    observed[_FEEL + 7] = cr * felt_y + sr * up
+    observed[_FEEL + 8] = cr * up - sr * felt_y
+    turn = sp * road_x + cp * state[YAW_RATE]
+    across = road_y + state[PITCH_RATE]
+    observed[_FEEL + 9] = state[ROLL_RATE] + cp * road_x - sp * state[YAW_RATE]
+    observed[_FEEL + 10] = cr * across + sr * turn
+    observed[_FEEL + 11] = cr * turn - sr * across

@@ -13,12 +13,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pdhef_logtool.errors import OutputError
 from pdhef_logtool.vehicle import load_vehicle
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
-from truthsim.samples import SAMPLES, write_samples
+from truthsim.samples import SAMPLES, write_sample, write_samples
 
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = {
@@ -27,6 +28,7 @@ TYPES = {
     "/vehicle/wheel_speeds": "truthsim_msgs/msg/WheelSpeeds",
     "/rtk/odometry": "nav_msgs/msg/Odometry",
     "/rtk/fix": "sensor_msgs/msg/NavSatFix",
+    "/rtk/quality": "truthsim_msgs/msg/RtkQuality",
     "/truth/perfect/odometry": "nav_msgs/msg/Odometry",
     "/truth/perfect/state": "truthsim_msgs/msg/VehicleTruth",
 }
@@ -70,7 +72,9 @@ def test_other_libraries_find_every_topic_with_its_type(read_back, drive: Drive)
     messages, types, _ = read_back
     assert types == TYPES
     n = drive.times_s.shape[0]
-    assert {t: len(m) for t, m in messages.items()} == {t: (61 if t == "/rtk/fix" else n) for t in TYPES}
+    assert {t: len(m) for t, m in messages.items()} == {
+        t: (61 if t in ("/rtk/fix", "/rtk/quality") else n) for t in TYPES
+    }
 
 
 def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
@@ -81,6 +85,7 @@ def test_stamps_are_measurement_times_and_log_times_arrivals(read_back) -> None:
         ("/vehicle/wheel_speeds", 10_000_000),
         ("/rtk/odometry", 20_000_000),
         ("/rtk/fix", 20_000_000),
+        ("/rtk/quality", 20_000_000),
         ("/truth/perfect/odometry", 0),
         ("/truth/perfect/state", 0),
     ):
@@ -115,6 +120,8 @@ def test_values_survive(read_back, drive: Drive) -> None:
     fix = messages["/rtk/fix"][-1][2]
     assert fix.latitude == drive.channels["fix"].fields["lat_deg"][-1]
     assert fix.status.status == 2 and fix.position_covariance_type == 2
+    assert fix.position_covariance[[0, 4, 8]] == pytest.approx([1e-4, 1e-4, 4e-4])
+    assert messages["/rtk/quality"][-1][2].quality == 4
 
 
 def test_perfect_truth_is_exact(read_back, drive: Drive) -> None:
@@ -133,8 +140,8 @@ def test_perfect_truth_is_exact(read_back, drive: Drive) -> None:
         assert np.abs(np.array([getattr(m, name) for m in states]) - truth[name]).max() < 1e-7, name
     twist = np.array([m.twist.twist.linear.y for _, _, m in messages["/truth/perfect/odometry"]])
     assert np.abs(twist - truth["vy_m_s"]).max() < 1e-7
-    assert states[-1].friction == 0.85
-    assert states[-1].vertical_force_n.sum() == pytest.approx(1440.0 * 9.80665, rel=1e-6)
+    assert states[-1].friction == pytest.approx(0.85, abs=1e-7)
+    assert states[-1].vertical_force_n.sum() == pytest.approx(1440.0 * 9.80665, rel=2e-3)
 
 
 def test_metadata_says_how_it_was_made(read_back) -> None:
@@ -168,18 +175,26 @@ def manifest() -> list[dict]:
 
 
 def test_manifest_lists_the_sample_logs_with_their_hashes(manifest: list[dict]) -> None:
-    assert [entry["file"] for entry in manifest] == [s.file for s in SAMPLES] == ["dlc.mcap", "sweep.mcap", "road.mcap"]
+    folder = ROOT / "sample_logs"
+    assert [entry["file"] for entry in manifest] == [s.file for s in SAMPLES]
+    assert {"dlc.mcap", "sweep.mcap", "road.mcap", "fishhook.mcap", "faults.mcap"} <= {e["file"] for e in manifest}
     for entry in manifest:
-        data = (ROOT / "sample_logs" / entry["file"]).read_bytes()
+        path = folder / entry["file"]
+        parts = sorted(path.iterdir()) if path.is_dir() else [path]
+        data = b"".join(p.read_bytes() for p in parts)
         assert hashlib.sha256(data).hexdigest() == entry["sha256"] and len(data) == entry["size_bytes"]
-        assert (ROOT / "sample_logs" / entry["vehicle"]).is_file()
-        assert f"--seed {entry['seed']}" in entry["command"] and entry["command"].endswith(f"-o {entry['file']}")
-    assert sum(entry["size_bytes"] for entry in manifest) < 15_000_000
+        assert (folder / entry["vehicle"]).is_file()
+        assert f"--seed {entry['seed']}" in entry["command"] and f"-o {entry['file']}" in entry["command"]
+    assert sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) < 15_000_000
 
 
-@pytest.mark.parametrize("sample", SAMPLES[:2], ids=lambda s: s.file)
+#: Five minutes take too long to be read by these libraries, and the rosbag2 has a test of its own.
+READABLE = [s for s in SAMPLES if s.file.endswith(".mcap") and s.file != "road.mcap"]
+
+
+@pytest.mark.parametrize("sample", READABLE, ids=lambda s: s.file)
 def test_a_sample_log_is_what_the_code_makes(sample, tmp_path: Path) -> None:
-    write_drive(sample.simulate(), tmp_path / sample.file)
+    write_sample(sample, tmp_path)
     new, _, new_metadata = read_with_other_libraries(tmp_path / sample.file)
     old, _, old_metadata = read_with_other_libraries(ROOT / "sample_logs" / sample.file)
     assert {k: len(v) for k, v in new.items()} == {k: len(v) for k, v in old.items()}
@@ -191,6 +206,8 @@ def test_a_sample_log_is_what_the_code_makes(sample, tmp_path: Path) -> None:
         ("/rtk/odometry", "twist.twist.linear.y"),
         ("/truth/perfect/state", "sideslip_rad"),
     ):
+        if topic not in new:
+            continue
         columns = []
         for messages in (new, old):
             values = [m for _, _, m in messages[topic]]
@@ -202,15 +219,44 @@ def test_a_sample_log_is_what_the_code_makes(sample, tmp_path: Path) -> None:
         assert np.mean(difference > 1e-6) < 1e-3 and difference.max() < 5e-3, topic
 
 
+def test_the_samples_are_what_they_are_for() -> None:
+    folder = ROOT / "sample_logs"
+    for name, low, high in (("dlc.mcap", 0.65, 0.75), ("sweep.mcap", 0.9 * 0.3, 0.3)):
+        messages, _, metadata = read_with_other_libraries(folder / name)
+        peak = max(abs(m.ay_m_s2) for _, _, m in messages["/truth/perfect/state"]) / 9.80665
+        assert low <= peak <= high and float(metadata["peak_ay_m_s2"]) == pytest.approx(peak * 9.80665, rel=1e-6)
+    blind, _, _ = read_with_other_libraries(folder / "no_truth.mcap")
+    assert not [topic for topic in blind if "truth" in topic or "rtk" in topic]
+    faulty, _, metadata = read_with_other_libraries(folder / "faults.mcap")
+    assert len(faulty["/truthsim/events"]) == 2 * len(json.loads(metadata["faults"])) == 16
+
+
+def test_the_rosbag2_sample_holds_what_its_mcap_would(tmp_path: Path) -> None:
+    sample = next(s for s in SAMPLES if not s.file.endswith(".mcap"))
+    write_drive(sample.simulate(), tmp_path / "x.mcap")
+    messages, types, _ = read_with_other_libraries(tmp_path / "x.mcap")
+    with AnyReader([ROOT / "sample_logs" / sample.file]) as reader:
+        assert {c.topic: c.msgtype for c in reader.connections} == types
+        found: dict[str, list] = {}
+        for connection, time, data in reader.messages():
+            found.setdefault(connection.topic, []).append((time, reader.deserialize(data, connection.msgtype)))
+    assert {t: len(m) for t, m in found.items()} == {t: len(m) for t, m in messages.items()}
+    for (time, new), (log_time, _, old) in zip(found["/imu/data"], messages["/imu/data"], strict=True):
+        assert time == log_time and new.angular_velocity.z == pytest.approx(old.angular_velocity.z, abs=2e-4)
+
+
 def test_write_samples_repeats_itself_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("truthsim.samples.SAMPLES", SAMPLES[:1])
+    chosen = tuple(s for s in SAMPLES if s.file in ("dlc.mcap", "step_rosbag2"))
+    monkeypatch.setattr("truthsim.samples.SAMPLES", chosen)
     manifests = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         write_samples(tmp_path / name)
         manifests.append((tmp_path / name / "manifest.toml").read_bytes())
     assert manifests[0] == manifests[1]
-    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["dlc.mcap", "manifest.toml"]
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["dlc.mcap", "manifest.toml", "step_rosbag2"]
+    write_samples(tmp_path / "a")  # over what is there
+    assert (tmp_path / "a" / "manifest.toml").read_bytes() == manifests[0]
 
 
 @pytest.fixture(scope="module")

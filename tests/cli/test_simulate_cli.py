@@ -1,0 +1,107 @@
+"""``pdhef simulate`` in all its forms: drives with faults, suites, condition tables, and the gate on RTK truth."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from truthsim.manoeuvres import MANOEUVRES
+
+
+def pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "pdhef_logtool", *arguments], capture_output=True, text=True, check=False
+    )
+
+
+def test_a_drive_s_command_makes_the_same_file_again(tmp_path: Path) -> None:
+    made = pdhef(
+        *("simulate", "step-steer", "--speed", "90", "--mu", "0.7", "--seed", "4", "--duration", "5"),
+        *("--amplitude", "0.8", "--vehicle", "suv~3,mass=1.1", "--fault", "burst20:yaw_rate:2:3"),
+        *("--sensor", "jitter_s=0.004", "--rtk-rate", "50", "-o", str(tmp_path / "a.mcap"), "--json"),
+    )
+    assert made.returncode == 0, made.stderr
+    facts = json.loads(made.stdout)
+    assert facts["peak_ay_m_s2"] < 0.7 * 9.81 and not facts["spun"]
+    again = pdhef(*shlex.split(facts["command"])[1:], "-o", str(tmp_path / "b.mcap"))
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_a_suite_and_each_of_its_commands(tmp_path: Path) -> None:
+    made = pdhef(
+        *("simulate", "suite", "-o", str(tmp_path / "logs"), "--count", "3", "--seed", "5", "--duration", "5"),
+        *("--vehicles", "randomised", "--jobs", "2", "--json"),
+    )
+    assert made.returncode == 0, made.stderr
+    assert json.loads(made.stdout)["written"] == 3
+    manifest = json.loads((tmp_path / "logs" / "manifest.json").read_text())
+    assert len({entry["vehicle"] for entry in manifest["drives"]}) == 3
+    entry = manifest["drives"][1]
+    again = pdhef(*shlex.split(entry["command"])[1:], "-o", str(tmp_path / "x.mcap"))
+    assert again.returncode == 0, again.stderr
+    assert hashlib.sha256((tmp_path / "x.mcap").read_bytes()).hexdigest() == entry["sha256"]
+
+
+def test_rows_of_the_condition_table(tmp_path: Path) -> None:
+    made = pdhef(
+        *("simulate", "conditions", "-o", str(tmp_path), "--drives", "1", "--rows", "gyro-dead,friction-unknown")
+    )
+    assert made.returncode == 0, made.stderr
+    assert "gyro-dead" in made.stdout and "the estimator is told no friction" in made.stdout
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["gyro-dead", "in-domain", "manifest.json"]
+
+
+def test_the_fix_quality_gates_the_rtk_truth(tmp_path: Path) -> None:
+    log, mapping, out = tmp_path / "gap.mcap", tmp_path / "mapping.toml", tmp_path / "out"
+    made = pdhef("simulate", "step-steer", "--fault", "lost:rtk:2:4", "-o", str(log))
+    assert made.returncode == 0, made.stderr
+    found = pdhef("inspect", str(log), "--prefer-truth", "rtk", "--write-mapping", str(mapping))
+    assert found.returncode == 0, found.stderr
+    gate = '[truth_quality]\ntopic = "/rtk/quality"\nfield = "quality"\nvalues = [4]\n'
+    mapping.write_text(mapping.read_text() + "\n" + gate)
+    ran = pdhef("run", str(log), "-o", str(out), "-m", str(mapping), "-e", "zero", "--annotate", "none")
+    assert ran.returncode == 0, ran.stderr
+    # Two seconds of a hundred samples a second, give or take the fix's own rate of 10 Hz.
+    assert "quality gate" in ran.stdout
+    counts = [int(line.split("note: ")[1].split()[0]) for line in ran.stdout.splitlines() if "quality gate" in line]
+    assert counts and all(abs(count - 200) <= 10 for count in counts)
+
+
+def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
+    listed = json.loads(pdhef("simulate", "--list", "--json").stdout)["manoeuvres"]
+    assert [row["name"] for row in listed] == list(MANOEUVRES)
+    text = pdhef("simulate", "--help").stdout
+    assert "KIND:WHAT:START:END" in text and "--keep-spins" in text and "suite" in text and "conditions" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("suite", "--mu", "0.5"), 2, ("--mu", "suite")),
+        (("conditions", "--count", "5"), 2, ("--count", "conditions")),
+        (("dlc", "--jobs", "2"), 2, ("--jobs", "dlc")),
+        (("suite", "--count", "0"), 2, ("count 0",)),
+        (("conditions", "--rows", "hail"), 2, ("hail", "in-domain")),
+        (("dlc", "--sensor", "jitter_s"), 2, ("NAME=NUMBER",)),
+        (("dlc", "--sensor", "gps=1"), 1, ("gps", "jitter_s")),
+        (("dlc", "--fault", "stuck:ay"), 1, ("KIND:WHAT:START:END",)),
+        (("dlc", "--vehicle", "tank"), 1, ("tank", "sedan")),
+        (("dlc", "--without", "gps"), 1, ("gps", "wheels")),
+        (("dlc-3888-2", "--speed", "100"), 1, ("70 km/h",)),
+        (("dlc-3888-2", "--speed", "70", "--mu", "0.2", "--vehicle", "sedan,cg=0.45"), 1, ("spun", "--keep-spins")),
+    ],
+)
+def test_mistakes_are_one_clear_line(
+    arguments: tuple[str, ...], code: int, words: tuple[str, ...], tmp_path: Path
+) -> None:
+    result = pdhef("simulate", *arguments, "-o", str(tmp_path / "x.mcap"))
+    assert result.returncode == code, result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1 and all(word in result.stderr for word in words)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,260 @@
+"""Suites and condition tables: the same whatever works on them, inside their ranges, and resumable."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.errors import SimulationError, UsageError
+from truthsim.batch import BINS, DriveSpec, Job, make_drive, run_jobs, sensor_noise, time_in_bins_s
+from truthsim.conditions import ROW_NAMES, plan_conditions, write_conditions
+from truthsim.suite import SHARES, is_held_out, plan_suite, write_suite
+from truthsim.vehicle import Vehicle
+from truthsim.vehicle_choice import choose_vehicle
+from truthsim.vehicle_files import load_vehicle
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {
+        str(p.relative_to(folder)): hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*.mcap"))
+    }
+
+
+@pytest.fixture(scope="module")
+def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("suite")
+    return folder, write_suite(folder, count=6, seed=3, duration_s=6.0, processes=2)
+
+
+def test_a_suite_does_not_depend_on_the_processes(suite: tuple[Path, dict], tmp_path: Path) -> None:
+    folder, manifest = suite
+    alone = write_suite(tmp_path, count=6, seed=3, duration_s=6.0, processes=1)
+    assert alone == manifest
+    assert digests(folder) == digests(tmp_path)
+    assert (folder / "manifest.json").read_bytes() == (tmp_path / "manifest.json").read_bytes()
+    assert not [p for p in folder.iterdir() if p.suffix not in (".mcap", ".json")]
+
+
+def test_a_suite_s_manifest_tells_what_is_there(suite: tuple[Path, dict]) -> None:
+    folder, manifest = suite
+    assert json.loads((folder / "manifest.json").read_text()) == manifest
+    assert manifest["complete"] and manifest["written"] == len(manifest["drives"]) == 6
+    assert sum(manifest["splits"].values()) == 6
+    for entry in manifest["drives"]:
+        data = (folder / entry["file"]).read_bytes()
+        assert hashlib.sha256(data).hexdigest() == entry["sha256"] and len(data) == entry["size_bytes"]
+        assert entry["command"].startswith(f"pdhef simulate {entry['manoeuvre']} --speed ")
+        assert entry["peak_share"] == pytest.approx(entry["peak_ay_m_s2"] / (entry["friction"] * 9.80665))
+        assert not entry["spun"] and not entry["lifted"]
+
+
+def test_a_larger_suite_begins_with_the_smaller_one() -> None:
+    small, large = plan_suite(5, 7), plan_suite(50, 7)
+    assert large[:5] == small
+    assert plan_suite(5, 8) != small
+    assert [j.candidates[0].vehicle for j in plan_suite(3, 7)] == ["sedan"] * 3
+    others = [j.candidates[0].vehicle for j in plan_suite(20, 7, vehicles="randomised")]
+    assert len(set(others)) == 20 and all(v.startswith("sedan~") for v in others)
+
+
+def test_draws_fill_the_range_and_the_splits() -> None:
+    jobs = plan_suite(3000, 1)
+    specs = [job.candidates[0] for job in jobs]
+    speeds, frictions = np.array([s.speed_km_h for s in specs]), np.array([s.friction for s in specs])
+    assert 40.0 <= speeds.min() < 42.0 and 118.0 < speeds.max() <= 120.0
+    assert 0.3 <= frictions.min() < 0.31 and 0.99 < frictions.max() <= 1.0
+    drawn = Counter(s.manoeuvre for s in specs)
+    total = sum(SHARES.values())
+    for name, share in SHARES.items():
+        assert drawn[name] / 3000 == pytest.approx(share / total, abs=0.025), name
+    assert "fishhook" not in drawn
+    assert len({s.seed for s in specs}) == 3000
+    splits = Counter(dict(job.facts)["split"] for job in jobs)
+    held_out = splits.pop("extrapolation")
+    assert 0.05 < held_out / 3000 < 0.25
+    inside = sum(splits.values())
+    for name, share in (("train", 0.70), ("validation", 0.15), ("test", 0.15)):
+        assert splits[name] / inside == pytest.approx(share, abs=0.025)
+
+
+def test_held_out_cells_are_never_trained_on_not_even_in_place_of_a_spun_drive() -> None:
+    for job in plan_suite(1000, 2):
+        apart = dict(job.facts)["split"] == "extrapolation"
+        for spec in job.candidates:
+            assert is_held_out(spec.manoeuvre, spec.speed_km_h, spec.friction) == apart
+    # Every manoeuvre has two of sixteen cells held out, at the edge of the range.
+    grid = [(s, f) for s in (50.0, 70.0, 90.0, 110.0) for f in (0.4, 0.6, 0.8, 0.9)]
+    for name in SHARES:
+        cells = [(s, f) for s, f in grid if is_held_out(name, s, f)]
+        assert len(cells) == 2 and all(s in (50.0, 110.0) or f in (0.4, 0.9) for s, f in cells)
+
+
+def test_what_is_there_is_kept_and_what_is_spoilt_is_made_again(suite: tuple[Path, dict]) -> None:
+    folder, manifest = suite
+    before = digests(folder)
+    names = [entry["file"] for entry in manifest["drives"]]
+    (folder / names[1]).write_bytes(b"spoilt")
+    (folder / names[2]).unlink()
+    stamps = {name: (folder / name).stat().st_mtime_ns for name in names if (folder / name).exists()}
+    assert write_suite(folder, count=6, seed=3, duration_s=6.0) == manifest
+    assert digests(folder) == before
+    kept = [n for n in names if n in stamps and (folder / n).stat().st_mtime_ns == stamps[n]]
+    assert kept == [names[0], *names[3:]]
+
+
+def test_an_interrupted_batch_goes_on(tmp_path: Path) -> None:
+    jobs = plan_suite(3, 3, duration_s=4.0)
+
+    def stop(_text: str, share: float) -> None:
+        if share > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_jobs(jobs, tmp_path, {}, processes=1, progress=stop)
+    partial = json.loads((tmp_path / "manifest.json").read_text())
+    assert not partial["complete"] and len(partial["drives"]) == 2
+    done: list[str] = []
+    whole = run_jobs(jobs, tmp_path, {}, processes=1, progress=lambda text, _share: done.append(text))
+    assert done == ["3 of 3 drives"] and whole["complete"] and len(whole["drives"]) == 3
+
+
+def test_a_drive_that_spins_gives_way_to_the_next_and_is_reported(tmp_path: Path) -> None:
+    # Swapped tyres with soft rears spin in the severe lane change.
+    spun = DriveSpec("dlc-3888-2", 70.0, 0.2, 1, 8.0, vehicle="sedan,cg=0.45")
+    calm = DriveSpec("step-steer", 60.0, 0.8, 1, 4.0)
+    entry = make_drive(Job("x.mcap", (spun, calm)), tmp_path)
+    assert entry["manoeuvre"] == "step-steer" and (tmp_path / "x.mcap").is_file()
+    assert len(entry["dropped"]) == 1 and "spun" in entry["dropped"][0]["reason"]
+    assert entry["dropped"][0]["spec"]["manoeuvre"] == "dlc-3888-2"
+    lost = make_drive(Job("y.mcap", (spun,)), tmp_path)
+    assert "sha256" not in lost and len(lost["dropped"]) == 1 and not (tmp_path / "y.mcap").exists()
+
+
+def test_seconds_in_the_bins_are_those_of_the_drive() -> None:
+    drive = DriveSpec("step-steer", 100.0, 0.85, 1, 11.0).simulate()
+    bins = time_in_bins_s(drive)
+    assert list(bins) == list(BINS) == ["low", "middle", "high"]
+    # A second straight, then 4 m/s² of 8.3: half of what the friction allows.
+    assert bins["low"] == pytest.approx(1.1, abs=0.15) and bins["middle"] == pytest.approx(9.9, abs=0.2)
+    assert sum(bins.values()) == pytest.approx(11.01)
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
+    folder = tmp_path_factory.mktemp("table")
+    return folder, write_conditions(folder, drives=2, seed=1, processes=2)
+
+
+def test_every_row_of_the_table_has_its_drives_in_every_bin(table: tuple[Path, dict]) -> None:
+    folder, manifest = table
+    assert [row["name"] for row in manifest["rows"]] == list(ROW_NAMES)
+    for row in manifest["rows"]:
+        assert len(row["files"]) == 2 and row["description"], row["name"]
+        assert all((folder / f).is_file() for f in row["files"])
+        assert min(row["drives_in_bin"].values()) == 2, row["name"]
+        if row["assume"]:
+            assert all(f.startswith("in-domain/") for f in row["files"])
+    assumed = {row["name"]: row["assume"] for row in manifest["rows"] if row["assume"]}
+    assert assumed == {
+        "friction-plus-20": {"friction_factor": 1.2},
+        "friction-minus-20": {"friction_factor": 0.8},
+        "friction-unknown": {"friction": "unknown"},
+        "no-wheel-speed": {"sensors": "esp"},
+    }
+
+
+def test_rows_are_the_same_drives_with_one_thing_wrong(table: tuple[Path, dict]) -> None:
+    _, manifest = table
+    by_row = {row: [d for d in manifest["drives"] if d["row"] == row] for row in ROW_NAMES}
+    base = by_row["in-domain"]
+    same = ("manoeuvre", "speed_km_h", "friction", "seed", "duration_s")
+    for row in ("mass-plus-20", "burst-20", "gyro-stuck", "delay-30", "other-tyres", "randomised-vehicle", "bias"):
+        for entry, usual in zip(by_row[row], base, strict=True):
+            assert [entry[k] for k in same] == [usual[k] for k in same], row
+            differs = (entry["vehicle"], entry["faults"]) != (usual["vehicle"], usual["faults"])
+            assert differs and not (entry["vehicle"] != "sedan" and entry["faults"]), row
+    assert {d["manoeuvre"] for d in by_row["unseen-manoeuvre"]} == {"fishhook"}
+    assert all(0.15 <= d["friction"] <= 0.25 for d in by_row["low-friction"])
+    for entry in base:
+        assert not is_held_out(entry["manoeuvre"], entry["speed_km_h"], entry["friction"])
+    for entry in by_row["extrapolation"]:
+        assert is_held_out(entry["manoeuvre"], entry["speed_km_h"], entry["friction"])
+    assert {(d["speed_km_h"], d["friction"]) for d in by_row["paper-b"]} == {(60.0, 0.3)}
+    assert all(d["peak_share"] > 0.89 for d in by_row["paper-b"])
+
+
+def test_chosen_rows_are_those_of_the_whole_table(table: tuple[Path, dict], tmp_path: Path) -> None:
+    folder, _ = table
+    part = write_conditions(tmp_path, drives=2, seed=1, rows=["gyro-dead", "friction-unknown"])
+    assert [row["name"] for row in part["rows"]] == ["friction-unknown", "gyro-dead"]
+    whole = digests(folder)
+    found = digests(tmp_path)
+    assert found == {name: whole[name] for name in found} and len(found) == 4  # in-domain's come along
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda p: write_suite(p, count=0, seed=1),
+        lambda p: write_suite(p, count=1, seed=-1),
+        lambda p: write_suite(p, count=1, seed=1, processes=0),
+        lambda p: write_suite(p, count=1, seed=1, vehicles="all"),
+        lambda p: write_suite(p, count=1, seed=1, duration_s=1.0),
+        lambda p: write_conditions(p, rows=["hail"]),
+        lambda p: write_conditions(p, rows=[]),
+        lambda p: write_conditions(p, drives=0),
+    ],
+)
+def test_bad_requests_are_refused(wrong, tmp_path: Path) -> None:
+    with pytest.raises(UsageError) as caught:
+        wrong(tmp_path / "x")
+    assert "\n" not in str(caught.value)
+
+
+def test_every_job_has_a_file_of_its_own() -> None:
+    jobs, rows = plan_conditions(4, 1)
+    assert len({job.file for job in jobs}) == len(jobs) == 4 * sum(row.draw is not None for row in rows)
+
+
+def test_a_vehicle_is_named_in_one_word() -> None:
+    sedan = load_vehicle("sedan")
+    assert choose_vehicle("sedan") == sedan == Vehicle()
+    heavy = choose_vehicle("sedan,mass=1.2,cg=0.1,height=1.1")
+    assert heavy.mass_kg == pytest.approx(1.2 * 1440.0) and heavy.yaw_inertia_kg_m2 == pytest.approx(1.2 * 1523.0)
+    assert heavy.cg_to_front_axle_m == pytest.approx(1.26) and heavy.cg_to_rear_axle_m == pytest.approx(1.61)
+    assert heavy.cg_height_m == pytest.approx(1.1 * 0.64)
+    soft = choose_vehicle("sedan,stiffness=0.85")
+    assert soft.front_tyre.stiffness_peak == pytest.approx(0.85 * sedan.front_tyre.stiffness_peak)
+    assert soft.rear_tyre.stiffness_peak == pytest.approx(0.85 * sedan.rear_tyre.stiffness_peak)
+    assert choose_vehicle("sedan,tyres=suv").rear_tyre == load_vehicle("suv").rear_tyre
+    assert choose_vehicle("suv~7") == choose_vehicle("suv~7") != choose_vehicle("suv~8")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "tank",
+        "sedan~x",
+        "sedan,colour=red",
+        "sedan,mass=",
+        "sedan,mass=9",
+        "sedan,cg=3",
+        "sedan,tyres=tank",
+        "sedan,mass=nan",
+    ],
+)
+def test_what_is_no_vehicle_is_refused(text: str) -> None:
+    with pytest.raises(SimulationError):
+        choose_vehicle(text)
+
+
+def test_sensor_values_are_checked_by_name_and_value() -> None:
+    assert sensor_noise({"jitter_s": 0.004, "imu_x_m": -0.3}).jitter_s == 0.004
+    for wrong in ({"gps": 1.0}, {"jitter_s": -1.0}, {"yaw_rate_rad_s": float("nan")}):
+        with pytest.raises(SimulationError):
+            sensor_noise(wrong)

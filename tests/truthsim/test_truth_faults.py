@@ -1,0 +1,222 @@
+"""Faults are what they are called, where and when they are said to be, and nowhere else."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy import stats
+
+from pdhef_logtool.errors import SimulationError
+from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
+from truthsim.faults import FIELDS, KINDS, TARGETS, apply_faults, parse_fault
+from truthsim.manoeuvres import Plan
+from truthsim.motion import simulate_motion
+from truthsim.recording import PARTS
+from truthsim.sensors import STEER_PHASE_S, WHEEL_PHASE_S, SensorChannel, SensorNoise, sense
+from truthsim.vehicle import Vehicle
+
+DURATION_S = 30.0
+
+
+@pytest.fixture(scope="module")
+def clean() -> Drive:
+    return simulate_drive("banked-road", seed=4, duration_s=DURATION_S)
+
+
+def with_faults(drive: Drive, *texts: str, seed: int = 4) -> dict[str, SensorChannel]:
+    return apply_faults(drive.channels, [parse_fault(t) for t in texts], drive.noise, seed)
+
+
+def inside(channel: SensorChannel, start_s: float, end_s: float) -> np.ndarray:
+    return (channel.times_s >= start_s) & (channel.times_s < end_s)
+
+
+@pytest.mark.parametrize("target", FIELDS)
+@pytest.mark.parametrize("kind", ["burst20", "stuck", "dead", "flip", "bias0.5", "dropout"])
+def test_a_fault_changes_its_field_in_its_interval_and_nothing_else(clean: Drive, kind: str, target: str) -> None:
+    message, field = FIELDS[target]
+    faulty = with_faults(clean, f"{kind}:{target}:8:14")
+    for name, channel in faulty.items():
+        before = clean.channels[name]
+        assert np.array_equal(channel.times_s, before.times_s) and np.array_equal(channel.arrival_s, before.arrival_s)
+        for key, column in channel.fields.items():
+            rows = inside(channel, 8.0, 14.0)
+            assert np.array_equal(column[~rows], before.fields[key][~rows], equal_nan=True)
+            touched = name == message and (key == field or (target == "steer" and key == "steering_wheel_rad"))
+            changed = np.mean(column[rows] != before.fields[key][rows])
+            assert changed > 0.9 if touched else changed == 0.0, key
+    values, usual = faulty[message].fields[field], clean.channels[message].fields[field]
+    rows = inside(faulty[message], 8.0, 14.0)
+    if kind == "stuck":
+        assert np.all(values[rows] == usual[np.argmax(rows)])
+    elif kind == "dead":
+        assert np.all(values[rows] == 0.0)
+    elif kind == "flip":
+        assert np.array_equal(values[rows], -usual[rows])
+    elif kind == "dropout":
+        assert np.all(np.isnan(values[rows]))
+    elif kind == "bias0.5":
+        assert values[rows] - usual[rows] == pytest.approx(0.5, abs=1e-3 if message == "imu" else 0.004)
+
+
+@pytest.mark.parametrize("factor", [5.0, 20.0])
+@pytest.mark.parametrize(
+    ("target", "sigma"), [("ay", 0.12), ("yaw_rate", 0.004), ("steer", 0.0008), ("wheel_rl", 0.08)]
+)
+def test_a_burst_has_its_factor_times_the_usual_noise(clean: Drive, target: str, sigma: float, factor: float) -> None:
+    message, field = FIELDS[target]
+    added = []
+    for seed in range(12):
+        faulty = with_faults(clean, f"burst{factor:g}:{target}:5:25", seed=seed)
+        rows = inside(faulty[message], 5.0, 25.0)
+        added.append((faulty[message].fields[field] - clean.channels[message].fields[field])[rows])
+    noise = np.concatenate(added)
+    # On top of the noise that is there: both together have factor times sigma.
+    assert np.sqrt(noise.std() ** 2 + sigma**2) == pytest.approx(factor * sigma, rel=0.03)
+    assert abs(noise.mean()) < 4.0 * noise.std() / np.sqrt(noise.size)
+    assert stats.kurtosis(noise) > 1.0  # Student-t, as the sensor's own
+
+
+def test_late_and_lost_messages_and_a_clock_that_jumps(clean: Drive) -> None:
+    before = clean.channels["imu"]
+    rows = inside(before, 10.0, 12.0)
+    late = with_faults(clean, "delay30:imu:10:12")["imu"]
+    assert late.arrival_s[rows] - before.arrival_s[rows] == pytest.approx(0.030)
+    assert np.all(np.diff(late.arrival_s) >= 0.0) and np.array_equal(late.times_s, before.times_s)
+    # The messages right after queue behind the last late one, the others are untouched.
+    assert np.array_equal(late.arrival_s[before.times_s >= 12.03], before.arrival_s[before.times_s >= 12.03])
+    assert np.array_equal(late.arrival_s[before.times_s < 10.0], before.arrival_s[before.times_s < 10.0])
+
+    gone = with_faults(clean, "dropout:imu:10:12")["imu"]
+    assert np.array_equal(gone.times_s, before.times_s[~rows])
+    assert np.array_equal(gone.fields["ay_m_s2"], before.fields["ay_m_s2"][~rows])
+
+    jumped = with_faults(clean, "jump0.5:imu:10:12")["imu"]
+    assert jumped.times_s[rows] - before.times_s[rows] == pytest.approx(0.5)
+    assert np.array_equal(jumped.times_s[~rows], before.times_s[~rows])
+    assert np.array_equal(jumped.arrival_s, before.arrival_s)
+
+    everything = with_faults(clean, "delay30:all:0:end")
+    for name in ("imu", "steering", "wheels"):
+        assert everything[name].arrival_s - clean.channels[name].arrival_s == pytest.approx(0.030), name
+    assert everything["rtk"] is clean.channels["rtk"]
+
+
+def test_rtk_outages_open_the_gate_and_close_it() -> None:
+    faults = [parse_fault("float:rtk:5:8"), parse_fault("lost:rtk:10:14")]
+    usual = simulate_drive("banked-road", seed=4, duration_s=DURATION_S)
+    drive = simulate_drive("banked-road", seed=4, duration_s=DURATION_S, faults=faults)
+    rtk, fix = drive.channels["rtk"], drive.channels["fix"]
+    assert np.all(rtk.fields["quality"][inside(rtk, 5.0, 8.0)] == 5)
+    assert np.all(rtk.fields["quality"][inside(rtk, 10.0, 14.0)] == 0)
+    good = rtk.fields["quality"] == 4
+    assert good.mean() == pytest.approx(1.0 - 7.0 / DURATION_S, abs=0.01)
+    error = np.hypot(rtk.fields["x_m"] - drive.truth["x_m"], rtk.fields["y_m"] - drive.truth["y_m"])
+    assert error[good].max() < 0.06 < 0.1 < error[inside(rtk, 5.0, 8.0)].max()
+    # Coasting, the error grows and ends with the outage; the stated sigma grows with it.
+    coast = error[inside(rtk, 10.0, 14.0)]
+    assert coast[-20:].mean() > coast[:20].mean()
+    assert rtk.fields["position_std_m"][inside(rtk, 13.9, 14.0)].min() > 0.1
+    assert np.all(np.isnan(fix.fields["lat_deg"]) == (fix.fields["quality"] == 0))
+    for key in ("x_m", "vy_m_s"):
+        assert np.array_equal(rtk.fields[key][good], usual.channels["rtk"].fields[key][good])
+    for name in ("imu", "steering", "wheels"):
+        for key, column in drive.channels[name].fields.items():
+            assert np.array_equal(column, usual.channels[name].fields[key])
+
+
+def test_outages_are_drawn_at_their_rate() -> None:
+    noise = SensorNoise(rtk_outages_per_h=360.0, rtk_outage_s=2.0)
+    straight = Plan(20.0, 300.0, steer_rad=np.zeros(300_001))
+    motion = simulate_motion(straight, 0.85, phases_s=(0.0, STEER_PHASE_S, WHEEL_PHASE_S))
+    qualities = [sense(motion, Vehicle(), noise, seed, 10)["rtk"].fields["quality"] for seed in range(30)]
+    # 360 an hour of 2 s each, counted from the end of the one before: 2 s of every 12, half of them float.
+    assert np.mean(np.concatenate(qualities) != 4) == pytest.approx(1.0 / 6.0, abs=0.02)
+    assert np.mean(np.concatenate(qualities) == 5) == pytest.approx(1.0 / 12.0, abs=0.02)
+    assert all(np.all(sense(motion, Vehicle(), SensorNoise(), s, 10)["rtk"].fields["quality"] == 4) for s in range(3))
+
+
+def test_every_fault_reads_back_from_its_text() -> None:
+    for text in (
+        "burst20:yaw_rate:5:8",
+        "dropout:imu:0:end",
+        "delay30:all:1.5:2",
+        "jump-0.5:rtk:3:4",
+        "bias-0.1:ax:0:1",
+    ):
+        assert str(parse_fault(text)) == text
+        assert parse_fault(str(parse_fault(text))) == parse_fault(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "burst20", "burst:ay:1:2", "burst0.5:ay:1:2", "stuck3:ay:1:2", "stuck:speed:1:2", "explode:ay:1:2"),
+        *("stuck:ay:2:1", "stuck:ay:-1:1", "stuck:ay:a:b", "delay30:ay:1:2", "delay-3:imu:1:2", "float:imu:1:2"),
+        *("dead:rtk:1:2", "stuck:ay:nan:2", "stuck:ay:1:2:3", "burst2.0.0:ay:1:2"),
+    ],
+)
+def test_what_is_no_fault_is_refused_in_one_line(text: str) -> None:
+    with pytest.raises(SimulationError) as caught:
+        parse_fault(text)
+    assert "\n" not in str(caught.value) and "burst20:yaw_rate:5:8" in str(caught.value)
+
+
+def read(path: Path) -> tuple[dict[str, list], dict[str, str]]:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    messages: dict[str, list] = {}
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic not in messages:
+                store.register(get_types_from_msg(schema.data.decode(), schema.name))
+            messages.setdefault(channel.topic, []).append(store.deserialize_cdr(message.data, schema.name))
+        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+    return messages, metadata["truthsim"]
+
+
+def test_a_log_tells_its_faults_as_events_and_in_its_metadata(tmp_path: Path) -> None:
+    texts = ("burst20:yaw_rate:2:4", "dropout:wheels:3:end", "lost:rtk:1:2")
+    drive = simulate_drive("step-steer", faults=[parse_fault(t) for t in texts])
+    write_drive(drive, tmp_path / "faulty.mcap", steering_wheel=True)
+    messages, metadata = read(tmp_path / "faulty.mcap")
+    events = messages["/truthsim/events"]
+    told = [((e.header.stamp.sec * 10**9 + e.header.stamp.nanosec - START_NS) * 1e-9, e.active) for e in events]
+    assert told == [(1.0, True), (2.0, True), (2.0, False), (3.0, True), (4.0, False), (6.0, False)]
+    first = events[1]
+    assert (KINDS[first.kind], TARGETS[first.target], first.value) == ("burst", "yaw_rate", 20.0)
+    assert all(getattr(first, f"KIND_{k.upper()}") == i for i, k in enumerate(KINDS))
+    assert all(getattr(first, f"TARGET_{t.upper()}") == i for i, t in enumerate(TARGETS))
+    recorded = json.loads(metadata["faults"])
+    assert [f["fault"] for f in recorded] == list(texts) and recorded[1]["end_s"] == 6.0
+    assert len(messages["/vehicle/wheel_speeds"]) == 300
+    statuses = np.array([m.status.status for m in messages["/rtk/fix"]])
+    qualities = np.array([m.quality for m in messages["/rtk/quality"]])
+    assert np.all(statuses[10:20] == -1) and np.all(qualities[10:20] == 0) and np.sum(qualities != 4) == 10
+    odometry = messages["/rtk/odometry"]
+    assert odometry[199].pose.covariance[0] > odometry[110].pose.covariance[0] > odometry[50].pose.covariance[0]
+    wheel = np.array([m.angle_rad for m in messages["/vehicle/steering_wheel"]])
+    road = np.array([m.steering_tire_angle for m in messages["/vehicle/status/steering_status"]])
+    assert wheel == pytest.approx(16.0 * road, abs=1e-5)
+
+
+def test_parts_can_be_left_out(tmp_path: Path) -> None:
+    drive = simulate_drive("step-steer", faults=[parse_fault("stuck:ay:1:2")])
+    write_drive(drive, tmp_path / "blind.mcap", without=["rtk", "perfect", "events"])
+    messages, _ = read(tmp_path / "blind.mcap")
+    assert set(messages) == {"/imu/data", "/vehicle/status/steering_status", "/vehicle/wheel_speeds"}
+    with pytest.raises(SimulationError, match="gps"):
+        write_drive(drive, tmp_path / "x.mcap", without=["gps"])
+    write_drive(drive, tmp_path / "x.mcap")
+    assert {topic for part in PARTS.values() for topic in part} == set(read(tmp_path / "x.mcap")[0])
+
+
+def test_a_sensor_that_never_speaks_leaves_an_empty_topic(tmp_path: Path) -> None:
+    drive = simulate_drive("step-steer", faults=[parse_fault("dropout:wheels:0:end")])
+    write_drive(drive, tmp_path / "x.mcap")
+    assert "/vehicle/wheel_speeds" not in read(tmp_path / "x.mcap")[0]

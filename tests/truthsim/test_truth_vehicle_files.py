@@ -1,0 +1,108 @@
+"""Vehicle files: what ships is sane, what is wrong is said in one line, and a randomised car is a car."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.errors import SimulationError
+from truthsim.linear_theory import steady_roll, understeer_gradient_rad_per_m_s2
+from truthsim.manoeuvres import Plan
+from truthsim.motion import simulate_motion
+from truthsim.randomisation import SPREADS, randomise
+from truthsim.vehicle import Vehicle
+from truthsim.vehicle_files import VEHICLES, load_vehicle
+
+SHIPPED = Path(__file__).resolve().parents[2] / "truthsim" / "vehicles"
+SEDAN = (SHIPPED / "sedan.toml").read_text()
+DEG_PER_G = np.degrees(1.0) * 9.80665
+
+
+def test_the_default_is_the_sedan_s_file() -> None:
+    assert load_vehicle("sedan") == Vehicle()
+    assert {p.stem for p in SHIPPED.glob("*.toml")} == set(VEHICLES)
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_shipped_vehicles_handle_like_cars_of_their_kind(name: str) -> None:
+    car = load_vehicle(name)
+    assert 1.5 < understeer_gradient_rad_per_m_s2(car, 0.85) * DEG_PER_G < 4.0
+    angle, (front, rear) = steady_roll(car)
+    assert 3.0 < angle * DEG_PER_G < 6.0
+    assert 0.5 < front / (front + rear) < 0.65
+    motion = simulate_motion(Plan(25.0, 4.0, steer_rad=np.linspace(0.0, 0.10, 4001)), 0.85, vehicle=car)
+    assert np.isfinite(motion.observed).all()
+    assert 0.6 < motion.column("ay_m_s2").max() / 9.80665 < 0.88
+
+
+def test_vehicles_differ_in_what_they_are() -> None:
+    sedan, suv, small = (load_vehicle(n) for n in VEHICLES)
+    assert suv.mass_kg > sedan.mass_kg > small.mass_kg
+    assert suv.cg_height_m > sedan.cg_height_m > small.cg_height_m
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("mass_kg = 1440.0\n", "", ("mass_kg", "nothing", "required")),
+        ("mass_kg = 1440.0", "mass_kg = -1.0", ("mass_kg", "-1.0", "greater than 0")),
+        ("mass_kg = 1440.0", 'mass_kg = "heavy"', ("mass_kg", "heavy", "number")),
+        ("mass_kg = 1440.0", "mass_kg = nan", ("mass_kg", "nan", "finite")),
+        ("track_m = ", "trakc_m = ", ("track_m",)),
+        ("ackermann = 0.5", "ackermann = 1.5", ("ackermann", "1.5")),
+        ("[rear_tyre]", "[rear_tire]", ("rear_tyre",)),
+        ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 400.0", ("unsprung",)),
+        ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 1.0", ("300 rad/s",)),
+        ("cg_height_m = 0.64", "cg_height_m = 6.4", ("upright",)),
+        ("front_roll_centre_height_m = 0.1", "front_roll_centre_height_m = 0.9", ("roll and pitch centres",)),
+        ("lateral_relaxation_min_m = 0.3", "lateral_relaxation_min_m = 0.9", ("front_tyre", "lateral_relaxation")),
+        ("track_m = 1.57", "track_m = = 2", ("TOML",)),
+    ],
+)
+def test_a_wrong_file_is_one_clear_line(tmp_path: Path, old: str, new: str, words: tuple[str, ...]) -> None:
+    assert old in SEDAN
+    path = tmp_path / "car.toml"
+    path.write_text(SEDAN.replace(old, new, 1))
+    with pytest.raises(SimulationError) as caught:
+        load_vehicle(path)
+    assert "\n" not in str(caught.value) and "car.toml" in str(caught.value)
+    assert all(word in str(caught.value) for word in words)
+
+
+def test_an_own_file_is_read_and_a_missing_one_named(tmp_path: Path) -> None:
+    path = tmp_path / "car.toml"
+    path.write_text(SEDAN.replace("mass_kg = 1440.0", "mass_kg = 1500"))
+    assert load_vehicle(path) == Vehicle()._replace(mass_kg=1500.0)
+    with pytest.raises(SimulationError, match="sedan, suv, hatchback"):
+        load_vehicle("lorry")
+
+
+def test_randomised_cars_spread_as_documented_and_repeat() -> None:
+    car = Vehicle()
+    cars = [randomise(car, seed) for seed in range(200)]
+    assert randomise(car, 7) == cars[7] and len(set(cars)) == 200
+    for values, half in (
+        ([c.mass_kg / car.mass_kg for c in cars], SPREADS["load"]),
+        ([c.front_damper_n_s_per_m / car.front_damper_n_s_per_m for c in cars], SPREADS["dampers"]),
+        ([c.front_tyre.lateral_relaxation_m / 0.65 for c in cars], SPREADS["relaxation"]),
+        ([c.cg_to_front_axle_m - 1.16 + 1.0 for c in cars], 0.03 * 2.87),
+    ):
+        spread = np.array(values) - 1.0
+        assert np.abs(spread).max() <= half * (1.0 + 1e-9)
+        assert spread.max() > 0.85 * half and spread.min() < -0.7 * half
+        assert abs(spread.mean()) < 0.15 * half
+    assert all(c.cg_to_front_axle_m + c.cg_to_rear_axle_m == pytest.approx(2.87) for c in cars)
+    assert min(understeer_gradient_rad_per_m_s2(c, 0.85) * DEG_PER_G for c in cars) > 0.5
+    for name in ("track_m", "wheel_radius_m", "steering_ratio", "front_drive_share", "front_brake_share"):
+        assert {getattr(c, name) for c in cars} == {getattr(car, name)}, name
+
+
+@pytest.mark.parametrize("name", VEHICLES)
+def test_randomised_cars_drive(name: str) -> None:
+    steer = 0.03 * np.sin(2.0 * np.pi * 0.7 * np.arange(0.0, 4.0, 1e-3))
+    for seed in range(8):
+        motion = simulate_motion(Plan(22.0, 3.9, steer_rad=steer), 0.7, vehicle=randomise(load_vehicle(name), seed))
+        assert np.isfinite(motion.observed).all()
+        assert 0.25 < np.abs(motion.column("ay_m_s2")).max() / 9.80665 < 0.72

@@ -1,0 +1,253 @@
+"""Many drives at once: what each is made from, work in processes, and a manifest that does not depend on their number.
+
+A drive that is on disk as a manifest has it is kept, so that an interrupted batch goes on where it was.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool import __version__
+from pdhef_logtool.errors import OutputError, SimulationError, UsageError
+from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
+from truthsim.faults import parse_fault
+from truthsim.manoeuvres import GRAVITY_M_S2
+from truthsim.sensors import SensorNoise
+from truthsim.vehicle_choice import choose_vehicle
+
+MANIFEST = "manifest.json"
+#: Bins of |a_y| over μ g in which METHOD §10 scores, by name; each from its lower limit on.
+BINS: dict[str, float] = {"low": 0.0, "middle": 0.3, "high": 0.6}
+#: Drives between two writings of the manifest, which is what an interrupted batch goes on from.
+_SAVE_EVERY = 25
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSpec:
+    """All that a drive is made from; ``vehicle`` and ``faults`` as the command line has them."""
+
+    manoeuvre: str
+    speed_km_h: float
+    friction: float
+    seed: int
+    duration_s: float
+    amplitude: float = 1.0
+    vehicle: str = DEFAULT_VEHICLE
+    faults: tuple[str, ...] = ()
+    sensors: tuple[tuple[str, float], ...] = ()
+    without: tuple[str, ...] = ()
+    keep_spins: bool = False
+
+    def simulate(self) -> Drive:
+        """Drive it.
+
+        Raises
+        ------
+        SimulationError : it cannot be driven, or the car spun.
+        """
+        return simulate_drive(
+            self.manoeuvre,
+            speed_km_h=self.speed_km_h,
+            friction=self.friction,
+            seed=self.seed,
+            duration_s=self.duration_s,
+            amplitude=self.amplitude,
+            vehicle=choose_vehicle(self.vehicle),
+            vehicle_name=self.vehicle,
+            noise=sensor_noise(dict(self.sensors)),
+            faults=[parse_fault(f) for f in self.faults],
+            keep_spins=self.keep_spins,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One file of a batch: the first of the candidates that the car survives is written; ``facts`` go to its entry."""
+
+    file: str
+    candidates: tuple[DriveSpec, ...]
+    facts: tuple[tuple[str, Any], ...] = ()
+
+    @property
+    def key(self) -> str:
+        """Digest of all that the file depends on; an entry with another key is made anew."""
+        text = json.dumps([__version__, [asdict(c) for c in self.candidates]], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def sensor_noise(values: Mapping[str, float]) -> SensorNoise:
+    """Return the usual sensors with some values changed.
+
+    Raises
+    ------
+    SimulationError
+        There is no such value, or it is no finite number.
+    """
+    unknown = [name for name in values if name not in SensorNoise._fields]
+    if unknown:
+        raise SimulationError(
+            expected=f"values of {', '.join(SensorNoise._fields)}", got=", ".join(unknown), where="sensor"
+        )
+    wrong = [
+        n for n, v in values.items() if not np.isfinite(v) or (v < 0.0 and n not in ("imu_x_m", "imu_y_m", "imu_z_m"))
+    ]
+    if wrong:
+        raise SimulationError(expected="finite numbers of at least 0", got=", ".join(wrong), where="sensor")
+    return SensorNoise(**values)
+
+
+def time_in_bins_s(drive: Drive) -> dict[str, float]:
+    """Seconds of a drive in each bin of |a_y| over μ g."""
+    share = np.abs(drive.truth["ay_m_s2"]) / (drive.truth["friction"] * GRAVITY_M_S2)
+    place = np.digitize(share, list(BINS.values())[1:])
+    step_s = float(drive.times_s[1] - drive.times_s[0])
+    return {name: round(float(np.sum(place == i)) * step_s, 2) for i, name in enumerate(BINS)}
+
+
+def make_drive(job: Job, folder: Path) -> dict[str, Any]:
+    """Write the job's file and return its entry; one whose candidates all fail has no ``sha256`` but the reasons."""
+    dropped: list[dict[str, Any]] = []
+    for spec in job.candidates:
+        try:
+            drive = spec.simulate()
+        except SimulationError as error:
+            dropped.append({"spec": asdict(spec), "reason": str(error)})
+            continue
+        path = folder / job.file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_drive(drive, path, without=spec.without)
+        data = path.read_bytes()
+        return {
+            "file": job.file,
+            **dict(job.facts),
+            "command": " ".join([drive.command, *(f"--without {w}" for w in spec.without)]),
+            **asdict(spec),
+            "scale": drive.scale,
+            "peak_ay_m_s2": drive.peak_ay_m_s2,
+            "peak_share": drive.peak_ay_m_s2 / (drive.friction * GRAVITY_M_S2),
+            "peak_sideslip_rad": drive.peak_sideslip_rad,
+            "bins_s": time_in_bins_s(drive),
+            "spun": drive.spun,
+            "lifted": drive.lifted,
+            "notes": list(drive.notes),
+            "dropped": dropped,
+            "key": job.key,
+            "size_bytes": len(data),
+            "sha256": hashlib.sha256(data).hexdigest(),
+        }
+    return {"file": job.file, **dict(job.facts), "dropped": dropped, "key": job.key}
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    folder: Path,
+    head: Mapping[str, Any],
+    *,
+    processes: int,
+    progress: Callable[[str, float], None] | None = None,
+    finish: Callable[[list[dict[str, Any]]], Mapping[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Make the files of the jobs in a folder and write ``manifest.json``; returns the manifest.
+
+    Parameters
+    ----------
+    head : what the manifest begins with.
+    processes : how many work at once; the result does not depend on it.
+    finish : further entries of the manifest from those of all drives.
+
+    Raises
+    ------
+    UsageError : ``processes`` is below 1.
+    OutputError : the folder or a file cannot be written.
+    """
+    if processes < 1:
+        raise UsageError(expected="at least one process", got=str(processes), where="--jobs")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(expected="a folder", got=error.strerror or str(error), where=str(folder)) from error
+    entries = _kept(jobs, folder)
+    todo = [i for i in range(len(jobs)) if i not in entries]
+    try:
+        with _workers(processes) as work:
+            for done, (i, entry) in enumerate(work([(i, jobs[i]) for i in todo], folder), start=1):
+                entries[i] = entry
+                if progress is not None:
+                    progress(f"{len(entries)} of {len(jobs)} drives", len(entries) / len(jobs))
+                if done % _SAVE_EVERY == 0:
+                    _write_manifest(folder, head, [entries[k] for k in sorted(entries)], complete=False)
+    finally:
+        ordered = [entries[k] for k in sorted(entries)]
+        complete = len(ordered) == len(jobs)
+        extra = finish(ordered) if finish is not None and complete else {}
+        manifest = _write_manifest(folder, {**head, **extra}, ordered, complete=complete)
+    return manifest
+
+
+def _kept(jobs: Sequence[Job], folder: Path) -> dict[int, dict[str, Any]]:
+    """Entries of an earlier manifest whose files are there with the right content."""
+    try:
+        old = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["drives"]
+        known = {entry["file"]: entry for entry in old}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+    kept: dict[int, dict[str, Any]] = {}
+    for i, job in enumerate(jobs):
+        entry = known.get(job.file)
+        path = folder / job.file
+        if entry is None or entry.get("key") != job.key:
+            continue
+        wanted = entry.get("sha256")
+        if wanted is None or (path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == wanted):
+            kept[i] = {**entry, **dict(job.facts)}
+    return kept
+
+
+_Work = Callable[[list[tuple[int, Job]], Path], Iterator[tuple[int, dict[str, Any]]]]
+
+
+@contextmanager
+def _workers(processes: int) -> Iterator[_Work]:
+    """Yield a function that makes drives, here or in processes of their own, and yields entries as they are done."""
+    if processes == 1:
+        yield lambda todo, folder: ((i, make_drive(job, folder)) for i, job in todo)
+        return
+    # A fresh interpreter each: threads of the parent would not survive a fork.
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+
+        def work(todo: list[tuple[int, Job]], folder: Path) -> Iterator[tuple[int, dict[str, Any]]]:
+            futures = {pool.submit(make_drive, job, folder): i for i, job in todo}
+            try:
+                for future in as_completed(futures):
+                    yield futures[future], future.result()
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+        yield work
+
+
+def _write_manifest(
+    folder: Path, head: Mapping[str, Any], entries: list[dict[str, Any]], *, complete: bool
+) -> dict[str, Any]:
+    manifest = {"format": 1, **head, "complete": complete, "drives": entries}
+    # Through JSON, so that a fresh manifest and one read back are the same.
+    text = json.dumps(manifest, indent=1, allow_nan=False)
+    temporary = folder / f".{MANIFEST}.part"
+    try:
+        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.replace(folder / MANIFEST)
+    except OSError as error:
+        raise OutputError(
+            expected="a writable folder", got=error.strerror or str(error), where=str(folder / MANIFEST)
+        ) from error
+    return dict(json.loads(text))

@@ -1,0 +1,52 @@
+"""The road under the car: friction of each wheel, bank and grade, read from a plan's road table."""
+
+from __future__ import annotations
+
+from numba.extending import register_jitable
+
+from pdhef_logtool.signals import FloatArray
+from truthsim.manoeuvres import ROAD_BANK, ROAD_FRICTION_LEFT, ROAD_FRICTION_RIGHT, ROAD_GRADE
+from truthsim.vehicle import BANK, BANK_PER_M, FRICTION, GRADE, GRADE_PER_M
+
+
+@register_jitable
+def _at(table: FloatArray, place: float, column: int) -> float:
+    """Interpolate a column at a place counted in rows; beyond the ends the outer rows hold."""
+    last = table.shape[0] - 1
+    if place <= 0.0:
+        return float(table[0, column])
+    if place >= last:
+        return float(table[last, column])
+    i = int(place)
+    return float(table[i, column] + (place - i) * (table[i + 1, column] - table[i, column]))
+
+
+@register_jitable
+def read_road(
+    table: FloatArray, step_m: float, at_m: float, front_m: float, rear_m: float, friction: float, road: FloatArray
+) -> None:
+    """Write what ``truthsim.vehicle`` wants to know of the road, [ROAD_SIZE].
+
+    Parameters
+    ----------
+    table : [R, 4], friction left and right, bank and grade (rad) every ``step_m``; empty for a level road.
+    at_m : distance of the CG along the table; ``front_m`` and ``rear_m`` are those of the axles from it, so that an
+        axle meets a change of friction when it gets there.
+    friction : of all wheels where there is no table.
+    """
+    if table.shape[0] == 0:
+        for i in range(road.shape[0]):
+            road[i] = 0.0
+        for wheel in range(4):
+            road[FRICTION + wheel] = friction
+        return
+    for axle in range(2):
+        place = (at_m + (front_m if axle == 0 else -rear_m)) / step_m
+        road[FRICTION + 2 * axle] = _at(table, place, ROAD_FRICTION_LEFT)
+        road[FRICTION + 2 * axle + 1] = _at(table, place, ROAD_FRICTION_RIGHT)
+    place = at_m / step_m
+    road[BANK] = _at(table, place, ROAD_BANK)
+    road[GRADE] = _at(table, place, ROAD_GRADE)
+    # Over two rows, so that the slope of a table does not jump at each of them.
+    road[BANK_PER_M] = (_at(table, place + 1.0, ROAD_BANK) - _at(table, place - 1.0, ROAD_BANK)) / (2.0 * step_m)
+    road[GRADE_PER_M] = (_at(table, place + 1.0, ROAD_GRADE) - _at(table, place - 1.0, ROAD_GRADE)) / (2.0 * step_m)
