@@ -124,6 +124,9 @@ def run(
     estimators: Annotated[
         str | None, typer.Option("--estimators", "-e", help="Comma-separated names; see pdhef estimators.")
     ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="Folder of a model bundle; adds the hybrid filters.")
+    ] = None,
     vehicle: Annotated[Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml.")] = None,
     mapping: MappingFile = None,
     start: Annotated[str | None, typer.Option("--start", help="Start of the slice (see Times).")] = None,
@@ -150,6 +153,7 @@ def run(
         config,
         {
             "estimators": None if estimators is None else tuple(n.strip() for n in estimators.split(",") if n.strip()),
+            "model": model,
             "vehicle": vehicle,
             "mapping": mapping,
             "start": start,

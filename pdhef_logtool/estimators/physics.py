@@ -127,15 +127,19 @@ class PosteriorSteps:
 def _propagate(chi, steer, ax, friction, rate_vy, rate_r, dt, p):  # type: ignore[no-untyped-def]
     """Move sigma points [s, 4] by ``dt`` through the nominal model and add the residual (Eq 19), in place.
 
-    A residual counts where the model is dynamic: it knows nothing of the kinematic range.
+    Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
+    has it, would leave the tyres' answer to it out of the step, 3 % of a residual at 25 m/s and 10 ms. A residual
+    counts where the model is dynamic: it knows nothing of the kinematic range.
     """
-    share = dynamic_share(chi[0, 0], p)
+    half = 0.5 * dynamic_share(chi[0, 0], p) * dt
     n = substeps(chi[0, 0], dt, friction, p)
     for i in range(chi.shape[0]):
-        vx, vy, r = rk4_step(chi[i, 0], chi[i, 1], chi[i, 2], steer, ax - chi[i, 3], friction, dt, n, p)
+        vy = chi[i, 1] + half * rate_vy
+        r = chi[i, 2] + half * rate_r
+        vx, vy, r = rk4_step(chi[i, 0], vy, r, steer, ax - chi[i, 3], friction, dt, n, p)
         chi[i, 0] = vx
-        chi[i, 1] = vy + share * rate_vy * dt
-        chi[i, 2] = r + share * rate_r * dt
+        chi[i, 1] = vy + half * rate_vy
+        chi[i, 2] = r + half * rate_r
 
 
 @njit(cache=True)
