@@ -52,6 +52,7 @@ from pdhef_logtool.training.residuals import (
     GAP_PERIODS,
     NEGLIGIBLE_NOISE,
     SMOOTHING_HALF_S,
+    ResidualRows,
     difference_noise,
     residual_windows,
 )
@@ -534,11 +535,13 @@ class _Counts:
         self._segments: set[int] = set()
         self._span: tuple[int, int] | None = None
 
-    def add(self, rows: Any) -> None:
+    def add(self, rows: ResidualRows) -> None:
         use = rows.weight > 0.0
         self.rows += len(rows)
         self.usable += int(np.count_nonzero(use))
-        self._squares += np.square(rows.targets[use] / rows.step_s[use, None]).sum(axis=0)
+        squares = np.square(rows.targets[use] / rows.step_s[use, None])
+        # Added one by one, so that the sum does not depend on how the rows come in parts.
+        self._squares = np.cumsum(np.concatenate([self._squares[None], squares]), axis=0)[-1]
         self._segments.update(int(s) for s in np.unique(rows.segment[use]))
         first = int(rows.stamps_ns[0]) if self._span is None else self._span[0]
         self._span = (first, int(rows.stamps_ns[-1]))
