@@ -40,6 +40,7 @@ from pdhef_logtool.mapping import auto_map, check_mapping, load_mapping, merge_l
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.sinks.report import tool_versions
 from pdhef_logtool.training.dataset import (
+    FORMAT,
     FORMAT_VERSION,
     MANIFEST,
     SPLITS,
@@ -198,6 +199,7 @@ def run_extraction(
     inputs = find_logs(arguments)
     mapping = None if settings.config.mapping is None else load_mapping(settings.config.mapping)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
+    _check_output(output)
     try:
         output.mkdir(parents=True, exist_ok=True)
         # Until the new manifest stands, what the old one says of the files here is no longer true.
@@ -231,6 +233,24 @@ def run_extraction(
     return ExtractResult(output, manifest, results)
 
 
+def _check_output(output: Path) -> None:
+    path = output / MANIFEST
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        ours = isinstance(document, dict) and document.get("format") == FORMAT
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError):
+        ours = False
+    if not ours:
+        raise UsageError(
+            expected="a new folder, or that of a residual dataset",
+            got=f"a folder with another {MANIFEST}",
+            where=str(output),
+            remedy="choose another folder with -o",
+        )
+
+
 def _check_counts(jobs: int, settings: ExtractSettings) -> None:
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
@@ -249,10 +269,10 @@ def _plan_jobs(
     warn: Warn,
 ) -> Iterator[_Job]:
     chosen = None if settings.config.vehicle is None else load_vehicle(settings.config.vehicle)
-    files = cache(load_vehicle)
+    files, manifests = cache(load_vehicle), cache(_set_manifest)
     told = False
     for log_input in inputs:
-        listed = _listed(log_input.path)
+        listed = _listed(log_input.path, manifests(log_input.path.parent))
         vehicle = chosen
         if vehicle is None and listed.vehicle is not None:
             vehicle = files(listed.vehicle)
@@ -403,9 +423,9 @@ class _Listed:
     vehicle: Path | None = None
 
 
-def _listed(path: Path) -> _Listed:
+def _listed(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
     """Return what the manifest of a simulated set beside a log says of it: its split and its vehicle file."""
-    entry = _set_manifest(path.parent).get(path.name, {})
+    entry = manifest.get(path.name, {})
     split, vehicle = entry.get("split"), entry.get("vehicle")
     file = path.parent / vehicle if isinstance(vehicle, str) and vehicle.endswith(".toml") else None
     return _Listed(
@@ -414,7 +434,6 @@ def _listed(path: Path) -> _Listed:
     )
 
 
-@cache
 def _set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
     """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
     documents: list[Any] = []

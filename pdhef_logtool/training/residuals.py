@@ -144,10 +144,8 @@ def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: 
     for start in range(0, centres.shape[0], _CHUNK):
         centre = centres[start : start + _CHUNK]
         curve = np.cumsum(increments[centre[:, None] + steps], axis=1)
-        # About the middle step's own beginning: nothing depends on where the drive or a window of it began.
-        curve = np.concatenate([np.zeros_like(curve[:, :1]), curve], axis=1) - curve[:, h - 1 : h]
+        curve = np.concatenate([np.zeros_like(curve[:, :1]), curve], axis=1)
         at = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * 1e-9
-        at -= 0.5 * at[:, h + 1 : h + 2]
         span = np.abs(at).max(axis=1)
         u = at / span[:, None]
         powers = [np.ones_like(u)]

@@ -327,6 +327,14 @@ def test_wrong_settings_are_told_before_any_log_is_read(tmp_path: Path, wrong: d
     assert not (tmp_path / "out").exists()
 
 
+def test_another_manifest_is_not_overwritten(sample_logs_dir: Path, tmp_path: Path) -> None:
+    shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
+    (tmp_path / "manifest.json").write_text('{"format": 1, "drives": []}')
+    with pytest.raises(UsageError, match="another manifest"):
+        run_extraction([str(tmp_path / "a.mcap")], tmp_path, ExtractSettings(RunConfig()))
+    assert (tmp_path / "manifest.json").read_text() == '{"format": 1, "drives": []}'
+
+
 # ---- command line ----
 
 
