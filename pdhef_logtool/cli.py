@@ -124,6 +124,9 @@ def run(
     estimators: Annotated[
         str | None, typer.Option("--estimators", "-e", help="Comma-separated names; see pdhef estimators.")
     ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="Folder of a model bundle; adds the hybrid filters.")
+    ] = None,
     vehicle: Annotated[Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml.")] = None,
     mapping: MappingFile = None,
     start: Annotated[str | None, typer.Option("--start", help="Start of the slice (see Times).")] = None,
@@ -150,6 +153,7 @@ def run(
         config,
         {
             "estimators": None if estimators is None else tuple(n.strip() for n in estimators.split(",") if n.strip()),
+            "model": model,
             "vehicle": vehicle,
             "mapping": mapping,
             "start": start,
@@ -501,6 +505,107 @@ def identify(
         _print_json(result.to_dict())
     else:
         render_identification(result, _stdout())
+
+
+@app.command(
+    epilog="""Examples:
+
+  pdhef extract logs/ -o residuals --vehicle car.toml --jobs 2
+
+  pdhef extract drive.mcap -o residuals --vehicle car.toml --prefer-truth rtk --truth-smoothing 0.15
+
+  pdhef extract 'held_out/*.mcap' -o residuals_test --split test --resume
+
+Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set beside them has
+a split, or --split puts all of them into one."""
+)
+def extract(
+    logs: Annotated[list[str], typer.Argument(help="Logs with truth, folders that hold some, or glob patterns.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the dataset.")],
+    vehicle: Annotated[
+        Path | None,
+        typer.Option(
+            "--vehicle", "-v", help="vehicle.toml of the nominal model. Default: what a set's manifest names."
+        ),
+    ] = None,
+    mapping: MappingFile = None,
+    start: Annotated[str | None, typer.Option("--start", help="Start of each slice, as in pdhef run.")] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End of each slice, as in pdhef run.")] = None,
+    sensors: Annotated[
+        str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
+    ] = None,
+    prefer_truth: TruthChoice = None,
+    truth_smoothing: Annotated[
+        str,
+        typer.Option("--truth-smoothing", help="auto (from the truth's noise), none, or half a window in seconds."),
+    ] = "auto",
+    split: Annotated[
+        str | None, typer.Option("--split", help="train, validation or test for all drives of this command.")
+    ] = None,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the split by drive.")] = 0,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes at work; changes nothing that is written.")] = 1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep drives whose log and settings are as they were.")
+    ] = False,
+    as_json: JsonFlag = False,
+) -> None:
+    """Write the residual dataset of drives with truth, which the network is trained on."""
+    from pdhef_logtool.config import load_config
+    from pdhef_logtool.summary import render_extraction
+    from pdhef_logtool.training.extract_command import ExtractSettings, run_extraction
+
+    config = load_config(
+        None,
+        {
+            "vehicle": vehicle,
+            "mapping": mapping,
+            "start": start,
+            "end": end,
+            "sensors": sensors,
+            "prefer_truth": prefer_truth,
+        },
+    )
+    settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed)
+    with _progress() as progress:
+        result = run_extraction(logs, output, settings, jobs=jobs, resume=resume, progress=progress, warn=_warn)
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        render_extraction(result, _stdout())
+    raise typer.Exit(result.exit_code)
+
+
+@app.command(
+    epilog="""Examples:
+
+  pdhef train residuals/ -o model
+
+  pdhef train mycar/ -o mycar_model --init model --epochs 10
+
+An interrupted training goes on from its last whole epoch when the same command is given again."""
+)
+def train(
+    dataset: Annotated[Path, typer.Argument(help="Folder that pdhef extract wrote.")],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the model bundle to write.")],
+    init: Annotated[Path | None, typer.Option("--init", help="Model bundle to fine-tune.")] = None,
+    paper: Annotated[bool, typer.Option("--paper", help="The paper's Table 1 instead of the default recipe.")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of weights, order and dropout.")] = 0,
+    epochs: Annotated[int | None, typer.Option("--epochs", help="Default: the recipe's.")] = None,
+    device: Annotated[str, typer.Option("--device", help="PyTorch device: cpu or cuda.")] = "cpu",
+    as_json: JsonFlag = False,
+) -> None:
+    """Train the residual network on a dataset of pdhef extract; write weights, loss history and plot."""
+    from pdhef_logtool.summary import render_training
+    from pdhef_logtool.training.train_command import run_training
+
+    with _progress() as progress:
+        result = run_training(
+            dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=progress
+        )
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        render_training(result, _stdout())
 
 
 @app.command()

@@ -65,3 +65,7 @@ class SimulationError(PdhefError):
 
 class OutputError(PdhefError):
     """An output cannot be written, or an output folder cannot be read back."""
+
+
+class ModelError(PdhefError):
+    """A model bundle is missing, wrong, or does not belong to its weights."""

@@ -28,10 +28,11 @@ from pdhef_logtool.errors import (
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.registry import default_names, runnable
 from pdhef_logtool.geometry import dead_reckon
-from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, auto_map, check_mapping, load_mapping, merge_losses
+from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
 from pdhef_logtool.signals import ALIGNED_SIGNALS, SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Loss, Signals, join_signals
 from pdhef_logtool.sinks.base import TRUTH, Event, Sink
 from pdhef_logtool.sinks.report import (
@@ -143,6 +144,7 @@ def run_logs(
     inputs = find_logs(arguments)
     vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
+    model = None if config.model is None else load_bundle(config.model)
     thresholds = read_thresholds(config, junit)
     if config.vehicle is None:
         warn(f"no --vehicle: the default {vehicle.name} is assumed, so the model-based estimates are of another car")
@@ -154,7 +156,7 @@ def run_logs(
             progress(text, (number + share) / len(inputs))
 
         try:
-            result = run_log(log_input, output, config, vehicle, mapping, progress=of_all, warn=warn)
+            result = run_log(log_input, output, config, vehicle, mapping, model, progress=of_all, warn=warn)
         except Exception as error:  # one bad log never stops the others, whatever is wrong with it
             if len(inputs) == 1:
                 raise
@@ -163,7 +165,7 @@ def run_logs(
             outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
             result = LogResult(outcome, None, None, ())
         results.append(judge(result, thresholds))
-    write_run(output, config.to_dict(), results)
+    write_run(output, config.to_dict(), results, model)
     write_verdicts(junit, results)
     return RunResult(output, tuple(results))
 
@@ -205,6 +207,7 @@ def run_log(
     config: RunConfig,
     vehicle: VehicleParameters,
     mapping: Mapping | None,
+    model: ModelBundle | None = None,
     *,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
@@ -219,7 +222,7 @@ def run_log(
     progress(log_input.stem, 0.0)
     log = open_log(log_input.path)
     try:
-        return _run_open_log(log, log_input, output, config, vehicle, mapping, progress, warn)
+        return _run_open_log(log, log_input, output, config, vehicle, mapping, model, progress, warn)
     finally:
         log.close()
 
@@ -231,6 +234,7 @@ def _run_open_log(
     config: RunConfig,
     vehicle: VehicleParameters,
     mapping: Mapping | None,
+    model: ModelBundle | None,
     progress: Progress,
     warn: Callable[[str], None],
 ) -> LogResult:
@@ -250,10 +254,11 @@ def _run_open_log(
     for name, reason in plan.alignment.unused:
         tell(f"{name} is not used: {reason}")
     estimators, skipped = runnable(
-        config.estimators or default_names(vehicle),
+        config.estimators or default_names(vehicle, model),
         vehicle,
         plan.alignment.available,
         use_speed=config.sensors == "full",
+        model=model,
     )
     for skip in skipped:
         tell(f"{skip.name} is skipped: {skip.reason}")
@@ -559,19 +564,6 @@ def _truth_quantity(name: str, how: str, mapping: Mapping, samples: dict[str, in
     return SourceFacts(name, source.label, TRUTH_UNITS[name], samples.get(source.label, 0), derivation=derivation)
 
 
-def hash_log(path: Path) -> str:
-    """Return the sha256 of a log file, or of the names and contents of a log folder's files in order."""
-    if path.is_file():
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    total = hashlib.sha256()
-    for file_path in sorted(p for p in path.rglob("*") if p.is_file()):
-        total.update(file_path.relative_to(path).as_posix().encode() + b"\0")
-        with file_path.open("rb") as file:
-            total.update(hashlib.file_digest(file, "sha256").digest())
-    return total.hexdigest()
-
-
 def make_folder(output: Path) -> None:
     """Make an output folder; raises OutputError."""
     try:
@@ -582,9 +574,12 @@ def make_folder(output: Path) -> None:
         ) from None
 
 
-def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult]) -> None:
+def write_run(
+    output: Path, config: dict[str, Any], results: Sequence[LogResult], model: ModelBundle | None = None
+) -> None:
     """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values."""
     from pdhef_logtool.sinks.parquet import write_metrics
 
+    used = None if model is None else {"name": str(config["model"]), "sha256": model.sha256}
     write_metrics(output / "metrics.parquet", [row for r in results for row in r.rows])
-    write_json(output / "run.json", build_run(tool_versions(), config, None, [r.outcome for r in results]))
+    write_json(output / "run.json", build_run(tool_versions(), config, used, [r.outcome for r in results]))

@@ -26,7 +26,7 @@ from pdhef_logtool.evaluation.truth import (
     share_equal,
     truth_at,
 )
-from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import (
@@ -48,7 +48,6 @@ from pdhef_logtool.pipeline import (
     RunResult,
     choose_mapping,
     first_pose,
-    hash_log,
     judge,
     make_folder,
     read_thresholds,

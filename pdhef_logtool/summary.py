@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from pdhef_logtool.training.extract_command import ExtractResult
     from pdhef_logtool.training.identify_command import IdentifyResult
+    from pdhef_logtool.training.train_command import TrainResult
 
 _DEG = math.degrees(1.0)
 #: Column head, signal, metric, factor to the shown unit, digits.
@@ -181,3 +183,52 @@ def render_identification(result: IdentifyResult, console: Console) -> None:
     for note in found.notes:
         console.print(f"  {note}", highlight=False)
     console.print(f"vehicle in {result.vehicle_file}, plot in {result.plot_file}", highlight=False, soft_wrap=True)
+
+
+def render_extraction(result: ExtractResult, console: Console) -> None:
+    """Print what each drive gave, and the dataset as a whole."""
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold", pad_edge=True)
+    table.add_column("drive", overflow="fold")
+    for head in ("seconds", "usable", "v̇_y residual\nRMS m/s²", "ṙ residual\nRMS rad/s²"):
+        table.add_column(head, justify="right")
+    table.add_column("split")
+    table.add_column("truth")
+    for drive in result.results:
+        if drive.entry is None:
+            table.add_row(drive.log, "-", "-", "-", "-", "-", "failed")
+            continue
+        e, truth = drive.entry, drive.entry["truth"]
+        half_s = truth["smoothing_half_s"]
+        how = truth["kind"] + (f", ±{half_s:g} s" if half_s else "") + (", kept" if drive.kept else "")
+        table.add_row(
+            drive.log,
+            f"{e['duration_s']:.1f}",
+            f"{100.0 * e['usable_rows'] / max(e['rows'], 1):.1f} %",
+            _cell(e["residual_rms"]["vy_dot_m_s2"], 1.0, 3),
+            _cell(e["residual_rms"]["yaw_acceleration_rad_s2"], 1.0, 3),
+            e["split"],
+            how,
+        )
+    console.print(table)
+    splits = result.manifest["splits"].items()
+    console.print(
+        ", ".join(f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits),
+        highlight=False,
+    )
+    console.print(f"dataset in {result.output}", highlight=False, soft_wrap=True)
+
+
+def render_training(result: TrainResult, console: Console) -> None:
+    """Print how the training went; losses are shares of the residual's own mean square."""
+    best = min(result.history, key=lambda e: e.validation_loss)
+    seconds = sum(e.seconds for e in result.history)
+    console.print(
+        f"{len(result.history)} epochs in {seconds:.0f} s; best epoch {best.epoch}: training {best.train_loss:.4f}, "
+        f"validation {best.validation_loss:.4f} of the residual's mean square",
+        highlight=False,
+    )
+    if result.test_loss is not None:
+        console.print(f"test drives: {result.test_loss:.4f}", highlight=False)
+    console.print(f"model in {result.model} ({result.bundle.sha256[:12]})", highlight=False, soft_wrap=True)

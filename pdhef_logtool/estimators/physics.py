@@ -23,6 +23,7 @@ from pdhef_logtool.estimators.unscented import (
 )
 from pdhef_logtool.nominal_model import (
     ModelParameters,
+    dynamic_share,
     measured_lateral_acceleration,
     model_parameters,
     planar_lateral_acceleration,
@@ -73,8 +74,9 @@ DIVERGED_SIDESLIP_RAD = math.radians(60.0)
 
 # Entries of the filter's scalar memory.
 M_INITIALISED, M_STEER, M_AX, M_AX_KNOWN, M_FRICTION, M_STEER_AGE, M_STILL, M_SPEED_AGE, M_NIS = range(9)
-M_REJECTED = 9  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
-MEMORY = 12
+M_RATE_VY, M_RATE_R = 9, 10  # residual of the step before
+M_REJECTED = 11  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
+MEMORY = 14
 #: What M_REJECTED holds at the first rejected sample itself; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 
@@ -92,7 +94,11 @@ class FilterCarry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSteps:
-    """Filter posteriors on measurement time: [K] each, state [K, 4], covariance [K, 4, 4], inputs [K, 4]."""
+    """Filter posteriors on measurement time: [K] each, state [K, 4], covariance [K, 4, 4], inputs [K, 4].
+
+    ``prior`` [K, 4] is the state before the update, NaN where the filter starts. ``residual_rate``
+    [K, 2] is what is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
+    """
 
     stamps_ns: IntArray
     ready_ns: IntArray
@@ -105,6 +111,8 @@ class PosteriorSteps:
     innovation: FloatArray
     valid: BoolArray
     diverged: BoolArray
+    prior: FloatArray
+    residual_rate: FloatArray
 
     def joined(self, other: PosteriorSteps) -> PosteriorSteps:
         """Append the steps of the next window."""
@@ -116,21 +124,31 @@ class PosteriorSteps:
 
 
 @njit(cache=True)
-def _propagate(chi, steer, ax, friction, dt, p):  # type: ignore[no-untyped-def]
-    """Move sigma points [s, 4] by ``dt`` through the nominal model, in place."""
+def _propagate(chi, steer, ax, friction, rate_vy, rate_r, dt, p):  # type: ignore[no-untyped-def]
+    """Move sigma points [s, 4] by ``dt`` through the nominal model and add the residual (Eq 19), in place.
+
+    Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
+    has it, would leave the tyres' answer to it out of the step, 3 % of a residual at 25 m/s and 10 ms. A residual
+    counts where the model is dynamic: it knows nothing of the kinematic range.
+    """
+    half = 0.5 * dynamic_share(chi[0, 0], p) * dt
     n = substeps(chi[0, 0], dt, friction, p)
     for i in range(chi.shape[0]):
-        vx, vy, r = rk4_step(chi[i, 0], chi[i, 1], chi[i, 2], steer, ax - chi[i, 3], friction, dt, n, p)
+        vy = chi[i, 1] + half * rate_vy
+        r = chi[i, 2] + half * rate_r
+        vx, vy, r = rk4_step(chi[i, 0], vy, r, steer, ax - chi[i, 3], friction, dt, n, p)
         chi[i, 0] = vx
-        chi[i, 1] = vy
-        chi[i, 2] = r
+        chi[i, 1] = vy + half * rate_vy
+        chi[i, 2] = r + half * rate_r
 
 
 @njit(cache=True)
-def _measure(chi, steer, friction, p, zeta):  # type: ignore[no-untyped-def]
-    """Write what the sensors would read at sigma points chi [s, 4] to zeta [s, 3]."""
+def _measure(chi, steer, friction, rate_vy, p, zeta):  # type: ignore[no-untyped-def]
+    """Write what the sensors would read at sigma points chi [s, 4] to zeta [s, 3]; the residual belongs to a_y too."""
+    residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, 0], p) * rate_vy
     for i in range(chi.shape[0]):
-        zeta[i, Z_AY] = measured_lateral_acceleration(chi[i, 0], chi[i, 1], chi[i, 2], steer, friction, p)
+        ay = measured_lateral_acceleration(chi[i, 0], chi[i, 1], chi[i, 2], steer, friction, p)
+        zeta[i, Z_AY] = ay + residual
         zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
         zeta[i, Z_SPEED] = chi[i, VX]
 
@@ -156,7 +174,8 @@ def _all_finite(x, P):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _filter(  # type: ignore[no-untyped-def]
     dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, default_friction, p, q_std, r_std, wm, wc, scale,
-    x, P, memory, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu, out_valid, out_diverged,
+    x, P, memory, residual_rate, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu, out_valid, out_diverged,
+    out_prior,
 ):  # fmt: skip
     """Run over one window; x [4], P [4, 4] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start."""
     n = STATES
@@ -197,6 +216,8 @@ def _filter(  # type: ignore[no-untyped-def]
         out_nu[k, :] = math.nan
         out_valid[k] = False
         out_diverged[k] = False
+        for i in range(n):
+            out_prior[k, i] = math.nan
 
         if memory[M_INITIALISED] == 0.0:
             if math.isfinite(z[Z_SPEED]) and math.isfinite(steer[k]):
@@ -212,13 +233,17 @@ def _filter(  # type: ignore[no-untyped-def]
                 out_valid[k] = True
         else:
             draw_sigma_points(x, P, scale, L, chi)
-            _propagate(chi, memory[M_STEER], memory[M_AX], memory[M_FRICTION], dt[k], p)
+            _propagate(
+                chi, memory[M_STEER], memory[M_AX], memory[M_FRICTION], memory[M_RATE_VY], memory[M_RATE_R], dt[k], p
+            )
             mean_and_covariance(chi, wm, wc, x, P)
             _add_process_noise(P, q_std, memory[M_AX_KNOWN] > 0.0, dt[k])
             alive = _all_finite(x, P)
+            for i in range(n):
+                out_prior[k, i] = x[i]
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
-                _measure(chi, steer_k, mu_k, p, zeta)
+                _measure(chi, steer_k, mu_k, memory[M_RATE_VY], p, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 opens = False
                 outside = False
@@ -253,7 +278,7 @@ def _filter(  # type: ignore[no-untyped-def]
                         for j in range(n):
                             P[i, j] *= GATE_INFLATION
                     draw_sigma_points(x, P, scale, L, chi)
-                    _measure(chi, steer_k, mu_k, p, zeta)
+                    _measure(chi, steer_k, mu_k, memory[M_RATE_VY], p, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                     for i in range(MEASUREMENTS):
                         S[i, i] += r_std[i] * r_std[i]
@@ -298,6 +323,8 @@ def _filter(  # type: ignore[no-untyped-def]
         memory[M_AX] = ax_k
         memory[M_AX_KNOWN] = 1.0 if has_ax else 0.0
         memory[M_FRICTION] = mu_k
+        memory[M_RATE_VY] = residual_rate[k, 0]
+        memory[M_RATE_R] = residual_rate[k, 1]
         for i in range(n):
             out_x[k, i] = x[i]
             for j in range(n):
@@ -309,7 +336,7 @@ def _filter(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _predict_outputs(step, horizon_s, x, P, inputs, p, q_std, wm, wc, scale, out_x, out_P, out_ay):  # type: ignore[no-untyped-def]
+def _predict_outputs(step, horizon_s, x, P, inputs, residual_rate, p, q_std, wm, wc, scale, out_x, out_P, out_ay):  # type: ignore[no-untyped-def]
     """Predict step ``step[m]`` by ``horizon_s[m]`` with its inputs held; writes state, covariance and planar a_y."""
     n = STATES
     chi = np.empty((2 * n + 1, n))
@@ -327,7 +354,10 @@ def _predict_outputs(step, horizon_s, x, P, inputs, p, q_std, wm, wc, scale, out
         Pm[:, :] = P[k]
         if horizon_s[m] > 0.0:
             draw_sigma_points(xm, Pm, scale, L, chi)
-            _propagate(chi, inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_FRICTION], horizon_s[m], p)
+            _propagate(
+                chi, inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_FRICTION], residual_rate[k, 0],
+                residual_rate[k, 1], horizon_s[m], p,
+            )  # fmt: skip
             mean_and_covariance(chi, wm, wc, xm, Pm)
             _add_process_noise(Pm, q_std, inputs[k, U_AX_KNOWN] > 0.0, horizon_s[m])
             if not _all_finite(xm, Pm):
@@ -335,9 +365,8 @@ def _predict_outputs(step, horizon_s, x, P, inputs, p, q_std, wm, wc, scale, out
                 Pm[:, :] = math.nan
         out_x[m] = xm
         out_P[m] = Pm
-        out_ay[m] = planar_lateral_acceleration(
-            xm[VX], xm[VY], xm[YAW_RATE], inputs[k, U_STEER], inputs[k, U_FRICTION], p
-        )
+        ay = planar_lateral_acceleration(xm[VX], xm[VY], xm[YAW_RATE], inputs[k, U_STEER], inputs[k, U_FRICTION], p)
+        out_ay[m] = ay + dynamic_share(xm[VX], p) * residual_rate[k, 0]
 
 
 def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -382,8 +411,13 @@ class PhysicsUkf:
         s = self.vehicle.sensors
         return np.array(self.r_std or (s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s))
 
-    def filter_steps(self, signals: Signals, carry: FilterCarry | None) -> tuple[PosteriorSteps, FilterCarry]:
-        """Run the filter on measurement time only; the steps and the carry with no pending steps in it."""
+    def filter_steps(
+        self, signals: Signals, carry: FilterCarry | None, residual_rate: FloatArray | None = None
+    ) -> tuple[PosteriorSteps, FilterCarry]:
+        """Run the filter on measurement time only; the steps and the carry with no pending steps in it.
+
+        ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
+        """
         signals = without_impossible(signals)
         count = len(signals)
         if carry is None:
@@ -408,21 +442,25 @@ class PhysicsUkf:
             innovation=np.empty((count, MEASUREMENTS)),
             valid=np.empty(count, dtype=np.bool_),
             diverged=np.empty(count, dtype=np.bool_),
+            prior=np.empty((count, STATES)),
+            residual_rate=np.zeros((count, 2)) if residual_rate is None else residual_rate,
         )
         wm, wc, scale = unscented_weights(STATES)
         _filter(
             dt, signals.steer_rad, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s,
             signals.friction, self.use_speed, self.vehicle.assumed_friction, self._parameters,
             np.array(self.q_std), self.measurement_std, wm, wc, scale[0], x, P, memory,
-            steps.x, steps.P, steps.inputs, steps.nis, steps.nis_dof, steps.log_likelihood, steps.innovation,
-            steps.valid, steps.diverged,
+            steps.residual_rate, steps.x, steps.P, steps.inputs, steps.nis, steps.nis_dof, steps.log_likelihood,
+            steps.innovation, steps.valid, steps.diverged, steps.prior,
         )  # fmt: skip
         last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
         return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count))
 
-    def run(self, signals: Signals, carry: FilterCarry | None) -> tuple[StateTrack, FilterCarry]:
+    def run(
+        self, signals: Signals, carry: FilterCarry | None, residual_rate: FloatArray | None = None
+    ) -> tuple[StateTrack, FilterCarry]:
         """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
-        steps, after = self.filter_steps(signals, carry)
+        steps, after = self.filter_steps(signals, carry, residual_rate)
         if carry is not None:
             steps = carry.steps.joined(steps)
         index = released_steps(steps.ready_ns, signals.stamps_ns)
@@ -434,8 +472,8 @@ class PhysicsUkf:
         x, P, ay = np.empty((count, STATES)), np.empty((count, STATES, STATES)), np.empty(count)
         wm, wc, scale = unscented_weights(STATES)
         _predict_outputs(
-            chosen, horizon, steps.x, steps.P, steps.inputs, self._parameters, np.array(self.q_std), wm, wc, scale[0],
-            x, P, ay,
+            chosen, horizon, steps.x, steps.P, steps.inputs, steps.residual_rate, self._parameters,
+            np.array(self.q_std), wm, wc, scale[0], x, P, ay,
         )  # fmt: skip
         usable &= np.isfinite(x[:, VX])
         at = np.maximum(chosen, 0)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pdhef_logtool.errors import UsageError
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.vehicle import VehicleParameters
 
 #: Name and one line on each, in the order of the tables.
@@ -16,11 +17,15 @@ DESCRIPTIONS: dict[str, str] = {
     "open-loop": "nominal single-track model from steering and speed alone",
     "phy-ukf": "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
     "phy-ukf-tuned": "the same with the noise of an identified vehicle file, corrected for body roll",
+    "pd-hef-fixed-r": "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs --model)",
+    "pd-hef-trust0": "the hybrid filter with its network switched off (needs --model)",
 }
 
 DEFAULT_ESTIMATORS = ("zero", "gyro", "kinematic", "open-loop", "phy-ukf")
 #: Run by default as well where the vehicle file has what it needs.
 TUNED_ESTIMATORS = ("phy-ukf-tuned",)
+#: Run by default as well where a model is given; trust by name.
+HYBRID_TRUST = {"pd-hef-fixed-r": 1.0, "pd-hef-trust0": 0.0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,15 +48,25 @@ def check_names(names: tuple[str, ...]) -> None:
         )
 
 
-def make_estimator(name: str, vehicle: VehicleParameters, *, use_speed: bool = True) -> Estimator:
+def make_estimator(
+    name: str, vehicle: VehicleParameters, *, use_speed: bool = True, model: ModelBundle | None = None
+) -> Estimator:
     """Build an estimator; compiled code is imported here and not before.
 
     Parameters
     ----------
     name : one of :data:`DESCRIPTIONS`.
     use_speed : False is the paper's ``esp`` suite for the filters (METHOD §1).
+    model : the network; those of :data:`HYBRID_TRUST` need it.
     """
     check_names((name,))
+    if name in HYBRID_TRUST:
+        if model is None:
+            raise UsageError(expected="a model bundle", got="none", where=name, remedy="give --model DIR")
+        from pdhef_logtool.estimators.hybrid import HybridUkf
+        from pdhef_logtool.residual_model.service import NetworkService
+
+        return HybridUkf(vehicle, NetworkService(model), trust=HYBRID_TRUST[name], use_speed=use_speed, name=name)
     if name in ("zero", "gyro"):
         from pdhef_logtool.estimators.pass_through import PassThrough
 
@@ -73,13 +88,19 @@ def make_estimator(name: str, vehicle: VehicleParameters, *, use_speed: bool = T
     return PhysicsUkf(vehicle, use_speed=use_speed)
 
 
-def default_names(vehicle: VehicleParameters) -> tuple[str, ...]:
+def default_names(vehicle: VehicleParameters, model: ModelBundle | None = None) -> tuple[str, ...]:
     """Return the estimators that run when none are named."""
-    return DEFAULT_ESTIMATORS + tuple(n for n in TUNED_ESTIMATORS if n in vehicle.filter)
+    tuned = tuple(n for n in TUNED_ESTIMATORS if n in vehicle.filter)
+    return DEFAULT_ESTIMATORS + tuned + (tuple(HYBRID_TRUST) if model is not None else ())
 
 
 def runnable(
-    names: tuple[str, ...], vehicle: VehicleParameters, available: frozenset[str], *, use_speed: bool = True
+    names: tuple[str, ...],
+    vehicle: VehicleParameters,
+    available: frozenset[str],
+    *,
+    use_speed: bool = True,
+    model: ModelBundle | None = None,
 ) -> tuple[list[Estimator], list[Skipped]]:
     """Split estimators into those whose needs the log meets and those that are skipped with the reason."""
     estimators: list[Estimator] = []
@@ -88,7 +109,10 @@ def runnable(
         if name in TUNED_ESTIMATORS and name not in vehicle.filter:
             skipped.append(Skipped(name, f"the vehicle file has no [filter.{name}]; pdhef identify writes one"))
             continue
-        estimator = make_estimator(name, vehicle, use_speed=use_speed)
+        if name in HYBRID_TRUST and model is None:
+            skipped.append(Skipped(name, "no network; --model names one, pdhef train writes one"))
+            continue
+        estimator = make_estimator(name, vehicle, use_speed=use_speed, model=model)
         missing = sorted(estimator.needs - available)
         if missing:
             skipped.append(Skipped(name, f"the log has no {', '.join(missing)}"))

@@ -54,6 +54,19 @@ def find_logs(arguments: Sequence[str]) -> list[LogInput]:
     return _with_stems(list(found.values()))
 
 
+def hash_log(path: Path) -> str:
+    """Return the sha256 of a log file, or of the names and contents of a log folder's files in order."""
+    if path.is_file():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    total = hashlib.sha256()
+    for file_path in sorted(p for p in path.rglob("*") if p.is_file()):
+        total.update(file_path.relative_to(path).as_posix().encode() + b"\0")
+        with file_path.open("rb") as file:
+            total.update(hashlib.file_digest(file, "sha256").digest())
+    return total.hexdigest()
+
+
 def _expand(argument: str) -> Iterator[Path]:
     path = Path(argument)
     if path.is_dir():

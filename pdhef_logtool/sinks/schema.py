@@ -27,6 +27,8 @@ def arrow_schema(name: str) -> pa.Schema:
 
     types = {
         "int64": pa.int64(),
+        "int32": pa.int32(),
+        "float": pa.float32(),
         "double": pa.float64(),
         "bool": pa.bool_(),
         "string": pa.string(),

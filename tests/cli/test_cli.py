@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
-COMMANDS = ("inspect", "run", "metrics", "simulate", "estimators", "view")
+COMMANDS = ("inspect", "run", "metrics", "simulate", "extract", "estimators", "view")
 
 
 def _pdhef(

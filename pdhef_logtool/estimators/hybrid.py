@@ -1,0 +1,74 @@
+"""The hybrid filter: the network's residual enters the sigma points and the predicted a_y (METHOD §6, Eq 19-21)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
+from pdhef_logtool.signals import Signals
+from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.vehicle import VehicleParameters
+
+#: Measurement noise at model-error level (METHOD §6): a_y m/s², yaw rate rad/s; the speed's is the sensor's.
+HYBRID_R_STD = (1.0, 0.003)
+HYBRID_Q_STD = (0.089, 0.06, 0.03, 0.021)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HybridCarry:
+    """What the parallel filter, the network and the hybrid filter take from window to window."""
+
+    physics: FilterCarry
+    network: NetworkCarry
+    hybrid: FilterCarry
+
+
+@dataclass(frozen=True, slots=True)
+class HybridUkf:
+    """Unscented filter on the nominal model plus trust times the network's residual; fixed R and trust.
+
+    Parameters
+    ----------
+    trust : β of Eq 19 in [0, 1].
+    q_std, r_std : as for :class:`~.physics.PhysicsUkf`; ``r_std`` without the speed's.
+    """
+
+    vehicle: VehicleParameters
+    network: NetworkService
+    trust: float = 1.0
+    q_std: tuple[float, float, float, float] = HYBRID_Q_STD
+    r_std: tuple[float, float] = HYBRID_R_STD
+    use_speed: bool = True
+    name: str = "pd-hef-fixed-r"
+    causal: bool = True
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """What the physics filter needs."""
+        return self._filter.needs
+
+    @property
+    def _filter(self) -> PhysicsUkf:
+        return PhysicsUkf(
+            self.vehicle,
+            q_std=self.q_std,
+            r_std=(*self.r_std, self.vehicle.sensors.speed_std_m_s),
+            use_speed=self.use_speed,
+            roll_correction=True,
+            name=self.name,
+        )
+
+    def run(self, signals: Signals, carry: HybridCarry | None) -> tuple[StateTrack, HybridCarry]:
+        """Process one window (see :class:`~.base.Estimator`)."""
+        features, steps, physics = run_features(
+            parallel_filter(self.vehicle, use_speed=self.use_speed), signals, carry.physics if carry else None
+        )
+        starts = ~np.isfinite(steps.prior[:, 0])
+        rate, network = self.network.run(features, starts, carry.network if carry else None)
+        track, hybrid = self._filter.run(signals, carry.hybrid if carry else None, self.trust * rate)
+        trust = np.where(track.valid, self.trust, np.nan)
+        return replace(track, network_trust=trust), HybridCarry(physics, network, hybrid)

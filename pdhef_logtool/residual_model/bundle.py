@@ -1,0 +1,154 @@
+"""A model bundle: ``weights.safetensors`` and ``model.json`` in one folder; never pickle."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.errors import ModelError
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.signals import FloatArray
+
+FORMAT = "pdhef.residual-model"
+FORMAT_VERSION = 1
+WEIGHTS_FILE = "weights.safetensors"
+DOCUMENT_FILE = "model.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Normalisation:
+    """x_normalised = (x − mean) / std per feature; residual rate = output · target_std."""
+
+    feature_mean: tuple[float, ...]
+    feature_std: tuple[float, ...]
+    target_std: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelBundle:
+    """Everything that service needs of a trained network.
+
+    Attributes
+    ----------
+    feature_names : in order; a subset of :data:`~.features.FEATURES`.
+    hidden, layers, head : architecture. period_s : step that the network was trained at.
+    weights : by name, float32, as PyTorch names them.
+    provenance : training data hash, seeds, metrics and what else the model card says; JSON-able.
+    """
+
+    feature_names: tuple[str, ...]
+    hidden: int
+    layers: int
+    head: tuple[int, ...]
+    period_s: float
+    normalisation: Normalisation
+    weights: dict[str, np.ndarray[Any, np.dtype[np.float32]]]
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of everything that decides the outputs."""
+        total = hashlib.sha256(json.dumps(self._document(), sort_keys=True).encode())
+        for name in sorted(self.weights):
+            total.update(name.encode() + b"\0" + np.ascontiguousarray(self.weights[name]).tobytes())
+        return total.hexdigest()
+
+    @property
+    def columns(self) -> list[int]:
+        """Where the bundle's features stand in the full feature array."""
+        return [FEATURES.index(name) for name in self.feature_names]
+
+    def normalise(self, features: FloatArray) -> FloatArray:
+        """Return the chosen features [N, k] of the full array [N, 8], normalised and limited to ±8."""
+        n = self.normalisation
+        scaled = (features[:, self.columns] - np.array(n.feature_mean)) / np.array(n.feature_std)
+        limited: FloatArray = np.clip(scaled, -8.0, 8.0)
+        return limited
+
+    def _document(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "features": list(self.feature_names),
+            "architecture": {"hidden": self.hidden, "layers": self.layers, "head": list(self.head)},
+            "period_s": float(self.period_s),
+            "normalisation": {k: [float(x) for x in v] for k, v in asdict(self.normalisation).items()},
+        }
+
+    def save(self, folder: Path) -> None:
+        """Write the bundle; both files are complete before either has its name, the document last.
+
+        Raises
+        ------
+        ModelError
+            The folder cannot be written.
+        """
+        from safetensors.numpy import save
+
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            pending = []
+            document = json.dumps({**self._document(), "sha256": self.sha256, "provenance": self.provenance}, indent=2)
+            for name, data in ((WEIGHTS_FILE, save(self.weights)), (DOCUMENT_FILE, (document + "\n").encode())):
+                partial = folder / f".{name}.partial"
+                partial.write_bytes(data)
+                pending.append((partial, folder / name))
+            for partial, target in pending:
+                partial.replace(target)
+        except OSError as error:
+            raise ModelError(
+                expected="a folder to write to", got=error.strerror or str(error), where=str(folder)
+            ) from None
+
+
+def load_bundle(folder: Path) -> ModelBundle:
+    """Read a bundle.
+
+    Raises
+    ------
+    ModelError
+        A file is missing or wrong, or the weights do not belong to the document.
+    """
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    where = str(folder)
+    try:
+        document = json.loads((folder / DOCUMENT_FILE).read_text(encoding="utf-8"))
+        weights = load((folder / WEIGHTS_FILE).read_bytes())
+    except (OSError, ValueError, SafetensorError) as error:
+        raise ModelError(
+            expected=f"a model bundle ({DOCUMENT_FILE}, {WEIGHTS_FILE})", got=str(error), where=where
+        ) from None
+    if document.get("format") != FORMAT or document.get("version") != FORMAT_VERSION:
+        got = f"{document.get('format')} {document.get('version')}"
+        raise ModelError(expected=f"{FORMAT} {FORMAT_VERSION}", got=got, where=where, remedy="train it anew")
+    try:
+        a, n = document["architecture"], document["normalisation"]
+        bundle = ModelBundle(
+            feature_names=tuple(document["features"]),
+            hidden=int(a["hidden"]),
+            layers=int(a["layers"]),
+            head=tuple(int(w) for w in a["head"]),
+            period_s=float(document["period_s"]),
+            normalisation=Normalisation(
+                tuple(float(x) for x in n["feature_mean"]),
+                tuple(float(x) for x in n["feature_std"]),
+                (float(n["target_std"][0]), float(n["target_std"][1])),
+            ),
+            weights=weights,
+            provenance=document.get("provenance", {}),
+        )
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ModelError(expected="the entries of model.json", got=f"{error!r}", where=where) from None
+    unknown = [f for f in bundle.feature_names if f not in FEATURES]
+    if unknown:
+        raise ModelError(expected=f"features out of {', '.join(FEATURES)}", got=", ".join(unknown), where=where)
+    if document.get("sha256") != bundle.sha256:
+        raise ModelError(expected="weights that belong to model.json", got="another hash", where=where)
+    return bundle

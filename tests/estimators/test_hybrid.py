@@ -1,0 +1,172 @@
+"""The hybrid filter: it is the physics filter plus exactly the residual, and a right residual makes it right."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+from pdhef_logtool.config import RunConfig
+from pdhef_logtool.errors import UsageError
+from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.estimators.physics import PhysicsUkf
+from pdhef_logtool.estimators.registry import make_estimator, runnable
+from pdhef_logtool.pipeline import run_logs
+from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.tracks import StateTrack, concatenate
+from pdhef_logtool.vehicle import default_vehicle
+
+VEHICLE = default_vehicle()
+COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis", "valid")
+
+
+def _bundle(constant: tuple[float, float] | None = None) -> ModelBundle:
+    """Return a small network; with ``constant`` one that always says so."""
+    torch.manual_seed(0)
+    network = ResidualNetwork(Architecture(8, 8, 1, (4,)))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    if constant is not None:
+        last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))
+        weights[last.replace("bias", "weight")][:] = 0.0
+        weights[last][:] = constant
+    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * 8, (10.0,) * 8, (1.0, 1.0)), weights)
+
+
+def _signals(count: int = 800, seed: int = 0, speed: float = 25.0) -> Signals:
+    rng = np.random.default_rng(seed)
+    stamps = 10**18 + np.cumsum(rng.integers(8_000_000, 12_000_000, count))
+    return Signals(
+        stamps_ns=stamps,
+        ready_ns=stamps + 10_000_000,
+        steer_rad=0.02 * np.sin(np.arange(count) / 60),
+        ax_m_s2=rng.normal(0, 0.1, count),
+        ay_m_s2=2.0 * np.sin(np.arange(count) / 60) + rng.normal(0, 0.1, count),
+        yaw_rate_rad_s=0.08 * np.sin(np.arange(count) / 60) + rng.normal(0, 0.004, count),
+        speed_m_s=speed + rng.normal(0, 0.05, count),
+        friction=np.full(count, np.nan),
+        wheel_speed_m_s=np.full((count, 4), np.nan),
+        available=frozenset(ALIGNED_SIGNALS),
+    )
+
+
+def _cut(s: Signals, a: int, b: int) -> Signals:
+    return Signals(
+        **{f.name: getattr(s, f.name)[a:b] for f in fields(Signals) if f.name != "available"}, available=s.available
+    )
+
+
+def _same(a: StateTrack, b: StateTrack) -> bool:
+    return all(np.array_equal(getattr(a, c), getattr(b, c), equal_nan=True) for c in COMPARED)
+
+
+def test_without_trust_it_is_the_physics_filter_with_its_noise() -> None:
+    hybrid = HybridUkf(VEHICLE, NetworkService(_bundle()), trust=0.0)
+    plain = PhysicsUkf(
+        VEHICLE, q_std=hybrid.q_std, r_std=(*hybrid.r_std, VEHICLE.sensors.speed_std_m_s), roll_correction=True
+    )
+    signals = _signals()
+    assert _same(hybrid.run(signals, None)[0], plain.run(signals, None)[0])
+    trusted = replace(hybrid, trust=1.0)
+    assert not _same(trusted.run(signals, None)[0], plain.run(signals, None)[0])
+
+
+def test_windows_join_bit_for_bit() -> None:
+    hybrid = HybridUkf(VEHICLE, NetworkService(_bundle()))
+    signals = _signals()
+    whole, _ = hybrid.run(signals, None)
+    carry = None
+    parts = []
+    for a, b in pairwise((0, 3, 250, 257, 600, 800)):
+        part, carry = hybrid.run(_cut(signals, a, b), carry)
+        parts.append(part)
+    assert _same(concatenate(parts), whole)
+
+
+def test_nothing_that_arrives_later_changes_an_output() -> None:
+    hybrid = HybridUkf(VEHICLE, NetworkService(_bundle()))
+    signals = _signals()
+    later = {"ay_m_s2": signals.ay_m_s2.copy(), "steer_rad": signals.steer_rad.copy()}
+    for column in later.values():
+        column[500:] += 0.1
+    before, _ = hybrid.run(signals, None)
+    after, _ = hybrid.run(replace(signals, **later), None)
+    seen = signals.stamps_ns < signals.ready_ns[500]
+    assert np.array_equal(before.vy_m_s[seen], after.vy_m_s[seen], equal_nan=True)
+    assert not np.array_equal(before.vy_m_s, after.vy_m_s, equal_nan=True)
+
+
+def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None:
+    """The car drives straight under a side force of m · 1 m/s² that the nominal model does not know."""
+    count, speed, force = 1500, 25.0, 1.0
+    stamps = 10**18 + np.arange(count, dtype=np.int64) * 10_000_000
+    vy, r = 0.0, 0.0
+    cf = VEHICLE.cornering_stiffness_n_per_rad(True, 0.85)
+    cr = VEHICLE.cornering_stiffness_n_per_rad(False, 0.85)
+    lf, lr, m, iz = VEHICLE.cg_to_front_axle_m, VEHICLE.cg_to_rear_axle_m, VEHICLE.mass_kg, VEHICLE.yaw_inertia_kg_m2
+    truth, ay = np.empty((count, 2)), np.empty(count)
+    for k in range(count):
+        truth[k] = vy, r
+        ff, fr = -cf * (vy + lf * r) / speed, -cr * (vy - lr * r) / speed
+        ay[k] = (ff + fr) / m + force
+        vy, r = vy + 0.01 * (ay[k] - speed * r), r + 0.01 * (lf * ff - lr * fr) / iz
+    gain = 1.0 + 9.80665 * VEHICLE.roll_gradient_rad_per_m_s2
+    nan = np.full(count, np.nan)
+    signals = Signals(
+        stamps, stamps, np.zeros(count), -truth[:, 0] * truth[:, 1], gain * ay, truth[:, 1], np.full(count, speed),
+        nan, np.full((count, 4), np.nan), frozenset(ALIGNED_SIGNALS),
+    )  # fmt: skip
+    error = {}
+    for trust in (0.0, 0.5, 1.0):
+        track, _ = HybridUkf(VEHICLE, NetworkService(_bundle((force, 0.0))), trust=trust).run(signals, None)
+        error[trust] = float(np.abs(track.vy_m_s - truth[:, 0])[500:].mean())
+        if trust == 1.0:
+            assert track.ay_m_s2[500:] == pytest.approx(ay[500:], abs=0.003)
+    assert error[1.0] < 0.02 * error[0.0]
+    assert error[1.0] < error[0.5] < error[0.0]
+
+
+def test_below_the_dynamic_range_the_residual_counts_for_nothing() -> None:
+    slow = replace(_signals(speed=1.0), ay_m_s2=np.zeros(800))
+    a, _ = HybridUkf(VEHICLE, NetworkService(_bundle((2.0, 1.0)))).run(slow, None)
+    b, _ = HybridUkf(VEHICLE, NetworkService(_bundle((2.0, 1.0))), trust=0.0).run(slow, None)
+    assert _same(a, b)
+
+
+def test_a_dead_accelerometer_and_gaps_stay_finite() -> None:
+    signals = _signals()
+    ay = signals.ay_m_s2.copy()
+    ay[100:400] = np.nan
+    stamps = signals.stamps_ns.copy()
+    stamps[600:] += 3_000_000_000
+    faulty = replace(signals, ay_m_s2=ay, stamps_ns=stamps, ready_ns=stamps + 10_000_000)
+    track, _ = HybridUkf(VEHICLE, NetworkService(_bundle())).run(faulty, None)
+    assert np.isfinite(track.vy_m_s[track.valid]).all()
+    assert track.valid[150:400].all()
+
+
+def test_it_needs_a_model_and_says_so() -> None:
+    with pytest.raises(UsageError, match="--model"):
+        make_estimator("pd-hef-fixed-r", VEHICLE)
+    _, skipped = runnable(("zero", "pd-hef-fixed-r"), VEHICLE, frozenset(ALIGNED_SIGNALS))
+    assert [s.name for s in skipped] == ["pd-hef-fixed-r"]
+
+
+def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Path, tmp_path: Path) -> None:
+    bundle = _bundle((0.0, 0.0))
+    bundle.save(tmp_path / "model")
+    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=tmp_path / "model", annotate="none")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    assert result.exit_code == 0
+    assert bundle.sha256 in (tmp_path / "out" / "run.json").read_text()
+    estimates = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet")
+    trust = estimates.filter((pl.col("estimator") == "pd-hef-fixed-r") & pl.col("valid"))["network_trust"]
+    assert trust.unique().to_list() == [1.0]

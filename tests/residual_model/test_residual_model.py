@@ -1,0 +1,153 @@
+"""Features, bundle, and the network in service."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.errors import ModelError
+from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, WEIGHTS_FILE, ModelBundle, Normalisation, load_bundle
+from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES, make_features
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.service import BLOCK_STEPS, LIMITS, NetworkService
+
+
+def make_bundle(seed: int = 0, names: tuple[str, ...] = FEATURES, hidden: int = 16) -> ModelBundle:
+    torch.manual_seed(seed)
+    network = ResidualNetwork(Architecture(len(names), hidden, 2, (8,)))
+    return ModelBundle(
+        feature_names=names,
+        hidden=hidden,
+        layers=2,
+        head=(8,),
+        period_s=0.01,
+        normalisation=Normalisation((0.5,) * len(names), (2.0,) * len(names), (0.7, 0.3)),
+        weights={k: v.numpy().copy() for k, v in network.state_dict().items()},
+        provenance={"seed": seed},
+    )
+
+
+def test_paper_features_are_the_first_six() -> None:
+    assert FEATURES[:6] == PAPER_FEATURES
+
+
+def test_features_by_hand() -> None:
+    posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
+    prior = np.array([[19.0, 0.2, 0.08, 0.0]])
+    features = make_features(np.array([0.02]), np.array([1.5]), np.array([0.11]), posterior, prior, np.array([1.4]))
+    beta = np.arctan2(0.4, 20.0) - np.arctan2(0.2, 19.0)
+    np.testing.assert_allclose(features, [[20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1]], rtol=1e-12)
+
+
+def test_missing_measurements_look_like_agreement_with_physics() -> None:
+    posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
+    prior = np.full((1, 4), np.nan)
+    nan = np.array([np.nan])
+    features = make_features(np.array([0.02]), nan, nan, posterior, prior, np.array([1.4]))
+    np.testing.assert_array_equal(features, [[20.0, 1.4, 0.02, 0.1, 0.0, 0.0, 0.4, 0.1]])
+
+
+def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
+    bundle = make_bundle()
+    bundle.save(tmp_path / "model")
+    back = load_bundle(tmp_path / "model")
+    assert back.sha256 == bundle.sha256
+    assert back.provenance == bundle.provenance
+    assert {p.name for p in (tmp_path / "model").iterdir()} == {DOCUMENT_FILE, WEIGHTS_FILE}
+    assert make_bundle(seed=1).sha256 != bundle.sha256
+
+
+@pytest.mark.parametrize("damage", ["weights", "document", "missing", "version", "feature"])
+def test_wrong_bundles_are_one_clear_error(tmp_path: Path, damage: str) -> None:
+    make_bundle().save(tmp_path)
+    document = json.loads((tmp_path / DOCUMENT_FILE).read_text())
+    if damage == "weights":
+        make_bundle(seed=9).save(tmp_path / "other")
+        (tmp_path / WEIGHTS_FILE).write_bytes((tmp_path / "other" / WEIGHTS_FILE).read_bytes())
+    elif damage == "document":
+        (tmp_path / DOCUMENT_FILE).write_text("{")
+    elif damage == "missing":
+        (tmp_path / WEIGHTS_FILE).unlink()
+    elif damage == "version":
+        (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "version": 99}))
+    else:
+        (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "features": ["truth"] * 8}))
+    with pytest.raises(ModelError, match=tmp_path.name):
+        load_bundle(tmp_path)
+
+
+def test_service_equals_the_network_step_by_step() -> None:
+    """The oracle runs PyTorch's own cell one step at a time."""
+    bundle = make_bundle(hidden=12)
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(BLOCK_STEPS + 37, 8))
+    rates, _ = NetworkService(bundle).run(features, np.zeros(len(features), dtype=np.bool_), None)
+    network = ResidualNetwork(Architecture(8, 12, 2, (8,)))
+    network.load_state_dict({k: torch.from_numpy(v) for k, v in bundle.weights.items()})
+    network.eval()
+    state = None
+    with torch.inference_mode():
+        for k, row in enumerate((features - 0.5) / 2.0):
+            output, state = network(torch.from_numpy(row.astype(np.float32))[None, None], state)
+            expected = output[0, 0].numpy() * np.array([0.7, 0.3])
+            np.testing.assert_allclose(rates[k], expected, atol=2e-6)
+
+
+@settings(derandomize=True, max_examples=15, deadline=None)
+@given(st.lists(st.integers(0, 900), max_size=6), st.lists(st.integers(0, 899), max_size=4))
+def test_windows_and_restarts_join_bit_for_bit(cuts: list[int], starts_at: list[int]) -> None:
+    service = NetworkService(make_bundle())
+    rng = np.random.default_rng(1)
+    features = rng.normal(size=(900, 8))
+    features[400:410, 3] = np.nan
+    starts = np.zeros(900, dtype=np.bool_)
+    starts[starts_at] = True
+    whole, _ = service.run(features, starts, None)
+    carry = None
+    parts = []
+    edges = sorted({0, 900, *cuts})
+    for a, b in pairwise(edges):
+        part, carry = service.run(features[a:b], starts[a:b], carry)
+        parts.append(part)
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
+    service = NetworkService(make_bundle())
+    rng = np.random.default_rng(2)
+    features = rng.normal(size=(300, 8))
+    starts = np.zeros(300, dtype=np.bool_)
+    starts[200] = True
+    features[100] = np.nan
+    rates, _ = service.run(features, starts, None)
+    assert np.all(rates[100] == 0.0)
+    alone, _ = service.run(features[200:], np.zeros(100, dtype=np.bool_), None)
+    np.testing.assert_array_equal(rates[200:], alone)
+    behind, _ = service.run(features[101:200], np.zeros(99, dtype=np.bool_), None)
+    np.testing.assert_array_equal(rates[101:200], behind)
+
+
+def test_causality_and_limits() -> None:
+    bundle = make_bundle()
+    service = NetworkService(bundle)
+    features = np.random.default_rng(3).normal(size=(400, 8))
+    starts = np.zeros(400, dtype=np.bool_)
+    before, _ = service.run(features, starts, None)
+    features[250:] = 1e9
+    after, _ = service.run(features, starts, None)
+    np.testing.assert_array_equal(before[:250], after[:250])
+    assert np.all(np.abs(after) <= LIMITS)
+    assert np.isfinite(after).all()
+
+
+def test_thread_setting_is_put_back() -> None:
+    threads = torch.get_num_threads()
+    NetworkService(make_bundle()).run(np.zeros((10, 8)), np.zeros(10, dtype=np.bool_), None)
+    assert torch.get_num_threads() == threads

@@ -1,0 +1,87 @@
+"""``pdhef train`` from a dataset on disk to a model that runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from pdhef_logtool.config import RunConfig
+from pdhef_logtool.errors import OutputError, UsageError
+from pdhef_logtool.pipeline import run_logs
+from pdhef_logtool.residual_model.bundle import load_bundle
+from pdhef_logtool.training.train_command import run_training
+
+
+def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pdhef_logtool", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "120"})
+
+
+@pytest.fixture(scope="module")
+def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dataset")
+    vehicle = str(sample_logs_dir / "vehicle.toml")
+    for split, start, end in (("train", "30", "110"), ("validation", "115", "150"), ("test", "155", "190")):
+        # One drive gives three parts only because there are no other sample drives of this length.
+        part = folder / split
+        done = _pdhef(
+            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(part), "--vehicle", vehicle, "--split", split,
+            "--start", start, "--end", end,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tmp_path: Path) -> None:
+    joined = _joined(dataset, tmp_path / "joined")
+    done = _pdhef("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    bundle = load_bundle(tmp_path / "model")
+    assert document["sha256"] == bundle.sha256
+    assert len(document["history"]) == 2
+    assert {p.name for p in (tmp_path / "model").iterdir()} == {
+        "history.parquet", "history.png", "model.json", "weights.safetensors",
+    }  # fmt: skip
+    assert pl.read_parquet(tmp_path / "model" / "history.parquet").height == 2
+    assert bundle.provenance["dataset_sha256"]
+    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=tmp_path / "model", annotate="none")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef-trust0"}
+    again = run_training(joined, tmp_path / "again", epochs=2)
+    assert again.bundle.sha256 == bundle.sha256
+
+
+def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="epoch"):
+        run_training(dataset / "train", tmp_path / "m", epochs=0)
+    with pytest.raises(OutputError, match="extract"):
+        run_training(tmp_path, tmp_path / "m")
+    done = _pdhef("train", str(dataset / "train"), "-o", str(tmp_path / "m"), "--epochs", "1")
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert "validation" in done.stderr
+
+
+def _joined(dataset: Path, target: Path) -> Path:
+    """Join datasets of one vehicle by hand: their drives' files side by side, their manifests' drives in one list."""
+    target.mkdir()
+    manifest = None
+    for part in sorted(dataset.iterdir()):
+        document = json.loads((part / "manifest.json").read_text())
+        for drive in document["drives"]:
+            name = f"{part.name}.parquet"
+            (target / name).write_bytes((part / drive["file"]).read_bytes())
+            drive["file"], drive["log"] = name, part.name
+        if manifest is None:
+            manifest = document
+        else:
+            manifest["drives"] += document["drives"]
+    (target / "manifest.json").write_text(json.dumps(manifest))
+    return target
