@@ -24,7 +24,12 @@ from truthsim.vehicle import Vehicle
 
 CAR = Vehicle()
 NOISE = SensorNoise()
-FRICTION = 0.85
+#: One file a road: the formula scales stiffness with friction, which real (and these simulated) tyres hardly do, so
+#: that tyres fitted on one road are wrong on another.
+ROADS = {
+    "vehicle.toml": ("truthsim saloon", 0.85),
+    "vehicle_mu03.toml": ("truthsim saloon on a road of friction 0.3", 0.3),
+}
 SPEED_KM_H = 80.0
 #: Steering goes to this multiple of what the plain ramp manoeuvre guesses, well into the plateau of the front axle.
 SCALE = 2.5
@@ -79,12 +84,12 @@ def fit_axle(alpha: FloatArray, force: FloatArray, friction: float, load_n: floa
     return AxleFit(b, c, d / friction, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
 
 
-def fit_axles(motion: Motion) -> dict[str, AxleFit]:
-    """Fit both axles to a motion at ``FRICTION``."""
+def fit_axles(motion: Motion, friction: float) -> dict[str, AxleFit]:
+    """Fit both axles to a motion at a friction."""
     wheelbase = CAR.cg_to_front_axle_m + CAR.cg_to_rear_axle_m
     arms = {"front": CAR.cg_to_rear_axle_m, "rear": CAR.cg_to_front_axle_m}
     return {
-        axle: fit_axle(*curve, FRICTION, CAR.mass_kg * GRAVITY_M_S2 * arms[axle] / wheelbase)
+        axle: fit_axle(*curve, friction, CAR.mass_kg * GRAVITY_M_S2 * arms[axle] / wheelbase)
         for axle, curve in axle_curves(motion).items()
     }
 
@@ -96,12 +101,12 @@ def roll_gradient_rad_per_m_s2(motion: Motion) -> float:
     return float(np.polyfit(a_y[small], roll[small], 1)[0])
 
 
-def ramp() -> Motion:
+def ramp(friction: float) -> Motion:
     """Return the slow ramp steer that everything is fitted to."""
     manoeuvre = MANOEUVRES["ramp-steer"]
     duration_s = manoeuvre.default_duration_s(SPEED_KM_H / 3.6)
-    request = Request(SPEED_KM_H / 3.6, FRICTION, seed=0, duration_s=duration_s, scale=SCALE)
-    return simulate_motion(manoeuvre.plan(request), FRICTION, vehicle=CAR)
+    request = Request(SPEED_KM_H / 3.6, friction, seed=0, duration_s=duration_s, scale=SCALE)
+    return simulate_motion(manoeuvre.plan(request), friction, vehicle=CAR)
 
 
 def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
@@ -112,8 +117,9 @@ def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, frictio
     )
     return f"""# Nominal vehicle of the simulated sample logs, made by benchmarks/fit_nominal_tyres.py:
 # mass and geometry of the paper's Table 3; axle tyres and roll gradient fitted to
-# a ramp steer at {SPEED_KM_H:g} km/h and friction {FRICTION:g} into the plateau of the front axle.
-# The formula scales stiffness with friction, which real (and these simulated) tyres hardly do.
+# a ramp steer at {SPEED_KM_H:g} km/h and friction {friction:g} into the plateau of the front axle.
+# The formula scales stiffness with friction, which real (and these simulated) tyres hardly do:
+# use it on such a road alone.
 name = "{name}"
 mass_kg = {CAR.mass_kg}
 yaw_inertia_kg_m2 = {CAR.yaw_inertia_kg_m2}
@@ -141,20 +147,17 @@ steer_std_rad = {NOISE.steer_rad}
 
 
 def main(folder: Path) -> None:
-    """Fit, print how well, and write both vehicle files."""
-    motion = ramp()
-    fits = fit_axles(motion)
-    print("axle      B      C     D_n       E   BCD at mu 0.85   rms N   largest N")
-    for axle, fit in fits.items():
-        stiffness = fit.B * fit.C * fit.D_n * FRICTION
-        print(
-            f"{axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {stiffness:16.0f}"
-            f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
-        )
-    for file, name, friction in (
-        ("vehicle.toml", "truthsim saloon", FRICTION),
-        ("vehicle_mu03.toml", "truthsim saloon on a road of friction 0.3", 0.3),
-    ):
+    """Fit, print how well, and write the vehicle files."""
+    print("friction  axle      B      C     D_n       E      BCD   rms N   largest N")
+    for file, (name, friction) in ROADS.items():
+        motion = ramp(friction)
+        fits = fit_axles(motion, friction)
+        for axle, fit in fits.items():
+            stiffness = fit.B * fit.C * fit.D_n * friction
+            print(
+                f"{friction:8.2f}  {axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {stiffness:8.0f}"
+                f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
+            )
         (folder / file).write_text(vehicle_text(motion, fits, name=name, friction=friction), encoding="utf-8")
 
 

@@ -275,15 +275,18 @@ def test_vehicle_files_are_the_fit_to_the_truth_vehicle(fitting: ModuleType, tmp
         old, new = load_vehicle(ROOT / "sample_logs" / name), load_vehicle(tmp_path / name)
         assert old.friction == new.friction == friction
         for front in (True, False):
-            assert new.magic_formula(front, 0.85) == pytest.approx(old.magic_formula(front, 0.85), rel=0.01)
+            assert new.magic_formula(front, friction) == pytest.approx(old.magic_formula(front, friction), rel=0.01)
         assert new.roll_gradient_rad_per_m_s2 == pytest.approx(old.roll_gradient_rad_per_m_s2, rel=0.01)
 
 
-def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(fitting: ModuleType) -> None:
-    vehicle = load_vehicle(ROOT / "sample_logs" / "vehicle.toml")
-    for axle, (alpha, force) in fitting.axle_curves(fitting.ramp()).items():
-        b, c, d, e = vehicle.magic_formula(axle == "front", 0.85)
+@pytest.mark.parametrize(("name", "friction"), [("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)])
+def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(
+    fitting: ModuleType, name: str, friction: float
+) -> None:
+    vehicle = load_vehicle(ROOT / "sample_logs" / name)
+    for axle, (alpha, force) in fitting.axle_curves(fitting.ramp(friction)).items():
+        b, c, d, e = vehicle.magic_formula(axle == "front", friction)
         x = b * alpha
         model = d * np.sin(c * np.arctan(x - e * (x - np.arctan(x))))
         assert np.sqrt(np.mean((model - force) ** 2)) < 0.015 * force.max(), axle
-    assert np.degrees(vehicle.understeer_gradient_rad_per_m_s2(0.85)) * 9.80665 == pytest.approx(1.93, abs=0.35)
+    assert np.degrees(vehicle.understeer_gradient_rad_per_m_s2(friction)) * 9.80665 == pytest.approx(1.93, abs=0.35)
