@@ -44,7 +44,8 @@ U_STEER, U_AX, U_FRICTION, U_AX_KNOWN = 0, 1, 2, 3
 INPUTS = 4
 
 #: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
-#: over simulated drives (``benchmarks/tune_physics_q.py``, its result beside it) and frozen.
+#: over simulated drives (``benchmarks/tune_physics_q.py``, its result beside it) and frozen: the drives were those of
+#: the simulator's first, planar vehicle, and a baseline does not follow every change of the simulator.
 PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
 #: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk (METHOD §1).
 NO_AX_Q_STD = 3.0
