@@ -98,6 +98,10 @@ def _render_log(one: LogResult, console: Console) -> None:
     console.print(_table(report, console.width))
     if not report["truth"]["available"]:
         console.print("  no truth in this log: estimates, NIS and disagreement only", highlight=False)
+        for row in report["metrics"]:
+            if row["metric"] == "disagreement_rms" and row["segment"] == "all" and row["value"] is not None:
+                pair = " and ".join(row["estimator"].split("~"))
+                console.print(f"  sideslip of {pair}: rms difference {row['value'] * _DEG:.3f}°", highlight=False)
     if report["truth"]["not_independent"]:
         console.print("  † the truth is an input or the estimate itself: no independent check", highlight=False)
     for estimator in report["estimators"]:
@@ -121,9 +125,8 @@ def _table(report: Mapping[str, Any], width: int) -> Table:
     dependent = report["truth"]["not_independent"]
     for head, signal, *_ in shown:
         table.add_column(head + (" †" if signal in dependent else ""), justify="right")
-    by_segment = [
-        s for s in _SEGMENTS if any(m["segment"] == s and m["signal"] == "sideslip_rad" for m in report["metrics"])
-    ]
+    scored = {m["segment"] for m in report["metrics"] if (m["signal"], m["metric"]) == ("sideslip_rad", "rmse")}
+    by_segment = [s for s in _SEGMENTS if s in scored]
     for segment in by_segment:
         table.add_column(f"{segment}\nRMSE °", justify="right")
     nis = any(m["metric"] == "nis" for m in report["metrics"])

@@ -214,3 +214,12 @@ def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path) ->
         env={**os.environ, "PDHEF_TRACEBACK": "1"},
     )  # fmt: skip
     assert "Traceback" in asked.stderr
+
+
+def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = str(sample_logs_dir / "no_truth.mcap")
+    result = _pdhef("run", log, "-o", str(tmp_path), "--annotate", "none", "-e", "zero,open-loop,phy-ukf")
+    assert result.returncode == 0
+    assert "no truth in this log" in result.stdout
+    assert "sideslip of open-loop and phy-ukf: rms difference" in result.stdout
+    assert "RMSE" not in result.stdout
