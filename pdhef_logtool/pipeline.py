@@ -20,7 +20,6 @@ from pdhef_logtool.errors import (
     EXIT_OK,
     EXIT_PARTIAL,
     EstimatorError,
-    MappingError,
     OutputError,
     PdhefError,
     UsageError,
@@ -31,9 +30,9 @@ from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import Mapping, auto_map, check_mapping, load_mapping, merge_losses
+from pdhef_logtool.mapping import Mapping, choose_mapping, load_mapping, merge_losses
 from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
-from pdhef_logtool.signals import ALIGNED_SIGNALS, SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Loss, Signals, join_signals
+from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Loss, Signals, join_signals
 from pdhef_logtool.sinks.base import TRUTH, Event, Sink
 from pdhef_logtool.sinks.report import (
     EstimatorFacts,
@@ -246,7 +245,7 @@ def _run_open_log(
         warnings.append(text)
         warn(f"{log_input.stem}: {text}")
 
-    mapping, missing = choose_mapping(log, mapping, config, tell)
+    mapping, missing = choose_mapping(log, mapping, tell, prefer_truth=config.prefer_truth)
     start_ns, end_ns = time_slice(config, log.start_ns, log.end_ns)
     plan = plan_drive(log, mapping, vehicle, start_ns, end_ns)
     for warning in plausibility_warnings(plan.survey_signals):
@@ -303,41 +302,6 @@ def _run_open_log(
     outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=sha256, lost=lost)
     progress(log_input.stem, 1.0)
     return LogResult(outcome, folder, report, tuple(rows))
-
-
-def choose_mapping(
-    log: DriveLog,
-    mapping: Mapping | None,
-    config: RunConfig,
-    tell: Callable[[str], None],
-    *,
-    require_signals: bool = True,
-) -> tuple[Mapping, tuple[str, ...]]:
-    """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently.
-
-    Raises
-    ------
-    MappingError
-        The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
-    """
-    if mapping is not None:
-        check_mapping(mapping, log)
-        for note in mapping.notes:
-            tell(note)
-        return mapping, tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
-    found = auto_map(log, prefer_truth=config.prefer_truth)
-    for ambiguity in found.ambiguities:
-        tell(str(ambiguity))
-    for note in found.mapping.notes:
-        tell(note)
-    if require_signals and not found.mapping.signals:
-        raise MappingError(
-            expected="topics of well-known message types",
-            got=", ".join(sorted({t.type_name for t in log.topics})) or "no topics",
-            where=str(log.path),
-            remedy="write a mapping.toml (pdhef inspect LOG --write-mapping mapping.toml) and give it with --mapping",
-        )
-    return found.mapping, found.missing
 
 
 def _open_sinks(

@@ -35,6 +35,7 @@ from pdhef_logtool.mapping import (
 from pdhef_logtool.mapping import (
     SignalSource,
     check_mapping,
+    choose_mapping,
     join_channels,
     load_mapping,
     merge_losses,
@@ -46,7 +47,6 @@ from pdhef_logtool.pipeline import (
     LogResult,
     Progress,
     RunResult,
-    choose_mapping,
     first_pose,
     judge,
     make_folder,
@@ -176,7 +176,9 @@ class _Scoring:
             mapping = None  # a file of estimates alone leaves the rest to recognition
         if mapping is not None and named is not None:
             mapping = self._with_truth(mapping, named)
-        chosen, self.missing = choose_mapping(self.log, mapping, self.config, self.tell, require_signals=False)
+        chosen, self.missing = choose_mapping(
+            self.log, mapping, self.tell, prefer_truth=self.config.prefer_truth, require_signals=False
+        )
         if mapping is None and named is not None:
             chosen = replace(self._with_truth(chosen, named), can=can)
             check_mapping(chosen, self.log)

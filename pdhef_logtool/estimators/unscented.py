@@ -112,18 +112,8 @@ def innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz):  # type: ignore[no-
     """
     s, n = chi.shape
     m = zeta.shape[1]
+    mean_and_covariance(zeta, wm, wc, z_hat, S)
     for k in range(m):
-        v = 0.0
-        for i in range(s):
-            v += wm[i] * zeta[i, k]
-        z_hat[k] = v
-    for k in range(m):
-        for q in range(k + 1):
-            c = 0.0
-            for i in range(s):
-                c += wc[i] * (zeta[i, k] - z_hat[k]) * (zeta[i, q] - z_hat[q])
-            S[k, q] = c
-            S[q, k] = c
         for a in range(n):
             c = 0.0
             for i in range(s):

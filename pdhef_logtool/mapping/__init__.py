@@ -12,6 +12,7 @@ from pdhef_logtool.mapping.channels import (
     read_signals,
 )
 from pdhef_logtool.mapping.checking import check_mapping, resolve_mapping
+from pdhef_logtool.mapping.choosing import choose_mapping
 from pdhef_logtool.mapping.clocks import ClockModel, apply_clock, clock_key, fit_clock_line, fit_clocks
 from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_to_toml
 from pdhef_logtool.mapping.recognition import Ambiguity, AutoMapping, auto_map
@@ -31,6 +32,7 @@ __all__ = [
     "apply_clock",
     "auto_map",
     "check_mapping",
+    "choose_mapping",
     "clean_samples",
     "clock_key",
     "fit_clock_line",

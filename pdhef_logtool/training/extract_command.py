@@ -24,7 +24,6 @@ from pdhef_logtool.errors import (
     EXIT_OK,
     EXIT_PARTIAL,
     EstimatorError,
-    MappingError,
     OutputError,
     PdhefError,
     UsageError,
@@ -33,10 +32,9 @@ from pdhef_logtool.estimators.parallel_physics import parallel_filter
 from pdhef_logtool.evaluation.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.evaluation.truth import derive_truth
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
-from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import auto_map, check_mapping, load_mapping, merge_losses
+from pdhef_logtool.mapping import choose_mapping, load_mapping, merge_losses
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.sinks.report import tool_versions
 from pdhef_logtool.training.dataset import (
@@ -347,7 +345,9 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     warnings: list[str] = []
     log = open_log(job.log_input.path)
     try:
-        mapping = _choose_mapping(log, job, warnings.append)
+        mapping, _ = choose_mapping(
+            log, job.mapping, warnings.append, prefer_truth=job.settings.config.prefer_truth, tell_notes=False
+        )
         start_ns, end_ns = time_slice(job.settings.config, log.start_ns, log.end_ns)
         plan = _strict_truth(plan_drive(log, mapping, job.vehicle, start_ns, end_ns))
         _check_plan(plan, job)
@@ -448,23 +448,6 @@ def _set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
 
 def _entries(value: Any) -> list[dict[str, Any]]:
     return [e for e in value if isinstance(e, dict)] if isinstance(value, list) else []
-
-
-def _choose_mapping(log: DriveLog, job: _Job, tell: Warn) -> SignalMapping:
-    if job.mapping is not None:
-        check_mapping(job.mapping, log)
-        return job.mapping
-    found = auto_map(log, prefer_truth=job.settings.config.prefer_truth)
-    for ambiguity in found.ambiguities:
-        tell(str(ambiguity))
-    if not found.mapping.signals:
-        raise MappingError(
-            expected="topics of well-known message types",
-            got=", ".join(sorted({t.type_name for t in log.topics})) or "no topics",
-            where=str(log.path),
-            remedy="write a mapping.toml (pdhef inspect LOG --write-mapping mapping.toml) and give it with --mapping",
-        )
-    return found.mapping
 
 
 def _strict_truth(plan: DrivePlan) -> DrivePlan:

@@ -23,6 +23,7 @@ from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
 from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.sinks.base import write_bytes
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -322,10 +323,7 @@ def _write_checkpoint(
     document = {"identity": identity, "history": [asdict(e) for e in history]}
     # One file holds tensors and document, so that a kill between two writes cannot leave a pair that disagrees.
     data = save(tensors, metadata={"document": json.dumps(document)})
-    work.mkdir(parents=True, exist_ok=True)
-    partial = work / f".{CHECKPOINT}.partial"
-    partial.write_bytes(data)
-    partial.replace(work / CHECKPOINT)
+    write_bytes(work / CHECKPOINT, data)
 
 
 def _resume(

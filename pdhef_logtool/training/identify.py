@@ -25,7 +25,7 @@ from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.geometry import wrap_angle
-from pdhef_logtool.signals import BoolArray, FloatArray
+from pdhef_logtool.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.training.axle_forces import (
     PEAK_LOG_STD,
     PEAK_OVER_SEEN,
@@ -398,13 +398,7 @@ def _sideslip_errors(
     estimator = physics_ukf_tuned(vehicle)
     parts = []
     for drive in drives:
-        signals = correct_signals(drive.signals, vehicle)
-        ratio = start.steering_ratio / vehicle.steering_ratio
-        if ratio != 1.0:
-            signals = replace(
-                signals, steer_rad=(signals.steer_rad + vehicle.steer_offset_rad) * ratio - vehicle.steer_offset_rad
-            )
-        steps, _ = estimator.filter_steps(signals, None)
+        steps, _ = estimator.filter_steps(_signals_of(drive, start, vehicle), None)
         every = max(1, round(1.0 / (FIT_RATE_HZ * _period_s(drive))))
         pick = slice(None, None, every)
         beta = np.arctan2(steps.x[pick, 1], steps.x[pick, 0])
@@ -417,6 +411,12 @@ def _sideslip_errors(
     return parts
 
 
+def _signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParameters) -> Signals:
+    """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
+    ratio = start.steering_ratio / vehicle.steering_ratio
+    return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
+
+
 # ---- the verdict ----
 
 
@@ -425,14 +425,12 @@ def _score(part: str, drives: Sequence[FitDrive], start: VehicleParameters, iden
     squares = np.zeros(3)
     counts = np.zeros(3)
     slow = start.low_speed_blend_m_s
-    ratio = start.steering_ratio / identified.steering_ratio
     for drive in drives:
-        before = correct_signals(drive.signals, start)
-        turned = replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio)
+        before = _signals_of(drive, start, start)
         tracks = (
             PassThrough("zero", claims_zero_sideslip=True).run(before, None)[0],
             PhysicsUkf(start).run(before, None)[0],
-            physics_ukf_tuned(identified).run(correct_signals(turned, identified), None)[0],
+            physics_ukf_tuned(identified).run(_signals_of(drive, start, identified), None)[0],
         )
         for i, track in enumerate(tracks):
             error = signal_error(track, drive.truth, "sideslip_rad", slow)

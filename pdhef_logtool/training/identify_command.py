@@ -12,7 +12,7 @@ from pdhef_logtool.errors import EstimatorError, OutputError, UsageError
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import auto_map, check_mapping, load_mapping
+from pdhef_logtool.mapping import choose_mapping, load_mapping
 from pdhef_logtool.sinks.base import write_bytes
 from pdhef_logtool.training.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.training.identify import Identification, Identified, identify, understeer_deg_per_g
@@ -102,27 +102,33 @@ def run_identification(
     start = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
     if config.vehicle is None:
         warn(f"no --vehicle: mass, geometry and priors are those of the default {start.name}")
+    given = None if config.mapping is None else load_mapping(config.mapping)
     fit: list[FitDrive] = []
     held_out: list[FitDrive] = []
     steering_wheel = False
     logs = find_logs(arguments)
     for number, log_input in enumerate(logs):
         progress(f"reading {log_input.stem}", 0.2 * number / len(logs))
+
+        def tell(text: str, name: str = log_input.stem) -> None:
+            warn(f"{name}: {text}")
+
         log = open_log(log_input.path)
         try:
-            if config.mapping is None:
-                mapping = auto_map(log, prefer_truth=config.prefer_truth).mapping
-            else:
-                mapping = load_mapping(config.mapping)
-                check_mapping(mapping, log)
+            mapping, _ = choose_mapping(
+                log,
+                given,
+                tell,
+                prefer_truth=config.prefer_truth,
+            )
             drive = load_fit_drive(log_input.stem, log, mapping, start, *time_slice(config, log.start_ns, log.end_ns))
             steering_wheel = steering_wheel or "steer_rad" not in mapping.signals
             for loss in log.lost:
-                warn(f"{log_input.stem}: {loss.what} ({loss.where})")
+                tell(f"{loss.what} ({loss.where})")
         finally:
             log.close()
         if drive is None:
-            warn(f"{log_input.stem}: no truth from which a sideslip follows; not used")
+            tell("no truth from which a sideslip follows; not used")
             continue
         kept, scored = split_drive(drive, holdout)
         fit.append(kept)

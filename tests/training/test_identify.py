@@ -229,3 +229,10 @@ def test_projected_steps_find_the_bounded_minimum_also_from_a_start_at_the_bound
         cost, best = np.sum((a @ found - b) ** 2), np.sum((a @ expected - b) ** 2)
         assert cost <= best * (1 + 1e-3) + 1e-9
         assert np.all(found >= low)
+
+
+def test_command_says_which_truth_it_took(sample_logs_dir: Path, tmp_path: Path) -> None:
+    said: list[str] = []
+    with pytest.raises(EstimatorError):
+        run_identification([str(sample_logs_dir / "dlc.mcap")], tmp_path / "car.toml", RunConfig(), warn=said.append)
+    assert any(text.startswith("dlc: ") and "/rtk/odometry" in text for text in said)

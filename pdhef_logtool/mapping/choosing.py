@@ -1,0 +1,53 @@
+"""The mapping in effect for one log: the one given, or what its types tell, with every ambiguity said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+from pdhef_logtool.errors import MappingError
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping.checking import check_mapping
+from pdhef_logtool.mapping.recognition import auto_map
+from pdhef_logtool.mapping.records import Mapping
+from pdhef_logtool.signals import ALIGNED_SIGNALS
+
+
+def choose_mapping(
+    log: DriveLog,
+    mapping: Mapping | None,
+    tell: Callable[[str], None],
+    *,
+    prefer_truth: Literal["perfect", "rtk"],
+    require_signals: bool = True,
+    tell_notes: bool = True,
+) -> tuple[Mapping, tuple[str, ...]]:
+    """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently.
+
+    Parameters
+    ----------
+    tell_notes : False keeps what is merely worth knowing of a mapping to itself; ambiguities are told in any case.
+
+    Raises
+    ------
+    MappingError
+        The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
+    """
+    if mapping is not None:
+        check_mapping(mapping, log)
+        for note in mapping.notes if tell_notes else ():
+            tell(note)
+        return mapping, tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
+    found = auto_map(log, prefer_truth=prefer_truth)
+    for ambiguity in found.ambiguities:
+        tell(str(ambiguity))
+    for note in found.mapping.notes if tell_notes else ():
+        tell(note)
+    if require_signals and not found.mapping.signals:
+        raise MappingError(
+            expected="topics of well-known message types",
+            got=", ".join(sorted({t.type_name for t in log.topics})) or "no topics",
+            where=str(log.path),
+            remedy="write a mapping.toml (pdhef inspect LOG --write-mapping mapping.toml) and give it with --mapping",
+        )
+    return found.mapping, found.missing
