@@ -9,11 +9,14 @@ import numpy as np
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.signals import Signals
+from pdhef_logtool.signals import FloatArray, Signals
 from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.vehicle import FilterTuning, VehicleParameters
 
-#: Measurement noise at model-error level (METHOD §6): a_y m/s², yaw rate rad/s; the speed's is the sensor's.
+#: Table of the vehicle file that holds this filter's noise.
+TABLE = "pd-hef"
+#: Used where the file has no such table. Measurement noise at model-error level (METHOD §6): a_y m/s², yaw rate rad/s;
+#: the speed's is the sensor's.
 HYBRID_R_STD = (1.0, 0.003)
 HYBRID_Q_STD = (0.089, 0.06, 0.03, 0.021)
 
@@ -49,10 +52,11 @@ class HybridUkf:
     @property
     def needs(self) -> frozenset[str]:
         """What the physics filter needs."""
-        return self._filter.needs
+        return self.filter.needs
 
     @property
-    def _filter(self) -> PhysicsUkf:
+    def filter(self) -> PhysicsUkf:
+        """The filter that the residual goes into."""
         return PhysicsUkf(
             self.vehicle,
             q_std=self.q_std,
@@ -64,11 +68,41 @@ class HybridUkf:
 
     def run(self, signals: Signals, carry: HybridCarry | None) -> tuple[StateTrack, HybridCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
+        rate, physics, network = self.residual_rate(signals, carry)
+        track, hybrid = self.filter.run(signals, carry.hybrid if carry else None, self.trust * rate)
+        trust = np.where(track.valid, self.trust, np.nan)
+        return replace(track, network_trust=trust), HybridCarry(physics, network, hybrid)
+
+    def residual_rate(
+        self, signals: Signals, carry: HybridCarry | None
+    ) -> tuple[FloatArray, FilterCarry, NetworkCarry]:
+        """Return the network's residual rate [N, 2] in m/s² and rad/s², which no noise of this filter changes."""
         features, steps, physics = run_features(
             parallel_filter(self.vehicle, use_speed=self.use_speed), signals, carry.physics if carry else None
         )
         starts = ~np.isfinite(steps.prior[:, 0])
         rate, network = self.network.run(features, starts, carry.network if carry else None)
-        track, hybrid = self._filter.run(signals, carry.hybrid if carry else None, self.trust * rate)
-        trust = np.where(track.valid, self.trust, np.nan)
-        return replace(track, network_trust=trust), HybridCarry(physics, network, hybrid)
+        return rate, physics, network
+
+
+def hybrid_ukf(
+    vehicle: VehicleParameters,
+    network: NetworkService,
+    *,
+    trust: float = 1.0,
+    use_speed: bool = True,
+    name: str = "pd-hef-fixed-r",
+) -> HybridUkf:
+    """Return the filter with the noise of ``[filter.pd-hef]``; what the vehicle file leaves out is the default."""
+    tuning = vehicle.filter.get(TABLE, FilterTuning())
+    q = (*tuning.q_std, *HYBRID_Q_STD[len(tuning.q_std) :])
+    r = (tuning.r_std.get("ay_m_s2", HYBRID_R_STD[0]), tuning.r_std.get("yaw_rate_rad_s", HYBRID_R_STD[1]))
+    return HybridUkf(
+        vehicle,
+        network,
+        trust=trust,
+        q_std=(q[0], q[1], q[2], q[3]),
+        r_std=r,
+        use_speed=use_speed,
+        name=name,
+    )

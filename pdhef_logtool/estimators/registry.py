@@ -63,10 +63,10 @@ def make_estimator(
     if name in HYBRID_TRUST:
         if model is None:
             raise UsageError(expected="a model bundle", got="none", where=name, remedy="give --model DIR")
-        from pdhef_logtool.estimators.hybrid import HybridUkf
+        from pdhef_logtool.estimators.hybrid import hybrid_ukf
         from pdhef_logtool.residual_model.service import NetworkService
 
-        return HybridUkf(vehicle, NetworkService(model), trust=HYBRID_TRUST[name], use_speed=use_speed, name=name)
+        return hybrid_ukf(vehicle, NetworkService(model), trust=HYBRID_TRUST[name], use_speed=use_speed, name=name)
     if name in ("zero", "gyro"):
         from pdhef_logtool.estimators.pass_through import PassThrough
 

@@ -13,7 +13,7 @@ import torch
 
 from pdhef_logtool.config import RunConfig
 from pdhef_logtool.errors import UsageError
-from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.registry import make_estimator, runnable
 from pdhef_logtool.pipeline import run_logs
@@ -23,7 +23,7 @@ from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import default_vehicle
+from pdhef_logtool.vehicle import FilterTuning, default_vehicle
 
 VEHICLE = default_vehicle()
 COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis", "valid")
@@ -170,3 +170,13 @@ def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Pat
     estimates = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet")
     trust = estimates.filter((pl.col("estimator") == "pd-hef-fixed-r") & pl.col("valid"))["network_trust"]
     assert trust.unique().to_list() == [1.0]
+
+
+def test_the_noise_is_the_vehicle_files_where_it_has_one() -> None:
+    network = NetworkService(_bundle())
+    plain = hybrid_ukf(VEHICLE, network)
+    assert (plain.q_std, plain.r_std) == (HYBRID_Q_STD, HYBRID_R_STD)
+    table = FilterTuning(q_std=(0.1, 0.2), r_std={"ay_m_s2": 0.7})
+    tuned = hybrid_ukf(VEHICLE.model_copy(update={"filter": {"pd-hef": table}}), network)
+    assert tuned.q_std == (0.1, 0.2, *HYBRID_Q_STD[2:])
+    assert tuned.r_std == (0.7, HYBRID_R_STD[1])
