@@ -32,8 +32,11 @@ class _Record(BaseModel):
 class AxleTyre(_Record):
     """Axle magic formula at friction 1 (METHOD Eq 3), or a cornering stiffness alone.
 
-    ``D_n`` is the axle's peak force in N at friction 1. A tyre that is given by ``cornering_stiffness_n_per_rad``
-    keeps that stiffness at any friction and saturates at friction · F_z.
+    ``D_n`` is the axle's peak force in N at friction 1. Eq 3 scales the whole curve with friction, its stiffness too;
+    real tyres keep theirs. With ``reference_friction``, the friction that the curve was measured at, B becomes
+    B · reference / friction: the peak follows friction, the stiffness stays (similarity, Pacejka 2012, section 4.2).
+    A tyre that is given by ``cornering_stiffness_n_per_rad`` keeps that stiffness at any friction and saturates at
+    friction · F_z.
     """
 
     B: Positive | None = None
@@ -41,6 +44,12 @@ class AxleTyre(_Record):
     D_n: Positive | None = None
     E: Annotated[float, Field(le=1.0, allow_inf_nan=False)] | None = None
     cornering_stiffness_n_per_rad: Positive | None = None
+    reference_friction: Positive | None = None
+
+    @property
+    def keeps_stiffness(self) -> bool:
+        """Whether the slope at zero slip is the same at any friction."""
+        return self.cornering_stiffness_n_per_rad is not None or self.reference_friction is not None
 
     @model_validator(mode="after")
     def _one_form(self) -> AxleTyre:
@@ -48,6 +57,8 @@ class AxleTyre(_Record):
         stiffness = self.cornering_stiffness_n_per_rad is not None
         if not (all(magic) and not stiffness) and not (stiffness and not any(magic)):
             raise ValueError("give either all of B, C, D_n, E or cornering_stiffness_n_per_rad alone")
+        if stiffness and self.reference_friction is not None:
+            raise ValueError("reference_friction belongs to B, C, D_n, E")
         return self
 
 
@@ -61,8 +72,9 @@ class Tyres(_Record):
 class Sensors(_Record):
     """1-sigma white noise of the sensors, which is R of the sensor-level filters, and their constant biases.
 
-    A bias is what the sensor reads too much; it is taken off before any estimator sees the signal. The defaults of
-    the noise are METHOD §9's for a production car's sensors.
+    A bias is what the sensor reads too much; it is taken off before any estimator sees the signal. ``*_bias_std`` is
+    the 1-sigma of what is left of it from drive to drive, for the filters that estimate it. The defaults are METHOD
+    §9's for a production car's sensors.
     """
 
     ax_std_m_s2: Positive = 0.12
@@ -73,6 +85,9 @@ class Sensors(_Record):
     ax_bias_m_s2: Finite = 0.0
     ay_bias_m_s2: Finite = 0.0
     yaw_rate_bias_rad_s: Finite = 0.0
+    ay_bias_std_m_s2: Positive = 0.08
+    yaw_rate_bias_std_rad_s: Positive = 0.0015
+    steer_bias_std_rad: Positive = 0.0008
 
 
 class FilterTuning(_Record):
@@ -110,6 +125,11 @@ class VehicleParameters(_Record):
     imu_position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     truth_position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
     low_speed_blend_m_s: Positive = 3.0
+    #: Way over which a lateral axle force builds up; 0.3-0.7 m for car tyres (METHOD §13; Pacejka 2012, chapter 7).
+    relaxation_length_m: NonNegative = 0.5
+    #: Share of lateral force per load that a tyre loses for each relative excess of load: −p_Dy2/p_Dy1, 0.145/0.990 for
+    #: the 205/60 R15 of Pacejka 2012, appendix 3.
+    load_sensitivity: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.15
     sensors: Sensors = Sensors()
     tyres: Tyres
     filter: dict[str, FilterTuning] = Field(default_factory=dict)
@@ -136,7 +156,8 @@ class VehicleParameters(_Record):
         tyre = self.tyres.front if front else self.tyres.rear
         if tyre.cornering_stiffness_n_per_rad is None:
             assert tyre.B is not None and tyre.C is not None and tyre.D_n is not None and tyre.E is not None
-            return tyre.B, tyre.C, friction * tyre.D_n, tyre.E
+            b = tyre.B if tyre.reference_friction is None else tyre.B * tyre.reference_friction / friction
+            return b, tyre.C, friction * tyre.D_n, tyre.E
         peak = friction * self.axle_load_n(front)
         shape = STIFFNESS_TYRE_SHAPE
         return tyre.cornering_stiffness_n_per_rad / (shape * peak), shape, peak, 0.0

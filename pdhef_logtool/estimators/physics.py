@@ -1,14 +1,20 @@
 """``phy-ukf``: the pure physics unscented Kalman filter on the nominal single-track model (METHOD §1, §2, §6).
 
-State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Measurements
-[a_y, r, v_x], each of which may be missing at any step. This is the paper's physics baseline and frozen: R at sensor
+State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer (grade, pitch). Optional states
+behind it: the biases of a_y, yaw rate and steering angle, and the force scale s, by which model and residual are taken
+to be wrong: (1 + s) times their forces, an Ornstein-Uhlenbeck process (METHOD §12, §15). Measurements [a_y, r, v_x],
+each of which may be missing at any step. Without options this is the paper's physics baseline and frozen: R at sensor
 level from the vehicle file, Q by innovation likelihood (``benchmarks/tune_physics_q.py``).
+
+Over a step the inputs are the mean of those at its two ends: both are known when the step is taken, and the residual
+targets are made the same way.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -37,6 +43,7 @@ from pdhef_logtool.vehicle import VehicleParameters
 # State entries and measurement entries, by name.
 VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3
 STATES = 4
+BIAS_STATES = 3
 Z_AY, Z_YAW_RATE, Z_SPEED = 0, 1, 2
 MEASUREMENTS = 3
 # Inputs of a step; a_x is 0 where U_AX_KNOWN is 0.
@@ -51,6 +58,11 @@ PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
 NO_AX_Q_STD = 3.0
 
 INITIAL_STD = (0.5, 0.5, 0.1, 0.3)
+#: Random walk of the a_y (m/s²), yaw-rate (rad/s) and steering (rad) bias, 1-sigma per square root of second.
+BIAS_WALK_STD = (0.004, 0.00008, 0.00002)
+#: Force scale: its spread, and the time constant with which it returns to 0 (METHOD §15).
+FORCE_SCALE_STD = 0.05
+FORCE_SCALE_TIME_S = 2.0
 #: Longer steps are no steps: the filter starts anew behind such a gap.
 RESTART_GAP_S = 0.5
 #: The last steering angle is kept for this long where the signal is missing.
@@ -124,41 +136,66 @@ class PosteriorSteps:
         return PosteriorSteps(*(getattr(self, n)[index:] for n in self.__slots__))
 
 
+class StateLayout(NamedTuple):
+    """Where the optional states stand; −1 = not there. The three biases follow each other: a_y, yaw rate, steering."""
+
+    bias: int
+    force_scale: int
+
+
 @njit(cache=True)
-def _propagate(chi, steer, ax, friction, rate_vy, rate_r, dt, p):  # type: ignore[no-untyped-def]
-    """Move sigma points [s, 4] by ``dt`` through the nominal model and add the residual (Eq 19), in place.
+def _propagate(chi, steer, ax, friction, rate_vy, rate_r, dt, layout, p):  # type: ignore[no-untyped-def]
+    """Move sigma points [s, n] by ``dt`` through the nominal model and add the residual (Eq 19), in place.
 
     Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
     has it, would leave the tyres' answer to it out of the step, 3 % of a residual at 25 m/s and 10 ms. A residual
     counts where the model is dynamic: it knows nothing of the kinematic range.
     """
-    half = 0.5 * dynamic_share(chi[0, 0], p) * dt
+    share = 0.5 * dynamic_share(chi[0, 0], p) * dt
     n = substeps(chi[0, 0], dt, friction, p)
+    keep = math.exp(-dt / FORCE_SCALE_TIME_S)
     for i in range(chi.shape[0]):
+        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
+        angle = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
+        half = share * force
         vy = chi[i, 1] + half * rate_vy
         r = chi[i, 2] + half * rate_r
-        vx, vy, r = rk4_step(chi[i, 0], vy, r, steer, ax - chi[i, 3], friction, dt, n, p)
+        vx, vy, r = rk4_step(chi[i, 0], vy, r, angle, ax - chi[i, 3], friction, dt, n, p, force)
         chi[i, 0] = vx
         chi[i, 1] = vy + half * rate_vy
         chi[i, 2] = r + half * rate_r
+        if layout.force_scale >= 0:
+            chi[i, layout.force_scale] *= keep
 
 
 @njit(cache=True)
-def _measure(chi, steer, friction, rate_vy, p, zeta):  # type: ignore[no-untyped-def]
-    """Write what the sensors would read at sigma points chi [s, 4] to zeta [s, 3]; the residual belongs to a_y too."""
+def _measure(chi, steer, friction, rate_vy, layout, p, zeta):  # type: ignore[no-untyped-def]
+    """Write what the sensors would read at sigma points chi [s, n] to zeta [s, 3]; the residual belongs to a_y too."""
     residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, 0], p) * rate_vy
     for i in range(chi.shape[0]):
-        ay = measured_lateral_acceleration(chi[i, 0], chi[i, 1], chi[i, 2], steer, friction, p)
-        zeta[i, Z_AY] = ay + residual
+        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
+        angle = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
+        ay = measured_lateral_acceleration(chi[i, 0], chi[i, 1], chi[i, 2], angle, friction, p, force)
+        zeta[i, Z_AY] = ay + force * residual
         zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
         zeta[i, Z_SPEED] = chi[i, VX]
+        if layout.bias >= 0:
+            zeta[i, Z_AY] += chi[i, layout.bias]
+            zeta[i, Z_YAW_RATE] += chi[i, layout.bias + 1]
 
 
 @njit(cache=True)
-def _add_process_noise(P, q_std, ax_known, dt):  # type: ignore[no-untyped-def]
-    for i in range(P.shape[0]):
+def _add_process_noise(P, q_std, ax_known, dt, layout):  # type: ignore[no-untyped-def]
+    """Add what a step of ``dt`` s makes uncertain; ``q_std`` [4] covers the fixed states, the others have their own."""
+    for i in range(STATES):
         q = q_std[i] if i != VX or ax_known else NO_AX_Q_STD
         P[i, i] += q * q * dt
+    if layout.bias >= 0:
+        for i in range(BIAS_STATES):
+            P[layout.bias + i, layout.bias + i] += BIAS_WALK_STD[i] ** 2 * dt
+    if layout.force_scale >= 0:
+        forgotten = 1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S)
+        P[layout.force_scale, layout.force_scale] += FORCE_SCALE_STD**2 * forgotten
 
 
 @njit(cache=True)
@@ -175,11 +212,11 @@ def _all_finite(x, P):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _filter(  # type: ignore[no-untyped-def]
     dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, default_friction, p, q_std, r_std, wm, wc, scale,
-    x, P, memory, residual_rate, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu, out_valid, out_diverged,
-    out_prior,
+    layout, initial_std, x, P, memory, residual_rate, extra_r, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu,
+    out_valid, out_diverged, out_prior,
 ):  # fmt: skip
-    """Run over one window; x [4], P [4, 4] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start."""
-    n = STATES
+    """Run over one window; x [n], P [n, n] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start."""
+    n = x.shape[0]
     chi = np.empty((2 * n + 1, n))
     L = np.empty((n, n))
     zeta = np.empty((2 * n + 1, MEASUREMENTS))
@@ -226,32 +263,36 @@ def _filter(  # type: ignore[no-untyped-def]
                 x[VX] = z[Z_SPEED]
                 x[VY] = p.rear_m * r0  # the rear axle rolls without slip
                 x[YAW_RATE] = r0
-                x[AX_BIAS] = 0.0
+                x[AX_BIAS:] = 0.0
                 P[:, :] = 0.0
                 for i in range(n):
-                    P[i, i] = INITIAL_STD[i] ** 2
+                    P[i, i] = initial_std[i] ** 2
                 memory[M_INITIALISED] = 1.0
                 out_valid[k] = True
         else:
             draw_sigma_points(x, P, scale, L, chi)
+            # A missing steering angle is held; a missing a_x at one end leaves that of the other.
+            ax_step = memory[M_AX] if not has_ax else ax_k if memory[M_AX_KNOWN] == 0.0 else 0.5 * (memory[M_AX] + ax_k)
+            ax_known = has_ax or memory[M_AX_KNOWN] > 0.0
             _propagate(
-                chi, memory[M_STEER], memory[M_AX], memory[M_FRICTION], memory[M_RATE_VY], memory[M_RATE_R], dt[k], p
-            )
+                chi, 0.5 * (memory[M_STEER] + steer_k), ax_step, 0.5 * (memory[M_FRICTION] + mu_k),
+                memory[M_RATE_VY], memory[M_RATE_R], dt[k], layout, p,
+            )  # fmt: skip
             mean_and_covariance(chi, wm, wc, x, P)
-            _add_process_noise(P, q_std, memory[M_AX_KNOWN] > 0.0, dt[k])
+            _add_process_noise(P, q_std, ax_known, dt[k], layout)
             alive = _all_finite(x, P)
             for i in range(n):
                 out_prior[k, i] = x[i]
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
-                _measure(chi, steer_k, mu_k, memory[M_RATE_VY], p, zeta)
+                _measure(chi, steer_k, mu_k, memory[M_RATE_VY], layout, p, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 opens = False
                 outside = False
                 seen = 0
                 squares = 0.0
                 for i in range(MEASUREMENTS):
-                    S[i, i] += r_std[i] * r_std[i]
+                    S[i, i] += r_std[i] * r_std[i] + (extra_r[k, i] if i < Z_SPEED else 0.0)
                     nu[i] = z[i] - z_hat[i]
                     use[i] = math.isfinite(nu[i]) and (i != Z_AY or steer_ok)
                     given[i] = use[i]
@@ -279,10 +320,10 @@ def _filter(  # type: ignore[no-untyped-def]
                         for j in range(n):
                             P[i, j] *= GATE_INFLATION
                     draw_sigma_points(x, P, scale, L, chi)
-                    _measure(chi, steer_k, mu_k, memory[M_RATE_VY], p, zeta)
+                    _measure(chi, steer_k, mu_k, memory[M_RATE_VY], layout, p, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                     for i in range(MEASUREMENTS):
-                        S[i, i] += r_std[i] * r_std[i]
+                        S[i, i] += r_std[i] * r_std[i] + (extra_r[k, i] if i < Z_SPEED else 0.0)
                         nu[i] = z[i] - z_hat[i]
                         if use[i]:
                             memory[M_REJECTED + i] = 0.0
@@ -337,9 +378,11 @@ def _filter(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _predict_outputs(step, horizon_s, x, P, inputs, residual_rate, p, q_std, wm, wc, scale, out_x, out_P, out_ay):  # type: ignore[no-untyped-def]
+def _predict_outputs(  # type: ignore[no-untyped-def]
+    step, horizon_s, x, P, inputs, residual_rate, layout, p, q_std, wm, wc, scale, out_x, out_P, out_ay
+):  # fmt: skip
     """Predict step ``step[m]`` by ``horizon_s[m]`` with its inputs held; writes state, covariance and planar a_y."""
-    n = STATES
+    n = x.shape[1]
     chi = np.empty((2 * n + 1, n))
     L = np.empty((n, n))
     xm = np.empty(n)
@@ -357,17 +400,19 @@ def _predict_outputs(step, horizon_s, x, P, inputs, residual_rate, p, q_std, wm,
             draw_sigma_points(xm, Pm, scale, L, chi)
             _propagate(
                 chi, inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_FRICTION], residual_rate[k, 0],
-                residual_rate[k, 1], horizon_s[m], p,
+                residual_rate[k, 1], horizon_s[m], layout, p,
             )  # fmt: skip
             mean_and_covariance(chi, wm, wc, xm, Pm)
-            _add_process_noise(Pm, q_std, inputs[k, U_AX_KNOWN] > 0.0, horizon_s[m])
+            _add_process_noise(Pm, q_std, inputs[k, U_AX_KNOWN] > 0.0, horizon_s[m], layout)
             if not _all_finite(xm, Pm):
                 xm[:] = math.nan
                 Pm[:, :] = math.nan
         out_x[m] = xm
         out_P[m] = Pm
-        ay = planar_lateral_acceleration(xm[VX], xm[VY], xm[YAW_RATE], inputs[k, U_STEER], inputs[k, U_FRICTION], p)
-        out_ay[m] = ay + dynamic_share(xm[VX], p) * residual_rate[k, 0]
+        angle = inputs[k, U_STEER] if layout.bias < 0 else inputs[k, U_STEER] - xm[layout.bias + 2]
+        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + xm[layout.force_scale])
+        ay = planar_lateral_acceleration(xm[VX], xm[VY], xm[YAW_RATE], angle, inputs[k, U_FRICTION], p, force)
+        out_ay[m] = ay + force * dynamic_share(xm[VX], p) * residual_rate[k, 0]
 
 
 def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -387,6 +432,8 @@ class PhysicsUkf:
     vehicle : parameters; ``sensors`` gives R unless ``r_std`` does.
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
+    bias_states : estimate the biases of a_y, yaw rate and steering angle; their priors stand in ``sensors``.
+    force_scale : estimate a factor on all lateral forces.
     """
 
     vehicle: VehicleParameters
@@ -394,6 +441,8 @@ class PhysicsUkf:
     r_std: tuple[float, float, float] | None = None
     use_speed: bool = True
     roll_correction: bool = False
+    bias_states: bool = False
+    force_scale: bool = False
     name: str = "phy-ukf"
     causal: bool = True
 
@@ -412,17 +461,40 @@ class PhysicsUkf:
         s = self.vehicle.sensors
         return np.array(self.r_std or (s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s))
 
+    @property
+    def layout(self) -> StateLayout:
+        """Where the optional states stand."""
+        after = STATES + (BIAS_STATES if self.bias_states else 0)
+        return StateLayout(STATES if self.bias_states else -1, after if self.force_scale else -1)
+
+    @property
+    def _initial_std(self) -> FloatArray:
+        s = self.vehicle.sensors
+        std = [*INITIAL_STD]
+        if self.bias_states:
+            std += [s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s, s.steer_bias_std_rad]
+        if self.force_scale:
+            std += [FORCE_SCALE_STD]
+        return np.array(std)
+
     def filter_steps(
-        self, signals: Signals, carry: FilterCarry | None, residual_rate: FloatArray | None = None
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
     ) -> tuple[PosteriorSteps, FilterCarry]:
         """Run the filter on measurement time only; the steps and the carry with no pending steps in it.
 
         ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
+        ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
         signals = without_impossible(signals)
         count = len(signals)
+        initial_std = self._initial_std
+        n = initial_std.shape[0]
         if carry is None:
-            x, P, memory = np.zeros(STATES), np.eye(STATES), np.zeros(MEMORY)
+            x, P, memory = np.zeros(n), np.eye(n), np.zeros(MEMORY)
             first_dt = np.nan
         else:
             x, P, memory = carry.x.copy(), carry.P.copy(), carry.memory.copy()
@@ -434,8 +506,8 @@ class PhysicsUkf:
         steps = PosteriorSteps(
             stamps_ns=signals.stamps_ns,
             ready_ns=signals.ready_ns,
-            x=np.empty((count, STATES)),
-            P=np.empty((count, STATES, STATES)),
+            x=np.empty((count, n)),
+            P=np.empty((count, n, n)),
             inputs=np.empty((count, INPUTS)),
             nis=np.empty(count),
             nis_dof=np.empty(count),
@@ -443,25 +515,30 @@ class PhysicsUkf:
             innovation=np.empty((count, MEASUREMENTS)),
             valid=np.empty(count, dtype=np.bool_),
             diverged=np.empty(count, dtype=np.bool_),
-            prior=np.empty((count, STATES)),
+            prior=np.empty((count, n)),
             residual_rate=np.zeros((count, 2)) if residual_rate is None else residual_rate,
         )
-        wm, wc, scale = unscented_weights(STATES)
+        wm, wc, scale = unscented_weights(n)
         _filter(
             dt, signals.steer_rad, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s,
             signals.friction, self.use_speed, self.vehicle.assumed_friction, self._parameters,
-            np.array(self.q_std), self.measurement_std, wm, wc, scale[0], x, P, memory,
-            steps.residual_rate, steps.x, steps.P, steps.inputs, steps.nis, steps.nis_dof, steps.log_likelihood,
-            steps.innovation, steps.valid, steps.diverged, steps.prior,
+            np.array(self.q_std), self.measurement_std, wm, wc, scale[0], self.layout, initial_std, x, P, memory,
+            steps.residual_rate, np.zeros((count, 2)) if extra_r is None else extra_r,
+            steps.x, steps.P, steps.inputs, steps.nis, steps.nis_dof, steps.log_likelihood, steps.innovation,
+            steps.valid, steps.diverged, steps.prior,
         )  # fmt: skip
         last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
         return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count))
 
     def run(
-        self, signals: Signals, carry: FilterCarry | None, residual_rate: FloatArray | None = None
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
     ) -> tuple[StateTrack, FilterCarry]:
         """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
-        steps, after = self.filter_steps(signals, carry, residual_rate)
+        steps, after = self.filter_steps(signals, carry, residual_rate, extra_r)
         if carry is not None:
             steps = carry.steps.joined(steps)
         index = released_steps(steps.ready_ns, signals.stamps_ns)
@@ -470,10 +547,11 @@ class PhysicsUkf:
         usable[usable] &= steps.valid[index[usable]]
         chosen = np.where(usable, index, -1)
         count = len(signals)
-        x, P, ay = np.empty((count, STATES)), np.empty((count, STATES, STATES)), np.empty(count)
-        wm, wc, scale = unscented_weights(STATES)
+        n = steps.x.shape[1]
+        x, P, ay = np.empty((count, n)), np.empty((count, n, n)), np.empty(count)
+        wm, wc, scale = unscented_weights(n)
         _predict_outputs(
-            chosen, horizon, steps.x, steps.P, steps.inputs, steps.residual_rate, self._parameters,
+            chosen, horizon, steps.x, steps.P, steps.inputs, steps.residual_rate, self.layout, self._parameters,
             np.array(self.q_std), wm, wc, scale[0], x, P, ay,
         )  # fmt: skip
         usable &= np.isfinite(x[:, VX])

@@ -36,7 +36,8 @@ def filterpy_run(signals):
     for k in range(1, len(signals)):
         dt = (signals.stamps_ns[k] - signals.stamps_ns[k - 1]) * 1e-9
         ukf.Q = np.diag(np.array(Q_STD) ** 2) * dt
-        ukf.predict(dt=dt, u=(signals.steer_rad[k - 1], signals.ax_m_s2[k - 1], mu[k - 1]))
+        u = [0.5 * (c[k - 1] + c[k]) for c in (signals.steer_rad, signals.ax_m_s2, mu)]
+        ukf.predict(dt=dt, u=u)
         z = np.array([signals.ay_m_s2[k], signals.yaw_rate_rad_s[k], signals.speed_m_s[k]])
         use = np.isfinite(z)
         if use.any():
