@@ -1,0 +1,48 @@
+"""The paper's fuzzy scheduler: trust in the network from two signs that the model fails (Eq 24, 25, Table 2).
+
+Inputs are E_ay = |a_y,m − a_y,nom| and I_dyn = |a_y,m| / (μ g), each in three overlapping sets. The paper gives Table 2
+and no set; METHOD §7 fixes the sets: triangles with shoulders whose tops stand at the constants below. A rule is as
+strong as the weaker of its two memberships (Mamdani's AND); the output is the mean of the rules' singletons weighted by
+strength, which is the centre of gravity of singletons.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+#: Tops of the sets small, medium and large of E_ay in m/s².
+DEVIATION_TOPS_M_S2 = (0.3, 1.0, 2.5)
+#: Tops of the sets small, medium and large of I_dyn.
+INTENSITY_TOPS = (0.3, 0.6, 0.85)
+#: Table 2: rows I_dyn small, medium, large; columns E_ay small, medium, large.
+RULES = ((0.1, 0.2, 0.3), (0.3, 0.5, 0.7), (0.5, 0.8, 0.9))
+#: Trust where nothing is known: the rule of the undisturbed drive.
+NOMINAL_TRUST = RULES[0][0]
+
+
+@njit(cache=True)
+def memberships(value, tops):  # type: ignore[no-untyped-def]
+    """Return how far ``value`` is small, medium and large, each in [0, 1], their sum 1."""
+    low, middle, high = tops
+    small = min(1.0, max(0.0, (middle - value) / (middle - low)))
+    large = min(1.0, max(0.0, (value - middle) / (high - middle)))
+    return small, 1.0 - small - large, large
+
+
+@njit(cache=True)
+def fuzzy_trust(deviation_m_s2, intensity):  # type: ignore[no-untyped-def]
+    """Return β in [0.1, 0.9] of E_ay in m/s² and I_dyn, both not negative; NaN of NaN."""
+    if not (math.isfinite(deviation_m_s2) and math.isfinite(intensity)):
+        return math.nan
+    columns = memberships(deviation_m_s2, DEVIATION_TOPS_M_S2)
+    rows = memberships(intensity, INTENSITY_TOPS)
+    total = 0.0
+    strengths = 0.0
+    for i in range(3):
+        for j in range(3):
+            strength = min(rows[i], columns[j])
+            total += strength * RULES[i][j]
+            strengths += strength
+    return total / strengths

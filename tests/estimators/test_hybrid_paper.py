@@ -1,0 +1,258 @@
+"""The paper's filter: its rules by hand, its noise by hand, and the whole of it against plain numpy."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import cut, drive, forces, runge_kutta, slalom, with_noise
+
+from pdhef_logtool.estimators.base import without_impossible
+from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
+from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf, adapted_noise
+from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.signals import Signals
+from pdhef_logtool.tracks import concatenate
+from pdhef_logtool.vehicle import default_vehicle
+
+VEHICLE = default_vehicle()
+GRAVITY = 9.80665
+
+
+def make_bundle(names: tuple[str, ...] = PAPER_FEATURES, scale: float = 2.0) -> ModelBundle:
+    """Return a small random network whose residuals are of the order of ``scale``."""
+    torch.manual_seed(3)
+    network = ResidualNetwork(Architecture(len(names), 8, 2, (8,)))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    size = len(names)
+    normalisation = Normalisation((0.0,) * size, (3.0,) * size, (scale, scale))
+    return ModelBundle(names, 8, 2, (8,), 0.01, normalisation, weights)
+
+
+def paper_filter(**options: object) -> PaperHybridUkf:
+    return PaperHybridUkf(VEHICLE, NetworkService(make_bundle()), **options)
+
+
+@pytest.fixture(scope="module")
+def weaving() -> Signals:
+    """A noisy slalom to the limit, with a burst of noise on a_y, missing samples and messages that come late."""
+    made = drive(slalom(0.055, 0.5), 4.0, speed=23.0, step_s=np.random.default_rng(4).uniform(0.008, 0.012, 400))
+    s = with_noise(made.signals, seed=8)
+    s.ay_m_s2[200:260] += 3.0 * np.random.default_rng(5).standard_normal(60)
+    s.ay_m_s2[120:124] = np.nan
+    s.yaw_rate_rad_s[300] = np.nan
+    s.ax_m_s2[50:52] = np.nan
+    s.friction[:200] = 0.85
+    s.friction[200:] = 0.8
+    return replace(s, ready_ns=s.stamps_ns + 25_000_000)
+
+
+# --- the rules -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", range(3))
+@pytest.mark.parametrize("column", range(3))
+def test_at_the_tops_of_the_sets_trust_is_table_2(row, column):
+    table = ((0.1, 0.2, 0.3), (0.3, 0.5, 0.7), (0.5, 0.8, 0.9))
+    assert table == RULES
+    assert fuzzy_trust((0.3, 1.0, 2.5)[column], (0.3, 0.6, 0.85)[row]) == pytest.approx(table[row][column], abs=1e-15)
+
+
+def test_between_the_tops_rules_weigh_by_their_strength():
+    # E_ay 0.65: half small, half medium. I_dyn 0.3: small. Two rules of strength 1/2.
+    assert fuzzy_trust(0.65, 0.3) == pytest.approx(0.15)
+    # I_dyn 0.7: medium 0.6, large 0.4; E_ay 1.75: medium 0.5, large 0.5.
+    # strengths min: 0.5, 0.5 (medium row), 0.4, 0.4 (large row)
+    expected = (0.5 * 0.5 + 0.5 * 0.7 + 0.4 * 0.8 + 0.4 * 0.9) / 1.8
+    assert fuzzy_trust(1.75, 0.7) == pytest.approx(expected)
+
+
+def test_beyond_the_outer_tops_the_sets_have_shoulders():
+    assert fuzzy_trust(0.0, 0.0) == 0.1
+    assert fuzzy_trust(50.0, 3.0) == 0.9
+    assert fuzzy_trust(50.0, 0.0) == 0.3
+    assert math.isnan(fuzzy_trust(math.nan, 0.5))
+    assert math.isnan(fuzzy_trust(0.5, math.nan))
+
+
+@settings(derandomize=True, deadline=None)
+@given(st.floats(0, 5), st.floats(0, 5), st.floats(0, 2))
+def test_trust_never_falls_when_the_model_deviates_more(a, b, intensity):
+    low, high = sorted((a, b))
+    sets = memberships(low, (0.3, 1.0, 2.5))
+    assert min(sets) >= 0.0
+    assert sum(sets) == pytest.approx(1.0)
+    assert 0.1 <= fuzzy_trust(low, intensity) <= 0.9
+    # the weights of min-strengths are not bilinear: between tops they may fall by a little
+    assert fuzzy_trust(high, intensity) >= fuzzy_trust(low, intensity) - 0.03
+
+
+# --- the noise -------------------------------------------------------------------------------------------------------
+
+
+def test_noise_by_hand():
+    c, r = adapted_noise(math.nan, 0.0, 0.2, 0.1)  # C starts at 0.3
+    assert (c, r) == (pytest.approx(0.285), pytest.approx(0.1))
+    c, r = adapted_noise(0.3, 2.0, 0.2, 0.1)
+    assert c == pytest.approx(0.95 * 0.3 + 0.05 * 4.0)
+    assert r == pytest.approx(0.485 - 0.2)
+
+
+@settings(derandomize=True, deadline=None)
+@given(st.floats(0, 1e3), st.floats(-100, 100), st.floats(1e-12, 1e3), st.floats(1e-9, 10))
+def test_noise_never_falls_below_the_sensors(c, nu, predicted, r0):
+    assert adapted_noise(c, nu, predicted, r0)[1] >= r0
+
+
+def test_noise_rises_in_a_burst_and_only_then(weaving):
+    track, _ = paper_filter().run(weaving, None)
+    assert (track.r_scale[track.valid] >= 1.0).all()
+    assert track.r_scale[240:262].max() > 10.0
+    assert track.r_scale[20:100].max() < track.r_scale[240:262].max() / 3
+
+
+def test_the_undisturbed_norm_is_the_papers():
+    assert np.linalg.norm(paper_filter().measurement_variance) == pytest.approx(0.1, rel=0.01)
+
+
+# --- the whole filter ------------------------------------------------------------------------------------------------
+
+
+def numpy_reference(signals: Signals, bundle: ModelBundle) -> dict[str, np.ndarray]:
+    """Every step of Eq 19-26 in plain numpy, predicted to the stamps; the parallel filter and the network are given."""
+    features, physics, _ = run_features(parallel_filter(VEHICLE), signals, None)
+    rate, _ = NetworkService(bundle).run(features, ~np.isfinite(physics.prior[:, 0]), None)
+    signals = without_impossible(signals)
+    q = np.array([0.089, 0.31, 0.062, 0.021])
+    r0 = np.array([0.1, 0.004**2, 0.08**2])
+    wc = np.full(9, 1 / 8)
+    wc[0] = 2.0
+    wm = np.full(9, 1 / 8)
+    wm[0] = 0.0
+
+    def points(x, P):
+        root = np.linalg.cholesky(4.0 * P)
+        return np.vstack([x, x + root.T, x - root.T])
+
+    def moments(rows):
+        mean = wm @ rows
+        return mean, (rows - mean).T @ (wc[:, None] * (rows - mean))
+
+    def predict(x, P, steer, ax, mu, dt, residual, beta, has_ax):
+        chi = points(x, P)
+        moved = np.array([np.append(runge_kutta(c[:3], steer, ax - c[3], mu, dt), c[3]) for c in chi])
+        moved[:, 1:3] += beta * residual * dt
+        x, P = moments(moved)
+        std = q.copy()
+        if not has_ax:
+            std[0] = 3.0
+        return x, P + np.diag(std**2 * dt * (1 + 3 * beta))
+
+    n = len(signals)
+    t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+    steer, ax, ay = signals.steer_rad, signals.ax_m_s2, signals.ay_m_s2
+    steps = []
+    x, P = physics.x[0].copy()[:4], np.diag([0.5, 0.5, 0.1, 0.3]) ** 2
+    beta, C, r_scale = 0.1, None, 1.0
+    steps.append((x, P, beta, r_scale))
+    for k in range(1, n):
+        mu = signals.friction[k]
+        if np.isfinite(ay[k]):
+            nominal = forces(*physics.prior[k, :3], steer[k], mu)[0]
+            e, i = abs(ay[k] - nominal), abs(ay[k]) / (mu * GRAVITY)
+            columns = [np.interp(e, (0.3, 1.0, 2.5), v) for v in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+            rows = [np.interp(i, (0.3, 0.6, 0.85), v) for v in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+            strength = np.minimum.outer(rows, columns)
+            table = np.array([[0.1, 0.2, 0.3], [0.3, 0.5, 0.7], [0.5, 0.8, 0.9]])
+            beta = (strength * table).sum() / strength.sum()
+        known = [a for a in (ax[k - 1], ax[k]) if np.isfinite(a)]
+        mean_mu = (signals.friction[k - 1] + mu) / 2
+        x, P = predict(
+            x, P, (steer[k - 1] + steer[k]) / 2, np.mean(known) if known else 0.0, mean_mu, t[k] - t[k - 1],
+            rate[k - 1], beta, bool(known),
+        )  # fmt: skip
+        chi = points(x, P)
+        zeta = np.array([[forces(*c[:3], steer[k], mu)[0] + beta * rate[k - 1, 0], c[2], c[0]] for c in chi])
+        z_hat, Pzz = moments(zeta)
+        Pxz = (chi - x).T @ (wc[:, None] * (zeta - z_hat))
+        z = np.array([ay[k], signals.yaw_rate_rad_s[k], signals.speed_m_s[k]])
+        nu = z - z_hat
+        if C is None:
+            C = np.full(3, np.nan)
+        seen = np.isfinite(nu)
+        fresh = seen & np.isnan(C)
+        C[fresh] = (np.diag(Pzz) + r0)[fresh]
+        C[seen] = 0.95 * C[seen] + 0.05 * nu[seen] ** 2
+        R = np.fmax(r0, C - np.diag(Pzz))
+        r_scale = R[0] / r0[0]
+        S = (Pzz + np.diag(R))[np.ix_(seen, seen)]
+        K = Pxz[:, seen] @ np.linalg.inv(S)
+        x = x + K @ nu[seen]
+        P = P - K @ S @ K.T
+        steps.append((x, P, beta, r_scale))
+    out = {c: np.full(n, np.nan) for c in ("vx", "vy", "r", "beta", "r_scale", "ay", "vy_var")}
+    for m in range(n):
+        k = int(np.searchsorted(signals.ready_ns, signals.stamps_ns[m], side="right")) - 1
+        if k < 0:
+            continue
+        x, P, beta, r_scale = steps[k]
+        has_ax = bool(np.isfinite(ax[k]))
+        mu = signals.friction[k]
+        x, P = predict(x, P, steer[k], ax[k] if has_ax else 0.0, mu, t[m] - t[k], rate[k], beta, has_ax)
+        out["vx"][m], out["vy"][m], out["r"][m] = x[:3]
+        out["beta"][m], out["r_scale"][m], out["vy_var"][m] = beta, r_scale, P[1, 1]
+        out["ay"][m] = forces(*x[:3], steer[k], mu)[0] + beta * rate[k, 0]
+    return out
+
+
+def test_it_is_the_papers_equations_in_plain_numpy(weaving):
+    bundle = make_bundle()
+    want = numpy_reference(weaving, bundle)
+    track, _ = PaperHybridUkf(VEHICLE, NetworkService(bundle)).run(weaving, None)
+    got = {
+        "vx": track.vx_m_s, "vy": track.vy_m_s, "r": track.yaw_rate_rad_s, "beta": track.network_trust,
+        "r_scale": track.r_scale, "ay": track.ay_m_s2, "vy_var": track.vy_std_m_s**2,
+    }  # fmt: skip
+    for name, values in want.items():
+        np.testing.assert_allclose(got[name], values, rtol=1e-9, atol=1e-9, err_msg=name)
+    assert np.ptp(want["beta"][5:]) > 0.5  # the drive goes through the table
+    assert np.nanmax(want["r_scale"]) > 5.0
+
+
+def test_windows_join_bit_for_bit(weaving):
+    estimator = paper_filter()
+    whole, _ = estimator.run(weaving, None)
+    carry, parts = None, []
+    for a, b in pairwise((0, 1, 1, 90, 122, 123, 300, len(weaving))):
+        part, carry = estimator.run(cut(weaving, a, b), carry)
+        parts.append(part)
+    joined = concatenate(parts)
+    for column in ("vx_m_s", "vy_m_s", "ay_m_s2", "covariance", "network_trust", "r_scale", "nis", "valid"):
+        np.testing.assert_array_equal(getattr(joined, column), getattr(whole, column), err_msg=column, strict=True)
+
+
+def test_it_says_when_the_network_is_not_the_papers():
+    assert paper_filter().notes == ()
+    other = PaperHybridUkf(VEHICLE, NetworkService(make_bundle(FEATURES)))
+    assert "not the paper's 6" in other.notes[0]
+    assert "physics_vy_m_s" in other.notes[0]
+
+
+def test_a_missing_accelerometer_leaves_trust_where_it_was(weaving):
+    ay = weaving.ay_m_s2.copy()
+    ay[200:300] = np.nan
+    on_time = replace(weaving, ay_m_s2=ay, ready_ns=weaving.stamps_ns)
+    track, _ = paper_filter().run(on_time, None)
+    assert track.valid[200:300].all()
+    np.testing.assert_array_equal(track.network_trust[200:300], track.network_trust[199])
+    assert np.isfinite(track.vy_m_s[200:]).all()
