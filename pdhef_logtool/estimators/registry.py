@@ -17,11 +17,12 @@ DESCRIPTIONS: dict[str, str] = {
     "open-loop": "nominal single-track model from steering and speed alone",
     "phy-ukf": "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
     "phy-ukf-tuned": "the same with the noise of an identified vehicle file, corrected for body roll",
+    "physics-plus": "the strongest filter on physics alone: lagging axle forces, load transfer, body roll",
     "pd-hef-fixed-r": "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs --model)",
     "pd-hef-trust0": "the hybrid filter with its network switched off (needs --model)",
 }
 
-DEFAULT_ESTIMATORS = ("zero", "gyro", "kinematic", "open-loop", "phy-ukf")
+DEFAULT_ESTIMATORS = ("zero", "gyro", "kinematic", "open-loop", "phy-ukf", "physics-plus")
 #: Run by default as well where the vehicle file has what it needs.
 TUNED_ESTIMATORS = ("phy-ukf-tuned",)
 #: Run by default as well where a model is given; trust by name.
@@ -83,6 +84,10 @@ def make_estimator(
         from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
 
         return physics_ukf_tuned(vehicle, use_speed=use_speed)
+    if name == "physics-plus":
+        from pdhef_logtool.estimators.physics_plus import physics_plus
+
+        return physics_plus(vehicle, use_speed=use_speed)
     from pdhef_logtool.estimators.physics import PhysicsUkf
 
     return PhysicsUkf(vehicle, use_speed=use_speed)

@@ -24,7 +24,7 @@ TUNING = FilterTuning(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle().model_copy(update={"filter": {"phy-ukf-tuned": TUNING}})
 NAMES = tuple(n for n in DESCRIPTIONS if n not in HYBRID_TRUST)
 #: Those that claim a lateral velocity by a model or by integration.
-FILTERS = ("phy-ukf", "phy-ukf-tuned")
+FILTERS = ("phy-ukf", "phy-ukf-tuned", "physics-plus")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
     update={
