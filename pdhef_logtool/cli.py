@@ -608,6 +608,79 @@ def train(
         render_training(result, _stdout())
 
 
+@app.command(
+    epilog="""Examples:
+
+  pdhef tune logs/ --split validation --vehicle car.toml -o car_tuned.toml --jobs 2
+
+  pdhef tune logs/ --split validation --vehicle car.toml --model model --trials 256 -o car_tuned.toml
+
+Every estimator gets the same search space, drives and number of trials. Beside the vehicle file stand NAME.tuning.json
+with every trial, and NAME.tuning.png. Drives that a set's manifest marks test or extrapolation are refused
+(docs/tune.md)."""
+)
+def tune(
+    logs: Annotated[list[str], typer.Argument(help="Logs with truth, folders that hold some, or glob patterns.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="vehicle.toml to write; record and plot go beside it.")
+    ],
+    vehicle: Annotated[
+        Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml whose filter noise is tuned.")
+    ] = None,
+    model: Annotated[Path | None, typer.Option("--model", help="Folder of a model bundle; adds pd-hef.")] = None,
+    estimators: Annotated[
+        str | None,
+        typer.Option("--estimators", "-e", help="Out of phy-ukf-tuned, physics-plus, pd-hef; default: all that can."),
+    ] = None,
+    trials: Annotated[int, typer.Option("--trials", help="Of each estimator.")] = 128,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the search.")] = 0,
+    split: Annotated[
+        str | None, typer.Option("--split", help="Only drives of this split, by the manifest of their set.")
+    ] = None,
+    any_split: Annotated[
+        bool, typer.Option("--any-split", help="Take drives of the splits test and extrapolation too.")
+    ] = False,
+    mapping: Annotated[
+        Path | None,
+        typer.Option("--mapping", "-m", "--signal-map", help="mapping.toml: topic.field -> signal, for all drives."),
+    ] = None,
+    start: Annotated[str | None, typer.Option("--start", help="Start of the slice of each log (as for run).")] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End of the slice of each log (as for run).")] = None,
+    sensors: Annotated[
+        str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
+    ] = None,
+    prefer_truth: TruthChoice = None,
+    jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes at work; changes no number.")] = 1,
+    as_json: JsonFlag = False,
+) -> None:
+    """Tune the process and measurement noise of several estimators alike, for sideslip, on drives with truth."""
+    from pdhef_logtool.config import load_config
+    from pdhef_logtool.summary import render_tuning
+    from pdhef_logtool.training.tune_command import TuneSettings, run_tuning
+
+    config = load_config(
+        None,
+        {
+            "vehicle": vehicle,
+            "model": model,
+            "mapping": mapping,
+            "start": start,
+            "end": end,
+            "sensors": sensors,
+            "prefer_truth": prefer_truth,
+        },
+    )
+    names = None if estimators is None else tuple(n.strip() for n in estimators.split(",") if n.strip())
+    settings = TuneSettings(config, names, trials=trials, seed=seed, split=split, any_split=any_split)
+    with _progress() as progress:
+        result = run_tuning(logs, output, settings, jobs=jobs, progress=progress, warn=_warn)
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        render_tuning(result, _stdout())
+    raise typer.Exit(result.exit_code)
+
+
 @app.command()
 def estimators(as_json: JsonFlag = False) -> None:
     """List the estimators that run can use."""

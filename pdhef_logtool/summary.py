@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.training.extract_command import ExtractResult
     from pdhef_logtool.training.identify_command import IdentifyResult
     from pdhef_logtool.training.train_command import TrainResult
+    from pdhef_logtool.training.tune_command import TuneResult
 
 _DEG = math.degrees(1.0)
 #: Column head, signal, metric, factor to the shown unit, digits.
@@ -235,3 +236,34 @@ def render_training(result: TrainResult, console: Console) -> None:
     if result.test_loss is not None:
         console.print(f"test drives: {result.test_loss:.4f}", highlight=False)
     console.print(f"model in {result.model} ({result.bundle.sha256[:12]})", highlight=False, soft_wrap=True)
+
+
+def render_tuning(result: TuneResult, console: Console) -> None:
+    """Print the best noise of each estimator and its sideslip error; all had the same drives and trials."""
+    from rich.table import Table
+
+    from pdhef_logtool.training.tune import FACTORS
+
+    table = Table(box=None, header_style="bold")
+    table.add_column("\nestimator")
+    for f in FACTORS:
+        table.add_column(f"{f.name}\n{f.unit}", justify="right")
+    for head in ("geometric\nmean °", "\nmedian °", "\npooled °", "file's own\nmean °"):
+        table.add_column(head, justify="right")
+    for t in result.tuned:
+        score = t.best.score
+        table.add_row(
+            t.name,
+            *(f"{v:g}" for v in t.best.values),
+            *(f"{v:.4f}" for v in (score.objective_deg, score.median_deg, score.pooled_deg)),
+            "-" if t.before is None else f"{t.before.objective_deg:.4f}",
+        )
+    console.print("sideslip RMSE over drives", highlight=False)
+    console.print(table)
+    trials = len(result.tuned[0].trials)
+    console.print(f"{len(result.drives)} drives, {trials} trials of each estimator", highlight=False)
+    console.print(
+        f"vehicle in {result.vehicle_file}, trials in {result.tuning_file}, plot in {result.plot_file}",
+        highlight=False,
+        soft_wrap=True,
+    )
