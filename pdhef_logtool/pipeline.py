@@ -24,7 +24,7 @@ from pdhef_logtool.errors import (
     PdhefError,
     UsageError,
 )
-from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.registry import default_names, runnable
 from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
@@ -278,7 +278,7 @@ def _run_open_log(
             progress(log_input.stem, 0.8)
             rows, events = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
         losses = merge_losses([log.lost, reader.losses, *(sink.lost for sink in sinks)])
-        ran = [EstimatorFacts(e.name, causal=e.causal) for e in estimators]
+        ran = [EstimatorFacts(e.name, causal=e.causal, notes=notes_of(e)) for e in estimators]
         left_out = [EstimatorFacts(s.name, causal=True, skipped=s.reason) for s in skipped]
         report = build_report(
             report_facts(

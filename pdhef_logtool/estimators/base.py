@@ -60,6 +60,11 @@ class Estimator(Protocol):
         ...
 
 
+def notes_of(estimator: Estimator) -> tuple[str, ...]:
+    """Return what a reader of the report must know of an estimator; only some have something to say."""
+    return tuple(getattr(estimator, "notes", ()))
+
+
 def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
     """Return for each scored stamp the newest step whose data had arrived by then, −1 for none.
 

@@ -20,13 +20,21 @@ DESCRIPTIONS: dict[str, str] = {
     "physics-plus": "the strongest filter on physics alone: lagging axle forces, load transfer, body roll",
     "pd-hef-fixed-r": "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs --model)",
     "pd-hef-trust0": "the hybrid filter with its network switched off (needs --model)",
+    "pd-hef-trust1": "the hybrid filter at trust 1, whatever the vehicle file allows (needs --model)",
+    "pd-hef-paper": "the paper's hybrid filter with its adaptive mechanism, to the letter (needs --model)",
 }
+#: Names that stand for another estimator, under whose name it runs.
+ALIASES = {"pd-hef": "pd-hef-fixed-r"}
 
 DEFAULT_ESTIMATORS = ("zero", "gyro", "kinematic", "open-loop", "phy-ukf", "physics-plus")
 #: Run by default as well where the vehicle file has what it needs.
 TUNED_ESTIMATORS = ("phy-ukf-tuned",)
-#: Run by default as well where a model is given; trust by name.
-HYBRID_TRUST = {"pd-hef-fixed-r": 1.0, "pd-hef-trust0": 0.0}
+#: Trust of the hybrid filters by name; they need a model.
+HYBRID_TRUST = {"pd-hef-fixed-r": 1.0, "pd-hef-trust0": 0.0, "pd-hef-trust1": 1.0}
+#: Every estimator that needs a model.
+MODEL_ESTIMATORS = (*HYBRID_TRUST, "pd-hef-paper")
+#: Run by default as well where a model is given.
+DEFAULT_MODEL_ESTIMATORS = ("pd-hef-fixed-r", "pd-hef-trust0", "pd-hef-paper")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +47,9 @@ class Skipped:
 
 def check_names(names: tuple[str, ...]) -> None:
     """Raise UsageError if a name is unknown or occurs twice."""
-    unknown = [n for n in names if n not in DESCRIPTIONS]
-    twice = sorted({n for n in names if names.count(n) > 1})
+    meant = [ALIASES.get(n, n) for n in names]
+    unknown = [n for n in meant if n not in DESCRIPTIONS]
+    twice = sorted({n for n in meant if meant.count(n) > 1})
     if unknown or twice or not names:
         raise UsageError(
             expected=f"estimators out of {', '.join(DESCRIPTIONS)}",
@@ -56,18 +65,14 @@ def make_estimator(
 
     Parameters
     ----------
-    name : one of :data:`DESCRIPTIONS`.
+    name : one of :data:`DESCRIPTIONS` or :data:`ALIASES`.
     use_speed : False is the paper's ``esp`` suite for the filters (METHOD §1).
-    model : the network; those of :data:`HYBRID_TRUST` need it.
+    model : the network; those of :data:`MODEL_ESTIMATORS` need it.
     """
     check_names((name,))
-    if name in HYBRID_TRUST:
-        if model is None:
-            raise UsageError(expected="a model bundle", got="none", where=name, remedy="give --model DIR")
-        from pdhef_logtool.estimators.hybrid import hybrid_ukf
-        from pdhef_logtool.residual_model.service import NetworkService
-
-        return hybrid_ukf(vehicle, NetworkService(model), trust=HYBRID_TRUST[name], use_speed=use_speed, name=name)
+    name = ALIASES.get(name, name)
+    if name in MODEL_ESTIMATORS:
+        return _model_estimator(name, vehicle, use_speed, model)
     if name in ("zero", "gyro"):
         from pdhef_logtool.estimators.pass_through import PassThrough
 
@@ -93,10 +98,24 @@ def make_estimator(
     return PhysicsUkf(vehicle, use_speed=use_speed)
 
 
+def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, model: ModelBundle | None) -> Estimator:
+    if model is None:
+        raise UsageError(expected="a model bundle", got="none", where=name, remedy="give --model DIR")
+    from pdhef_logtool.residual_model.service import NetworkService
+
+    if name == "pd-hef-paper":
+        from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf
+
+        return PaperHybridUkf(vehicle, NetworkService(model), use_speed=use_speed)
+    from pdhef_logtool.estimators.hybrid import hybrid_ukf
+
+    return hybrid_ukf(vehicle, NetworkService(model), trust=HYBRID_TRUST[name], use_speed=use_speed, name=name)
+
+
 def default_names(vehicle: VehicleParameters, model: ModelBundle | None = None) -> tuple[str, ...]:
     """Return the estimators that run when none are named."""
     tuned = tuple(n for n in TUNED_ESTIMATORS if n in vehicle.filter)
-    return DEFAULT_ESTIMATORS + tuned + (tuple(HYBRID_TRUST) if model is not None else ())
+    return DEFAULT_ESTIMATORS + tuned + (DEFAULT_MODEL_ESTIMATORS if model is not None else ())
 
 
 def runnable(
@@ -110,11 +129,11 @@ def runnable(
     """Split estimators into those whose needs the log meets and those that are skipped with the reason."""
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
-    for name in names:
+    for name in (ALIASES.get(n, n) for n in names):
         if name in TUNED_ESTIMATORS and name not in vehicle.filter:
             skipped.append(Skipped(name, f"the vehicle file has no [filter.{name}]; pdhef identify writes one"))
             continue
-        if name in HYBRID_TRUST and model is None:
+        if name in MODEL_ESTIMATORS and model is None:
             skipped.append(Skipped(name, "no network; --model names one, pdhef train writes one"))
             continue
         estimator = make_estimator(name, vehicle, use_speed=use_speed, model=model)

@@ -14,7 +14,7 @@ from reference_car import cut, drive, keep, make_signals, rolling_drive, slalom,
 
 from pdhef_logtool.errors import UsageError
 from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, HYBRID_TRUST, check_names, make_estimator, runnable
+from pdhef_logtool.estimators.registry import DESCRIPTIONS, MODEL_ESTIMATORS, check_names, make_estimator, runnable
 from pdhef_logtool.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
 from pdhef_logtool.tracks import StateTrack, concatenate
 from pdhef_logtool.vehicle import AxleTyre, FilterTuning, Tyres, default_vehicle
@@ -22,7 +22,7 @@ from pdhef_logtool.vehicle import AxleTyre, FilterTuning, Tyres, default_vehicle
 #: With the noise that ``phy-ukf-tuned`` looks for in the vehicle file.
 TUNING = FilterTuning(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle().model_copy(update={"filter": {"phy-ukf-tuned": TUNING}})
-NAMES = tuple(n for n in DESCRIPTIONS if n not in HYBRID_TRUST)
+NAMES = tuple(n for n in DESCRIPTIONS if n not in MODEL_ESTIMATORS)
 #: Those that claim a lateral velocity by a model or by integration.
 FILTERS = ("phy-ukf", "phy-ukf-tuned", "physics-plus")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)

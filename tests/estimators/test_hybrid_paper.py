@@ -13,15 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, forces, runge_kutta, slalom, with_noise
 
+from pdhef_logtool.errors import UsageError
 from pdhef_logtool.estimators.base import without_impossible
 from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
 from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf, adapted_noise
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.registry import check_names, runnable
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import Signals
+from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.tracks import concatenate
 from pdhef_logtool.vehicle import default_vehicle
 
@@ -256,3 +258,19 @@ def test_a_missing_accelerometer_leaves_trust_where_it_was(weaving):
     assert track.valid[200:300].all()
     np.testing.assert_array_equal(track.network_trust[200:300], track.network_trust[199])
     assert np.isfinite(track.vy_m_s[200:]).all()
+
+
+# --- the registry ----------------------------------------------------------------------------------------------------
+
+
+def test_the_registry_makes_it_with_a_model_and_skips_it_without():
+    names = ("pd-hef-paper", "pd-hef-trust1", "pd-hef")
+    available = frozenset(ALIGNED_SIGNALS)
+    estimators, skipped = runnable(names, VEHICLE, available, model=make_bundle())
+    assert [e.name for e in estimators] == ["pd-hef-paper", "pd-hef-trust1", "pd-hef-fixed-r"]
+    assert skipped == []
+    estimators, skipped = runnable(names, VEHICLE, available)
+    assert estimators == []
+    assert all("--model" in s.reason for s in skipped)
+    with pytest.raises(UsageError, match="pd-hef-fixed-r"):
+        check_names(("pd-hef", "pd-hef-fixed-r"))
