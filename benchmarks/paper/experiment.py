@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.paper.schemes import SCHEMES, Scheme, schemes_for
+from benchmarks.paper.schemes import SCHEMES, schemes_for
 from pdhef_logtool.drive_channels import DriveReader, DriveWindow, plan_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.evaluation.metrics import MetricRow, score_track
@@ -244,7 +244,7 @@ def run_experiment(
 
     Parameters
     ----------
-    nominal : vehicle file; its friction is replaced by that of each drive. models : at least one.
+    nominal : vehicle file; its friction is replaced by that of each drive. models : without any, the drives alone are made.
     """
     runs: list[Run] = []
     drives: dict[str, ReadDrive] = {}
@@ -277,6 +277,3 @@ def run_experiment(
 def vehicle_sha256(vehicle: VehicleParameters) -> str:
     """Return the hash of a vehicle file's values."""
     return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()
-
-
-__all__ = ["BURST", "BURST_S", "A", "B", "Experiment", "Model", "ReadDrive", "Run", "Scenario", "Scheme"]

@@ -89,13 +89,18 @@ def _style(name: str) -> dict[str, Any]:
     return {"color": COLOURS.get(name, OTHERS), "linestyle": DASHES.get(name, "-"), "label": name}
 
 
+def _thin(name: str) -> dict[str, Any]:
+    """Style of errors: noise in dashes cannot be read."""
+    return {"color": COLOURS.get(name, OTHERS), "linewidth": 0.9, "label": name}
+
+
 def _time_s(track: StateTrack) -> FloatArray:
     return np.asarray((track.stamps_ns - track.stamps_ns[0]) * 1e-9)
 
 
 def convergence(folder: Path, histories: dict[int, History]) -> None:
     """Figure 9: loss over epochs, each training seed."""
-    fig, axes = _axes(1, 1, 6.4, 3.2)
+    fig, axes = _axes(1, 1, 7.4, 3.2)
     ax = axes[0, 0]
     for number, (seed, history) in enumerate(sorted(histories.items())):
         shade = {"alpha": 1.0 if number == 0 else 0.45}
@@ -111,7 +116,7 @@ def convergence(folder: Path, histories: dict[int, History]) -> None:
             label=f"validation, seed {seed}",
         )
     ax.set(yscale="log", xlabel="epoch", ylabel="mean square error,\nshare of the residual's mean square")
-    ax.legend(ncols=max(1, len(histories)), loc="upper right")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     _save(fig, folder, "figure09_convergence")
 
 
@@ -129,9 +134,8 @@ def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
         ax.plot([-reach, reach], [-reach, reach], color=COLOURS["truth"], linewidth=1.0)
         ax.plot(target, output, ".", markersize=2.0, color="#009E73", rasterized=True)
         ax.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel=f"residual, {unit}", ylabel="network")
-    axes[0, 0].set_title(title)
-    axes[0, 0].legend(ncols=2, loc="upper left")
-    axes[0, 0].margins(y=0.25)
+    axes[0, 1].set_title(title)
+    _legend_above(axes[0, 0])
     axes[1, 0].set_xlabel("time, s")
     _save(fig, folder, name)
 
@@ -152,7 +156,7 @@ def history(
         if signal == "sideslip":
             error = np.degrees(wrap_angle(np.radians(error)))
         axes[0, 0].plot(time_s, value, **_style(scheme))
-        axes[1, 0].plot(time_s, np.abs(error), **_style(scheme))
+        axes[1, 0].plot(time_s, np.abs(error), **_thin(scheme))
     axes[0, 0].set(ylabel=label)
     axes[1, 0].set(ylabel=f"absolute error, {label.rsplit(', ', 1)[1]}", xlabel="time, s", ylim=(0.0, None))
     _legend_above(axes[0, 0])
@@ -178,7 +182,7 @@ def position(folder: Path, name: str, experiment: Experiment, scenario: str, sch
             track.stamps_ns[part], track.vx_m_s[part], track.vy_m_s[part], track.yaw_rate_rad_s[part], start
         )
         axes[0, 0].plot(x, y, **_style(scheme))
-        axes[1, 0].plot(_time_s(truth), position_error(track, truth), **_style(scheme))
+        axes[1, 0].plot(_time_s(truth), position_error(track, truth), **_thin(scheme))
     axes[0, 0].set(xlabel="x, m", ylabel="y, m (axes not equal)")
     axes[1, 0].set(xlabel="time, s", ylabel="distance to truth, m", ylim=(0.0, None))
     _legend_above(axes[0, 0])
@@ -201,11 +205,12 @@ def noise_adaptation(folder: Path, experiment: Experiment, adaptive: Sequence[st
     for scheme in compared:
         track = experiment.tracks["A-burst", scheme]
         error = np.degrees(np.abs(wrap_angle(track.sideslip_rad - truth.sideslip_rad)))
-        axes[2, 0].plot(time_s, np.where(track.valid, error, np.nan), **_style(scheme))
+        axes[2, 0].plot(time_s, np.where(track.valid, error, np.nan), **_thin(scheme))
     axes[2, 0].set(ylabel="absolute sideslip\nerror, deg", xlabel="time, s", ylim=(0.0, None))
     for ax in axes[:, 0]:
         ax.axvspan(*BURST_S, color="#F0E442", alpha=0.25, linewidth=0)
-        _legend_above(ax)
+        if ax.get_legend_handles_labels()[0]:
+            _legend_above(ax)
     _save(fig, folder, "figure20_noise_adaptation")
 
 
@@ -232,8 +237,8 @@ def trust(folder: Path, curves: dict[str, dict[str, TrustCurve]]) -> None:
 BAR_FIGURES = {
     "sideslip_deg": "sideslip, deg",
     "yaw_rate_rad_s": "yaw rate, rad/s",
-    "ay_g": "lateral acceleration, g",
-    "lateral_1s_m": "lateral position after 1 s, m",
+    "ay_g": "lateral accel., g",
+    "lateral_1s_m": "lateral after 1 s, m",
 }
 
 
@@ -261,7 +266,7 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
             ax.grid(axis="y", visible=False)
             ax.set_xlim(left=0.0)
             if i == len(scenarios) - 1:
-                ax.set_xlabel(f"RMSE: {label}")
+                ax.set_xlabel(f"RMSE of {label}" if j < 3 else f"RMSE, {label}")
         axes[i, 0].set_title(f"scenario {scenario}", loc="left")
     _save(fig, folder, "figure22_rmse")
 
