@@ -7,7 +7,7 @@ OUT ?= out/demo
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: help demo test check lint format bench samples docs-truthsim clean
+.PHONY: help demo test check lint format bench samples docs-truthsim paper clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -16,6 +16,7 @@ help:
 	@echo "make bench    speed against peers, and the tuning tables"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
+	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make clean    remove the virtual environment and everything that was built"
 
 $(BIN)/python:
@@ -70,6 +71,10 @@ samples: $(VENV)/installed $(VENV)/compiled
 
 docs-truthsim: $(VENV)/installed
 	$(BIN)/python -m benchmarks.truthsim_docs
+
+# One core: step times are measured in the same run.
+paper: $(VENV)/installed $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.paper
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -28,7 +28,8 @@ def other_tables() -> list[str]:
     """Return the commands beside the benchmarks that make the tables behind frozen settings."""
     own = {*NAMES, "__init__", "__main__", "measuring", "one_hour_log"}
     found = [p for p in (ROOT / "benchmarks").glob("*.py") if p.stem not in own]
-    return sorted(p.stem for p in found if "__main__" in p.read_text(encoding="utf-8"))
+    folders = [p.parent.name for p in (ROOT / "benchmarks").glob("*/__main__.py")]
+    return sorted([p.stem for p in found if "__main__" in p.read_text(encoding="utf-8")] + folders)
 
 
 def cells(figure: Figure) -> tuple[str, ...]:

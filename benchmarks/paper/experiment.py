@@ -244,7 +244,8 @@ def run_experiment(
 
     Parameters
     ----------
-    nominal : vehicle file; its friction is replaced by that of each drive. models : without any, the drives alone are made.
+    nominal : vehicle file; its friction is replaced by that of each drive.
+    models : without any, the drives alone are made.
     """
     runs: list[Run] = []
     drives: dict[str, ReadDrive] = {}

@@ -128,7 +128,7 @@ def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
         ax = axes[row, 0]
         ax.plot(fit.time_s, target, color="#0072B2", linewidth=0.8, label="residual of the nominal model")
         ax.plot(fit.time_s, output, color="#E69F00", linewidth=1.6, label="network")
-        ax.set(ylabel=f"{what}, {unit}")
+        ax.set(ylabel=f"residual of {what}, {unit}")
         ax = axes[row, 1]
         reach = 1.05 * float(np.percentile(np.abs(np.concatenate([target, output])), 99.8))
         ax.plot([-reach, reach], [-reach, reach], color=COLOURS["truth"], linewidth=1.0)

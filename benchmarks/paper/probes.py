@@ -16,7 +16,7 @@ from pdhef_logtool.training.residuals import join_rows, residual_windows
 from pdhef_logtool.training.train_command import HISTORY_FILE
 
 #: Rows of the residual, with their units.
-RESIDUAL_ROWS = (("lateral velocity", "m/s^2"), ("yaw rate", "rad/s^2"))
+RESIDUAL_ROWS = (("v_y", "m/s²"), ("yaw rate", "rad/s²"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +117,10 @@ def trust_curve(experiment: Experiment, scenario: str, scheme: str, bins: int = 
 
 @dataclass(frozen=True, slots=True)
 class Inflation:
-    """Factor on R of a scheme: median before the burst, largest within, and the largest in the same drive without."""
+    """Factor on R of a scheme: median before the burst, largest within, and the largest of that time without a burst.
+
+    The first half second, in which a filter settles, is left out.
+    """
 
     before: float
     within: float
@@ -131,8 +134,8 @@ def inflation(experiment: Experiment, scheme: str, burst_s: tuple[float, float])
         return None
     time_s = (track.stamps_ns - track.stamps_ns[0]) * 1e-9
     use = track.valid & np.isfinite(track.r_scale)
-    before, within = use & (time_s < burst_s[0]) & (time_s > 0.5), use & (time_s >= burst_s[0]) & (time_s < burst_s[1])
-    calm = clean.valid & np.isfinite(clean.r_scale)
+    before, within = use & (time_s > 0.5) & (time_s < burst_s[0]), use & (time_s >= burst_s[0]) & (time_s < burst_s[1])
+    calm = clean.valid & np.isfinite(clean.r_scale) & (time_s >= burst_s[0]) & (time_s < burst_s[1])
     if not before.any() or not within.any() or not calm.any() or np.ptp(track.r_scale[use]) < 1e-9:
         return None
     return Inflation(

@@ -25,6 +25,8 @@ STEP_MS = {"phy-ukf": 1.9, "pd-hef": 4.0}
 CYCLE_MS = 10.0
 #: β from the linear region to the limit (section 5.4.3).
 TRUST = (0.1, 0.9)
+#: Table 2: large I_dyn, small E_ay.
+TRUST_BY_INTENSITY = 0.5
 #: Norm of R before and in the disturbance (section 5.4.2).
 R_NORM = (0.1, 3.5)
 #: Network output in rad/s (section 5.4.1).

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, runnable
+from pdhef_logtool.estimators.registry import ALIASES, DESCRIPTIONS, runnable
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.vehicle import VehicleParameters
 
@@ -23,7 +23,7 @@ SCHEMES: dict[str, str] = {
     "pure-lstm": "network alone, same inputs",
     "pd-hef-paper": "the paper's filter and adaptation, to the letter",
     "pd-hef-trust0": "our hybrid filter with its network switched off",
-    "pd-hef-fixed-r": "our hybrid filter, trust 1, fixed R (`pd-hef-trust1` is the same)",
+    "pd-hef-fixed-r": "our hybrid filter, full trust, fixed R",
     "pd-hef": "our hybrid filter with its adaptive mechanism",
 }
 
@@ -44,6 +44,9 @@ def schemes_for(
     ready: list[Scheme] = []
     missing: dict[str, str] = {}
     for name in names:
+        if name in ALIASES:
+            missing[name] = f"in this version the name stands for `{ALIASES[name]}`"
+            continue
         if name not in DESCRIPTIONS:
             missing[name] = "this version has no such estimator"
             continue
