@@ -1,10 +1,15 @@
-"""Fit the nominal axle tyres to a slow ramp steer of the truth vehicle, and write the vehicle files of the sample logs.
+"""Fit the nominal axle tyres to slow ramp steers of the truth vehicle on two roads, and write the vehicle files of the sample logs.
 
     python benchmarks/fit_nominal_tyres.py [sample_logs]
 
 The nominal model (METHOD section 2) knows one slip angle an axle, from the mean steering angle and the motion of the
 CG. So load transfer, compliance and both wheels of an axle go into its magic formula. Forces follow from Newton and
 Euler as they would from measured accelerations: F_f = (l_r m a_y + I_z dr/dt) / (L cos d), F_r = m a_y - F_f cos d.
+
+One curve serves all roads: by similarity (Pacejka 2012, section 4.2) the force over friction is a function of the slip
+angle over friction, so that the peak follows friction and the stiffness stays. The fit is to both roads at once, with
+``reference_friction = 1``; fitted on one road alone the rear axle, which never reaches its peak there, was wrong on the
+other.
 """
 
 from __future__ import annotations
@@ -24,8 +29,7 @@ from truthsim.vehicle import Vehicle
 
 CAR = Vehicle()
 NOISE = SensorNoise()
-#: One file a road: the formula scales stiffness with friction, which real (and these simulated) tyres hardly do, so
-#: that tyres fitted on one road are wrong on another.
+#: One file a road, with the same tyres: a vehicle file says the friction where no log does.
 ROADS = {
     "vehicle.toml": ("truthsim saloon", 0.85),
     "vehicle_mu03.toml": ("truthsim saloon on a road of friction 0.3", 0.3),
@@ -68,29 +72,34 @@ def magic_formula(alpha: FloatArray, b: float, c: float, d: float, e: float) -> 
     return np.asarray(d * np.sin(c * np.arctan(x - curvature * (x - np.arctan(x)))))
 
 
-def fit_axle(alpha: FloatArray, force: FloatArray, friction: float, load_n: float) -> AxleFit:
-    """Fit B, C, D, E by least squares.
+def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleFit:
+    """Fit B, C, D, E to slip angle and force, both over friction, by least squares.
 
-    The rear axle of an understeering car never reaches its peak in a ramp: friction times static load bounds it.
+    The rear axle of an understeering car never reaches its peak in a ramp: the static load bounds it.
     """
     top = float(force.max())
     start = [10.0, 1.3, 1.01 * top, 0.0]
-    bounds = ([3.0, 1.05, 1.0 * top, -2.0], [40.0, 1.7, max(friction * load_n, 1.02 * top), 1.1])
+    bounds = ([3.0, 1.05, 1.0 * top, -2.0], [40.0, 1.7, max(load_n, 1.02 * top), 1.1])
     found = least_squares(
         lambda p: (magic_formula(alpha, *p) - force) / top, start, bounds=bounds, x_scale=[10.0, 1.0, top, 1.0]
     )
     b, c, d, e = found.x
     error = magic_formula(alpha, b, c, d, e) - force
-    return AxleFit(b, c, d / friction, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
+    return AxleFit(b, c, d, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
 
 
-def fit_axles(motion: Motion, friction: float) -> dict[str, AxleFit]:
-    """Fit both axles to a motion at a friction."""
+def fit_axles(motions: dict[float, Motion]) -> dict[str, AxleFit]:
+    """Fit both axles to one motion a friction."""
     wheelbase = CAR.cg_to_front_axle_m + CAR.cg_to_rear_axle_m
     arms = {"front": CAR.cg_to_rear_axle_m, "rear": CAR.cg_to_front_axle_m}
+    curves = {friction: axle_curves(motion) for friction, motion in motions.items()}
     return {
-        axle: fit_axle(*curve, friction, CAR.mass_kg * GRAVITY_M_S2 * arms[axle] / wheelbase)
-        for axle, curve in axle_curves(motion).items()
+        axle: fit_axle(
+            np.concatenate([curve[axle][0] / friction for friction, curve in curves.items()]),
+            np.concatenate([curve[axle][1] / friction for friction, curve in curves.items()]),
+            CAR.mass_kg * GRAVITY_M_S2 * arm / wheelbase,
+        )
+        for axle, arm in arms.items()
     }
 
 
@@ -112,14 +121,15 @@ def ramp(friction: float) -> Motion:
 def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
     """Return a vehicle file."""
     tyres = "\n".join(
-        f"[tyres.{axle}]\nB = {fit.B:.3f}\nC = {fit.C:.4f}\nD_n = {fit.D_n:.1f}\nE = {fit.E:.4f}"
+        f"[tyres.{axle}]\nB = {fit.B:.3f}\nC = {fit.C:.4f}\nD_n = {fit.D_n:.1f}\nE = {fit.E:.4f}\n"
+        "reference_friction = 1.0"
         for axle, fit in fits.items()
     )
+    roads = " and ".join(f"{road:g}" for _, road in ROADS.values())
     return f"""# Nominal vehicle of the simulated sample logs, made by benchmarks/fit_nominal_tyres.py:
 # mass and geometry of the paper's Table 3; axle tyres and roll gradient fitted to
-# a ramp steer at {SPEED_KM_H:g} km/h and friction {friction:g} into the plateau of the front axle.
-# The formula scales stiffness with friction, which real (and these simulated) tyres hardly do:
-# use it on such a road alone.
+# ramp steers at {SPEED_KM_H:g} km/h into the plateau of the front axle, on roads of friction {roads}.
+# Peak forces follow the friction, stiffness does not (reference_friction).
 name = "{name}"
 mass_kg = {CAR.mass_kg}
 yaw_inertia_kg_m2 = {CAR.yaw_inertia_kg_m2}
@@ -148,17 +158,17 @@ steer_std_rad = {NOISE.steer_rad}
 
 def main(folder: Path) -> None:
     """Fit, print how well, and write the vehicle files."""
-    print("friction  axle      B      C     D_n       E      BCD   rms N   largest N")
+    motions = {friction: ramp(friction) for _, friction in ROADS.values()}
+    fits = fit_axles(motions)
+    print("axle      B      C     D_n       E      BCD   rms N   largest N (over friction)")
+    for axle, fit in fits.items():
+        print(
+            f"{axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {fit.B * fit.C * fit.D_n:8.0f}"
+            f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
+        )
     for file, (name, friction) in ROADS.items():
-        motion = ramp(friction)
-        fits = fit_axles(motion, friction)
-        for axle, fit in fits.items():
-            stiffness = fit.B * fit.C * fit.D_n * friction
-            print(
-                f"{friction:8.2f}  {axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {stiffness:8.0f}"
-                f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
-            )
-        (folder / file).write_text(vehicle_text(motion, fits, name=name, friction=friction), encoding="utf-8")
+        text = vehicle_text(motions[max(motions)], fits, name=name, friction=friction)
+        (folder / file).write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

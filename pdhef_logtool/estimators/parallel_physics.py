@@ -25,6 +25,22 @@ def _predicted_ay(x, inputs, p, out):  # type: ignore[no-untyped-def]
             )
 
 
+def car_features(vehicle: VehicleParameters, friction: FloatArray) -> FloatArray:
+    """Return what tells cars apart, [K, 7], at the friction [K] of each step (see features.FEATURES)."""
+    m, front, rear = vehicle.mass_kg, vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
+    columns = [
+        np.full_like(friction, front),
+        np.full_like(friction, rear),
+        np.full_like(friction, vehicle.yaw_inertia_kg_m2 / (m * front * rear)),
+    ]
+    for axle in (True, False):
+        keeps = (vehicle.tyres.front if axle else vehicle.tyres.rear).keeps_stiffness
+        at_one = vehicle.cornering_stiffness_n_per_rad(axle, 1.0) / m
+        columns.append(np.full_like(friction, at_one) if keeps else at_one * friction)
+    columns += [np.full_like(friction, vehicle.magic_formula(axle, 1.0)[2] / m) for axle in (True, False)]
+    return np.stack(columns, axis=1)
+
+
 def parallel_filter(vehicle: VehicleParameters, *, use_speed: bool = True) -> PhysicsUkf:
     """Return the filter whose steps the features are made of: ``phy-ukf`` as it is frozen."""
     return PhysicsUkf(vehicle, use_speed=use_speed, name="parallel")
@@ -37,14 +53,16 @@ def run_features(
 
     Returns
     -------
-    features : [K, 8], NaN where the filter has no state. steps, carry : of the filter.
+    features : [K, 17], NaN where the filter has no state. steps, carry : of the filter.
     """
     steps, after = physics.filter_steps(signals, carry)
     usable = without_impossible(signals)
     predicted = np.empty(len(signals))
+    friction = steps.inputs[:, U_FRICTION]
     _predicted_ay(steps.x, steps.inputs, model_parameters(physics.vehicle), predicted)
     features = make_features(
-        steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior, predicted
-    )
+        steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior, predicted,
+        friction, usable.ax_m_s2, car_features(physics.vehicle, friction),
+    )  # fmt: skip
     features[~steps.valid] = np.nan
     return features, steps, after

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
 from pdhef_logtool.errors import MappingError
@@ -11,6 +12,17 @@ from pdhef_logtool.mapping.checking import check_mapping
 from pdhef_logtool.mapping.recognition import auto_map
 from pdhef_logtool.mapping.records import Mapping
 from pdhef_logtool.signals import ALIGNED_SIGNALS
+
+
+def _filled(mapping: Mapping, found: Mapping) -> Mapping:
+    """Return the mapping with what recognised types give for the signals, and the truth as a whole, that it lacks."""
+    return replace(
+        mapping,
+        signals={**found.signals, **mapping.signals},
+        truth=mapping.truth or found.truth,
+        quality=mapping.quality if mapping.truth else mapping.quality or found.quality,
+        notes=(*mapping.notes, *found.notes),
+    )
 
 
 def choose_mapping(
@@ -33,6 +45,8 @@ def choose_mapping(
     MappingError
         The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
     """
+    if mapping is not None and mapping.fill_recognised:
+        mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)
     if mapping is not None:
         check_mapping(mapping, log)
         for note in mapping.notes if tell_notes else ():

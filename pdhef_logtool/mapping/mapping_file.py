@@ -129,14 +129,26 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
         Entries are wrong, unknown, missing or contradict one another.
     """
     problems: list[str] = []
-    sections = ("signals", "truth", "truth_quality", "estimates", "can")
+    sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised")
     problems += [f"{key}: unknown table{_near(key, sections)}" for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
     quality = _read_gate(raw["truth_quality"], problems) if "truth_quality" in raw else None
     estimates = _read_estimates(raw.get("estimates", {}), problems)
     can = _read_can(raw["can"], folder, problems) if "can" in raw else None
-    mapping = Mapping(signals=signals, truth=truth, quality=quality, origin="file", can=can, estimates=estimates)
+    fill = raw.get("fill_recognised", False)
+    if not isinstance(fill, bool):
+        problems.append(f"fill_recognised: true or false expected, got {fill!r}")
+        fill = False
+    mapping = Mapping(
+        signals=signals,
+        truth=truth,
+        quality=quality,
+        origin="file",
+        can=can,
+        estimates=estimates,
+        fill_recognised=fill,
+    )
     if "can" not in raw:
         # Others than estimators read the estimates, so that they are looked through as well.
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))

@@ -163,6 +163,7 @@ class Mapping:
     can : how raw CAN frames are read, for sources whose field is ``can:<message>.<signal>``.
     estimates : estimates that somebody else recorded in the log, by estimator and quantity (``ESTIMATE_UNITS``). They
         are no part of :meth:`sources`: only ``pdhef metrics`` reads them.
+    fill_recognised : what the file does not name is taken from recognised types.
     """
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
@@ -172,6 +173,7 @@ class Mapping:
     notes: tuple[str, ...] = ()
     can: CanSettings | None = None
     estimates: dict[str, dict[str, SignalSource]] = field(default_factory=dict)
+    fill_recognised: bool = False
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, truth, the gate."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +12,30 @@ import numpy as np
 
 from pdhef_logtool.errors import ModelError
 from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.signals import FloatArray
 
 FORMAT = "pdhef.residual-model"
 FORMAT_VERSION = 1
 WEIGHTS_FILE = "weights.safetensors"
 DOCUMENT_FILE = "model.json"
+#: Baselines that were trained on the same dataset stand beside the network, where there are any.
+PURE_LSTM_FOLDER = "baselines/pure-lstm"
+LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
+
+#: What a network may predict, and how many numbers that is: rates of v_y and r that f_nom lacks, or v_y itself.
+RESIDUAL = "residual_rates"
+LATERAL_VELOCITY = "lateral_velocity"
+OUTPUT_COUNT = {RESIDUAL: 2, LATERAL_VELOCITY: 1}
 
 
 @dataclass(frozen=True, slots=True)
 class Normalisation:
-    """x_normalised = (x − mean) / std per feature; residual rate = output · target_std."""
+    """x_normalised = (x − mean) / std per feature; target = output · target_std."""
 
     feature_mean: tuple[float, ...]
     feature_std: tuple[float, ...]
-    target_std: tuple[float, float]
+    target_std: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,6 +48,8 @@ class ModelBundle:
     hidden, layers, head : architecture. period_s : step that the network was trained at.
     weights : by name, float32, as PyTorch names them.
     provenance : training data hash, seeds, metrics and what else the model card says; JSON-able.
+    target : what it predicts, one of :data:`OUTPUT_COUNT`.
+    pure_lstm, linear_regression : the baselines beside it, None where there are none.
     """
 
     feature_names: tuple[str, ...]
@@ -49,6 +60,9 @@ class ModelBundle:
     normalisation: Normalisation
     weights: dict[str, np.ndarray[Any, np.dtype[np.float32]]]
     provenance: dict[str, Any] = field(default_factory=dict)
+    target: str = RESIDUAL
+    pure_lstm: ModelBundle | None = None
+    linear_regression: LinearModel | None = None
 
     @property
     def sha256(self) -> str:
@@ -64,14 +78,16 @@ class ModelBundle:
         return [FEATURES.index(name) for name in self.feature_names]
 
     def normalise(self, features: FloatArray) -> FloatArray:
-        """Return the chosen features [N, k] of the full array [N, 8], normalised and limited to ±8."""
+        """Return the chosen features [N, k] of the full array [N, 17], normalised and limited to ±8."""
         n = self.normalisation
         scaled = (features[:, self.columns] - np.array(n.feature_mean)) / np.array(n.feature_std)
         limited: FloatArray = np.clip(scaled, -8.0, 8.0)
         return limited
 
     def _document(self) -> dict[str, Any]:
+        other = {} if self.target == RESIDUAL else {"target": self.target}
         return {
+            **other,
             "format": FORMAT,
             "version": FORMAT_VERSION,
             "features": list(self.feature_names),
@@ -107,7 +123,27 @@ class ModelBundle:
 
 
 def load_bundle(folder: Path) -> ModelBundle:
-    """Read a bundle.
+    """Read a residual network with the baselines beside it.
+
+    Raises
+    ------
+    ModelError
+        A file is missing or wrong, or the weights do not belong to the document.
+    """
+    lstm, regression = folder / PURE_LSTM_FOLDER, folder / LINEAR_REGRESSION_FILE
+    return replace(
+        load_network(folder, RESIDUAL),
+        pure_lstm=load_network(lstm, LATERAL_VELOCITY) if lstm.is_dir() else None,
+        linear_regression=load_linear_model(regression) if regression.is_file() else None,
+    )
+
+
+def load_network(folder: Path, target: str) -> ModelBundle:
+    """Read one network.
+
+    Parameters
+    ----------
+    target : what it must predict.
 
     Raises
     ------
@@ -128,6 +164,8 @@ def load_bundle(folder: Path) -> ModelBundle:
     if document.get("format") != FORMAT or document.get("version") != FORMAT_VERSION:
         got = f"{document.get('format')} {document.get('version')}"
         raise ModelError(expected=f"{FORMAT} {FORMAT_VERSION}", got=got, where=where, remedy="train it anew")
+    if document.get("target", RESIDUAL) != target:
+        raise ModelError(expected=f"a network for {target}", got=f"one for {document['target']}", where=where)
     try:
         a, n = document["architecture"], document["normalisation"]
         bundle = ModelBundle(
@@ -139,10 +177,11 @@ def load_bundle(folder: Path) -> ModelBundle:
             normalisation=Normalisation(
                 tuple(float(x) for x in n["feature_mean"]),
                 tuple(float(x) for x in n["feature_std"]),
-                (float(n["target_std"][0]), float(n["target_std"][1])),
+                tuple(float(n["target_std"][i]) for i in range(OUTPUT_COUNT[target])),
             ),
             weights=weights,
             provenance=document.get("provenance", {}),
+            target=target,
         )
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise ModelError(expected="the entries of model.json", got=f"{error!r}", where=where) from None

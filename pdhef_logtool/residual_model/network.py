@@ -24,6 +24,7 @@ class Architecture:
     layers: int = 2
     head: tuple[int, ...] = (64, 32)
     dropout: float = 0.2
+    outputs: int = len(OUTPUTS)
 
 
 class ResidualNetwork(nn.Module):
@@ -40,10 +41,10 @@ class ResidualNetwork(nn.Module):
         blocks: list[nn.Module] = []
         for i, o in pairwise(widths):
             blocks += [nn.Linear(i, o), nn.ReLU(), nn.Dropout(a.dropout)]
-        self.head = nn.Sequential(*blocks, nn.Linear(widths[-1], len(OUTPUTS)))
+        self.head = nn.Sequential(*blocks, nn.Linear(widths[-1], a.outputs))
 
     def forward(self, features: torch.Tensor, state: State | None = None) -> tuple[torch.Tensor, State]:
-        """Run [batch, time, features] from ``state`` (None = zeros); returns [batch, time, 2] and the state after."""
+        """Run [batch, time, features] from ``state`` (None = zeros); [batch, time, outputs] and the state after."""
         hidden, after = self.lstm(features, state)
         return self.head(hidden), after
 

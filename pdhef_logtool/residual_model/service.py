@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.residual_model.bundle import ModelBundle
+from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, OUTPUT_COUNT, RESIDUAL, ModelBundle
 from pdhef_logtool.signals import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 BLOCK_STEPS = 256
 #: A residual beyond these is none: m/s² and rad/s².
 LIMITS = (4.0, 6.0)
+_LIMITS_OF = {RESIDUAL: LIMITS, LATERAL_VELOCITY: (30.0,)}  # m/s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,7 +32,7 @@ class NetworkCarry:
 
 @dataclass(frozen=True)
 class NetworkService:
-    """Residual rates of one bundle; PyTorch is loaded at the first use."""
+    """What one bundle predicts, step by step; PyTorch is loaded at the first use."""
 
     bundle: ModelBundle
 
@@ -42,7 +43,9 @@ class NetworkService:
         from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 
         b = self.bundle
-        network = ResidualNetwork(Architecture(len(b.feature_names), b.hidden, b.layers, b.head))
+        network = ResidualNetwork(
+            Architecture(len(b.feature_names), b.hidden, b.layers, b.head, outputs=OUTPUT_COUNT[b.target])
+        )
         network.load_state_dict({name: torch.from_numpy(np.array(w)) for name, w in b.weights.items()})
         return network.eval()
 
@@ -53,16 +56,16 @@ class NetworkService:
     def run(
         self, features: FloatArray, starts: BoolArray, carry: NetworkCarry | None
     ) -> tuple[FloatArray, NetworkCarry]:
-        """Return residual rates [N, 2] in m/s² and rad/s² from each step on, and the carry.
+        """Return residual rates [N, 2] in m/s² and rad/s² from each step on, or v_y [N, 1] in m/s; and the carry.
 
         Parameters
         ----------
-        features : [N, 8] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
+        features : [N, 17] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
         starts : [N], where a sequence begins anew.
         """
         if carry is None:
             carry = self.initial_carry()
-        out = np.zeros((features.shape[0], 2))
+        out = np.zeros((features.shape[0], OUTPUT_COUNT[self.bundle.target]))
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
         breaks = np.logical_or(starts, ~known).astype(np.bool_)
         breaks[1:] |= ~known[:-1]
@@ -75,7 +78,8 @@ class NetworkService:
             if known[a]:
                 out[a:b], carry = self._sequence(self.bundle.normalise(features[a:b]), carry)
         target_std = np.array(self.bundle.normalisation.target_std)
-        return np.clip(out * target_std, -np.array(LIMITS), LIMITS), carry
+        limits = np.array(_LIMITS_OF[self.bundle.target])
+        return np.clip(out * target_std, -limits, limits), carry
 
     def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
         import torch

@@ -30,10 +30,11 @@ from pdhef_logtool.training.residuals import ResidualRows
 from pdhef_logtool.vehicle import VehicleParameters
 
 FORMAT = "pdhef.residual-dataset"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST = "manifest.json"
 DRIVES = "drives"
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
+TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
 SPLITS = ("train", "validation", "test")
 #: Rows of a row group: what waits stays below 2 MB.
 ROWS_A_GROUP = 32768
@@ -109,6 +110,7 @@ class DriveWriter:
 def _table(rows: ResidualRows, split: str, schema: pa.Schema) -> pa.Table:
     columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
+    columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
     arrays = []
     for f in schema:
@@ -203,10 +205,11 @@ class DriveArrays:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : float32 [N, 8], finite.
+    stamps_ns : int64 [N]. features : float32 [N, 17], finite.
     targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
     step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
     weight : float32 [N]. segment : int64 [N]; recurrent state starts anew where it changes.
+    truth_velocity : float32 [N, 2], true v_x and v_y; NaN where unknown.
     """
 
     stamps_ns: IntArray
@@ -215,6 +218,7 @@ class DriveArrays:
     step_s: FloatArray
     weight: FloatArray32
     segment: IntArray
+    truth_velocity: FloatArray32
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +248,7 @@ class DatasetDrive:
 
     @property
     def features(self) -> FloatArray32:
-        """float32 [N, 8]."""
+        """float32 [N, 17]."""
         return self.arrays.features
 
     @property
@@ -266,6 +270,11 @@ class DatasetDrive:
     def segment(self) -> IntArray:
         """int64 [N]."""
         return self.arrays.segment
+
+    @property
+    def truth_velocity(self) -> FloatArray32:
+        """float32 [N, 2]."""
+        return self.arrays.truth_velocity
 
     def load(self) -> DriveArrays:
         """Read the drive's file, without keeping anything.
@@ -299,6 +308,7 @@ class DatasetDrive:
             step_s=step_s[known],
             weight=weight[known],
             segment=column["segment"].astype(np.int64)[known],
+            truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32)[known],
         )
 
 

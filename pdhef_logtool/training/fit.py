@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from pdhef_logtool.errors import ModelError
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
 from pdhef_logtool.signals import FloatArray
 from pdhef_logtool.sinks.base import write_bytes
@@ -35,7 +35,10 @@ GRADIENT_CLIP = 1.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureSequence:
-    """One gap-free run of one drive: features [N, 8], target rates [N, 2] in m/s² and rad/s², weight [N]."""
+    """One gap-free run of one drive: features [N, 17], target [N, m], weight [N].
+
+    The target is residual rates in m/s² and rad/s² (m = 2), or v_y in m/s (m = 1).
+    """
 
     drive: str
     features: FloatArray
@@ -47,7 +50,7 @@ class FeatureSequence:
 class Recipe:
     """How to train. The defaults are METHOD §5's recipe; :data:`PAPER_RECIPE` is the paper's Table 1."""
 
-    feature_names: tuple[str, ...] = FEATURES
+    feature_names: tuple[str, ...] = ONE_CAR_FEATURES
     hidden: int = 128
     layers: int = 2
     head: tuple[int, ...] = (64, 32)
@@ -60,6 +63,7 @@ class Recipe:
     patience: int = 10
     seed: int = 0
     period_s: float = 0.01
+    target: str = RESIDUAL
 
 
 PAPER_RECIPE = Recipe(
@@ -69,7 +73,7 @@ PAPER_RECIPE = Recipe(
 
 @dataclass(frozen=True, slots=True)
 class Epoch:
-    """One line of the loss history; losses are mean squares of normalised residual rates."""
+    """One line of the loss history; losses are mean squares of normalised targets."""
 
     epoch: int
     train_loss: float
@@ -93,7 +97,7 @@ def normalisation_of(sequences: Sequence[FeatureSequence], names: tuple[str, ...
     return Normalisation(
         tuple(float(x) for x in features.mean(axis=0)),
         tuple(float(x) for x in std),
-        (float(spread[0]), float(spread[1])),
+        tuple(float(x) for x in spread),
     )
 
 
@@ -128,7 +132,12 @@ def train(
         )
     if init is not None:
         recipe = replace(
-            recipe, feature_names=init.feature_names, hidden=init.hidden, layers=init.layers, head=init.head
+            recipe,
+            feature_names=init.feature_names,
+            hidden=init.hidden,
+            layers=init.layers,
+            head=init.head,
+            target=init.target,
         )
     normalisation = init.normalisation if init is not None else normalisation_of(training, recipe.feature_names)
     network = _new_network(recipe, init).to(device)
@@ -175,6 +184,7 @@ def train(
             "training_sequences": len(training),
             "validation_sequences": len(validation),
         },
+        target=recipe.target,
     )
     return bundle, history
 
@@ -272,7 +282,10 @@ def _learning_rate(recipe: Recipe, share: float) -> float:
 
 def _new_network(recipe: Recipe, init: ModelBundle | None) -> ResidualNetwork:
     torch.manual_seed(recipe.seed)
-    shape = Architecture(len(recipe.feature_names), recipe.hidden, recipe.layers, recipe.head, recipe.dropout)
+    shape = Architecture(
+        len(recipe.feature_names), recipe.hidden, recipe.layers, recipe.head, recipe.dropout,
+        OUTPUT_COUNT[recipe.target],
+    )  # fmt: skip
     network = ResidualNetwork(shape)
     if init is not None:
         network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})

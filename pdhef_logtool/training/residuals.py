@@ -56,11 +56,12 @@ class ResidualRows:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : [N, 8] at the stamp, NaN where the parallel filter has no state.
+    stamps_ns : int64 [N]. features : [N, 17] at the stamp, NaN where the parallel filter has no state.
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
     step_s : [N], time to the next stamp; NaN at the last row.
     weight : [N], 1 where target and features can be used and the next row carries on from this one, else 0.
     segment : int64 [N], a new number wherever the parallel filter starts anew: sequences must not cross it.
+    truth_velocity : [N, 2], true v_x and v_y at the stamp, for networks that learn them; NaN where unknown.
     """
 
     stamps_ns: IntArray
@@ -69,6 +70,7 @@ class ResidualRows:
     step_s: FloatArray
     weight: FloatArray
     segment: IntArray
+    truth_velocity: FloatArray
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -246,6 +248,7 @@ def residual_windows(
             step_s=step_s[part],
             weight=usable[part].astype(np.float64),
             segment=steps.segment[part],
+            truth_velocity=steps.state[part, :2],
         )
 
     for window in windows:

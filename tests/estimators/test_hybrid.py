@@ -32,13 +32,15 @@ COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis"
 def _bundle(constant: tuple[float, float] | None = None) -> ModelBundle:
     """Return a small network; with ``constant`` one that always says so."""
     torch.manual_seed(0)
-    network = ResidualNetwork(Architecture(8, 8, 1, (4,)))
+    network = ResidualNetwork(Architecture(len(FEATURES), 8, 1, (4,)))
     weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
     if constant is not None:
         last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))
         weights[last.replace("bias", "weight")][:] = 0.0
         weights[last][:] = constant
-    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * 8, (10.0,) * 8, (1.0, 1.0)), weights)
+    return ModelBundle(
+        FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * len(FEATURES), (10.0,) * len(FEATURES), (1.0, 1.0)), weights
+    )
 
 
 def _signals(count: int = 800, seed: int = 0, speed: float = 25.0) -> Signals:

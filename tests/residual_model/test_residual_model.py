@@ -41,17 +41,23 @@ def test_paper_features_are_the_first_six() -> None:
 def test_features_by_hand() -> None:
     posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
     prior = np.array([[19.0, 0.2, 0.08, 0.0]])
-    features = make_features(np.array([0.02]), np.array([1.5]), np.array([0.11]), posterior, prior, np.array([1.4]))
+    measured = (np.array([0.02]), np.array([1.5]), np.array([0.11]))
+    car = np.arange(1.0, 8.0)[None]
+    features = make_features(*measured, posterior, prior, np.array([1.4]), np.array([0.8]), np.array([-0.5]), car)
     beta = np.arctan2(0.4, 20.0) - np.arctan2(0.2, 19.0)
-    np.testing.assert_allclose(features, [[20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1]], rtol=1e-12)
+    np.testing.assert_allclose(
+        features, [[20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, *car[0]]], rtol=1e-12
+    )
 
 
 def test_missing_measurements_look_like_agreement_with_physics() -> None:
     posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
     prior = np.full((1, 4), np.nan)
     nan = np.array([np.nan])
-    features = make_features(np.array([0.02]), nan, nan, posterior, prior, np.array([1.4]))
-    np.testing.assert_array_equal(features, [[20.0, 1.4, 0.02, 0.1, 0.0, 0.0, 0.4, 0.1]])
+    features = make_features(
+        np.array([0.02]), nan, nan, posterior, prior, np.array([1.4]), np.array([0.8]), nan, np.zeros((1, 7))
+    )
+    np.testing.assert_array_equal(features[:, :10], [[20.0, 1.4, 0.02, 0.1, 0.0, 0.0, 0.4, 0.1, 0.8, 0.0]])
 
 
 def test_bundle_round_trip_and_hash(tmp_path: Path) -> None:
@@ -87,9 +93,9 @@ def test_service_equals_the_network_step_by_step() -> None:
     """The oracle runs PyTorch's own cell one step at a time."""
     bundle = make_bundle(hidden=12)
     rng = np.random.default_rng(0)
-    features = rng.normal(size=(BLOCK_STEPS + 37, 8))
+    features = rng.normal(size=(BLOCK_STEPS + 37, len(FEATURES)))
     rates, _ = NetworkService(bundle).run(features, np.zeros(len(features), dtype=np.bool_), None)
-    network = ResidualNetwork(Architecture(8, 12, 2, (8,)))
+    network = ResidualNetwork(Architecture(len(FEATURES), 12, 2, (8,)))
     network.load_state_dict({k: torch.from_numpy(v) for k, v in bundle.weights.items()})
     network.eval()
     state = None
@@ -105,7 +111,7 @@ def test_service_equals_the_network_step_by_step() -> None:
 def test_windows_and_restarts_join_bit_for_bit(cuts: list[int], starts_at: list[int]) -> None:
     service = NetworkService(make_bundle())
     rng = np.random.default_rng(1)
-    features = rng.normal(size=(900, 8))
+    features = rng.normal(size=(900, len(FEATURES)))
     features[400:410, 3] = np.nan
     starts = np.zeros(900, dtype=np.bool_)
     starts[starts_at] = True
@@ -122,7 +128,7 @@ def test_windows_and_restarts_join_bit_for_bit(cuts: list[int], starts_at: list[
 def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
     service = NetworkService(make_bundle())
     rng = np.random.default_rng(2)
-    features = rng.normal(size=(300, 8))
+    features = rng.normal(size=(300, len(FEATURES)))
     starts = np.zeros(300, dtype=np.bool_)
     starts[200] = True
     features[100] = np.nan
@@ -137,7 +143,7 @@ def test_a_restart_forgets_and_unknown_rows_give_nothing() -> None:
 def test_causality_and_limits() -> None:
     bundle = make_bundle()
     service = NetworkService(bundle)
-    features = np.random.default_rng(3).normal(size=(400, 8))
+    features = np.random.default_rng(3).normal(size=(400, len(FEATURES)))
     starts = np.zeros(400, dtype=np.bool_)
     before, _ = service.run(features, starts, None)
     features[250:] = 1e9
@@ -149,5 +155,5 @@ def test_causality_and_limits() -> None:
 
 def test_thread_setting_is_put_back() -> None:
     threads = torch.get_num_threads()
-    NetworkService(make_bundle()).run(np.zeros((10, 8)), np.zeros(10, dtype=np.bool_), None)
+    NetworkService(make_bundle()).run(np.zeros((10, len(FEATURES))), np.zeros(10, dtype=np.bool_), None)
     assert torch.get_num_threads() == threads

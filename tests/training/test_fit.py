@@ -18,7 +18,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.training.fit import CHECKPOINT, PAPER_RECIPE, FeatureSequence, Recipe, normalisation_of, train
 
-SMALL = Recipe(hidden=12, layers=1, head=(8,), epochs=6, batch=4, learning_rate=2e-2)
+SMALL = Recipe(FEATURES[:8], hidden=12, layers=1, head=(8,), epochs=6, batch=4, learning_rate=2e-2)
 
 
 def make_sequences(seed: int, count: int, steps: int = 400) -> list[FeatureSequence]:
@@ -26,7 +26,7 @@ def make_sequences(seed: int, count: int, steps: int = 400) -> list[FeatureSeque
     rng = np.random.default_rng(seed)
     out = []
     for i in range(count):
-        drive = np.cumsum(rng.normal(size=(steps, 8)), axis=0) * 0.1
+        drive = np.cumsum(rng.normal(size=(steps, len(FEATURES))), axis=0) * 0.1
         lagged = np.zeros(steps)
         for k in range(1, steps):
             lagged[k] = 0.9 * lagged[k - 1] + 0.1 * np.tanh(drive[k, 1])

@@ -1,0 +1,112 @@
+"""A sideslip that is linear in the network's features, smoothed by a causal low-pass: one small JSON file.
+
+β = low-pass(intercept + Σ coefficient · feature), first order, at ``low_pass_hz``. Both are linear, so that the fit
+sees low-passed features: the coefficients then make up for what the low-pass delays, as far as they can.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.errors import ModelError
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.signals import FloatArray
+
+FORMAT = "pdhef.linear-regression"
+FORMAT_VERSION = 1
+TARGET = "sideslip"
+
+
+@dataclass(frozen=True, slots=True)
+class LinearModel:
+    """Coefficients of the file's equation.
+
+    Attributes
+    ----------
+    feature_names : out of :data:`~.features.FEATURES`. coefficients : rad per unit of each feature, [k].
+    intercept_rad : sideslip at features of zero. low_pass_hz : corner of the low-pass.
+    provenance : training data hash, errors and what else the model card says; JSON-able.
+    """
+
+    feature_names: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    intercept_rad: float
+    low_pass_hz: float
+    provenance: dict[str, Any] = field(default_factory=dict, compare=False)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of everything that decides the outputs."""
+        return hashlib.sha256(json.dumps(self._document(), sort_keys=True).encode()).hexdigest()
+
+    def sideslip_rad(self, features: FloatArray) -> FloatArray:
+        """Return the sideslip before the low-pass, [N], of the full feature array."""
+        columns = [FEATURES.index(name) for name in self.feature_names]
+        weighted = features[:, columns] * np.array(self.coefficients)
+        # numpy's own sum of a row may depend on how many rows there are; a window must not change a bit
+        total = np.full(features.shape[0], self.intercept_rad)
+        for i in range(weighted.shape[1]):
+            total += weighted[:, i]
+        return total
+
+    def _document(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "version": FORMAT_VERSION,
+            "target": TARGET,
+            "features": list(self.feature_names),
+            "coefficients": [float(c) for c in self.coefficients],
+            "intercept_rad": float(self.intercept_rad),
+            "low_pass_hz": float(self.low_pass_hz),
+        }
+
+    def to_json(self) -> str:
+        """Return the file's text."""
+        document = {**self._document(), "sha256": self.sha256, "provenance": self.provenance}
+        return json.dumps(document, indent=2) + "\n"
+
+
+def load_linear_model(path: Path) -> LinearModel:
+    """Read the file.
+
+    Raises
+    ------
+    ModelError
+        The file is missing or wrong, or its coefficients do not belong to its hash.
+    """
+    where = str(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        kind = (document["format"], document["version"], document["target"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ModelError(
+            expected="the coefficients of a linear regression",
+            got=f"{type(error).__name__} {error}",
+            where=where,
+            remedy="pdhef train DATASET -o MODEL --baselines writes them",
+        ) from None
+    if kind != (FORMAT, FORMAT_VERSION, TARGET):
+        wanted = f"{FORMAT} {FORMAT_VERSION} of {TARGET}"
+        raise ModelError(expected=wanted, got=f"{kind[0]} {kind[1]} of {kind[2]}", where=where, remedy="train it anew")
+    try:
+        model = LinearModel(
+            feature_names=tuple(document["features"]),
+            coefficients=tuple(float(c) for c in document["coefficients"]),
+            intercept_rad=float(document["intercept_rad"]),
+            low_pass_hz=float(document["low_pass_hz"]),
+            provenance=document.get("provenance", {}),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise ModelError(expected="the entries of a linear regression", got=f"{error!r}", where=where) from None
+    unknown = [f for f in model.feature_names if f not in FEATURES]
+    if unknown:
+        raise ModelError(expected=f"features out of {', '.join(FEATURES)}", got=", ".join(unknown), where=where)
+    if len(model.coefficients) != len(model.feature_names) or document.get("sha256") != model.sha256:
+        raise ModelError(expected="coefficients that belong to the file's hash", got="another hash", where=where)
+    return model

@@ -1,0 +1,29 @@
+"""A causal first-order low-pass with carried memory, compiled."""
+
+from __future__ import annotations
+
+import math
+
+from numba import njit
+
+
+@njit(cache=True)
+def low_pass(values, dt_s, corner_hz, memory, out):  # type: ignore[no-untyped-def]
+    """Write the first-order low-pass of ``values`` [N, k] to ``out``; exact for values held over each step.
+
+    Parameters
+    ----------
+    dt_s : [N], step that ends at each value; NaN where a sequence starts, which takes the value as it is.
+    memory : [k], the last output, updated in place; rows with NaN are passed through and leave it.
+    """
+    for n in range(values.shape[0]):
+        share = 1.0
+        if math.isfinite(dt_s[n]):
+            share = 1.0 - math.exp(-2.0 * math.pi * corner_hz * dt_s[n])
+        for i in range(values.shape[1]):
+            value = values[n, i]
+            if math.isfinite(value):
+                memory[i] += share * (value - memory[i])
+                out[n, i] = memory[i]
+            else:
+                out[n, i] = value
