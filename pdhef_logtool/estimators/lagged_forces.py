@@ -11,7 +11,9 @@ vehicle's mass in m/s² (METHOD §3, Eq 5-7).
 - A magic formula that was fitted to an axle holds that loss already, for steady cornering, in which the axle's own
   force says what a_y was: a_y,i = F_ss(α) / m_i. What is left is the ratio (1 − s x²) / (1 − s x_i²): it differs from 1
   only while the axles' forces do not balance, in transients. A tyre that is given by its cornering stiffness knows
-  nothing of it and gets the whole factor.
+  nothing of it and gets the whole factor. On the drives of ``benchmarks/tune_physics_plus_q.py`` the load transfer
+  raises the innovation likelihood (1.922 to 1.934 a sample) and leaves the sideslip as it is (median RMSE 0.091°
+  without it, 0.090° with it).
 """
 
 from __future__ import annotations
@@ -99,13 +101,14 @@ def relaxation_rate(vx, p, f):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def lagged_derivative(vx, vy, r, ff, fr, steer, cos_steer, ax, friction, rate, p, f):  # type: ignore[no-untyped-def]
+def lagged_derivative(vx, vy, r, ff, fr, steer, cos_steer, ax, friction, max_rate, p, f):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r, f_f, f_r], blended to the kinematic model at low speed.
 
-    ``rate`` is the relaxation rate in 1/s; 0 = no lag, the forces of the state are then not looked at.
+    ``max_rate`` limits the relaxation rate, 1/s. Without lag the forces of the state are not looked at.
     """
     w = dynamic_share(vx, p)
-    if rate > 0.0:
+    if f.relaxation_length_m > 0.0:
+        rate = min(relaxation_rate(vx, p, f), max_rate)
         steady_f, steady_r = steady_forces(vx, vy, r, steer, ff * cos_steer + fr, friction, p, f)
         ff_dot = rate * (steady_f - ff)
         fr_dot = rate * (steady_r - fr)
@@ -142,18 +145,17 @@ def lagged_rk4_step(vx, vy, r, ff, fr, steer, ax, friction, dt, n, p, f):  # typ
     h = dt / n
     g = 0.5 * h
     c = math.cos(steer)
-    lagged = f.relaxation_length_m > 0.0
+    max_rate = MAX_STEP_TIMES_POLE / h
     for _ in range(n):
-        rate = min(relaxation_rate(vx, p, f), MAX_STEP_TIMES_POLE / h) if lagged else 0.0
-        a1, b1, c1, d1, e1 = lagged_derivative(vx, vy, r, ff, fr, steer, c, ax, friction, rate, p, f)
+        a1, b1, c1, d1, e1 = lagged_derivative(vx, vy, r, ff, fr, steer, c, ax, friction, max_rate, p, f)
         a2, b2, c2, d2, e2 = lagged_derivative(
-            vx + g * a1, vy + g * b1, r + g * c1, ff + g * d1, fr + g * e1, steer, c, ax, friction, rate, p, f
+            vx + g * a1, vy + g * b1, r + g * c1, ff + g * d1, fr + g * e1, steer, c, ax, friction, max_rate, p, f
         )
         a3, b3, c3, d3, e3 = lagged_derivative(
-            vx + g * a2, vy + g * b2, r + g * c2, ff + g * d2, fr + g * e2, steer, c, ax, friction, rate, p, f
+            vx + g * a2, vy + g * b2, r + g * c2, ff + g * d2, fr + g * e2, steer, c, ax, friction, max_rate, p, f
         )
         a4, b4, c4, d4, e4 = lagged_derivative(
-            vx + h * a3, vy + h * b3, r + h * c3, ff + h * d3, fr + h * e3, steer, c, ax, friction, rate, p, f
+            vx + h * a3, vy + h * b3, r + h * c3, ff + h * d3, fr + h * e3, steer, c, ax, friction, max_rate, p, f
         )
         k = h / 6.0
         vx += k * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
@@ -161,7 +163,7 @@ def lagged_rk4_step(vx, vy, r, ff, fr, steer, ax, friction, dt, n, p, f):  # typ
         r += k * (c1 + 2.0 * c2 + 2.0 * c3 + c4)
         ff += k * (d1 + 2.0 * d2 + 2.0 * d3 + d4)
         fr += k * (e1 + 2.0 * e2 + 2.0 * e3 + e4)
-    if not lagged:
+    if not f.relaxation_length_m > 0.0:
         ff, fr = settled_forces(vx, vy, r, steer, friction, p, f)
     return vx, vy, r, ff, fr
 

@@ -90,12 +90,15 @@ NAME = "physics-plus"
 #: Forces over the mass, m/s²; the entries before them are those of ``phy-ukf``.
 FRONT_FORCE, REAR_FORCE = AX_BIAS + 1, AX_BIAS + 2
 STATES = REAR_FORCE + 1
-#: Where the biases stand if there are any.
-AY_BIAS, YAW_RATE_BIAS, STEER_BIAS = STATES, STATES + 1, STATES + 2
+#: Where the biases stand if there are any; those that only the sensors feel are last.
+STEER_BIAS, AY_BIAS, YAW_RATE_BIAS = STATES, STATES + 1, STATES + 2
+#: Walk of the biases in that order.
+_WALK_STD = (BIAS_WALK_STD[2], BIAS_WALK_STD[0], BIAS_WALK_STD[1])
 
-#: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r]; used where the vehicle file has
-#: no ``[filter.physics-plus]``.
-PHYSICS_PLUS_Q_STD = (0.089, 0.1, 0.05, 0.021, 2.0, 2.0)
+#: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r], used where the vehicle file has
+#: no ``[filter.physics-plus]``. By innovation likelihood over simulated drives, as that of ``phy-ukf``
+#: (``benchmarks/tune_physics_plus_q.py``, its result beside it).
+PHYSICS_PLUS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 INITIAL_STD = (*PHYSICS_INITIAL_STD, 0.5, 0.5)
 #: 1-sigma of an axle's force over the mass at a standstill, m/s².
 STANDSTILL_FORCE_STD = 0.05
@@ -103,10 +106,18 @@ STANDSTILL_FORCE_STD = 0.05
 
 @njit(cache=True)
 def _propagate(chi, steer, ax, friction, dt, p, f):  # type: ignore[no-untyped-def]
-    """Move sigma points [s, n] by ``dt`` s in place; the biases stay."""
+    """Move sigma points [s, n] by ``dt`` s in place; the biases stay.
+
+    Points that differ from the centre in the sensors' biases alone (the last columns of a lower Cholesky factor) move
+    with it.
+    """
     n = lagged_substeps(chi[0, VX], dt, friction, p, f)
-    biased = chi.shape[1] > STATES
+    size = chi.shape[1]
+    biased = size > STATES
     for i in range(chi.shape[0]):
+        if i > 0 and (i - 1) % size >= AY_BIAS:
+            chi[i, :STATES] = chi[0, :STATES]
+            continue
         angle = steer - chi[i, STEER_BIAS] if biased else steer
         vx, vy, r, ff, fr = lagged_rk4_step(
             chi[i, VX], chi[i, VY], chi[i, YAW_RATE], chi[i, FRONT_FORCE], chi[i, REAR_FORCE], angle,
@@ -120,14 +131,21 @@ def _propagate(chi, steer, ax, friction, dt, p, f):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _measure(chi, steer, p, zeta):  # type: ignore[no-untyped-def]
+def _axle_forces(x, angle, friction, p, f):  # type: ignore[no-untyped-def]
+    """Return the axles' forces over the mass in state x [n]: its own, or the tyres' at once where nothing lags."""
+    if f.relaxation_length_m > 0.0:
+        return x[FRONT_FORCE], x[REAR_FORCE]
+    return settled_forces(x[VX], x[VY], x[YAW_RATE], angle, friction, p, f)
+
+
+@njit(cache=True)
+def _measure(chi, steer, friction, p, f, zeta):  # type: ignore[no-untyped-def]
     """Write what the sensors would read at sigma points chi [s, n] to zeta [s, 3]."""
     biased = chi.shape[1] > STATES
     for i in range(chi.shape[0]):
         angle = steer - chi[i, STEER_BIAS] if biased else steer
-        zeta[i, Z_AY] = lagged_measured_ay(
-            chi[i, VX], chi[i, YAW_RATE], chi[i, FRONT_FORCE], chi[i, REAR_FORCE], angle, p
-        )
+        front, rear = _axle_forces(chi[i], angle, friction, p, f)
+        zeta[i, Z_AY] = lagged_measured_ay(chi[i, VX], chi[i, YAW_RATE], front, rear, angle, p)
         zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
         zeta[i, Z_SPEED] = chi[i, VX]
         if biased:
@@ -230,10 +248,12 @@ def _nail_down(x, P):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _predicted_measurement(chi, x, P, L, steer, wm, wc, scale, r_std, z, p, zeta, z_hat, S, Pxz, nu):  # type: ignore[no-untyped-def]
+def _predicted_measurement(  # type: ignore[no-untyped-def]
+    chi, x, P, L, steer, friction, wm, wc, scale, r_std, z, p, f, zeta, z_hat, S, Pxz, nu
+):  # fmt: skip
     """Write innovation ``nu`` [3], its covariance S [3, 3] with R and the cross covariance, from sigma points anew."""
     draw_sigma_points(x, P, scale, L, chi)
-    _measure(chi, steer, p, zeta)
+    _measure(chi, steer, friction, p, f, zeta)
     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
     for i in range(MEASUREMENTS):
         S[i, i] += r_std[i] * r_std[i]
@@ -304,7 +324,7 @@ def _filter(  # type: ignore[no-untyped-def]
             out_prior[k] = x
             if alive:
                 _predicted_measurement(
-                    chi, x, P, L, steer_k, wm, wc, scale, r_std, z, p, zeta, z_hat, S, Pxz, nu
+                    chi, x, P, L, steer_k, mu_k, wm, wc, scale, r_std, z, p, f, zeta, z_hat, S, Pxz, nu
                 )  # fmt: skip
                 for i in range(MEASUREMENTS):
                     given[i] = math.isfinite(nu[i]) and (i != Z_AY or steer_ok)
@@ -317,7 +337,7 @@ def _filter(  # type: ignore[no-untyped-def]
                 if opens:
                     P *= GATE_INFLATION
                     _predicted_measurement(
-                        chi, x, P, L, steer_k, wm, wc, scale, r_std, z, p, zeta, z_hat, S, Pxz, nu
+                        chi, x, P, L, steer_k, mu_k, wm, wc, scale, r_std, z, p, f, zeta, z_hat, S, Pxz, nu
                     )  # fmt: skip
                     for i in range(MEASUREMENTS):
                         if use[i]:
@@ -381,7 +401,8 @@ def _predict_outputs(step, horizon_s, x, P, inputs, p, f, q_std, wm, wc, scale, 
         out_x[m] = xm
         out_P[m] = Pm
         angle = inputs[k, U_STEER] - xm[STEER_BIAS] if n > STATES else inputs[k, U_STEER]
-        out_ay[m] = lagged_planar_ay(xm[VX], xm[YAW_RATE], xm[FRONT_FORCE], xm[REAR_FORCE], angle, p)
+        front, rear = _axle_forces(xm, angle, inputs[k, U_FRICTION], p, f)
+        out_ay[m] = lagged_planar_ay(xm[VX], xm[YAW_RATE], front, rear, angle, p)
 
 
 @dataclass(frozen=True, slots=True)
@@ -394,7 +415,7 @@ class PhysicsPlusUkf:
     q_std : process 1-sigma per √s of [v_x, v_y, r, b_ax, f_f, f_r], forces over mass in m/s².
     r_std : 1-sigma of [a_y, r, v_x].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
-    bias_states : estimate the biases of a_y, yaw rate and steering angle.
+    bias_states : estimate the biases of a_y, yaw rate and steering angle, whose priors stand in ``sensors``.
     """
 
     vehicle: VehicleParameters
@@ -402,7 +423,7 @@ class PhysicsPlusUkf:
     r_std: tuple[float, float, float] | None = None
     use_speed: bool = True
     roll_correction: bool = True
-    bias_states: bool = False
+    bias_states: bool = True
     name: str = NAME
     causal: bool = True
 
@@ -423,12 +444,12 @@ class PhysicsPlusUkf:
 
     @property
     def _process_std(self) -> FloatArray:
-        return np.array([*self.q_std, *(BIAS_WALK_STD if self.bias_states else ())])
+        return np.array([*self.q_std, *(_WALK_STD if self.bias_states else ())])
 
     @property
     def _initial_std(self) -> FloatArray:
         s = self.vehicle.sensors
-        biases = (s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s, s.steer_bias_std_rad)
+        biases = (s.steer_bias_std_rad, s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s)
         return np.array([*INITIAL_STD, *(biases if self.bias_states else ())])
 
     def filter_steps(self, signals: Signals, carry: FilterCarry | None) -> tuple[PosteriorSteps, FilterCarry]:

@@ -17,7 +17,7 @@ DESCRIPTIONS: dict[str, str] = {
     "open-loop": "nominal single-track model from steering and speed alone",
     "phy-ukf": "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
     "phy-ukf-tuned": "the same with the noise of an identified vehicle file, corrected for body roll",
-    "physics-plus": "the strongest filter on physics alone: lagging axle forces, load transfer, body roll",
+    "physics-plus": "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
     "pd-hef-fixed-r": "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs --model)",
     "pd-hef-trust0": "the hybrid filter with its network switched off (needs --model)",
     "pd-hef-trust1": "the hybrid filter at trust 1, whatever the vehicle file allows (needs --model)",
