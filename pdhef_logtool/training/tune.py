@@ -62,10 +62,10 @@ class Factor:
 #: The space of every estimator. It holds sensor-level and model-error-level noise and more on both sides; the other
 #: noises (speed, a_x bias, further states) stay what they are.
 FACTORS = (
-    Factor("q_vy", "m/s/sqrt(s)", 0.01, 3.0),
-    Factor("q_yaw_rate", "rad/s/sqrt(s)", 0.002, 1.0),
-    Factor("r_ay", "m/s^2", 0.05, 5.0),
-    Factor("r_yaw_rate", "rad/s", 0.0005, 0.05),
+    Factor("q_vy", "m/s/sqrt(s)", 0.002, 2.0),
+    Factor("q_yaw_rate", "rad/s/sqrt(s)", 0.001, 1.0),
+    Factor("r_ay", "m/s^2", 0.02, 5.0),
+    Factor("r_yaw_rate", "rad/s", 0.0002, 0.05),
 )
 
 
