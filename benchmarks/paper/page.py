@@ -178,7 +178,7 @@ def _figure_10(r: Results) -> str:
 def _figure_position(r: Results, scenario: str, title: str, picture: str) -> str:
     hybrid = r.hybrid
     lines = []
-    for name in (*drawn(r.ran), "gyro"):
+    for name in drawn(r.ran):
         drift, side = r.spread(scenario, name, "position_m"), r.spread(scenario, name, "lateral_1s_m")
         if drift and side:
             lines.append(f"`{name}` {ranged(drift)} m, after 1 s {ranged(side)} m to the side")
