@@ -47,16 +47,26 @@ def parallel_filter(vehicle: VehicleParameters, *, use_speed: bool = True) -> Ph
 
 
 def run_features(
-    physics: PhysicsUkf, signals: Signals, carry: FilterCarry | None
+    physics: PhysicsUkf,
+    signals: Signals,
+    carry: FilterCarry | None,
+    *,
+    seen: Signals | None = None,
+    extra_r: FloatArray | None = None,
 ) -> tuple[FloatArray, PosteriorSteps, FilterCarry]:
     """Run the parallel filter over a window.
+
+    Parameters
+    ----------
+    seen : the measurements that the network may see; those of ``signals`` when None.
+    extra_r : [K, 2], as for :meth:`~.physics.PhysicsUkf.filter_steps`.
 
     Returns
     -------
     features : [K, 17], NaN where the filter has no state. steps, carry : of the filter.
     """
-    steps, after = physics.filter_steps(signals, carry)
-    usable = without_impossible(signals)
+    steps, after = physics.filter_steps(signals, carry, extra_r=extra_r)
+    usable = without_impossible(signals if seen is None else seen)
     predicted = np.empty(len(signals))
     friction = steps.inputs[:, U_FRICTION]
     _predicted_ay(steps.x, steps.inputs, model_parameters(physics.vehicle), predicted)

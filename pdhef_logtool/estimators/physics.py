@@ -539,6 +539,12 @@ class PhysicsUkf:
     ) -> tuple[StateTrack, FilterCarry]:
         """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
         steps, after = self.filter_steps(signals, carry, residual_rate, extra_r)
+        return self.outputs(signals, carry, steps, after)
+
+    def outputs(
+        self, signals: Signals, carry: FilterCarry | None, steps: PosteriorSteps, after: FilterCarry
+    ) -> tuple[StateTrack, FilterCarry]:
+        """Predict to the window's stamps what :meth:`filter_steps` returned for it; the carry keeps waiting steps."""
         if carry is not None:
             steps = carry.steps.joined(steps)
         index = released_steps(steps.ready_ns, signals.stamps_ns)
