@@ -126,8 +126,8 @@ def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
     for row, (what, unit) in enumerate(RESIDUAL_ROWS):
         target, output = fit.target[:, row], fit.output[:, row]
         ax = axes[row, 0]
+        ax.plot(fit.time_s, output, color="#E69F00", linewidth=2.4, label="network")
         ax.plot(fit.time_s, target, color="#0072B2", linewidth=0.8, label="residual of the nominal model")
-        ax.plot(fit.time_s, output, color="#E69F00", linewidth=1.6, label="network")
         ax.set(ylabel=f"residual of {what}, {unit}")
         ax = axes[row, 1]
         reach = 1.05 * float(np.percentile(np.abs(np.concatenate([target, output])), 99.8))
