@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from pdhef_logtool.training.extract_command import ExtractResult
     from pdhef_logtool.training.identify_command import IdentifyResult
+    from pdhef_logtool.training.baselines import BaselinesResult
     from pdhef_logtool.training.train_command import TrainResult
     from pdhef_logtool.training.tune_command import TuneResult
 
@@ -225,12 +226,12 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
 
 
 def render_training(result: TrainResult, console: Console) -> None:
-    """Print how the training went; losses are shares of the residual's own mean square."""
+    """Print how the training went; losses are shares of the target's own mean square."""
     best = min(result.history, key=lambda e: e.validation_loss)
     seconds = sum(e.seconds for e in result.history)
     console.print(
         f"{len(result.history)} epochs in {seconds:.0f} s; best epoch {best.epoch}: training {best.train_loss:.4f}, "
-        f"validation {best.validation_loss:.4f} of the residual's mean square",
+        f"validation {best.validation_loss:.4f} of the target's mean square",
         highlight=False,
     )
     if result.test_loss is not None:
@@ -248,7 +249,7 @@ def render_tuning(result: TuneResult, console: Console) -> None:
     table.add_column("\nestimator")
     for f in FACTORS:
         table.add_column(f"{f.name}\n{f.unit}", justify="right")
-    for head in ("geometric\nmean °", "\nmedian °", "\npooled °", "file's own\nmean °"):
+    for head in ("\nobjective °", "\nmedian °", "\npooled °", "file's own\nobjective °"):
         table.add_column(head, justify="right")
     for t in result.tuned:
         score = t.best.score
@@ -267,3 +268,12 @@ def render_tuning(result: TuneResult, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def render_baselines(result: BaselinesResult, console: Console) -> None:
+    """Print how both baselines came out."""
+    render_training(result.pure_lstm, console)
+    errors = result.regression.provenance["sideslip_rmse_deg"]
+    shown = ", ".join(f"{split} {value:.3f}" for split, value in errors.items() if value is not None)
+    console.print(f"linear regression, sideslip RMSE in degrees: {shown}", highlight=False)
+    console.print(f"coefficients in {result.regression_file}", highlight=False, soft_wrap=True)

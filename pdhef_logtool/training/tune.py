@@ -5,9 +5,10 @@ same points for all. The rest are Gaussian steps from each estimator's own best 
 factors, with a width that shrinks on the same schedule and with the same random numbers for all. Nothing depends on
 the number of processes or on which other estimators take part.
 
-The objective is the mean over drives of ln max(RMSE, floor) of the sideslip, told as its exponential, the geometric
-mean in degrees: every drive counts by what is gained on it in per cent, so that neither one spin decides (as in a
-pooled RMSE) nor is half of the drives ignored (as in a median).
+The objective is the mean over drives of ln √(RMSE² + floor²) of the sideslip, told as its exponential, a geometric mean
+in degrees: every drive counts by what is gained on it in per cent, so that neither one spin decides (as in a pooled
+RMSE) nor is half of the drives ignored (as in a median). The floor keeps drives that hardly turn from deciding instead:
+there a tenth of nothing would be as good as a tenth of a degree.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from pdhef_logtool.signals import BoolArray, FloatArray
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import FilterTuning, VehicleParameters
 
-#: A drive whose error is smaller than this gains nothing more: it is below what truth and sensors can tell.
-FLOOR_RAD = math.radians(0.01)
+#: Added to each drive's RMSE as squares: a gain far below this is worth little.
+FLOOR_RAD = math.radians(0.05)
 #: An estimate that is missing at more of the scored stamps counts as no better than sideslip 0 on that drive.
 MIN_AVAILABILITY = 0.9
 #: Share of the trials that explore the whole space.
@@ -129,7 +130,7 @@ def scorable_stamps(truth: StateTrack, low_speed_m_s: float) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Figures of one trial over all drives, in degrees; ``objective_deg``, the geometric mean, is minimised."""
+    """Figures of one trial over all drives, in degrees; ``objective_deg`` is minimised, the others hold no floor."""
 
     objective_deg: float
     median_deg: float
@@ -141,7 +142,7 @@ def score_drives(errors: Sequence[DriveError]) -> Score:
     counted = np.array([e.counted_rad for e in errors])
     weight = np.array([e.expected for e in errors], dtype=np.float64)
     return Score(
-        objective_deg=math.degrees(math.exp(float(np.mean(np.log(np.maximum(counted, FLOOR_RAD)))))),
+        objective_deg=math.degrees(math.exp(float(np.mean(np.log(np.hypot(counted, FLOOR_RAD)))))),
         median_deg=math.degrees(float(np.median(counted))),
         pooled_deg=math.degrees(math.sqrt(float(np.sum(weight * counted**2) / np.sum(weight)))),
     )

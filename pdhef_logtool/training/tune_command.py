@@ -386,7 +386,7 @@ def _record(
             "space": [asdict(f) for f in FACTORS],
             "exploring_share": EXPLORING_SHARE,
             "step_shares": [STEP_FIRST, STEP_LAST],
-            "objective": "geometric mean over drives of the sideslip RMSE in degrees",
+            "objective": "geometric mean over drives of the sideslip RMSE, each with the floor added as squares",
             "floor_deg": float(f"{np.degrees(FLOOR_RAD):.6g}"),
             "min_availability": MIN_AVAILABILITY,
             "low_speed_m_s": vehicle.low_speed_blend_m_s,
@@ -445,7 +445,7 @@ def _plot(result: TuneResult) -> None:
     axes.axvline(exploring + 0.5, color="0.5", lw=0.8)
     axes.set(
         xlabel="trial (left of the line: Sobol points, right: refinement; dotted: the file's own noise)",
-        ylabel="sideslip RMSE (°), geometric mean over drives",
+        ylabel="objective (°): geometric mean of drives' sideslip RMSE",
         title=f"{len(result.drives)} drives",
     )
     axes.grid(alpha=0.3, which="both")
