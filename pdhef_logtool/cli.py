@@ -543,6 +543,9 @@ def extract(
         str | None, typer.Option("--split", help="train, validation or test for all drives of this command.")
     ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the split by drive.")] = 0,
+    vary: Annotated[
+        float, typer.Option("--vary", help="Make friction and vehicle wrong by this spread for a part of the drives.")
+    ] = 0.0,
     jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes at work; changes nothing that is written.")] = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep drives whose log and settings are as they were.")
@@ -565,7 +568,7 @@ def extract(
             "prefer_truth": prefer_truth,
         },
     )
-    settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed)
+    settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed, vary=vary)
     with _progress() as progress:
         result = run_extraction(logs, output, settings, jobs=jobs, resume=resume, progress=progress, warn=_warn)
     if as_json:
@@ -582,12 +585,17 @@ def extract(
 
   pdhef train mycar/ -o mycar_model --init model --epochs 10
 
+  pdhef train residuals/ -o model --baselines
+
 An interrupted training goes on from its last whole epoch when the same command is given again."""
 )
 def train(
     dataset: Annotated[Path, typer.Argument(help="Folder that pdhef extract wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the model bundle to write.")],
     init: Annotated[Path | None, typer.Option("--init", help="Model bundle to fine-tune.")] = None,
+    baselines: Annotated[
+        bool, typer.Option("--baselines", help="Train pure-lstm and linear-regression into the model instead.")
+    ] = False,
     paper: Annotated[bool, typer.Option("--paper", help="The paper's Table 1 instead of the default recipe.")] = False,
     seed: Annotated[int, typer.Option("--seed", help="Seed of weights, order and dropout.")] = 0,
     epochs: Annotated[int | None, typer.Option("--epochs", help="Default: the recipe's.")] = None,
@@ -595,9 +603,23 @@ def train(
     as_json: JsonFlag = False,
 ) -> None:
     """Train the residual network on a dataset of pdhef extract; write weights, loss history and plot."""
-    from pdhef_logtool.summary import render_training
+    from pdhef_logtool.summary import render_baselines, render_training
     from pdhef_logtool.training.train_command import run_training
 
+    if baselines:
+        from pdhef_logtool.training.baselines import run_baselines
+
+        if init is not None:
+            raise UsageError(expected="--baselines or --init", got="both", where="train")
+        with _progress() as progress:
+            both = run_baselines(
+                dataset, output, paper=paper, seed=seed, epochs=epochs, device=device, progress=progress
+            )
+        if as_json:
+            _print_json(both.to_dict())
+        else:
+            render_baselines(both, _stdout())
+        return
     with _progress() as progress:
         result = run_training(
             dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=progress

@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from pdhef_logtool.training.baselines import BaselinesResult
     from pdhef_logtool.training.extract_command import ExtractResult
     from pdhef_logtool.training.identify_command import IdentifyResult
-    from pdhef_logtool.training.baselines import BaselinesResult
     from pdhef_logtool.training.train_command import TrainResult
     from pdhef_logtool.training.tune_command import TuneResult
 

@@ -15,9 +15,11 @@ DESCRIPTIONS: dict[str, str] = {
     "gyro": "the sensors passed through; claims no lateral velocity",
     "kinematic": "leaky integral of a_y - v_x r",
     "open-loop": "nominal single-track model from steering and speed alone",
+    "linear-regression": "sideslip linear in the network's features, low-passed at 2 Hz (needs --model with baselines)",
     "phy-ukf": "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
     "phy-ukf-tuned": "the same with the noise of an identified vehicle file, corrected for body roll",
     "physics-plus": "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
+    "pure-lstm": "a network that says v_y itself, from the same inputs, no filter (needs --model with baselines)",
     "pd-hef-fixed-r": "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs --model)",
     "pd-hef-trust0": "the hybrid filter with its network switched off (needs --model)",
     "pd-hef-trust1": "the hybrid filter at trust 1, whatever the vehicle file allows (needs --model)",
@@ -32,9 +34,9 @@ TUNED_ESTIMATORS = ("phy-ukf-tuned",)
 #: Trust of the hybrid filters by name; they need a model.
 HYBRID_TRUST = {"pd-hef-fixed-r": 1.0, "pd-hef-trust0": 0.0, "pd-hef-trust1": 1.0}
 #: Every estimator that needs a model.
-MODEL_ESTIMATORS = (*HYBRID_TRUST, "pd-hef-paper")
-#: Run by default as well where a model is given.
-DEFAULT_MODEL_ESTIMATORS = ("pd-hef-fixed-r", "pd-hef-trust0", "pd-hef-paper")
+MODEL_ESTIMATORS = (*HYBRID_TRUST, "pd-hef-paper", "pure-lstm", "linear-regression")
+#: Run by default as well where a model is given that has what they need.
+DEFAULT_MODEL_ESTIMATORS = ("linear-regression", "pure-lstm", "pd-hef-fixed-r", "pd-hef-trust0", "pd-hef-paper")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +101,19 @@ def make_estimator(
 
 
 def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, model: ModelBundle | None) -> Estimator:
-    if model is None:
-        raise UsageError(expected="a model bundle", got="none", where=name, remedy="give --model DIR")
+    missing = _missing_of_model(name, model)
+    if missing or model is None:
+        raise UsageError(expected="a model that has what it needs", got=missing, where=name)
+    if name == "linear-regression" and model.linear_regression is not None:
+        from pdhef_logtool.estimators.linear_regression import LinearRegression
+
+        return LinearRegression(vehicle, model.linear_regression, use_speed=use_speed)
     from pdhef_logtool.residual_model.service import NetworkService
+
+    if name == "pure-lstm" and model.pure_lstm is not None:
+        from pdhef_logtool.estimators.direct_network import DirectNetwork
+
+        return DirectNetwork(vehicle, NetworkService(model.pure_lstm), use_speed=use_speed)
 
     if name == "pd-hef-paper":
         from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf
@@ -112,10 +124,22 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
     return hybrid_ukf(vehicle, NetworkService(model), trust=HYBRID_TRUST[name], use_speed=use_speed, name=name)
 
 
+def _missing_of_model(name: str, model: ModelBundle | None) -> str:
+    """Return why the model does not let an estimator run, empty if it does."""
+    if name not in MODEL_ESTIMATORS:
+        return ""
+    if model is None:
+        return "no network; --model names one, pdhef train writes one"
+    baselines = {"pure-lstm": model.pure_lstm, "linear-regression": model.linear_regression}
+    if name in baselines and baselines[name] is None:
+        return "the model has no such baseline; pdhef train --baselines writes it"
+    return ""
+
+
 def default_names(vehicle: VehicleParameters, model: ModelBundle | None = None) -> tuple[str, ...]:
     """Return the estimators that run when none are named."""
     tuned = tuple(n for n in TUNED_ESTIMATORS if n in vehicle.filter)
-    return DEFAULT_ESTIMATORS + tuned + (DEFAULT_MODEL_ESTIMATORS if model is not None else ())
+    return DEFAULT_ESTIMATORS + tuned + tuple(n for n in DEFAULT_MODEL_ESTIMATORS if not _missing_of_model(n, model))
 
 
 def runnable(
@@ -133,8 +157,8 @@ def runnable(
         if name in TUNED_ESTIMATORS and name not in vehicle.filter:
             skipped.append(Skipped(name, f"the vehicle file has no [filter.{name}]; pdhef identify writes one"))
             continue
-        if name in MODEL_ESTIMATORS and model is None:
-            skipped.append(Skipped(name, "no network; --model names one, pdhef train writes one"))
+        if reason := _missing_of_model(name, model):
+            skipped.append(Skipped(name, reason))
             continue
         estimator = make_estimator(name, vehicle, use_speed=use_speed, model=model)
         missing = sorted(estimator.needs - available)

@@ -164,8 +164,8 @@ def load_network(folder: Path, target: str) -> ModelBundle:
     if document.get("format") != FORMAT or document.get("version") != FORMAT_VERSION:
         got = f"{document.get('format')} {document.get('version')}"
         raise ModelError(expected=f"{FORMAT} {FORMAT_VERSION}", got=got, where=where, remedy="train it anew")
-    if document.get("target", RESIDUAL) != target:
-        raise ModelError(expected=f"a network for {target}", got=f"one for {document['target']}", where=where)
+    if (learnt := document.get("target", RESIDUAL)) != target:
+        raise ModelError(expected=f"a network for {target}", got=f"one for {learnt}", where=where)
     try:
         a, n = document["architecture"], document["normalisation"]
         bundle = ModelBundle(

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.errors import ModelError, OutputError, UsageError
-from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
+from pdhef_logtool.residual_model.bundle import RESIDUAL, ModelBundle, load_bundle
 from pdhef_logtool.sinks.base import PendingFile
-from pdhef_logtool.training.dataset import DatasetDrive, read_dataset
+from pdhef_logtool.training.dataset import Dataset, DatasetDrive, read_dataset
 from pdhef_logtool.training.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 
 HISTORY_FILE = "history.parquet"
@@ -69,6 +69,19 @@ def run_training(
     ModelError
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
+    recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
+    return train_on(
+        read_dataset(dataset),
+        output,
+        recipe,
+        init=None if init is None else load_bundle(init),
+        device=device,
+        progress=progress,
+    )
+
+
+def make_recipe(*, paper: bool, seed: int, epochs: int | None, device: str) -> Recipe:
+    """Return the recipe of a call; raises UsageError where it cannot be followed."""
     import torch
 
     if device != "cpu" and not torch.cuda.is_available():
@@ -76,13 +89,23 @@ def run_training(
     if epochs is not None and epochs < 1:
         raise UsageError(expected="at least one epoch", got=str(epochs), where="--epochs")
     recipe = replace(PAPER_RECIPE if paper else Recipe(), seed=seed)
-    if epochs is not None:
-        recipe = replace(recipe, epochs=epochs)
-    data = read_dataset(dataset)
+    return recipe if epochs is None else replace(recipe, epochs=epochs)
+
+
+def train_on(
+    data: Dataset,
+    output: Path,
+    recipe: Recipe,
+    *,
+    init: ModelBundle | None = None,
+    device: str = "cpu",
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> TrainResult:
+    """Train one network by a recipe, whose target says what it learns; the rest as :func:`run_training`."""
     splits = {
-        name: list(_sequences(d for d in data.drives if d.split == name)) for name in ("train", "validation", "test")
+        name: list(_sequences((d for d in data.drives if d.split == name), recipe.target))
+        for name in ("train", "validation", "test")
     }
-    start = None if init is None else load_bundle(init)
 
     def tell(epoch: Epoch, of: int) -> None:
         progress(
@@ -91,14 +114,14 @@ def run_training(
         )
 
     bundle, history = train(
-        splits["train"], splits["validation"], recipe, output, init=start, device=device, progress=tell
+        splits["train"], splits["validation"], recipe, output, init=init, device=device, progress=tell
     )
     test_loss = mean_square(bundle, splits["test"]) if splits["test"] else None
     provenance = {
         **bundle.provenance,
         "dataset_sha256": data.sha256,
         "vehicle": data.vehicle_name,
-        "fine_tuned_from": None if start is None else start.sha256,
+        "fine_tuned_from": None if init is None else init.sha256,
         "test_loss": test_loss,
         "training_hours": round(sum(len(s.weight) for s in splits["train"]) * recipe.period_s / 3600.0, 3),
     }
@@ -111,7 +134,7 @@ def run_training(
 
 
 def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> float:
-    """Return the weighted mean square of the normalised residual rates, as service computes them."""
+    """Return the weighted mean square of the normalised targets, as service computes them."""
     from pdhef_logtool.residual_model.service import NetworkService
 
     service = NetworkService(bundle)
@@ -126,20 +149,29 @@ def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> fl
     return total / weight
 
 
-def _sequences(drives: Iterable[DatasetDrive]) -> Iterable[FeatureSequence]:
-    """Yield the gap-free runs of the drives; increments become rates by the true step."""
+def gap_free_runs(drive: DatasetDrive) -> Iterable[slice]:
+    """Yield the runs of a drive that no restart of the parallel filter cuts and that are long enough to learn from."""
+    edges = [0, *(np.flatnonzero(np.diff(drive.segment)) + 1).tolist(), drive.stamps_ns.shape[0]]
+    for a, b in pairwise(edges):
+        known = np.isfinite(drive.features[a:b]).all()
+        if b - a >= MIN_SEQUENCE_STEPS and known and drive.weight[a:b].sum() > 0.0:
+            yield slice(a, b)
+
+
+def _sequences(drives: Iterable[DatasetDrive], target: str = RESIDUAL) -> Iterable[FeatureSequence]:
+    """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
     for drive in drives:
-        edges = [0, *(np.flatnonzero(np.diff(drive.segment)) + 1).tolist(), drive.stamps_ns.shape[0]]
-        for a, b in pairwise(edges):
-            weight = np.asarray(drive.weight[a:b], dtype=np.float64)
-            features = np.asarray(drive.features[a:b], dtype=np.float64)
-            known = np.isfinite(features).all(axis=1)
-            if b - a < MIN_SEQUENCE_STEPS or not known.all() or weight.sum() == 0.0:
-                continue
-            usable = weight > 0.0
-            target = np.zeros((b - a, 2))
-            target[usable] = drive.targets[a:b][usable] / drive.step_s[a:b][usable, None]
-            yield FeatureSequence(drive.name, features, target, weight)
+        for part in gap_free_runs(drive):
+            weight = np.asarray(drive.weight[part], dtype=np.float64)
+            features = np.asarray(drive.features[part], dtype=np.float64)
+            if target == RESIDUAL:
+                values = np.asarray(drive.targets[part], dtype=np.float64) / drive.step_s[part, None]
+            else:
+                values = np.asarray(drive.truth_velocity[part, 1:2], dtype=np.float64)
+                weight = weight * np.isfinite(values[:, 0])
+            values[weight == 0.0] = 0.0
+            if weight.sum() > 0.0:
+                yield FeatureSequence(drive.name, features, values, weight)
 
 
 def _write_history(path: Path, history: Iterable[Epoch]) -> None:
@@ -159,7 +191,7 @@ def _plot_history(path: Path, history: list[Epoch]) -> None:
     at = [e.epoch for e in history]
     axes.semilogy(at, [e.train_loss for e in history], label="training", color="#0072B2")
     axes.semilogy(at, [e.validation_loss for e in history], label="validation", color="#D55E00")
-    axes.set(xlabel="epoch", ylabel="mean square of normalised residuals")
+    axes.set(xlabel="epoch", ylabel="mean square of normalised targets")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
     try:

@@ -56,6 +56,32 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef-trust0"}
     again = run_training(joined, tmp_path / "again", epochs=2)
     assert again.bundle.sha256 == bundle.sha256
+    check_baselines(sample_logs_dir, joined, tmp_path, bundle.sha256)
+
+
+def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str) -> None:
+    """Train the baselines into the model; they run, the network stays as it was, the split is the network's."""
+    done = _pdhef("train", str(dataset), "-o", str(folder / "model"), "--epochs", "2", "--baselines", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    bundle = load_bundle(folder / "model")
+    assert bundle.sha256 == network_sha256
+    assert bundle.pure_lstm is not None
+    assert bundle.linear_regression is not None
+    assert document["pure_lstm"]["sha256"] == bundle.pure_lstm.sha256
+    assert document["linear_regression"]["sha256"] == bundle.linear_regression.sha256
+    same = ("dataset_sha256", "training_sequences", "epochs")
+    assert [bundle.pure_lstm.provenance[k] for k in same] == [bundle.provenance[k] for k in same]
+    assert bundle.pure_lstm.feature_names == bundle.linear_regression.feature_names == bundle.feature_names
+    errors = bundle.linear_regression.provenance["sideslip_rmse_deg"]
+    assert 0.0 < errors["train"] < 1.0
+    assert errors["test"] is not None
+    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=folder / "model", annotate="none")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
+    assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression", "pd-hef-paper"}
+    both = _pdhef("train", str(dataset), "-o", str(folder / "m"), "--baselines", "--init", str(folder / "model"))
+    assert both.returncode == 2
+    assert len(both.stderr.splitlines()) == 1
 
 
 def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:

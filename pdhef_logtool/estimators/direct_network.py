@@ -1,0 +1,91 @@
+"""``pure-lstm``: a network that says v_y itself, from what the hybrid filter's network sees, with no filter behind it.
+
+The paper's Pure-LSTM with the same information as PD-HEF: sensors, the parallel physics filter's outputs and friction.
+v_x is that filter's, the yaw rate the gyro's. At the scored stamp stands what the sensors say of the latency:
+v_x and v_y go on by a_x + v_y r and a_y − v_x r, a_y corrected for body roll.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.physics import FilterCarry
+from pdhef_logtool.estimators.stepwise import AY, VX, VY, YAW_RATE, StepCarry, run_stepwise
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
+from pdhef_logtool.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
+
+_VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
+
+
+def write_direct_steps(
+    vehicle: VehicleParameters,
+    features: FloatArray,
+    vy_m_s: FloatArray,
+    known: BoolArray,
+    values: FloatArray,
+    rates: FloatArray,
+    valid: BoolArray,
+) -> None:
+    """Write the steps of an estimator that says v_y alone; the rest is as the features have it.
+
+    Parameters
+    ----------
+    vehicle : its roll gradient gives the planar a_y.
+    features : [K, f] as of :func:`~.parallel_physics.run_features`. vy_m_s : [K]. known : [K], where both hold.
+    values, rates, valid : [K, 4], [K, 4], [K] as of :mod:`~.stepwise`, written in place.
+    """
+    vx, yaw_rate, vy = features[known, _VX], features[known, _RATE], vy_m_s[known]
+    ay = features[known, _AY] / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
+    values[known, VX], values[known, VY] = vx, vy
+    values[known, YAW_RATE], values[known, AY] = yaw_rate, ay
+    rates[known, VX] = features[known, _AX] + vy * yaw_rate
+    rates[known, VY] = ay - vx * yaw_rate
+    valid[:] = known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DirectCarry:
+    """What the parallel filter, the network and the release of outputs take from window to window."""
+
+    physics: FilterCarry
+    network: NetworkCarry
+    steps: StepCarry
+
+
+@dataclass(frozen=True, slots=True)
+class DirectNetwork:
+    """The estimator of this file; ``network`` is one whose target is the lateral velocity."""
+
+    vehicle: VehicleParameters
+    network: NetworkService
+    use_speed: bool = True
+    name: str = "pure-lstm"
+    causal: bool = True
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """What the physics filter needs, which gives the features."""
+        return parallel_filter(self.vehicle, use_speed=self.use_speed).needs
+
+    def run(self, signals: Signals, carry: DirectCarry | None) -> tuple[StateTrack, DirectCarry]:
+        """Process one window (see :class:`~.base.Estimator`)."""
+        features, physics, after = run_features(
+            parallel_filter(self.vehicle, use_speed=self.use_speed), signals, carry.physics if carry else None
+        )
+        starts = ~np.isfinite(physics.prior[:, 0])
+        output, network = self.network.run(features, starts, carry.network if carry else None)
+        known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
+
+        def step(
+            _dt: FloatArray, _s: Signals, _state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
+        ) -> None:
+            write_direct_steps(self.vehicle, features, output[:, 0], known, values, rates, valid)
+
+        track, steps = run_stepwise(self.name, signals, carry.steps if carry else None, 0, step)
+        return track, DirectCarry(after, network, steps)

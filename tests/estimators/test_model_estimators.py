@@ -1,0 +1,172 @@
+"""The estimators that need a model, under the properties that hold for every estimator."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import test_estimators as properties
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import cut, drive, keep, make_signals, slalom, with_noise
+
+from pdhef_logtool.errors import UsageError
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S
+from pdhef_logtool.estimators.registry import make_estimator, runnable
+from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, RESIDUAL, ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES
+from pdhef_logtool.residual_model.linear_model import LinearModel
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.tracks import StateTrack, concatenate
+from pdhef_logtool.vehicle import default_vehicle
+
+VEHICLE = default_vehicle()
+NAMES = ("pd-hef-paper", "pure-lstm", "linear-regression")
+
+
+def make_network(target: str, outputs: int) -> ModelBundle:
+    torch.manual_seed(1)
+    size = len(ONE_CAR_FEATURES)
+    network = ResidualNetwork(Architecture(size, 8, 1, (4,), outputs=outputs))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    normalisation = Normalisation((0.0,) * size, (5.0,) * size, (1.0,) * outputs)
+    return ModelBundle(ONE_CAR_FEATURES, 8, 1, (4,), 0.01, normalisation, weights, target=target)
+
+
+#: β = 0.9 v_y,phy / 22 m/s − 0.001 a_y, at 22 m/s.
+REGRESSION = LinearModel(("ay_m_s2", "physics_vy_m_s"), (-0.001, 0.9 / 22.0), 0.0, 2.0)
+MODEL = replace(make_network(RESIDUAL, 2), pure_lstm=make_network(LATERAL_VELOCITY, 1), linear_regression=REGRESSION)
+
+
+def run(name: str, signals: Signals, vehicle=VEHICLE) -> StateTrack:
+    return make_estimator(name, vehicle, model=MODEL).run(signals, None)[0]
+
+
+@pytest.fixture(scope="module")
+def rough() -> Signals:
+    """Noise, irregular stamps, missing samples, a gap that restarts the filter, messages late and bunched."""
+    rng = np.random.default_rng(12)
+    s = with_noise(drive(slalom(0.035, 0.5), speed=22.0, step_s=rng.uniform(0.004, 0.022, 500)).signals, seed=6)
+    for column in (s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s):
+        column[rng.random(len(s)) < 0.05] = np.nan
+    ready = np.maximum.accumulate(s.stamps_ns + rng.integers(0, 45_000_000, len(s)))
+    t = (s.stamps_ns - s.stamps_ns[0]) * 1e-9
+    return keep(replace(s, ready_ns=ready), (t < 3.0) | (t > 3.8))
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(derandomize=True, deadline=None, max_examples=15)
+@given(data=st.data())
+def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
+    inner = data.draw(st.lists(st.integers(0, len(rough)), max_size=8))
+    estimator = make_estimator(name, VEHICLE, model=MODEL)
+    whole, _ = estimator.run(rough, None)
+    parts, carry = [], None
+    for first, end in pairwise([0, *sorted(inner), len(rough)]):
+        track, carry = estimator.run(cut(rough, first, end), carry)
+        parts.append(track)
+    properties.same_bits(concatenate(parts), whole)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_carry_can_be_used_twice(name, rough):
+    estimator = make_estimator(name, VEHICLE, model=MODEL)
+    _, carry = estimator.run(cut(rough, 0, 100), None)
+    first, _ = estimator.run(cut(rough, 100, 300), carry)
+    again, _ = estimator.run(cut(rough, 100, 300), carry)
+    properties.same_bits(first, again)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@settings(derandomize=True, deadline=None, max_examples=15)
+@given(j=st.integers(1, 400), seed=st.integers(0, 2**32 - 1), missing=st.booleans())
+def test_nothing_that_arrives_later_changes_an_output(name, rough, j, seed, missing):
+    rng = np.random.default_rng(seed)
+    changed = {}
+    for column in ALIGNED_SIGNALS:
+        values = getattr(rough, column).copy()
+        values[j:] = np.nan if missing else rng.normal(0, 5, len(rough) - j) + 10.0
+        changed[column] = values
+    before = int(np.searchsorted(rough.stamps_ns, rough.ready_ns[j], side="left"))
+    properties.same_bits(run(name, rough), run(name, replace(rough, **changed)), before)
+
+
+@pytest.mark.parametrize("fault", properties.FAULTS)
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.filterwarnings("error")
+def test_no_fault_breaks_an_estimator(name, fault):
+    s = with_noise(drive(slalom(0.035, 0.5), 8.0, speed=22.0).signals, seed=9)
+    s.friction[:] = 0.85
+    faulty = properties.FAULTS[fault](replace(s, ready_ns=s.stamps_ns + 10_000_000))
+    track = run(name, faulty)
+    assert len(track) == len(faulty)
+    for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"):
+        assert np.isfinite(getattr(track, column)[track.valid]).all(), column
+        assert np.isnan(getattr(track, column)[~track.valid]).all(), column
+    if len(faulty) > 1:
+        assert track.valid[-50:].all(), "it must run again after the fault"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_runs_on_what_it_needs_alone_and_not_on_what_is_too_late(name):
+    plain = drive(slalom(), 3.0).signals
+    estimator = make_estimator(name, VEHICLE, model=MODEL)
+    assert (estimator.name, estimator.causal) == (name, True)
+    bare = make_signals(np.diff(plain.stamps_ns) * 1e-9, **{c: getattr(plain, c) for c in estimator.needs})
+    assert estimator.run(bare, None)[0].valid[5:].all()
+    late = replace(plain, ready_ns=plain.stamps_ns + round((MAX_PREDICTION_S + 0.02) * 1e9))
+    assert not estimator.run(late, None)[0].valid.any()
+
+
+def test_pure_lstm_says_what_its_network_says_and_predicts_it_over_the_delay():
+    """A network that always says 0.25 m/s; what is added to it is the latency times what the sensors say of v̇_y."""
+    lstm = MODEL.pure_lstm
+    assert lstm is not None
+    weights = {k: np.zeros_like(v) for k, v in lstm.weights.items()}
+    constant = max(k for k in weights if k.endswith("bias") and k.startswith("head"))
+    weights[constant][:] = 0.25
+    model = replace(MODEL, pure_lstm=replace(lstm, weights=weights))
+    made = drive(slalom(0.02, 0.5), 4.0)
+    gain = 1.0 + 9.80665 * VEHICLE.roll_gradient_rad_per_m_s2
+    on_time = replace(made.signals, ay_m_s2=gain * made.ay)
+    track, _ = make_estimator("pure-lstm", VEHICLE, model=model).run(on_time, None)
+    np.testing.assert_allclose(track.vy_m_s, 0.25, rtol=1e-6)
+    np.testing.assert_array_equal(track.yaw_rate_rad_s, made.r)
+    np.testing.assert_allclose(track.ay_m_s2, made.ay, rtol=1e-12, atol=1e-12)
+    late = replace(on_time, ready_ns=on_time.stamps_ns + 20_000_000)
+    track, _ = make_estimator("pure-lstm", VEHICLE, model=model).run(late, None)
+    expected = 0.25 + 0.02 * (made.ay - made.vx * made.r)[:-2]
+    np.testing.assert_allclose(track.vy_m_s[2:], expected, atol=1e-3)
+    assert np.ptp(track.vy_m_s[2:]) > 0.01
+
+
+def test_linear_regression_is_its_equation():
+    """At constant features the low-pass has no say."""
+    n = 1500
+    signals = make_signals(
+        np.full(n - 1, 0.01),
+        steer_rad=np.full(n, 0.02), ax_m_s2=np.zeros(n), ay_m_s2=np.full(n, 3.0), yaw_rate_rad_s=np.full(n, 0.15),
+        speed_m_s=np.full(n, 20.0),
+    )  # fmt: skip
+    model = replace(MODEL, linear_regression=LinearModel(("ay_m_s2", "yaw_rate_rad_s"), (-0.01, 0.2), 0.004, 2.0))
+    track, _ = make_estimator("linear-regression", VEHICLE, model=model).run(signals, None)
+    assert track.sideslip_rad[-1] == pytest.approx(0.004 - 0.03 + 0.03, abs=1e-9)
+    step = replace(signals, ay_m_s2=np.where(np.arange(n) < 1000, 3.0, 1.0))
+    after, _ = make_estimator("linear-regression", VEHICLE, model=model).run(step, None)
+    share = 1.0 - math.exp(-2.0 * math.pi * 2.0 * 0.01 * 8)  # eight steps behind the jump
+    assert after.sideslip_rad[1007] == pytest.approx(0.004 + 0.02 * share, abs=1e-9)
+
+
+def test_what_the_model_has_not_is_skipped_with_the_reason():
+    bare = replace(MODEL, pure_lstm=None, linear_regression=None)
+    estimators, skipped = runnable(NAMES, VEHICLE, frozenset(ALIGNED_SIGNALS), model=bare)
+    assert [e.name for e in estimators] == ["pd-hef-paper"]
+    assert [s.name for s in skipped] == ["pure-lstm", "linear-regression"]
+    assert all("--baselines" in s.reason for s in skipped)
+    with pytest.raises(UsageError, match="--baselines"):
+        make_estimator("pure-lstm", VEHICLE, model=bare)
