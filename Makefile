@@ -15,6 +15,8 @@ help:
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make bench    speed against peers, and the tuning tables"
 	@echo "make samples  write sample_logs/ anew with the simulator"
+	@echo "make conditions VEHICLE=car.toml MODEL=model  docs/conditions.md: every estimator on the condition table"
+	@echo "make real MODEL=model  docs/real.md: every estimator on the recorded drives in ../shared"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make clean    remove the virtual environment and everything that was built"
@@ -75,6 +77,15 @@ docs-truthsim: $(VENV)/installed
 # One core: step times are measured in the same run.
 paper: $(VENV)/installed $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.paper
+
+# Every estimator on the condition table; MODEL is the bundle of the network, VEHICLE the file that it belongs to.
+DRIVES ?= 30
+conditions: $(VENV)/installed-dev $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.conditions --drives $(DRIVES) --jobs $(JOBS) \
+	  $(if $(VEHICLE),--vehicle $(VEHICLE)) $(if $(MODEL),--model $(MODEL))
+
+real: $(VENV)/installed-dev $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.real $(if $(MODEL),--model $(MODEL))
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
