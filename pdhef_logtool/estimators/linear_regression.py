@@ -40,6 +40,11 @@ class LinearRegression:
         """What the physics filter needs, which gives the features."""
         return parallel_filter(self.vehicle, use_speed=self.use_speed).needs
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Say which file ran: run.json has the residual network's hash alone."""
+        return (f"coefficients {self.model.sha256}",)
+
     def run(self, signals: Signals, carry: RegressionCarry | None) -> tuple[StateTrack, RegressionCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(

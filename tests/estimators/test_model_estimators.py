@@ -117,6 +117,8 @@ def test_it_runs_on_what_it_needs_alone_and_not_on_what_is_too_late(name):
     plain = drive(slalom(), 3.0).signals
     estimator = make_estimator(name, VEHICLE, model=MODEL)
     assert (estimator.name, estimator.causal) == (name, True)
+    hashes = {"pure-lstm": MODEL.pure_lstm.sha256, "linear-regression": REGRESSION.sha256}
+    assert name not in hashes or hashes[name] in estimator.notes[0]
     bare = make_signals(np.diff(plain.stamps_ns) * 1e-9, **{c: getattr(plain, c) for c in estimator.needs})
     assert estimator.run(bare, None)[0].valid[5:].all()
     late = replace(plain, ready_ns=plain.stamps_ns + round((MAX_PREDICTION_S + 0.02) * 1e9))
