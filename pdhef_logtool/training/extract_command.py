@@ -55,11 +55,13 @@ from pdhef_logtool.training.residuals import (
     difference_noise,
     residual_windows,
 )
+from pdhef_logtool.training.variation import vary
 from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle
 
 #: Upper ends of the shares of train and validation in [0, 1); the rest is test.
 SPLIT_ENDS = (0.70, 0.85)
 MAX_SMOOTHING_HALF_S = 1.0
+MAX_VARIATION = 0.3
 
 Progress = Callable[[str, float], None]
 Warn = Callable[[str], None]
@@ -74,13 +76,15 @@ class ExtractSettings:
     config : vehicle, mapping, slice, sensors, which truth; the other entries are not used.
     truth_smoothing : ``auto`` (decided per drive from the truth's noise), ``none``, or a half window in seconds.
     split : for all drives; None = what a set's manifest says of a drive, else 70/15/15 by a hash of its content.
-    seed : of that hash.
+    seed : of that hash, and of the variation.
+    vary : spread by which friction and vehicle are made wrong for a part of the drives (``variation.vary``).
     """
 
     config: RunConfig
     truth_smoothing: str = "auto"
     split: str | None = None
     seed: int = 0
+    vary: float = 0.0
 
     def smoothing_half_s(self) -> float | None:
         """Return the half window that was asked for, 0 for none, None for ``auto``; raises UsageError."""
@@ -108,6 +112,7 @@ class ExtractSettings:
             **{k: config[k] for k in used},
             "truth_smoothing": self.truth_smoothing,
             "split": self.split,
+            **({"vary": self.vary, "vary_seed": self.seed} if self.vary else {}),
         }
 
 
@@ -254,6 +259,8 @@ def _check_counts(jobs: int, settings: ExtractSettings) -> None:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if settings.seed < 0:
         raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
+    if not 0.0 <= settings.vary <= MAX_VARIATION:
+        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.vary), where="--vary")
     if settings.split is not None and settings.split not in SPLITS:
         raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
 
@@ -353,10 +360,12 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         _check_plan(plan, job)
         smoothing = _choose_smoothing(plan, job.settings)
         reader = DriveReader(log, plan, job.settings.config.window_s)
+        told = vary(job.vehicle, job.settings.vary, f"{job.settings.seed}:{source}")
 
         def windows() -> Iterator[Any]:
             for window in reader.windows():
-                yield window
+                signals = replace(window.signals, friction=window.signals.friction * told.friction_factor)
+                yield replace(window, signals=signals)
                 progress(window.share_done)
 
         writer = DriveWriter(target, split)
@@ -364,7 +373,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             counts = _Counts()
             for rows in residual_windows(
                 windows(),
-                job.vehicle,
+                told.vehicle,
                 period_s=plan.alignment.grid_period_s,
                 half_window=round(smoothing.half_s / plan.alignment.grid_period_s),
                 use_speed=job.settings.config.sensors == "full",
@@ -385,6 +394,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 **counts.to_dict(),
                 "truth": _truth_facts(plan, smoothing),
                 "friction_from": _friction_source(plan, job.vehicle),
+                **({"friction_factor": told.friction_factor} if job.settings.vary else {}),
                 "losses": [
                     {"kind": x.kind, "what": x.what, "where": x.where, "count": x.count, "severity": x.severity}
                     for x in losses
