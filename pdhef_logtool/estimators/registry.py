@@ -118,7 +118,7 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
     if name == "pd-hef-paper":
         from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf
 
-        return PaperHybridUkf(vehicle, NetworkService(model), use_speed=use_speed)
+        return PaperHybridUkf(vehicle, NetworkService(model.paper_network or model), use_speed=use_speed)
     from pdhef_logtool.estimators.hybrid import hybrid_ukf
 
     return hybrid_ukf(vehicle, NetworkService(model), trust=HYBRID_TRUST[name], use_speed=use_speed, name=name)

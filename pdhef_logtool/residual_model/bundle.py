@@ -22,6 +22,8 @@ DOCUMENT_FILE = "model.json"
 #: Baselines that were trained on the same dataset stand beside the network, where there are any.
 PURE_LSTM_FOLDER = "baselines/pure-lstm"
 LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
+#: The paper's network, six features and Table 1's size, for the paper's filter.
+PAPER_FOLDER = "baselines/paper-network"
 
 #: What a network may predict, and how many numbers that is: rates of v_y and r that f_nom lacks, or v_y itself.
 RESIDUAL = "residual_rates"
@@ -49,7 +51,7 @@ class ModelBundle:
     weights : by name, float32, as PyTorch names them.
     provenance : training data hash, seeds, metrics and what else the model card says; JSON-able.
     target : what it predicts, one of :data:`OUTPUT_COUNT`.
-    pure_lstm, linear_regression : the baselines beside it, None where there are none.
+    pure_lstm, linear_regression, paper_network : the baselines beside it, None where there are none.
     """
 
     feature_names: tuple[str, ...]
@@ -63,6 +65,7 @@ class ModelBundle:
     target: str = RESIDUAL
     pure_lstm: ModelBundle | None = None
     linear_regression: LinearModel | None = None
+    paper_network: ModelBundle | None = None
 
     @property
     def sha256(self) -> str:
@@ -130,11 +133,12 @@ def load_bundle(folder: Path) -> ModelBundle:
     ModelError
         A file is missing or wrong, or the weights do not belong to the document.
     """
-    lstm, regression = folder / PURE_LSTM_FOLDER, folder / LINEAR_REGRESSION_FILE
+    lstm, regression, paper = folder / PURE_LSTM_FOLDER, folder / LINEAR_REGRESSION_FILE, folder / PAPER_FOLDER
     return replace(
         load_network(folder, RESIDUAL),
         pure_lstm=load_network(lstm, LATERAL_VELOCITY) if lstm.is_dir() else None,
         linear_regression=load_linear_model(regression) if regression.is_file() else None,
+        paper_network=load_network(paper, RESIDUAL) if paper.is_dir() else None,
     )
 
 
