@@ -125,7 +125,7 @@ def run(
         str | None, typer.Option("--estimators", "-e", help="Comma-separated names; see pdhef estimators.")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Folder of a model bundle; adds the hybrid filters.")
+        Path | None, typer.Option("--model", help="Folder of a model bundle, or none. Default: the shipped model.")
     ] = None,
     vehicle: Annotated[Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml.")] = None,
     mapping: MappingFile = None,

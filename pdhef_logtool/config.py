@@ -33,7 +33,7 @@ class RunConfig:
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
-    model : folder of a model bundle for the hybrid filters.
+    model : folder of a model bundle for the hybrid filters; None = the shipped one, ``none`` = no network.
     thresholds : limits that the figures are held against; None = no gate.
     """
 

@@ -31,7 +31,7 @@ from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, choose_mapping, load_mapping, merge_losses
-from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
+from pdhef_logtool.residual_model.bundle import SHIPPED, ModelBundle, open_model
 from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Loss, Signals, join_signals
 from pdhef_logtool.sinks.base import TRUTH, Event, Sink
 from pdhef_logtool.sinks.report import (
@@ -143,7 +143,7 @@ def run_logs(
     inputs = find_logs(arguments)
     vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
-    model = None if config.model is None else load_bundle(config.model)
+    model = open_model(config.model)
     thresholds = read_thresholds(config, junit)
     if config.vehicle is None:
         warn(f"no --vehicle: the default {vehicle.name} is assumed, so the model-based estimates are of another car")
@@ -544,6 +544,6 @@ def write_run(
     """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values."""
     from pdhef_logtool.sinks.parquet import write_metrics
 
-    used = None if model is None else {"name": str(config["model"]), "sha256": model.sha256}
+    used = None if model is None else {"name": str(config["model"] or SHIPPED), "sha256": model.sha256}
     write_metrics(output / "metrics.parquet", [row for r in results for row in r.rows])
     write_json(output / "run.json", build_run(tool_versions(), config, used, [r.outcome for r in results]))

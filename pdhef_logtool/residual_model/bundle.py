@@ -25,6 +25,10 @@ LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
 #: The paper's network, six features and Table 1's size, for the paper's filter.
 PAPER_FOLDER = "baselines/paper-network"
 
+#: Names instead of a folder: the network that comes with the package, and no network.
+SHIPPED, NO_MODEL = "default", "none"
+SHIPPED_FOLDER = Path(__file__).parents[1] / "models" / "default"
+
 #: What a network may predict, and how many numbers that is: rates of v_y and r that f_nom lacks, or v_y itself.
 RESIDUAL = "residual_rates"
 LATERAL_VELOCITY = "lateral_velocity"
@@ -123,6 +127,21 @@ class ModelBundle:
             raise ModelError(
                 expected="a folder to write to", got=error.strerror or str(error), where=str(folder)
             ) from None
+
+
+def open_model(model: Path | None) -> ModelBundle | None:
+    """Return the network of a run: the shipped one for None or ``default``, no network for ``none``, or a folder's.
+
+    Raises
+    ------
+    ModelError
+        The folder holds no model.
+    """
+    if model is not None and str(model) == NO_MODEL:
+        return None
+    if model is None or str(model) == SHIPPED:
+        return load_bundle(SHIPPED_FOLDER) if SHIPPED_FOLDER.is_dir() else None
+    return load_bundle(model)
 
 
 def load_bundle(folder: Path) -> ModelBundle:

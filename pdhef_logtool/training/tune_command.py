@@ -16,7 +16,7 @@ from pdhef_logtool.config import RunConfig
 from pdhef_logtool.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.residual_model.bundle import load_bundle
+from pdhef_logtool.residual_model.bundle import open_model
 from pdhef_logtool.sinks.base import PendingFile, write_bytes
 from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.training.extract_command import _set_manifest as set_manifest
@@ -160,7 +160,7 @@ def run_tuning(
     _check(output, settings, jobs)
     assert config.vehicle is not None
     vehicle = load_vehicle(config.vehicle)
-    model = None if config.model is None else load_bundle(config.model)
+    model = None if config.model is None else open_model(config.model)
     names = choose_names(settings.names, model)
     inputs, splits = choose_drives(find_logs(arguments), settings)
     if model is not None and "train" in splits.values():
