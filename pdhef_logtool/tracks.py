@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -39,6 +39,9 @@ class StateTrack:
     length 0 when the source gives none. ``x_m``, ``y_m``, ``yaw_rad`` are in a local ENU frame.
     ``valid`` is False where the source says that its state must not be used. ``diverged`` flags the stamps at
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
+    ``mixture_weight`` (of an adaptive estimator's second filter) and ``reason`` (bits of
+    :mod:`pdhef_logtool.estimators.sensor_faults`, why samples were not used as usual) are [N], or of length 0 where the
+    source has none.
     """
 
     name: str
@@ -60,6 +63,8 @@ class StateTrack:
     friction: FloatArray
     valid: BoolArray
     diverged: BoolArray
+    mixture_weight: FloatArray = field(default_factory=lambda: np.empty(0))
+    reason: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __len__(self) -> int:
         """Return the number of stamps."""
@@ -106,6 +111,8 @@ def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | BoolArray
             continue
         if f.name in columns:
             values[f.name] = columns[f.name]
+        elif f.name in ("mixture_weight", "reason"):
+            continue
         elif f.name == "covariance":
             values[f.name] = np.empty((0, 3, 3))
         elif f.name == "valid":

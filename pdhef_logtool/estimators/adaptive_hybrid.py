@@ -1,0 +1,287 @@
+"""``pd-hef``: the hybrid filter with an adaptive mechanism that does not read model error as noise (METHOD §7, §15).
+
+Bottom layer: :mod:`~.sensor_faults` looks at a_y and yaw rate alone. What it finds goes into every filter here, the
+parallel one too, and keeps bad samples from the network.
+
+Top layer: two filters on one pass of the network. F1 is the hybrid filter; F2 has a state that scales all forces. White
+noise does not repeat itself, a model error does, and in proportion to the force. So the mean product of innovations of
+a_y three steps apart is what a filter's model misses. F2 gets weight as its own product stays below that of F1, beyond
+chance: a force scale that does not explain a_y is the wrong cure, for another car or a spin, and is not taken. More is
+asked of it where the sideslip is uncertain, for at the grip limit force and sideslip can be traded for each other, and
+it counts for nothing at a very large sideslip. The output is the mixture of both, its covariance with their difference.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.estimators.base import released_steps
+from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
+from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.physics import (
+    VX,
+    VY,
+    YAW_RATE,
+    Z_AY,
+    FilterCarry,
+    PhysicsUkf,
+    PosteriorSteps,
+    sideslip_std,
+)
+from pdhef_logtool.estimators.sensor_faults import AY, BURST_AY, FaultCarry, SensorFaults, find_faults
+from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
+from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.vehicle import VehicleParameters
+
+#: Steps between the innovations that are multiplied.
+LAG_STEPS = 3
+#: Time constant of the mean product.
+MEAN_S = 0.5
+#: Time constants of the evidence: when it rises, when it falls, and when F2 is the worse of the two.
+ATTACK_S, RELEASE_S, DISPROVED_S = 0.05, 3.0, 0.2
+#: The mean innovation, which is the sensor's bias, is learnt in this time where the car drives straight.
+BIAS_S, STRAIGHT_AY_M_S2, STRAIGHT_YAW_RATE_RAD_S = 2.0, 0.6, 0.04
+#: F2's product counts by this much more than F1's: s is a free parameter, and fits something in any case.
+FREEDOM = 1.3
+#: Evidence up to which F2 has no weight, and from which on it has all, (m/s²)², at a certain sideslip.
+EVIDENCE_LOW, EVIDENCE_HIGH = 0.005, 0.03
+#: 1-sigma of F1's sideslip at which twice that evidence is asked for.
+UNCERTAIN_RAD = math.radians(0.1)
+#: Sideslip between which F2 loses its weight.
+SIDESLIP_FROM_RAD, SIDESLIP_TO_RAD = math.radians(10.0), math.radians(15.0)
+#: A longer step starts the mixture anew, as it does the filters.
+RESTART_GAP_S = 0.5
+
+# Memory of the mixture: the last innovations, mean product and mean innovation of F1 and F2, and the evidence.
+M_INNOVATION, M_PRODUCT, M_BIAS, M_EVIDENCE = 0, 2 * LAG_STEPS, 2 * LAG_STEPS + 2, 2 * LAG_STEPS + 4
+MEMORY = 2 * LAG_STEPS + 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MixtureSteps:
+    """By step on measurement time, [K]: when it arrived, weight of F2, factor on R, and the detector's bit mask."""
+
+    ready_ns: IntArray
+    weight: FloatArray
+    r_scale: FloatArray
+    reason: IntArray
+
+    def joined(self, other: MixtureSteps) -> MixtureSteps:
+        """Append the steps of the next window."""
+        return MixtureSteps(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__slots__))
+
+    def since(self, index: int) -> MixtureSteps:
+        """Keep the steps from ``index`` on."""
+        return MixtureSteps(*(getattr(self, n)[index:] for n in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdaptiveCarry:
+    """What the detector, the filters, the network and the mixture take from window to window."""
+
+    faults: FaultCarry
+    physics: FilterCarry
+    network: NetworkCarry
+    plain: FilterCarry
+    scaled: FilterCarry
+    memory: FloatArray
+    last_stamp_ns: int
+    waiting: MixtureSteps
+
+
+@njit(cache=True)
+def _weights(  # type: ignore[no-untyped-def]
+    dt, innovations, starts, skip, ay, noise, vx, vy, vy_variance, yaw_rate, low, high, memory, out
+):
+    """Write the weight of F2 at each step; ``innovations`` [K, 2] of F1 and F2, ``memory`` is updated in place."""
+    for k in range(dt.shape[0]):
+        step = dt[k] if dt[k] <= RESTART_GAP_S else 0.0
+        if starts[k] or step == 0.0:
+            memory[:] = 0.0
+            memory[: 2 * LAG_STEPS] = math.nan
+        usable = math.isfinite(innovations[k, 0]) and math.isfinite(innovations[k, 1]) and not skip[k]
+        straight = abs(ay[k]) < STRAIGHT_AY_M_S2 and abs(yaw_rate[k]) < STRAIGHT_YAW_RATE_RAD_S
+        gain = 1.0 - math.exp(-step / MEAN_S)
+        for i in range(2):
+            nu = math.nan
+            last = M_INNOVATION + i * LAG_STEPS
+            if usable:
+                nu = innovations[k, i]
+                if straight:
+                    memory[M_BIAS + i] += (1.0 - math.exp(-step / BIAS_S)) * (nu - memory[M_BIAS + i])
+                nu -= memory[M_BIAS + i]
+                before = memory[last + LAG_STEPS - 1]
+                if math.isfinite(before):
+                    memory[M_PRODUCT + i] += gain * (nu * before - memory[M_PRODUCT + i])
+            for j in range(LAG_STEPS - 1, 0, -1):
+                memory[last + j] = memory[last + j - 1]
+            memory[last] = nu
+        # What a mean over so few products of white noise may be by chance.
+        chance = 2.0 * noise[k] * noise[k] * math.sqrt(0.5 * step / MEAN_S)
+        evidence = memory[M_PRODUCT] - FREEDOM * max(memory[M_PRODUCT + 1], 0.0) - chance
+        tau = ATTACK_S if evidence > memory[M_EVIDENCE] else RELEASE_S if evidence > -2.0 * chance else DISPROVED_S
+        memory[M_EVIDENCE] += (1.0 - math.exp(-step / tau)) * (max(evidence, 0.0) - memory[M_EVIDENCE])
+        v = max(vx[k], 1.0)
+        needed = 1.0 + vy_variance[k] / (v * UNCERTAIN_RAD) ** 2
+        share = min(1.0, max(0.0, (memory[M_EVIDENCE] / needed - low) / (high - low)))
+        sideslip = abs(math.atan2(vy[k], v))
+        fade = min(1.0, max(0.0, (SIDESLIP_TO_RAD - sideslip) / (SIDESLIP_TO_RAD - SIDESLIP_FROM_RAD)))
+        out[k] = share * fade if math.isfinite(share * fade) else 0.0
+
+
+def mix(weight: FloatArray, first: StateTrack, second: StateTrack) -> StateTrack:
+    """Return (1 − w) of the first track and w of the second as one Gaussian, its covariance with their difference.
+
+    With d = x₂ − x₁: x = x₁ + w d, P = (1 − w) P₁ + w P₂ + w (1 − w) d dᵀ. Where only one is valid, it is the result.
+    """
+    w = np.where(second.valid, np.where(first.valid, weight, 1.0), 0.0)
+    alone = w == 0.0
+    state = [np.stack([t.vx_m_s, t.vy_m_s, t.yaw_rate_rad_s, t.ay_m_s2], axis=1) for t in (first, second)]
+    difference = np.where(alone[:, None], 0.0, state[1] - state[0])
+    # Only the second is valid: nothing of the first, which is NaN there.
+    x = np.where(w[:, None] == 1.0, state[1], state[0] + w[:, None] * np.where(w[:, None] == 1.0, 0.0, difference))
+    d = np.where(w[:, None] == 1.0, 0.0, difference[:, :3])
+    share = w[:, None, None]
+    spread = share * (1.0 - share) * d[:, :, None] * d[:, None, :]
+    both = (1.0 - share) * first.covariance + share * second.covariance + spread
+    P = np.where(share == 0.0, first.covariance, np.where(share == 1.0, second.covariance, both))
+    mostly = w > 0.5
+    return replace(
+        first,
+        vx_m_s=x[:, 0].copy(),
+        vy_m_s=x[:, 1].copy(),
+        yaw_rate_rad_s=x[:, 2].copy(),
+        ay_m_s2=x[:, 3].copy(),
+        sideslip_rad=np.arctan2(x[:, 1], x[:, 0]),
+        covariance=P,
+        sideslip_std_rad=np.where(alone, first.sideslip_std_rad, sideslip_std(x[:, 0], x[:, 1], P)),
+        nis=np.where(mostly, second.nis, first.nis),
+        nis_dof=np.where(mostly, second.nis_dof, first.nis_dof),
+        valid=first.valid | second.valid,
+        diverged=np.where(mostly, second.diverged, first.diverged),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class AdaptiveHybridUkf:
+    """Hybrid filter with fault detection and a mixture over a force scale.
+
+    Parameters
+    ----------
+    trust : share of the network's residual that both filters take, in [0, 1]; the cap of METHOD §14 goes here.
+    q_std, r_std : as for :class:`~.hybrid.HybridUkf`.
+    evidence_low, evidence_high : between which F2 gains its weight, (m/s²)².
+    """
+
+    vehicle: VehicleParameters
+    network: NetworkService
+    trust: float = 1.0
+    q_std: tuple[float, float, float, float] = HYBRID_Q_STD
+    r_std: tuple[float, float] = HYBRID_R_STD
+    evidence_low: float = EVIDENCE_LOW
+    evidence_high: float = EVIDENCE_HIGH
+    use_speed: bool = True
+    name: str = "pd-hef"
+    causal: bool = True
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """What the hybrid filter needs."""
+        return self.hybrid.needs
+
+    @property
+    def hybrid(self) -> HybridUkf:
+        """The fixed filter that F1 is when nothing is wrong."""
+        return HybridUkf(
+            self.vehicle, self.network, self.trust, self.q_std, self.r_std, use_speed=self.use_speed, name=self.name
+        )
+
+    @property
+    def filters(self) -> tuple[PhysicsUkf, PhysicsUkf]:
+        """F1 and F2."""
+        plain = self.hybrid.filter
+        return plain, replace(plain, force_scale=True)
+
+    def run(self, signals: Signals, carry: AdaptiveCarry | None) -> tuple[StateTrack, AdaptiveCarry]:
+        """Process one window (see :class:`~.base.Estimator`)."""
+        c = carry
+        faults, fault_carry = find_faults(signals, self.vehicle, c.faults if c else None)
+        given, extra = faults.filtered, faults.extra_r
+        features, physics_steps, physics = run_features(
+            parallel_filter(self.vehicle, use_speed=self.use_speed),
+            given,
+            c.physics if c else None,
+            seen=faults.network,
+            extra_r=extra,
+        )
+        starts = ~np.isfinite(physics_steps.prior[:, 0])
+        rate, network = self.network.run(features, starts, c.network if c else None)
+        rate = self.trust * rate
+        plain, scaled = self.filters
+        plain_steps, plain_after = plain.filter_steps(given, c.plain if c else None, rate, extra)
+        scaled_steps, scaled_after = scaled.filter_steps(given, c.scaled if c else None, rate, extra)
+        weight, memory = self._mixture(plain_steps, scaled_steps, faults, c)
+        first, plain_carry = plain.outputs(given, c.plain if c else None, plain_steps, plain_after)
+        second, scaled_carry = scaled.outputs(given, c.scaled if c else None, scaled_steps, scaled_after)
+
+        steps = MixtureSteps(signals.ready_ns, weight, _r_scale(extra, self.r_std), faults.reason)
+        if c is not None:
+            steps = c.waiting.joined(steps)
+        index = released_steps(steps.ready_ns, signals.stamps_ns)
+        at = np.maximum(index, 0)
+        track = mix(steps.weight[at] if len(steps.weight) else weight, first, second)
+        count = len(signals)
+        track = replace(
+            track,
+            network_trust=np.where(track.valid, self.trust, np.nan),
+            r_scale=np.where(track.valid, steps.r_scale[at], 1.0) if count else np.ones(0),
+            mixture_weight=np.where(track.valid, steps.weight[at], np.nan) if count else np.empty(0),
+            reason=np.where(index >= 0, steps.reason[at], 0) if count else np.empty(0, dtype=np.int64),
+        )
+        newest = int(index[-1]) if count else -1
+        last = int(signals.stamps_ns[-1]) if count else (c.last_stamp_ns if c else -1)
+        after = AdaptiveCarry(
+            fault_carry, physics, network, plain_carry, scaled_carry, memory, last, steps.since(max(newest, 0))
+        )
+        return track, after
+
+    def _mixture(
+        self, plain: PosteriorSteps, scaled: PosteriorSteps, faults: SensorFaults, carry: AdaptiveCarry | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the weight of F2 at each step and the memory after the window."""
+        count = len(plain.stamps_ns)
+        memory = np.zeros(MEMORY) if carry is None else carry.memory.copy()
+        dt = np.full(count, np.nan)
+        if count:
+            dt[1:] = np.diff(plain.stamps_ns) * 1e-9
+            if carry is not None and carry.last_stamp_ns >= 0:
+                dt[0] = (int(plain.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
+        innovations = np.stack([plain.innovation[:, Z_AY], scaled.innovation[:, Z_AY]], axis=1)
+        starts: BoolArray = ~np.isfinite(plain.prior[:, VX])
+        skip = faults.reason & BURST_AY > 0
+        out = np.empty(count)
+        _weights(
+            dt, innovations, starts, skip, faults.filtered.ay_m_s2, faults.noise_std[:, AY], plain.x[:, VX],
+            plain.x[:, VY], plain.P[:, VY, VY], plain.x[:, YAW_RATE], self.evidence_low, self.evidence_high, memory,
+            out,
+        )  # fmt: skip
+        return out, memory
+
+
+def _r_scale(extra_r: FloatArray, r_std: tuple[float, float]) -> FloatArray:
+    """Return the larger factor by which the detector raised R of a_y or yaw rate, [N]."""
+    factor: FloatArray = 1.0 + (extra_r / np.square(r_std)).max(axis=1, initial=0.0)
+    return factor
+
+
+def adaptive_hybrid_ukf(
+    vehicle: VehicleParameters, network: NetworkService, *, trust: float = 1.0, use_speed: bool = True
+) -> AdaptiveHybridUkf:
+    """Return ``pd-hef`` with the noise of ``[filter.pd-hef]`` of the vehicle file."""
+    fixed = hybrid_ukf(vehicle, network, trust=trust, use_speed=use_speed)
+    return AdaptiveHybridUkf(vehicle, network, trust, fixed.q_std, fixed.r_std, use_speed=use_speed)

@@ -1,0 +1,307 @@
+"""The adaptive filter: nothing happens where nothing is wrong, and what is wrong is seen for what it is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import cut, drive, slalom, tanh_tyre, with_noise
+
+from pdhef_logtool.estimators.adaptive_hybrid import (
+    SIDESLIP_TO_RAD,
+    AdaptiveHybridUkf,
+    adaptive_hybrid_ukf,
+    mix,
+)
+from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.signals import Signals
+from pdhef_logtool.tracks import StateTrack, concatenate, make_track
+from pdhef_logtool.vehicle import FilterTuning, default_vehicle
+
+#: The reference car does not roll.
+VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
+COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2", "covariance", "nis", "valid", "r_scale")
+ADAPTIVE = (*COMPARED, "mixture_weight", "reason")
+
+
+def _bundle(output: tuple[float, float] | None = None) -> ModelBundle:
+    torch.manual_seed(0)
+    network = ResidualNetwork(Architecture(len(FEATURES), 8, 1, (4,)))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    if output is not None:
+        last = max(k for k in weights if k.startswith("head") and k.endswith("bias"))
+        weights[last.replace("bias", "weight")][:] = 0.0
+        weights[last][:] = output
+    n = len(FEATURES)
+    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
+
+
+NETWORK = NetworkService(_bundle())
+SILENT = NetworkService(_bundle((0.0, 0.0)))
+
+
+def adaptive(network: NetworkService = SILENT, **options) -> AdaptiveHybridUkf:
+    return replace(adaptive_hybrid_ukf(VEHICLE, network), **options)
+
+
+def fixed(network: NetworkService = SILENT, **options) -> HybridUkf:
+    return HybridUkf(VEHICLE, network, **options)
+
+
+def times(signals: Signals) -> np.ndarray:
+    return (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+
+
+def same(a: StateTrack, b: StateTrack, columns=COMPARED) -> bool:
+    return all(np.array_equal(getattr(a, c), getattr(b, c), equal_nan=True) for c in columns)
+
+
+def noisy(made, seed: int = 0) -> Signals:
+    s = with_noise(made.signals, seed)
+    s.friction[:] = 0.85
+    return replace(s, ready_ns=s.stamps_ns + 10_000_000)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return drive(slalom(0.035, 0.5), 12.0, speed=22.0)
+
+
+@pytest.fixture(scope="module")
+def weak():
+    """The car has a quarter less grip and stiffness than the model is told: all forces are 0.75 times the model's."""
+    return drive(slalom(0.035, 0.5), 12.0, speed=22.0, mu=0.75 * 0.85)
+
+
+@pytest.fixture(scope="module")
+def rough() -> Signals:
+    rng = np.random.default_rng(4)
+    s = with_noise(drive(slalom(0.04, 0.5), speed=22.0, mu=0.6, step_s=rng.uniform(0.004, 0.022, 700)).signals, seed=5)
+    t = times(s)
+    s.friction[:] = 0.85
+    s.yaw_rate_rad_s[(t > 2) & (t < 3)] = 0.01
+    s.ay_m_s2[(t > 4) & (t < 5)] += 2.0 * rng.standard_normal(int(((t > 4) & (t < 5)).sum()))
+    s.ay_m_s2[rng.random(len(t)) < 0.05] = np.nan
+    return replace(s, ready_ns=np.maximum.accumulate(s.stamps_ns + rng.integers(0, 45_000_000, len(s))))
+
+
+# --- nothing wrong ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("trust", [0.0, 0.4, 1.0])
+def test_without_noise_and_error_it_is_the_fixed_filter_to_the_bit(made, trust):
+    signals = replace(made.signals, friction=np.full(len(made.signals), 0.85))
+    a, _ = adaptive(trust=trust).run(signals, None)
+    b, _ = fixed(trust=trust).run(signals, None)
+    assert same(a, b)
+    assert set(a.network_trust[a.valid]) == {trust}
+
+
+def test_with_noise_it_is_the_fixed_filter_but_for_a_few_samples(made):
+    """Clean drives: the mechanism costs next to nothing."""
+    for seed in range(5):
+        signals = noisy(made, seed)
+        a, _ = adaptive().run(signals, None)
+        b, _ = fixed().run(signals, None)
+        away = np.abs(a.sideslip_rad - b.sideslip_rad)[a.valid]
+        assert np.median(away) < np.radians(0.001)
+        assert np.sqrt(np.mean(away**2)) < np.radians(0.01)
+
+
+# --- bottom layer ----------------------------------------------------------------------------------------------------
+
+
+def test_a_burst_raises_r_for_its_time_and_costs_less(made):
+    t = made.time_s
+    clean, burst = noisy(made, 1), (t > 4) & (t < 6)
+    rng = np.random.default_rng(2)
+    bad = replace(
+        clean,
+        ay_m_s2=clean.ay_m_s2 + burst * 2.4 * rng.standard_normal(len(t)),
+        yaw_rate_rad_s=clean.yaw_rate_rad_s + burst * 0.08 * rng.standard_normal(len(t)),
+    )
+    track, _ = adaptive().run(bad, None)
+    assert np.median(track.r_scale[(t > 4.1) & burst]) > 50
+    assert (track.r_scale[t > 6.7] == 1.0).all()
+    error = {e.name: np.abs(e.run(bad, None)[0].sideslip_rad - made.sideslip) for e in (adaptive(), fixed())}
+    assert error["pd-hef"][burst].mean() < 0.5 * error["pd-hef-fixed-r"][burst].mean()
+
+
+def test_a_slow_model_error_leaves_r_alone(weak):
+    track, _ = adaptive().run(noisy(weak), None)
+    assert (track.r_scale == 1.0).mean() > 0.99
+    innovation = adaptive().hybrid.filter.filter_steps(noisy(weak), None)[0].innovation[:, 0]
+    assert np.sqrt(np.nanmean(innovation**2)) > 3 * VEHICLE.sensors.ay_std_m_s2, "there was an error to be misread"
+
+
+@pytest.mark.parametrize("how", ["stuck", "dead"])
+def test_a_gyro_that_fails_does_not_take_the_filter_with_it(made, how):
+    t, signals = made.time_s, noisy(made, 3)
+    bad = (t > 4) & (t < 8)
+    held = signals.yaw_rate_rad_s[np.argmax(bad)] if how == "stuck" else 0.0
+    faulty = replace(signals, yaw_rate_rad_s=np.where(bad, held, signals.yaw_rate_rad_s))
+    error = {
+        e.name: np.sqrt(np.nanmean((e.run(faulty, None)[0].sideslip_rad - made.sideslip)[bad] ** 2))
+        for e in (adaptive(), fixed())
+    }
+    assert error["pd-hef"] < np.radians(0.1)
+    assert error["pd-hef"] < 0.2 * error["pd-hef-fixed-r"]
+
+
+# --- top layer -------------------------------------------------------------------------------------------------------
+
+
+def weights(estimator: AdaptiveHybridUkf, signals: Signals) -> np.ndarray:
+    return np.nan_to_num(estimator.run(signals, None)[0].mixture_weight)
+
+
+def test_forces_that_are_wrong_in_proportion_are_scaled(weak):
+    signals = noisy(weak)
+    assert weights(adaptive(), signals)[150:].mean() > 0.8
+    error = {
+        e.name: np.sqrt(np.nanmean((e.run(signals, None)[0].sideslip_rad - weak.sideslip)[150:] ** 2))
+        for e in (adaptive(), fixed())
+    }
+    assert error["pd-hef"] < 0.7 * error["pd-hef-fixed-r"]
+
+
+def test_white_noise_alone_gives_no_weight(made):
+    signals = noisy(made, 4)
+    louder = replace(signals, ay_m_s2=signals.ay_m_s2 + 0.3 * np.random.default_rng(0).standard_normal(len(signals)))
+    assert weights(adaptive(), signals).max() < 0.05
+    assert weights(adaptive(), louder).mean() < 0.02
+
+
+def test_a_biased_accelerometer_gives_little_weight():
+    made = drive(lambda t: 0.035 * np.sin(3 * t) * (t > 4.0), 12.0, speed=22.0)
+    signals = noisy(made, 4)
+    assert weights(adaptive(), replace(signals, ay_m_s2=signals.ay_m_s2 + 0.16)).mean() < 0.05
+
+
+def test_at_a_very_large_sideslip_it_has_no_weight(weak):
+    """A car that spins out: the weight is that of F1 wherever F1 says so."""
+    estimator = adaptive()
+    made = drive(lambda t: 0.3 * min(1.0, max(0.0, t - 2.0)), 6.0, speed=25.0, mu=0.3)
+    signals = noisy(made)
+    steps, _ = estimator.hybrid.filter.filter_steps(signals, None)
+    large = np.abs(np.arctan2(steps.x[:, 1], steps.x[:, 0])) > SIDESLIP_TO_RAD
+    track, _ = estimator.run(signals, None)
+    first, _ = fixed().run(signals, None)
+    gone = np.flatnonzero(large)[1:] + 1  # one step later it is put out
+    gone = gone[gone < len(signals)]
+    if len(gone):
+        np.testing.assert_array_equal(track.vy_m_s[gone], first.vy_m_s[gone])
+
+
+def test_the_mixture_has_the_moments_of_its_samples():
+    rng = np.random.default_rng(0)
+    means = np.array([[20.0, 0.5, 0.1], [20.4, 0.2, 0.16]])
+    roots = 0.1 * rng.standard_normal((2, 3, 3))
+    P = roots @ roots.transpose(0, 2, 1)
+    tracks = [
+        replace(
+            make_track("x", np.array([0]), vx_m_s=m[:1], vy_m_s=m[1:2], yaw_rate_rad_s=m[2:], ay_m_s2=np.array([1.0])),
+            covariance=p[None],
+        )
+        for m, p in zip(means, P, strict=True)
+    ]
+    mixed = mix(np.array([0.3]), *tracks)
+    n = 400_000
+    drawn = np.concatenate(
+        [rng.multivariate_normal(m, p, int(share * n)) for m, p, share in zip(means, P, (0.7, 0.3), strict=True)]
+    )
+    np.testing.assert_allclose(
+        [mixed.vx_m_s[0], mixed.vy_m_s[0], mixed.yaw_rate_rad_s[0]], drawn.mean(axis=0), atol=2e-3
+    )
+    np.testing.assert_allclose(mixed.covariance[0], np.cov(drawn.T), atol=1e-3)
+    assert mixed.sideslip_std_rad[0] == pytest.approx(np.arctan2(drawn[:, 1], drawn[:, 0]).std(), rel=0.02)
+    lone = replace(tracks[0], valid=np.array([False]), vy_m_s=np.array([np.nan]))
+    assert mix(np.array([0.3]), lone, tracks[1]).vy_m_s[0] == tracks[1].vy_m_s[0]
+    assert mix(np.array([0.3]), tracks[1], lone).vy_m_s[0] == tracks[1].vy_m_s[0]
+
+
+def test_trust_scales_the_network_in_both_filters(made):
+    wrong = NetworkService(_bundle((0.5, 0.2)))
+    signals = noisy(made)
+    a, _ = adaptive(wrong, trust=0.0).run(signals, None)
+    b, _ = adaptive(SILENT, trust=1.0).run(signals, None)
+    assert same(a, b)
+    assert not same(adaptive(wrong).run(signals, None)[0], b)
+
+
+def test_its_noise_comes_from_the_vehicle_file():
+    tuned = VEHICLE.model_copy(update={"filter": {"pd-hef": FilterTuning(r_std={"ay_m_s2": 2.0})}})
+    assert adaptive_hybrid_ukf(tuned, SILENT).r_std[0] == 2.0
+
+
+# --- windows, causality, symmetry ------------------------------------------------------------------------------------
+
+
+@settings(derandomize=True, deadline=None, max_examples=15)
+@given(st.lists(st.integers(0, 701), max_size=8))
+def test_windows_of_any_cut_join_bit_for_bit(rough, inner):
+    estimator = adaptive(NETWORK)
+    whole, _ = estimator.run(rough, None)
+    parts, carry = [], None
+    for first, end in pairwise([0, *sorted(inner), len(rough)]):
+        track, carry = estimator.run(cut(rough, first, end), carry)
+        parts.append(track)
+    assert same(concatenate(parts), whole, ADAPTIVE)
+    assert whole.reason.any()
+    assert len(whole.mixture_weight) == len(whole)
+
+
+@settings(derandomize=True, deadline=None, max_examples=15)
+@given(j=st.integers(1, 600), seed=st.integers(0, 2**32 - 1))
+def test_nothing_that_arrives_later_changes_an_output(rough, j, seed):
+    rng = np.random.default_rng(seed)
+    later = np.arange(len(rough)) >= j
+    columns = {
+        c: np.where(later, rng.normal(0, 5, len(rough)), getattr(rough, c))
+        for c in ("ay_m_s2", "yaw_rate_rad_s", "steer_rad")
+    }
+    estimator = adaptive(NETWORK)
+    a, b = estimator.run(rough, None)[0], estimator.run(replace(rough, **columns), None)[0]
+    before = int(np.searchsorted(rough.stamps_ns, rough.ready_ns[j], side="left"))
+    for column in ADAPTIVE:
+        np.testing.assert_array_equal(getattr(a, column)[:before], getattr(b, column)[:before])
+
+
+def test_left_and_right_are_mirrored(rough):
+    mirrored = replace(rough, **{c: -getattr(rough, c) for c in ("steer_rad", "ay_m_s2", "yaw_rate_rad_s")})
+    a, b = adaptive().run(rough, None)[0], adaptive().run(mirrored, None)[0]
+    np.testing.assert_allclose(b.vy_m_s, -a.vy_m_s, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(b.sideslip_std_rad, a.sideslip_std_rad, rtol=1e-6)
+
+
+@pytest.mark.filterwarnings("error")
+def test_bad_signals_leave_it_finite_and_its_covariance_definite(rough):
+    nothing = {c: np.full(len(rough), np.nan) for c in ("ay_m_s2", "yaw_rate_rad_s", "friction", "ax_m_s2")}
+    spiked = {"ay_m_s2": np.where(np.arange(len(rough)) % 50 == 0, 1e6, rough.ay_m_s2)}
+    for change in ({}, nothing, spiked):
+        track, _ = adaptive(NETWORK).run(replace(rough, **change), None)
+        assert track.valid[20:].mean() > 0.9
+        ok = track.valid
+        for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "sideslip_std_rad"):
+            assert np.isfinite(getattr(track, column)[ok]).all(), column
+            assert np.isnan(getattr(track, column)[~ok]).all(), column
+        assert (np.linalg.eigvalsh(track.covariance[ok]) > 0).all()
+    assert len(adaptive().run(cut(rough, 0, 0), None)[0]) == 0
+
+
+def test_another_tyre_is_not_noise():
+    made = drive(slalom(0.05, 0.4), 12.0, speed=24.0, tyre=tanh_tyre, mu=0.85)
+    signals = noisy(made)
+    track, _ = adaptive().run(signals, None)
+    first, _ = fixed().run(signals, None)
+    worse = [np.sqrt(np.nanmean((x.sideslip_rad - made.sideslip)[100:] ** 2)) for x in (track, first)]
+    assert worse[0] < 1.05 * worse[1]
