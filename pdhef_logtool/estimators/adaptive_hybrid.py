@@ -134,22 +134,36 @@ def _weights(  # type: ignore[no-untyped-def]
         out[k] = share * fade if math.isfinite(share * fade) else 0.0
 
 
+@njit(cache=True)
+def _mix(w, first, second, P1, P2, x, P):  # type: ignore[no-untyped-def]
+    """Write the mixtures of states [N, 4] and covariances [N, 3, 3]; the first three states have a covariance."""
+    for k in range(w.shape[0]):
+        if w[k] <= 0.0:
+            x[k] = first[k]
+            P[k] = P1[k]
+            continue
+        if w[k] >= 1.0:
+            x[k] = second[k]
+            P[k] = P2[k]
+            continue
+        for i in range(4):
+            x[k, i] = first[k, i] + w[k] * (second[k, i] - first[k, i])
+        for i in range(3):
+            for j in range(3):
+                spread = (second[k, i] - first[k, i]) * (second[k, j] - first[k, j])
+                P[k, i, j] = (1.0 - w[k]) * P1[k, i, j] + w[k] * P2[k, i, j] + w[k] * (1.0 - w[k]) * spread
+
+
 def mix(weight: FloatArray, first: StateTrack, second: StateTrack) -> StateTrack:
     """Return (1 − w) of the first track and w of the second as one Gaussian, its covariance with their difference.
 
     With d = x₂ − x₁: x = x₁ + w d, P = (1 − w) P₁ + w P₂ + w (1 − w) d dᵀ. Where only one is valid, it is the result.
     """
     w = np.where(second.valid, np.where(first.valid, weight, 1.0), 0.0)
-    alone = w == 0.0
-    state = [np.stack([t.vx_m_s, t.vy_m_s, t.yaw_rate_rad_s, t.ay_m_s2], axis=1) for t in (first, second)]
-    difference = np.where(alone[:, None], 0.0, state[1] - state[0])
-    # Only the second is valid: nothing of the first, which is NaN there.
-    x = np.where(w[:, None] == 1.0, state[1], state[0] + w[:, None] * np.where(w[:, None] == 1.0, 0.0, difference))
-    d = np.where(w[:, None] == 1.0, 0.0, difference[:, :3])
-    share = w[:, None, None]
-    spread = share * (1.0 - share) * d[:, :, None] * d[:, None, :]
-    both = (1.0 - share) * first.covariance + share * second.covariance + spread
-    P = np.where(share == 0.0, first.covariance, np.where(share == 1.0, second.covariance, both))
+    count = len(w)
+    x, P = np.empty((count, 4)), np.empty((count, 3, 3))
+    states = [np.stack([t.vx_m_s, t.vy_m_s, t.yaw_rate_rad_s, t.ay_m_s2], axis=1) for t in (first, second)]
+    _mix(w, states[0], states[1], first.covariance, second.covariance, x, P)
     mostly = w > 0.5
     return replace(
         first,
@@ -159,9 +173,10 @@ def mix(weight: FloatArray, first: StateTrack, second: StateTrack) -> StateTrack
         ay_m_s2=x[:, 3].copy(),
         sideslip_rad=np.arctan2(x[:, 1], x[:, 0]),
         covariance=P,
-        sideslip_std_rad=np.where(alone, first.sideslip_std_rad, sideslip_std(x[:, 0], x[:, 1], P)),
+        sideslip_std_rad=sideslip_std(x[:, 0], x[:, 1], P),
         nis=np.where(mostly, second.nis, first.nis),
         nis_dof=np.where(mostly, second.nis_dof, first.nis_dof),
+        friction=np.where(first.valid, first.friction, second.friction),
         valid=first.valid | second.valid,
         diverged=np.where(mostly, second.diverged, first.diverged),
     )
@@ -226,6 +241,9 @@ class AdaptiveHybridUkf:
         plain_steps, plain_after = plain.filter_steps(given, c.plain if c else None, rate, extra)
         scaled_steps, scaled_after = scaled.filter_steps(given, c.scaled if c else None, rate, extra)
         weight, memory = self._mixture(plain_steps, scaled_steps, faults, c)
+        # Only what the mixture takes is predicted to the stamps.
+        plain_steps = replace(plain_steps, valid=plain_steps.valid & ((weight < 1.0) | ~scaled_steps.valid))
+        scaled_steps = replace(scaled_steps, valid=scaled_steps.valid & ((weight > 0.0) | ~plain_steps.valid))
         first, plain_carry = plain.outputs(given, c.plain if c else None, plain_steps, plain_after)
         second, scaled_carry = scaled.outputs(given, c.scaled if c else None, scaled_steps, scaled_after)
 
