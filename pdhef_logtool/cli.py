@@ -703,6 +703,69 @@ def tune(
     raise typer.Exit(result.exit_code)
 
 
+@app.command(
+    epilog="""Examples:
+
+  pdhef trust drive.mcap --vehicle car.toml --start 155 -o car_trusted.toml
+
+  pdhef trust logs/ --split test --vehicle car.toml --model model -o car_trusted.toml
+
+Give driving that neither the network nor the vehicle file was fitted to. The filter runs at trust 0, 0.25, 0.5, 0.75
+and 1. The cap is 1 only if a bootstrap of blocks confirms the gain, at most 0.5 on a mean gain, else 0 (docs/trust.md).
+Beside the vehicle file stands NAME.trust.json with all figures."""
+)
+def trust(
+    logs: Annotated[list[str], typer.Argument(help="Logs with truth, folders that hold some, or glob patterns.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="vehicle.toml to write, with its cap; may be that of --vehicle.")
+    ],
+    vehicle: Annotated[Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml of the drives' car.")] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="Folder of a model bundle. Default: the shipped model.")
+    ] = None,
+    mapping: MappingFile = None,
+    start: Annotated[str | None, typer.Option("--start", help="Start of the slice of each log (as for run).")] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End of the slice of each log (as for run).")] = None,
+    split: Annotated[
+        str | None, typer.Option("--split", help="Only drives of this split, by the manifest of their set.")
+    ] = None,
+    any_split: Annotated[
+        bool, typer.Option("--any-split", help="Take drives of the splits train and validation too.")
+    ] = False,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the bootstrap.")] = 0,
+    sensors: Annotated[
+        str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
+    ] = None,
+    prefer_truth: TruthChoice = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Find out on drives with truth how far the network may be trusted on a vehicle, and write it into its file."""
+    from pdhef_logtool.config import load_config
+    from pdhef_logtool.summary import render_trust
+    from pdhef_logtool.training.trust_command import TrustSettings, run_trust
+
+    config = load_config(
+        None,
+        {
+            "vehicle": vehicle,
+            "model": model,
+            "mapping": mapping,
+            "start": start,
+            "end": end,
+            "sensors": sensors,
+            "prefer_truth": prefer_truth,
+        },
+    )
+    settings = TrustSettings(config, seed=seed, split=split, any_split=any_split)
+    with _progress() as progress:
+        result = run_trust(logs, output, settings, progress=progress, warn=_warn)
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        render_trust(result, _stdout())
+    raise typer.Exit(result.exit_code)
+
+
 @app.command()
 def estimators(as_json: JsonFlag = False) -> None:
     """List the estimators that run can use."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.training.extract_command import ExtractResult
     from pdhef_logtool.training.identify_command import IdentifyResult
     from pdhef_logtool.training.train_command import TrainResult
+    from pdhef_logtool.training.trust_command import TrustResult
     from pdhef_logtool.training.tune_command import TuneResult
 
 _DEG = math.degrees(1.0)
@@ -109,6 +110,8 @@ def _render_log(one: LogResult, console: Console) -> None:
     for estimator in report["estimators"]:
         if estimator["outcome"] == "skipped":
             console.print(f"  {estimator['name']} skipped: {estimator['reason']}", highlight=False)
+        for note in estimator["notes"]:
+            console.print(f"  {estimator['name']}: {note}", highlight=False, markup=False)
     console.print()
 
 
@@ -268,6 +271,27 @@ def render_tuning(result: TuneResult, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def render_trust(result: TrustResult, console: Console) -> None:
+    """Print the sideslip error at each trust, its difference to trust 0 with bounds, and the cap with its reason."""
+    from rich.table import Table
+
+    from pdhef_logtool.training.trust import TRUSTS
+
+    d = result.decision
+    table = Table(box=None, header_style="bold")
+    for head in ("\ntrust", "sideslip\nRMSE °", "squared error less\nthat at 0, deg²", "\n95 % bounds"):
+        table.add_column(head, justify="right")
+    for trust, rmse, b in zip(TRUSTS, d.rmse_deg, d.against_zero, strict=True):
+        known = trust > 0.0 and not math.isnan(b.low_deg2)
+        bounds = f"{b.low_deg2:.4f} to {b.high_deg2:.4f}" if known else "-"
+        table.add_row(f"{trust:g}", f"{rmse:.4f}", f"{b.value_deg2:.4f}" if trust else "-", bounds)
+    console.print(table)
+    seconds = f"{d.scored_s:.0f} s scored, {d.excited_s:.0f} s of them excited"
+    console.print(f"{len(result.drives)} drives, {d.blocks} blocks, {seconds}", highlight=False)
+    console.print(f"trust cap {d.cap:g}: {d.reason}", highlight=False)
+    console.print(f"vehicle in {result.vehicle_file}, figures in {result.record_file}", highlight=False, soft_wrap=True)
 
 
 def render_baselines(result: BaselinesResult, console: Console) -> None:

@@ -101,10 +101,19 @@ class FilterTuning(_Record):
 
 
 class Network(_Record):
-    """How far a residual network may be trusted on this vehicle, and on which evidence."""
+    """How far a residual network may be trusted on this vehicle, and on which evidence (``pdhef trust`` writes it).
 
-    trust_cap: Annotated[float, Field(ge=0, le=1)] = 0.3
+    ``model_sha256`` is the network that the evidence is about: the cap holds for no other. None: for any.
+    """
+
+    trust_cap: Annotated[float, Field(ge=0, le=1)] = 0.0
     evidence: str = "none"
+    model_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
+
+    @property
+    def has_evidence(self) -> bool:
+        """Whether the file says why; without, its cap counts for nothing."""
+        return self.evidence.strip().lower() not in ("", "none")
 
 
 class VehicleParameters(_Record):

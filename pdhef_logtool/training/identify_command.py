@@ -16,8 +16,10 @@ from pdhef_logtool.mapping import choose_mapping, load_mapping
 from pdhef_logtool.sinks.base import write_bytes
 from pdhef_logtool.training.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.training.identify import Identification, Identified, identify, understeer_deg_per_g
-from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_to_toml
+from pdhef_logtool.vehicle import Network, VehicleParameters, default_vehicle, load_vehicle, vehicle_to_toml
 
+#: Other tyres, another nominal model: what was found with those of the starting file counts no more.
+NO_NETWORK_TRIED = "no network was tried on this vehicle"
 #: Entry of vehicle.toml that a parameter's interval is written beside.
 _ENTRIES = {
     "yaw inertia": "yaw_inertia_kg_m2",
@@ -149,7 +151,13 @@ def run_identification(
         progress=lambda text, share: progress(text, 0.2 + 0.8 * share),
     )
     name = f"{start.name} (identified)" if not start.name.endswith("(identified)") else start.name
-    vehicle = found.vehicle.model_copy(update={"name": name, "identification": _provenance(found, fit, holdout, start)})
+    vehicle = found.vehicle.model_copy(
+        update={
+            "name": name,
+            "network": Network(trust_cap=0.0, evidence=NO_NETWORK_TRIED),
+            "identification": _provenance(found, fit, holdout, start),
+        }
+    )
     write_bytes(output, vehicle_to_toml(vehicle, _comments(found)).encode())
     plot = output.with_suffix(".png")
     from pdhef_logtool.training.identify_plot import plot_identification

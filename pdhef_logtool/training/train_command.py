@@ -122,6 +122,7 @@ def train_on(
         "dataset_sha256": data.sha256,
         "vehicle": data.vehicle_name,
         "fine_tuned_from": None if init is None else init.sha256,
+        "fine_tuned_on": None if init is None else data.vehicle_name,
         "test_loss": test_loss,
         "training_hours": round(sum(len(s.weight) for s in splits["train"]) * recipe.period_s / 3600.0, 3),
     }

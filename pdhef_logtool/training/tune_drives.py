@@ -254,6 +254,11 @@ class DriveBench:
         seconds = float(joined.stamps_ns[-1] - joined.stamps_ns[0]) * 1e-9
         return facts(held, seconds, scored)
 
+    def take(self, index: int) -> tuple[Signals, StateTrack]:
+        """Return signals [N] and truth [N] of a drive that was loaded, and keep it no longer."""
+        drive = self._drives.pop(index)
+        return drive.signals, drive.truth
+
     def score(self, tunings: Mapping[str, FilterTuning]) -> dict[str, dict[int, DriveError]]:
         """Return the errors of each estimator by drive."""
         slow = self._setup.vehicle.low_speed_blend_m_s
