@@ -20,13 +20,14 @@ DESCRIPTIONS: dict[str, str] = {
     "phy-ukf-tuned": "the same with the noise of an identified vehicle file, corrected for body roll",
     "physics-plus": "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
     "pure-lstm": "a network that says v_y itself, from the same inputs, no filter (needs --model with baselines)",
+    "pd-hef": "hybrid filter that finds faulty sensors and scales wrong forces (needs --model)",
     "pd-hef-fixed-r": "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs --model)",
     "pd-hef-trust0": "the hybrid filter with its network switched off (needs --model)",
     "pd-hef-trust1": "the hybrid filter at trust 1, whatever the vehicle file allows (needs --model)",
     "pd-hef-paper": "the paper's hybrid filter with its adaptive mechanism, to the letter (needs --model)",
 }
 #: Names that stand for another estimator, under whose name it runs.
-ALIASES = {"pd-hef": "pd-hef-fixed-r"}
+ALIASES: dict[str, str] = {}
 
 DEFAULT_ESTIMATORS = ("zero", "gyro", "kinematic", "open-loop", "phy-ukf", "physics-plus")
 #: Run by default as well where the vehicle file has what it needs.
@@ -34,9 +35,16 @@ TUNED_ESTIMATORS = ("phy-ukf-tuned",)
 #: Trust of the hybrid filters by name; they need a model.
 HYBRID_TRUST = {"pd-hef-fixed-r": 1.0, "pd-hef-trust0": 0.0, "pd-hef-trust1": 1.0}
 #: Every estimator that needs a model.
-MODEL_ESTIMATORS = (*HYBRID_TRUST, "pd-hef-paper", "pure-lstm", "linear-regression")
+MODEL_ESTIMATORS = ("pd-hef", *HYBRID_TRUST, "pd-hef-paper", "pure-lstm", "linear-regression")
 #: Run by default as well where a model is given that has what they need.
-DEFAULT_MODEL_ESTIMATORS = ("linear-regression", "pure-lstm", "pd-hef-fixed-r", "pd-hef-trust0", "pd-hef-paper")
+DEFAULT_MODEL_ESTIMATORS = (
+    "linear-regression",
+    "pure-lstm",
+    "pd-hef",
+    "pd-hef-fixed-r",
+    "pd-hef-trust0",
+    "pd-hef-paper",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +123,10 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
 
         return DirectNetwork(vehicle, NetworkService(model.pure_lstm), use_speed=use_speed)
 
+    if name == "pd-hef":
+        from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
+
+        return adaptive_hybrid_ukf(vehicle, NetworkService(model), use_speed=use_speed)
     if name == "pd-hef-paper":
         from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf
 

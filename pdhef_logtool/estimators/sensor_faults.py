@@ -129,13 +129,14 @@ class SensorFaults:
     Attributes
     ----------
     extra_r : [N, 2], variance beyond the usual one, m²/s⁴ and rad²/s²; 0 where the channel is as usual.
-    noise_std : [N, 2], 1-sigma ŝ. reason : int64 [N], bit mask.
+    noise_std, usual_std : [N, 2], 1-sigma ŝ of now, and what is usual. reason : int64 [N], bit mask.
     filtered : the signals for filters; samples that are stuck, dead or a spike are missing.
     network : the signals for the network's inputs; samples of a burst are missing as well.
     """
 
     extra_r: FloatArray
     noise_std: FloatArray
+    usual_std: FloatArray
     reason: IntArray
     filtered: Signals
     network: Signals
@@ -304,7 +305,8 @@ def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _detect(  # type: ignore[no-untyped-def]
-    dt, steer, ay, yaw_rate, speed, friction, default_friction, s0, p, channels, w, extra, noise, reason, usable
+    dt, steer, ay, yaw_rate, speed, friction, default_friction, s0, p, channels, w, extra, noise, usual_noise, reason,
+    usable,
 ):  # fmt: skip
     """Run over one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
     for k in range(dt.shape[0]):
@@ -344,6 +346,7 @@ def _detect(  # type: ignore[no-untyped-def]
                 mask |= BURST_AY << i
                 extra[k, i] = c[C_NOISE] - s0[i] * s0[i]
             noise[k, i] = math.sqrt(max(c[C_NOISE], usual))
+            usual_noise[k, i] = math.sqrt(usual)
 
         mu = friction[k] if math.isfinite(friction[k]) else w[W_FRICTION] if w[W_FRICTION] > 0.0 else default_friction
         w[W_FRICTION] = mu
@@ -411,12 +414,13 @@ def find_faults(
             else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
         )
         dt[1:] = np.diff(signals.stamps_ns) * 1e-9
-    extra, noise, usable = np.empty((count, 2)), np.empty((count, 2)), np.empty((count, 2))
+    extra, noise, usual, usable = (np.empty((count, 2)) for _ in range(4))
     reason = np.empty(count, dtype=np.int64)
     s0 = np.array([vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s])
     _detect(
         dt, signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.friction,
-        vehicle.assumed_friction, s0, model_parameters(vehicle), channels, witness, extra, noise, reason, usable,
+        vehicle.assumed_friction, s0, model_parameters(vehicle), channels, witness, extra, noise, usual, reason,
+        usable,
     )  # fmt: skip
     last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else -1)
     filtered: dict[str, Any] = {"ay_m_s2": usable[:, AY].copy(), "yaw_rate_rad_s": usable[:, YAW_RATE].copy()}
@@ -424,5 +428,5 @@ def find_faults(
         "ay_m_s2": np.where(reason & BURST_AY, np.nan, usable[:, AY]),
         "yaw_rate_rad_s": np.where(reason & BURST_YAW_RATE, np.nan, usable[:, YAW_RATE]),
     }
-    faults = SensorFaults(extra, noise, reason, replace(signals, **filtered), replace(signals, **seen))
+    faults = SensorFaults(extra, noise, usual, reason, replace(signals, **filtered), replace(signals, **seen))
     return faults, FaultCarry(channels, witness, last)

@@ -267,10 +267,10 @@ def test_the_registry_makes_it_with_a_model_and_skips_it_without():
     names = ("pd-hef-paper", "pd-hef-trust1", "pd-hef")
     available = frozenset(ALIGNED_SIGNALS)
     estimators, skipped = runnable(names, VEHICLE, available, model=make_bundle())
-    assert [e.name for e in estimators] == ["pd-hef-paper", "pd-hef-trust1", "pd-hef-fixed-r"]
+    assert [e.name for e in estimators] == ["pd-hef-paper", "pd-hef-trust1", "pd-hef"]
     assert skipped == []
     estimators, skipped = runnable(names, VEHICLE, available)
     assert estimators == []
     assert all("--model" in s.reason for s in skipped)
-    with pytest.raises(UsageError, match="pd-hef-fixed-r"):
-        check_names(("pd-hef", "pd-hef-fixed-r"))
+    with pytest.raises(UsageError, match="pd-hef-paper"):
+        check_names(("pd-hef-paper", "pd-hef", "pd-hef-paper"))
