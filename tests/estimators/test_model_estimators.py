@@ -26,7 +26,7 @@ from pdhef_logtool.tracks import StateTrack, concatenate
 from pdhef_logtool.vehicle import default_vehicle
 
 VEHICLE = default_vehicle()
-NAMES = ("pd-hef-paper", "pure-lstm", "linear-regression")
+NAMES = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
 
 
 def make_network(target: str, outputs: int) -> ModelBundle:
