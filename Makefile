@@ -7,13 +7,14 @@ OUT ?= out/demo
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: help demo test check lint format bench samples docs-truthsim paper clean
+.PHONY: train-default help demo test check lint format bench samples docs-truthsim paper clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make bench    speed against peers, and the tuning tables"
+	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions VEHICLE=car.toml MODEL=model  docs/conditions.md: every estimator on the condition table"
 	@echo "make real MODEL=model  docs/real.md: every estimator on the recorded drives in ../shared"
@@ -67,6 +68,10 @@ check: lint test
 
 bench: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m benchmarks
+
+train-default: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m benchmarks.train_default
+	$(BIN)/python -m benchmarks.model_card
 
 samples: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/python -m truthsim.samples sample_logs
