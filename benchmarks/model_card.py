@@ -91,6 +91,7 @@ def page(work: Path, folder: Path) -> str:
     """Return the card."""
     model, vehicle = load_bundle(folder), load_vehicle(folder / "vehicle.toml")
     manifest = json.loads((work / "dataset" / "manifest.json").read_text(encoding="utf-8"))
+    recipe = model.provenance["recipe"]
     splits = ", ".join(f"{n} {s['drives']} drives" for n, s in manifest["splits"].items())
     networks = [network_line("residual network", model)]
     for name, bundle, place in (
@@ -111,7 +112,8 @@ Written by `python -m benchmarks.model_card`; the model by `make train-default`.
   with the filter noise that belongs to it). On another car its trust is capped by that car's vehicle file.
 - Data: simulated, {DRIVES} drives of 12.5 s of that car (seed {SETS["one_car"][0]}), friction 0.3 to 1.0, 40 to
   120 km/h, sensors with METHOD's noise, biases and delays; friction is told by the simulator. {splits}; split by drive.
-- Training: seed {model.provenance["recipe"]["seed"]}, one cycle up to a learning rate of {model.provenance["recipe"]["learning_rate"]:g}, {model.provenance["training_hours"]:.2f} h of driving.
+- Training: seed {recipe["seed"]}, one cycle up to a learning rate of {recipe["learning_rate"]:g}, on
+  {model.provenance["training_hours"]:.2f} h of driving.
 
 | network | features | LSTM | weights | epochs | validation loss | test loss |
 | --- | --- | --- | --- | --- | --- | --- |

@@ -15,7 +15,6 @@ tyres (``docs/model_card.md``).
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
@@ -99,8 +98,6 @@ def main(arguments: list[str] | None = None) -> int:
         say("tune the noise of all tuned estimators alike, on validation drives")
         search = ["--split", "validation", "--trials", TRIALS, "--model", model]
         _pdhef("tune", work / "one_car", *search, *told, "-o", model / "vehicle.toml")
-    facts = {"minutes": round((time.monotonic() - began) / 60.0, 1), "jobs": given.jobs, "seed": given.seed}
-    (work / f"train-{given.seed}.json").write_text(json.dumps(facts) + "\n", encoding="utf-8")
     say(f"done: {model}")
     return 0
 
