@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -11,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.config import RunConfig
+from pdhef_logtool.config import NANOSECONDS_FROM, RunConfig, parse_time
 from pdhef_logtool.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
 from pdhef_logtool.estimators.trust_policy import SHOWN_DIGITS
@@ -49,6 +51,8 @@ FORMAT = "pdhef-trust"
 FORMAT_VERSION = 1
 #: Splits of a set that a network is trained on and chosen by: it looks better there than in service.
 SEEN = ("train", "validation")
+#: A drive as ``pdhef identify`` names it in the vehicle file.
+_SPAN = re.compile(r"(?P<name>.+): (?P<start>-?[\d.]+) to (?P<end>-?[\d.]+) s")
 
 Warn = Callable[[str], None]
 
@@ -180,7 +184,7 @@ def run_trust(
             where="trust",
             remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
         )
-    for text in seen_by_identification(vehicle, drives):
+    for text in seen_by_identification(vehicle, drives, *_slice_s(config)):
         warn(text)
     together = join_blocks(scored)
     if together.lost:
@@ -261,16 +265,29 @@ def errors_by_trust(
     return block_errors(errors, truth.sideslip_rad, signals.stamps_ns, excited)
 
 
-def seen_by_identification(vehicle: VehicleParameters, drives: Sequence[DriveFacts]) -> list[str]:
-    """Return a warning for each drive whose name stands under those that the vehicle was identified on."""
+def seen_by_identification(
+    vehicle: VehicleParameters, drives: Sequence[DriveFacts], start_s: float = 0.0, end_s: float = math.inf
+) -> list[str]:
+    """Return a warning for each drive that the vehicle was identified on within [start_s, end_s) of the log."""
     spans = vehicle.identification.get("drives", [])
-    if not isinstance(spans, list):
-        return []
-    return [
-        f"the vehicle was identified on {span}: what is scored here must lie outside (--start, --end)"
-        for span in spans
-        if any(span.startswith(f"{d.name}: ") for d in drives)
+    told = []
+    for span in spans if isinstance(spans, list) else []:
+        found = _SPAN.fullmatch(span)
+        if found is None or found["name"] not in {d.name for d in drives}:
+            continue
+        if start_s < float(found["end"]) and end_s > float(found["start"]):
+            told.append(f"the vehicle was identified on {span}: score another part (--start, --end)")
+    return told
+
+
+def _slice_s(config: RunConfig) -> tuple[float, float]:
+    """Return the slice in seconds from a log's start as far as it is given so; else all of it."""
+    given = [
+        None if text is None else parse_time(text, 0, 0, option=option) * 1e-9
+        for text, option in ((config.start, "--start"), (config.end, "--end"))
     ]
+    start, end = (None if v is None or not 0.0 <= v < NANOSECONDS_FROM * 1e-9 else v for v in given)
+    return 0.0 if start is None else start, math.inf if end is None else end
 
 
 def evidence(decision: TrustDecision, drives: int, model_sha256: str) -> str:

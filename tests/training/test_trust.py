@@ -294,9 +294,12 @@ def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:
     facts = bench.load(0, find_logs([str(sample_logs_dir / "dlc.mcap")])[0], MAX_BYTES)
     spans: dict[str, str | float | int | list[str]] = {"drives": ["dlc: 0.00 to 7.00 s", "dlc_2: 0.00 to 7.00 s"]}
     assert seen_by_identification(vehicle, [facts]) == []
-    told = seen_by_identification(vehicle.model_copy(update={"identification": spans}), [facts])
+    identified = vehicle.model_copy(update={"identification": spans})
+    told = seen_by_identification(identified, [facts])
     assert len(told) == 1
     assert "dlc: 0.00 to 7.00 s" in told[0]
+    assert len(seen_by_identification(identified, [facts], 6.9)) == 1
+    assert seen_by_identification(identified, [facts], 7.0) == []
 
 
 def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -> None:

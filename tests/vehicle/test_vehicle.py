@@ -85,7 +85,8 @@ def test_defaults_of_what_the_file_leaves_out(tmp_path):
     assert vehicle.friction is None
     assert vehicle.assumed_friction == 1.0
     assert vehicle.imu_position_m == (0.0, 0.0, 0.0)
-    assert vehicle.network.trust_cap == 0.3
+    assert vehicle.network.trust_cap == 0.0
+    assert not vehicle.network.has_evidence
     assert vehicle.filter == {}
     assert vehicle.sensors.ay_std_m_s2 == 0.12
 
