@@ -1,4 +1,4 @@
-"""Fit the nominal axle tyres to slow ramp steers of the truth vehicle on two roads, and write the vehicle files of the sample logs.
+"""Fit the nominal axle tyres to slow ramp steers of the truth vehicle on two roads; write the samples' vehicle files.
 
     python benchmarks/fit_nominal_tyres.py [sample_logs]
 

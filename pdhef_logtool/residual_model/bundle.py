@@ -140,7 +140,7 @@ def open_model(model: Path | None) -> ModelBundle | None:
     if model is not None and str(model) == NO_MODEL:
         return None
     if model is None or str(model) == SHIPPED:
-        return load_bundle(SHIPPED_FOLDER) if SHIPPED_FOLDER.is_dir() else None
+        return load_bundle(SHIPPED_FOLDER) if (SHIPPED_FOLDER / DOCUMENT_FILE).is_file() else None
     return load_bundle(model)
 
 
