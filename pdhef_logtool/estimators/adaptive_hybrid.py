@@ -196,6 +196,7 @@ class AdaptiveHybridUkf:
     trust : share of the network's residual that both filters take, in [0, 1]; the cap of METHOD §14 goes here.
     q_std, r_std : as for :class:`~.hybrid.HybridUkf`.
     evidence_low, evidence_high : between which F2 gains its weight, over the noise variance of a_y.
+    notes : what the report says of it, such as the reason for its trust.
     """
 
     vehicle: VehicleParameters
@@ -208,6 +209,7 @@ class AdaptiveHybridUkf:
     use_speed: bool = True
     name: str = "pd-hef"
     causal: bool = True
+    notes: tuple[str, ...] = ()
 
     @property
     def needs(self) -> frozenset[str]:
@@ -303,8 +305,13 @@ def _r_scale(extra_r: FloatArray, r_std: tuple[float, float]) -> FloatArray:
 
 
 def adaptive_hybrid_ukf(
-    vehicle: VehicleParameters, network: NetworkService, *, trust: float = 1.0, use_speed: bool = True
+    vehicle: VehicleParameters,
+    network: NetworkService,
+    *,
+    trust: float = 1.0,
+    use_speed: bool = True,
+    notes: tuple[str, ...] = (),
 ) -> AdaptiveHybridUkf:
     """Return ``pd-hef`` with the noise of ``[filter.pd-hef]`` of the vehicle file."""
     fixed = hybrid_ukf(vehicle, network, trust=trust, use_speed=use_speed)
-    return AdaptiveHybridUkf(vehicle, network, trust, fixed.q_std, fixed.r_std, use_speed=use_speed)
+    return AdaptiveHybridUkf(vehicle, network, trust, fixed.q_std, fixed.r_std, use_speed=use_speed, notes=notes)

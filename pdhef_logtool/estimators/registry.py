@@ -125,8 +125,12 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
 
     if name == "pd-hef":
         from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
+        from pdhef_logtool.estimators.trust_policy import allowed_trust
 
-        return adaptive_hybrid_ukf(vehicle, NetworkService(model), use_speed=use_speed)
+        allowed = allowed_trust(vehicle, model)
+        return adaptive_hybrid_ukf(
+            vehicle, NetworkService(model), trust=allowed.cap, use_speed=use_speed, notes=(allowed.note,)
+        )
     if name == "pd-hef-paper":
         from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf
 
