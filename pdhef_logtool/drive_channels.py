@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,7 +30,7 @@ from pdhef_logtool.evaluation.truth import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import ClockModel, Mapping, fit_clocks, join_channels, merge_losses, read_signals
-from pdhef_logtool.signals import Channel, Loss, Signals
+from pdhef_logtool.signals import Channel, Loss, Signals, cut_signals, join_signals
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import VehicleParameters, correct_signals
 
@@ -209,6 +210,35 @@ class DriveReader:
         if plan.truth is not None:
             at_stamps = truth_at(derive_truth(truth, plan=plan.truth), aligned.stamps_ns, plan.truth_latency_s)
         return DriveWindow(aligned, at_stamps, share)
+
+
+def with_look_ahead(
+    windows: Iterable[DriveWindow], look_ahead_s: float
+) -> Iterator[tuple[DriveWindow, Signals | None]]:
+    """Yield the windows that hold a stamp, each with the signals of the ``look_ahead_s`` behind its last stamp.
+
+    They are fewer only where the drive ends, and None where there are none or none are asked for. No more windows
+    are held at once than that takes.
+    """
+    held: deque[DriveWindow] = deque()
+    look_ahead_ns = round(look_ahead_s * 1e9)
+    for window in windows:
+        if len(window.signals):
+            held.append(window)
+        while held and held[-1].signals.stamps_ns[-1] - held[0].signals.stamps_ns[-1] >= look_ahead_ns:
+            yield _with_following(held, look_ahead_ns)
+    while held:
+        yield _with_following(held, look_ahead_ns)
+
+
+def _with_following(held: deque[DriveWindow], look_ahead_ns: int) -> tuple[DriveWindow, Signals | None]:
+    """Take the first window from ``held``; return it with what follows within the time."""
+    first = held.popleft()
+    if not held or look_ahead_ns == 0:
+        return first, None
+    following = join_signals([w.signals for w in held])
+    until = int(np.searchsorted(following.stamps_ns, first.signals.stamps_ns[-1] + look_ahead_ns, side="right"))
+    return first, cut_signals(following, 0, until)
 
 
 def _since(channel: Channel, stamp_ns: int) -> Channel:

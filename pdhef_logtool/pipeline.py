@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.config import RunConfig, time_slice
-from pdhef_logtool.drive_channels import DrivePlan, DriveReader, plan_drive
+from pdhef_logtool.drive_channels import DrivePlan, DriveReader, plan_drive, with_look_ahead
 from pdhef_logtool.errors import (
     EXIT_FAILURE,
     EXIT_GATE,
@@ -24,7 +24,7 @@ from pdhef_logtool.errors import (
     PdhefError,
     UsageError,
 )
-from pdhef_logtool.estimators.base import Estimator, notes_of
+from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
 from pdhef_logtool.estimators.registry import default_names, runnable
 from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
@@ -384,9 +384,8 @@ def _estimate(
     poses = {e.name: DeadReckoning() for e in estimators} | {TRUTH: DeadReckoning()}
     seen: list[Signals] = []
     start: tuple[float, float, float] | None = None
-    for window in reader.windows():
-        if len(window.signals) == 0:
-            continue
+    look_ahead_s = max(map(look_ahead_of, estimators), default=0.0)
+    for window, ahead in with_look_ahead(reader.windows(), look_ahead_s):
         seen.append(window.signals)
         if start is None:
             start = first_pose(window.truth)
@@ -400,7 +399,8 @@ def _estimate(
             for sink in sinks:
                 sink.append(drawn)
         for estimator in estimators:
-            track, carries[estimator.name] = estimator.run(window.signals, carries.get(estimator.name))
+            carry = carries.get(estimator.name)
+            track, carries[estimator.name] = run_window(estimator, window.signals, carry, ahead)
             track = poses[estimator.name].add(track, start)
             store.append(track)
             for sink in sinks:

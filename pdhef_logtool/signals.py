@@ -151,3 +151,9 @@ def join_signals(windows: Sequence[Signals]) -> Signals:
         f.name: np.concatenate([getattr(w, f.name) for w in windows]) for f in fields(Signals) if f.name != "available"
     }
     return Signals(**columns, available=windows[0].available)
+
+
+def cut_signals(signals: Signals, first: int, end: int) -> Signals:
+    """Return the stamps [first, end) of a drive."""
+    columns = {f.name: getattr(signals, f.name)[first:end] for f in fields(Signals) if f.name != "available"}
+    return Signals(**columns, available=signals.available)

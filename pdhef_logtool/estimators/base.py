@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -58,6 +58,37 @@ class Estimator(Protocol):
             windows gives the same bits as one call over the whole log.
         """
         ...
+
+
+@runtime_checkable
+class LookingAhead(Protocol):
+    """An estimator that is not causal: beside the window it may see what follows."""
+
+    @property
+    def look_ahead_s(self) -> float:
+        """How much of what follows a window it must be given for its result not to depend on the windows."""
+        ...
+
+    def run(self, signals: Signals, carry: Any | None, ahead: Signals | None = None) -> tuple[StateTrack, Any]:
+        """Process one window as :meth:`Estimator.run`; ``ahead`` is what follows, and the next window begins with it.
+
+        Without it the log ends with the window for all that the estimator knows.
+        """
+        ...
+
+
+def look_ahead_of(estimator: Estimator) -> float:
+    """Return how much of what follows a window an estimator must be given, s; 0 for a causal one."""
+    return estimator.look_ahead_s if isinstance(estimator, LookingAhead) else 0.0
+
+
+def run_window(
+    estimator: Estimator, signals: Signals, carry: Any | None, ahead: Signals | None
+) -> tuple[StateTrack, Any]:
+    """Process one window; only an estimator that is not causal gets what follows."""
+    if isinstance(estimator, LookingAhead):
+        return estimator.run(signals, carry, ahead)
+    return estimator.run(signals, carry)
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:

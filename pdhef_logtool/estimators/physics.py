@@ -93,6 +93,10 @@ MEMORY = 14
 #: What M_REJECTED holds at the first rejected sample itself; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 
+#: How a step hangs together with the one before it: not at all (start, failure), through the whole state, or through
+#: what a standstill does not overwrite (the entries from AX_BIAS on).
+LINK_NONE, LINK_WHOLE, LINK_BIASES = 0, 1, 2
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterCarry:
@@ -134,6 +138,37 @@ class PosteriorSteps:
     def since(self, index: int) -> PosteriorSteps:
         """Keep the steps from ``index`` on."""
         return PosteriorSteps(*(getattr(self, n)[index:] for n in self.__slots__))
+
+    def until(self, index: int) -> PosteriorSteps:
+        """Keep the steps before ``index``."""
+        return PosteriorSteps(*(getattr(self, n)[:index] for n in self.__slots__))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepLinks:
+    """What a smoother needs beside the posteriors, one row a step, or of length 0 where nobody asked.
+
+    ``kind`` [K] is one of LINK_NONE, LINK_WHOLE, LINK_BIASES; ``predicted_P`` [K, n, n] the covariance before the
+    update, with what an opened gate added to it; ``cross`` [K, n, n] the covariance between the state of the step
+    before (rows) and the predicted state (columns), from the sigma points before Q is added and they are drawn anew.
+    """
+
+    kind: IntArray
+    predicted_P: FloatArray
+    cross: FloatArray
+
+    def joined(self, other: StepLinks) -> StepLinks:
+        """Append the steps of the next window."""
+        return StepLinks(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__slots__))
+
+    def since(self, index: int) -> StepLinks:
+        """Keep the steps from ``index`` on."""
+        return StepLinks(*(getattr(self, n)[index:] for n in self.__slots__))
+
+
+def empty_links(count: int, n: int) -> StepLinks:
+    """Return links of ``count`` steps of ``n`` states that tie nothing together."""
+    return StepLinks(np.full(count, LINK_NONE, dtype=np.int64), np.zeros((count, n, n)), np.zeros((count, n, n)))
 
 
 class StateLayout(NamedTuple):
@@ -199,6 +234,21 @@ def _add_process_noise(P, q_std, ax_known, dt, layout):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
+def _cross_covariance(chi_before, chi, x_after, wc, out):  # type: ignore[no-untyped-def]
+    """Write the covariance [n, n] between the sigma points before a step (rows) and after it, whose mean is x_after.
+
+    Those before it lie in pairs about their first, which is their mean.
+    """
+    s, n = chi.shape
+    for a in range(n):
+        for b in range(n):
+            c = 0.0
+            for i in range(s):
+                c += wc[i] * (chi_before[i, a] - chi_before[0, a]) * (chi[i, b] - x_after[b])
+            out[a, b] = c
+
+
+@njit(cache=True)
 def _all_finite(x, P):  # type: ignore[no-untyped-def]
     for i in range(x.shape[0]):
         if not math.isfinite(x[i]):
@@ -213,11 +263,16 @@ def _all_finite(x, P):  # type: ignore[no-untyped-def]
 def _filter(  # type: ignore[no-untyped-def]
     dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, default_friction, p, q_std, r_std, wm, wc, scale,
     layout, initial_std, x, P, memory, residual_rate, extra_r, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu,
-    out_valid, out_diverged, out_prior,
+    out_valid, out_diverged, out_prior, out_link, out_predicted_P, out_cross,
 ):  # fmt: skip
-    """Run over one window; x [n], P [n, n] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start."""
+    """Run over one window; x [n], P [n, n] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start.
+
+    The last three outputs are those of :class:`StepLinks`, of length 0 where nobody asks for them.
+    """
     n = x.shape[0]
+    linked = out_link.shape[0] > 0
     chi = np.empty((2 * n + 1, n))
+    chi_before = np.empty((2 * n + 1, n))
     L = np.empty((n, n))
     zeta = np.empty((2 * n + 1, MEASUREMENTS))
     z_hat = np.empty(MEASUREMENTS)
@@ -271,6 +326,8 @@ def _filter(  # type: ignore[no-untyped-def]
                 out_valid[k] = True
         else:
             draw_sigma_points(x, P, scale, L, chi)
+            if linked:
+                chi_before[:, :] = chi
             # A missing steering angle is held; a missing a_x at one end leaves that of the other.
             ax_step = memory[M_AX] if not has_ax else ax_k if memory[M_AX_KNOWN] == 0.0 else 0.5 * (memory[M_AX] + ax_k)
             ax_known = has_ax or memory[M_AX_KNOWN] > 0.0
@@ -279,8 +336,12 @@ def _filter(  # type: ignore[no-untyped-def]
                 memory[M_RATE_VY], memory[M_RATE_R], dt[k], layout, p,
             )  # fmt: skip
             mean_and_covariance(chi, wm, wc, x, P)
+            if linked:
+                _cross_covariance(chi_before, chi, x, wc, out_cross[k])
             _add_process_noise(P, q_std, ax_known, dt[k], layout)
             alive = _all_finite(x, P)
+            if linked:
+                out_predicted_P[k] = P
             for i in range(n):
                 out_prior[k, i] = x[i]
             if alive:
@@ -319,6 +380,8 @@ def _filter(  # type: ignore[no-untyped-def]
                     for i in range(n):
                         for j in range(n):
                             P[i, j] *= GATE_INFLATION
+                    if linked:  # to a smoother the inflation is process noise of the step that led here
+                        out_predicted_P[k] = P
                     draw_sigma_points(x, P, scale, L, chi)
                     _measure(chi, steer_k, mu_k, memory[M_RATE_VY], layout, p, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
@@ -353,6 +416,8 @@ def _filter(  # type: ignore[no-untyped-def]
                             P[j, i] = 0.0
                         P[i, i] = STANDSTILL_STD[i] ** 2
                 alive = _all_finite(x, P)
+            if linked and alive:
+                out_link[k] = LINK_BIASES if memory[M_STILL] >= STANDSTILL_AFTER_S else LINK_WHOLE
             if alive:
                 out_valid[k] = steer_ok
                 out_diverged[k] = memory[M_NIS] > DIVERGED_NIS_RATIO or (
@@ -489,6 +554,29 @@ class PhysicsUkf:
         ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
+        return self._steps(signals, carry, residual_rate, extra_r, empty_links(0, self._initial_std.shape[0]))
+
+    def linked_steps(
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
+    ) -> tuple[PosteriorSteps, FilterCarry, StepLinks]:
+        """Return what :meth:`filter_steps` does, bit for bit, and what ties the steps together."""
+        links = empty_links(len(signals), self._initial_std.shape[0])
+        steps, after = self._steps(signals, carry, residual_rate, extra_r, links)
+        return steps, after, links
+
+    def _steps(
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None,
+        extra_r: FloatArray | None,
+        links: StepLinks,
+    ) -> tuple[PosteriorSteps, FilterCarry]:
+        """Run the filter; ``links`` are written in place if they have a row a step."""
         signals = without_impossible(signals)
         count = len(signals)
         initial_std = self._initial_std
@@ -525,7 +613,7 @@ class PhysicsUkf:
             np.array(self.q_std), self.measurement_std, wm, wc, scale[0], self.layout, initial_std, x, P, memory,
             steps.residual_rate, np.zeros((count, 2)) if extra_r is None else extra_r,
             steps.x, steps.P, steps.inputs, steps.nis, steps.nis_dof, steps.log_likelihood, steps.innovation,
-            steps.valid, steps.diverged, steps.prior,
+            steps.valid, steps.diverged, steps.prior, links.kind, links.predicted_P, links.cross,
         )  # fmt: skip
         last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
         return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count))

@@ -24,6 +24,7 @@ DESCRIPTIONS: dict[str, str] = {
     "pd-hef-fixed-r": "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs --model)",
     "pd-hef-trust0": "the hybrid filter with its network switched off (needs --model)",
     "pd-hef-trust1": "the hybrid filter at trust 1, whatever the vehicle file allows (needs --model)",
+    "pd-hef-smoothed": "the hybrid filter smoothed with what came later: not causal, ranked apart (needs --model)",
     "pd-hef-paper": "the paper's hybrid filter with its adaptive mechanism, to the letter (needs --model)",
 }
 #: Names that stand for another estimator, under whose name it runs.
@@ -35,13 +36,14 @@ TUNED_ESTIMATORS = ("phy-ukf-tuned",)
 #: Trust of the hybrid filters by name; they need a model.
 HYBRID_TRUST = {"pd-hef-fixed-r": 1.0, "pd-hef-trust0": 0.0, "pd-hef-trust1": 1.0}
 #: Every estimator that needs a model.
-MODEL_ESTIMATORS = ("pd-hef", *HYBRID_TRUST, "pd-hef-paper", "pure-lstm", "linear-regression")
+MODEL_ESTIMATORS = ("pd-hef", *HYBRID_TRUST, "pd-hef-smoothed", "pd-hef-paper", "pure-lstm", "linear-regression")
 #: Run by default as well where a model is given that has what they need.
 DEFAULT_MODEL_ESTIMATORS = (
     "linear-regression",
     "pure-lstm",
     "pd-hef",
     "pd-hef-fixed-r",
+    "pd-hef-smoothed",
     "pd-hef-trust0",
     "pd-hef-paper",
 )
@@ -131,6 +133,10 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
         return adaptive_hybrid_ukf(
             vehicle, NetworkService(model), trust=allowed.cap, use_speed=use_speed, notes=(allowed.note,)
         )
+    if name == "pd-hef-smoothed":
+        from pdhef_logtool.estimators.smoothed import smoothed_hybrid
+
+        return smoothed_hybrid(vehicle, NetworkService(model), use_speed=use_speed)
     if name == "pd-hef-paper":
         from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf
 
