@@ -98,9 +98,6 @@ def main(arguments: list[str] | None = None) -> int:
         say("tune the noise of all tuned estimators alike, on validation drives")
         search = ["--split", "validation", "--trials", TRIALS, "--model", model]
         _pdhef("tune", work / "one_car", *search, *told, "-o", model / "vehicle.toml")
-        say("try the network on test drives: how far it may be trusted on its own car")
-        own = ["--vehicle", model / "vehicle.toml", "--mapping", mapping, "--model", model]
-        _pdhef("trust", work / "one_car", "--split", "test", *own, "-o", model / "vehicle.toml")
         say("evidence that the network helps on this car")
         trusted = ["--vehicle", model / "vehicle.toml", "--model", model, "--mapping", mapping]
         _pdhef("trust", work / "evidence", *trusted, "--any-split", "-o", model / "vehicle.toml")
