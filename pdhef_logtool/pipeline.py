@@ -25,7 +25,7 @@ from pdhef_logtool.errors import (
     UsageError,
 )
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
-from pdhef_logtool.estimators.registry import default_names, runnable
+from pdhef_logtool.estimators.registry import NOT_CAUSAL, default_names, runnable
 from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -279,7 +279,7 @@ def _run_open_log(
             rows, events = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
         losses = merge_losses([log.lost, reader.losses, *(sink.lost for sink in sinks)])
         ran = [EstimatorFacts(e.name, causal=e.causal, notes=notes_of(e)) for e in estimators]
-        left_out = [EstimatorFacts(s.name, causal=True, skipped=s.reason) for s in skipped]
+        left_out = [EstimatorFacts(s.name, causal=s.name not in NOT_CAUSAL, skipped=s.reason) for s in skipped]
         report = build_report(
             report_facts(
                 log, log_input, sha256, plan, missing, vehicle, [*ran, *left_out], rows, events, losses, warnings,

@@ -137,9 +137,8 @@ def _table(report: Mapping[str, Any], width: int) -> Table:
     nis = any(m["metric"] == "nis" for m in report["metrics"])
     if nis:
         table.add_column("\nNIS/dof", justify="right")
-    for estimator in report["estimators"]:
-        if estimator["outcome"] != "ran":
-            continue
+    ran = [e for e in report["estimators"] if e["outcome"] == "ran"]
+    for estimator in sorted(ran, key=lambda e: not e["causal"]):  # those that know the future stand apart, below
         name = estimator["name"]
         cells = [name + ("" if estimator["causal"] else " (not causal)")]
         cells += [_cell(values.get((name, signal, "all", metric)), f, d) for _, signal, metric, f, d in shown]

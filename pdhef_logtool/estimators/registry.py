@@ -37,6 +37,8 @@ TUNED_ESTIMATORS = ("phy-ukf-tuned",)
 HYBRID_TRUST = {"pd-hef-fixed-r": 1.0, "pd-hef-trust0": 0.0, "pd-hef-trust1": 1.0}
 #: Every estimator that needs a model.
 MODEL_ESTIMATORS = ("pd-hef", *HYBRID_TRUST, "pd-hef-smoothed", "pd-hef-paper", "pure-lstm", "linear-regression")
+#: Those whose estimates use what comes later.
+NOT_CAUSAL = ("pd-hef-smoothed",)
 #: Run by default as well where a model is given that has what they need.
 DEFAULT_MODEL_ESTIMATORS = (
     "linear-regression",
@@ -135,8 +137,12 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
         )
     if name == "pd-hef-smoothed":
         from pdhef_logtool.estimators.smoothed import smoothed_hybrid
+        from pdhef_logtool.estimators.trust_policy import allowed_trust
 
-        return smoothed_hybrid(vehicle, NetworkService(model), use_speed=use_speed)
+        allowed = allowed_trust(vehicle, model)
+        return smoothed_hybrid(
+            vehicle, NetworkService(model), trust=allowed.cap, use_speed=use_speed, notes=(allowed.note,)
+        )
     if name == "pd-hef-paper":
         from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf
 

@@ -279,9 +279,10 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     lines += _bullets("Warnings", report["warnings"])
     lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
     lines += _truth_lines(report["truth"])
+    not_causal = {e["name"] for e in report["estimators"] if not e["causal"]}
     signals = dict.fromkeys(m["signal"] for m in report["metrics"])
     for signal in sorted(signals, key=lambda s: s != "sideslip_rad"):
-        lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal])
+        lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal], not_causal)
     lines += ["## Estimators", ""]
     for e in report["estimators"]:
         notes = "; ".join([*([f"skipped: {e['reason']}"] if e["reason"] else []), *e["notes"]])
@@ -315,7 +316,7 @@ def _truth_lines(truth: Mapping[str, Any]) -> list[str]:
     return [*lines, *(f"- {note}" for note in truth["notes"]), ""]
 
 
-def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]], not_causal: set[str]) -> list[str]:
     metrics = list(dict.fromkeys((m["metric"], m["unit"]) for m in rows))
     shown = [(name, unit, _SHOWN_UNITS.get(unit, (unit, 1.0))) for name, unit in metrics]
     heads = [name if unit[0] in ("", "1") else f"{name} [{unit[0]}]" for name, _, unit in shown]
@@ -325,14 +326,16 @@ def _metric_table(signal: str, rows: Sequence[Mapping[str, Any]]) -> list[str]:
         "| estimator | segment | " + " | ".join(heads) + " |",
         "| --- | --- |" + " ---: |" * len(heads),
     ]
-    for estimator, segment in dict.fromkeys((m["estimator"], m["segment"]) for m in rows):
+    groups = dict.fromkeys((m["estimator"], m["segment"]) for m in rows)
+    for estimator, segment in sorted(groups, key=lambda g: g[0] in not_causal):  # those stand apart, below
         own = {
             (m["metric"], m["unit"]): m["value"]
             for m in rows
             if m["estimator"] == estimator and m["segment"] == segment
         }
         cells = [_number(own.get((name, unit)), factor) for name, unit, (_, factor) in shown]
-        lines.append(f"| {estimator} | {segment} | " + " | ".join(cells) + " |")
+        mark = " (not causal)" if estimator in not_causal else ""
+        lines.append(f"| {estimator}{mark} | {segment} | " + " | ".join(cells) + " |")
     return [*lines, ""]
 
 

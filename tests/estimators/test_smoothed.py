@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import json
 import math
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
+import polars as pl
 import pytest
 import test_estimators as properties
 import torch
@@ -14,7 +18,10 @@ from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
+from rich.console import Console
 
+from pdhef_logtool.config import RunConfig
+from pdhef_logtool.drive_channels import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of, run_window
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf
@@ -27,15 +34,18 @@ from pdhef_logtool.estimators.physics import (
     PosteriorSteps,
     StepLinks,
 )
-from pdhef_logtool.estimators.registry import make_estimator
+from pdhef_logtool.estimators.registry import MODEL_ESTIMATORS, NOT_CAUSAL, make_estimator
 from pdhef_logtool.estimators.smoothed import SMOOTHED_Q_STD, SmoothedHybrid, smooth_steps, smoothed_hybrid
+from pdhef_logtool.pipeline import run_logs
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.signals import Signals
+from pdhef_logtool.sinks.report import report_markdown
+from pdhef_logtool.summary import render_run
 from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import FilterTuning, default_vehicle
+from pdhef_logtool.vehicle import FilterTuning, Network, default_vehicle
 
 VEHICLE = default_vehicle()
 ALL = 10**6  # seconds: a block that holds every drive
@@ -383,9 +393,15 @@ def test_links_cost_the_filter_no_bit(rough):
 
 
 def test_what_it_says_of_itself(rough):
-    estimator = make_estimator("pd-hef-smoothed", VEHICLE, model=BUNDLE)
+    trusted = VEHICLE.model_copy(update={"network": Network(trust_cap=0.6, evidence="a drive of 300 s")})
+    estimator = make_estimator("pd-hef-smoothed", trusted, model=BUNDLE)
+    assert estimator.hybrid.trust == 0.6
+    assert "a drive of 300 s" in estimator.notes[1]
     assert isinstance(estimator, LookingAhead)
     assert (estimator.name, estimator.causal) == ("pd-hef-smoothed", False)
+    for name in MODEL_ESTIMATORS:
+        if name not in ("pure-lstm", "linear-regression"):
+            assert make_estimator(name, VEHICLE, model=BUNDLE).causal == (name not in NOT_CAUSAL)
     assert "not causal" in estimator.notes[0]
     assert look_ahead_of(estimator) == 240.0
     assert look_ahead_of(make_estimator("phy-ukf", VEHICLE)) == 0.0
@@ -410,3 +426,56 @@ def test_the_noise_is_its_own_tables_then_the_filters():
     assert noise(filters) == ((0.1, 0.2, *HYBRID_Q_STD[2:]), (0.7, HYBRID_R_STD[1]))
     assert noise(filters | own) == ((0.1, 0.05, *SMOOTHED_Q_STD[2:]), (HYBRID_R_STD[0], 0.002))
     assert smoothed_hybrid(VEHICLE, network, trust=0.3).hybrid.trust == 0.3
+
+
+# --- in a run --------------------------------------------------------------------------------------------------------
+
+
+def test_windows_come_with_what_follows(rough):
+    edges = [0, 40, 40, 41, 200, 500, len(rough)]
+    windows = [DriveWindow(cut(rough, a, b), None, b / len(rough)) for a, b in pairwise(edges)]
+    stamps = rough.stamps_ns
+    seen = 0
+    for window, ahead in with_look_ahead(iter(windows), 1.5):
+        assert len(window.signals), "a window without a stamp is left out"
+        seen += len(window.signals)
+        last = window.signals.stamps_ns[-1]
+        want = stamps[(stamps > last) & (stamps <= last + 1_500_000_000)]
+        assert (ahead is None) == (seen == len(rough))
+        if ahead is not None:
+            np.testing.assert_array_equal(ahead.stamps_ns, want)
+    assert seen == len(rough)
+    taken = iter(windows)
+    first, ahead = next(with_look_ahead(taken, 0.0))
+    assert (first, ahead) == (windows[0], None)
+    assert next(taken) is windows[1], "without look-ahead no window waits for the next"
+
+
+def test_a_run_is_the_same_whatever_its_windows_and_marks_it(sample_logs_dir: Path, tmp_path: Path):
+    BUNDLE.save(tmp_path / "model")
+    tables = []
+    for window_s in (600.0, 37.0):
+        config = RunConfig(
+            vehicle=sample_logs_dir / "vehicle.toml",
+            model=tmp_path / "model",
+            annotate="none",
+            estimators=("pd-hef-smoothed", "zero"),
+            window_s=window_s,
+        )
+        out = tmp_path / f"{window_s}"
+        result = run_logs([str(sample_logs_dir / "road.mcap")], out, config)
+        tables.append(pl.read_parquet(out / "logs/road/estimates.parquet").sort("estimator", "stamp_ns"))
+    assert tables[0].equals(tables[1], null_equal=True)
+    span = tables[0]["stamp_ns"].max() - tables[0]["stamp_ns"].min()
+    assert span > 2.0 * smoothed.BLOCK_S * NS, "the drive must be longer than what is seen ahead"
+
+    report = json.loads((out / "logs/road/report.json").read_text())
+    assert {e["name"]: e["causal"] for e in report["estimators"]} == {"pd-hef-smoothed": False, "zero": True}
+    lines = report_markdown(report).splitlines()
+    rows = [line.split(" | ")[0] for line in lines if line.startswith(("| zero", "| pd-hef-smoothed"))]
+    assert {"| zero", "| pd-hef-smoothed (not causal)"} == set(rows)
+    assert rows[0] == "| zero", "what is not causal stands below"
+    console = Console(file=io.StringIO(), width=200)
+    render_run(result, console)
+    printed = console.file.getvalue()
+    assert printed.index("zero") < printed.index("pd-hef-smoothed (not causal)")
