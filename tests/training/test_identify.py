@@ -20,7 +20,7 @@ from pdhef_logtool.training.axle_forces import AxleCurve, axle_samples, fit_axle
 from pdhef_logtool.training.fit_data import GUARD_S, FitDrive, split_drive
 from pdhef_logtool.training.identify import _projected_levenberg_marquardt, identify
 from pdhef_logtool.training.identify_command import run_identification
-from pdhef_logtool.vehicle import AxleTyre, Tyres, VehicleParameters, load_vehicle
+from pdhef_logtool.vehicle import AxleTyre, Network, Tyres, VehicleParameters, load_vehicle, vehicle_to_toml
 
 CAR = VehicleParameters(
     name="test car",
@@ -172,13 +172,18 @@ def test_held_out_part_changes_nothing_in_the_fit(drives: tuple[FitDrive, FitDri
 def test_command_writes_a_file_that_runs_and_says_where_its_numbers_come_from(
     sample_logs_dir: Path, tmp_path: Path
 ) -> None:
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", end="80")
+    given = load_vehicle(sample_logs_dir / "vehicle.toml")
+    found_with_other_tyres = Network(trust_cap=1.0, evidence="a gain", model_sha256="0" * 64)
+    guess = tmp_path / "guess.toml"
+    guess.write_text(vehicle_to_toml(given.model_copy(update={"network": found_with_other_tyres})))
+    config = RunConfig(vehicle=guess, end="80")
     out = tmp_path / "car.toml"
     result = run_identification([str(sample_logs_dir / "road.mcap")], out, config, holdout=0.25)
     vehicle = load_vehicle(out)
     assert vehicle == result.identification.vehicle.model_copy(
-        update={"name": vehicle.name, "identification": vehicle.identification}
+        update={"name": vehicle.name, "identification": vehicle.identification, "network": vehicle.network}
     )
+    assert vehicle.network == Network(trust_cap=0.0, evidence="no network was tried on this vehicle")
     assert "road: 0.0" in str(vehicle.identification["drives"])
     assert "95 %" in out.read_text()
     assert (tmp_path / "car.png").read_bytes().startswith(b"\x89PNG")

@@ -16,6 +16,7 @@ from pdhef_logtool.errors import OutputError, UsageError
 from pdhef_logtool.pipeline import run_logs
 from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.training.train_command import run_training
+from pdhef_logtool.vehicle import load_vehicle
 
 
 def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -56,6 +57,10 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef-trust0"}
     again = run_training(joined, tmp_path / "again", epochs=2)
     assert again.bundle.sha256 == bundle.sha256
+    assert again.bundle.provenance["fine_tuned_on"] is None
+    tuned = run_training(joined, tmp_path / "tuned", init=tmp_path / "model", epochs=1)
+    assert tuned.bundle.provenance["fine_tuned_from"] == bundle.sha256
+    assert tuned.bundle.provenance["fine_tuned_on"] == load_vehicle(sample_logs_dir / "vehicle.toml").name
     check_baselines(sample_logs_dir, joined, tmp_path, bundle.sha256)
 
 
