@@ -48,7 +48,7 @@ TABLE = "pd-hef-smoothed"
 #: bands at half of it; without bias states 0.0307° at the filter's noise; the filter itself has 0.0309°.
 SMOOTHED_Q_STD = (0.089, 0.045, 0.03, 0.021)
 #: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
-#: smoother that sees all of a drive of 300 s this changed v_y by less than 4e-5 m/s (60 s: 6e-4 m/s).
+#: smoother that sees all of a drive of 300 s this changed v_y by less than 5e-5 m/s (60 s: 5e-4 m/s).
 BLOCK_S = 120.0
 #: Steps that are smoothed at a time, whatever the window, so that 7 states need some 50 MB. Changes no bit.
 STEPS_AT_ONCE = 8192
