@@ -26,6 +26,7 @@ from benchmarks.table_maths import (
     pooled_rmse,
     verdict,
 )
+from pdhef_logtool.estimators.registry import NOT_CAUSAL
 from pdhef_logtool.signals import FloatArray
 from pdhef_logtool.sinks.base import PendingFile, write_bytes
 
@@ -146,12 +147,12 @@ def write_page(out: Path, facts: Facts, given: Tables) -> Path:
     tables = Tables(with_best(given.metrics, chosen), given.calibration, given.budget)
     figures = tables.figures
     ran = figures.estimators()
-    names = [n for n in (*facts.order, fixed_grid.BEST) if n in ran]
+    names = sorted((n for n in (*facts.order, fixed_grid.BEST) if n in ran), key=lambda n: n in NOT_CAUSAL)
     rows = [r for r in facts.rows if r in figures.rows()]
     references = [r for r in facts.references if r in ran and r != facts.subject]
     folder = out / "conditions"
     parts = [
-        _head(facts, figures, rows),
+        _head(facts, figures, rows, [n for n in names if n in NOT_CAUSAL]),
         _sideslip(figures, rows, names),
         _means(figures, rows, names),
         _against(figures, rows, facts.subject, references),
@@ -193,7 +194,7 @@ def _grid(rows: Sequence[str], names: Sequence[str], cell: Callable[[str, str], 
     return table([corner, *names], [[r, *(cell(r, n) for n in names)] for r in rows])
 
 
-def _head(facts: Facts, figures: Figures, rows: Sequence[str]) -> str:
+def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Sequence[str]) -> str:
     model = facts.setup["model"]
     used = f"`{facts.setup['vehicle_file']}` (sha256 {facts.setup['vehicle'][:12]})"
     network = "none: no hybrid filter ran" if model is None else f"sha256 {model[:12]}"
@@ -209,6 +210,9 @@ def _head(facts: Facts, figures: Figures, rows: Sequence[str]) -> str:
         "",
         table(["row", "drives", "what is different"], [[r, str(drives[r]), facts.rows[r]] for r in rows]),
     ]
+    if not_causal:
+        knows = ", ".join(f"`{n}`" for n in not_causal)
+        lines += [f"Not causal, and so last and to be ranked apart: {knows} (it uses what is measured later).", ""]
     if facts.notes:
         lines += ["What did not run:", "", *(f"- {note}" for note in facts.notes), ""]
     return "\n".join(lines)

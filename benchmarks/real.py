@@ -181,7 +181,8 @@ def run_case(case: Case, model: ModelBundle | None, model_folder: Path | None, t
             say(f"{case.name}: {e.name}, {label}")
             track, _ = e.run(part.signals, None)
             error = signal_error(track, part.truth, "sideslip_rad", case.min_speed_m_s)
-            results.append(Result(f"{e.name}, {label}" if label else e.name, error, part.truth.stamps_ns))
+            shown = e.name if e.causal else f"{e.name} (not causal)"
+            results.append(Result(f"{shown}, {label}" if label else shown, error, part.truth.stamps_ns))
 
     catalogue = load_vehicle(catalogue_file)
     free = ("zero", "kinematic")
