@@ -127,6 +127,10 @@ def run(
     model: Annotated[
         Path | None, typer.Option("--model", help="Folder of a model bundle, or none. Default: the shipped model.")
     ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", help="File of pdhef calibrate, or none. Default: the one in the model's folder."),
+    ] = None,
     vehicle: Annotated[Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml.")] = None,
     mapping: MappingFile = None,
     start: Annotated[str | None, typer.Option("--start", help="Start of the slice (see Times).")] = None,
@@ -154,6 +158,7 @@ def run(
         {
             "estimators": None if estimators is None else tuple(n.strip() for n in estimators.split(",") if n.strip()),
             "model": model,
+            "calibration": calibration,
             "vehicle": vehicle,
             "mapping": mapping,
             "start": start,
@@ -700,6 +705,79 @@ def tune(
         _print_json(result.to_dict())
     else:
         render_tuning(result, _stdout())
+    raise typer.Exit(result.exit_code)
+
+
+@app.command(
+    epilog="""Examples:
+
+  pdhef calibrate logs/ --split validation --vehicle car.toml --model model -o model
+
+  pdhef calibrate logs/ --vehicle car.toml --vary 0 -o car.calibration.json
+
+Give drives of many kinds that neither network nor filter noise was fitted to; drives that a set's manifest marks test
+or extrapolation are refused. pdhef run takes calibration.json from its model's folder, or the file that --calibration
+names (docs/calibrate.md)."""
+)
+def calibrate(
+    logs: Annotated[list[str], typer.Argument(help="Logs with truth, folders that hold some, or glob patterns.")],
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help="Folder of a model (calibration.json is written there), or a .json.")
+    ],
+    vehicle: Annotated[
+        Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml that the estimators run with.")
+    ] = None,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="Folder of a model bundle, or none. Default: the shipped model.")
+    ] = None,
+    estimators: Annotated[
+        str | None, typer.Option("--estimators", "-e", help="Comma-separated names; default: as for run.")
+    ] = None,
+    vary: Annotated[
+        float,
+        typer.Option("--vary", help="Run a part of the drives again with friction and vehicle wrong by this spread."),
+    ] = 0.1,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of --vary.")] = 0,
+    split: Annotated[
+        str | None, typer.Option("--split", help="Only drives of this split, by the manifest of their set.")
+    ] = None,
+    any_split: Annotated[
+        bool, typer.Option("--any-split", help="Take drives of the splits test and extrapolation too.")
+    ] = False,
+    mapping: MappingFile = None,
+    start: Annotated[str | None, typer.Option("--start", help="Start of the slice of each log (as for run).")] = None,
+    end: Annotated[str | None, typer.Option("--end", help="End of the slice of each log (as for run).")] = None,
+    sensors: Annotated[
+        str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
+    ] = None,
+    prefer_truth: TruthChoice = None,
+    as_json: JsonFlag = False,
+) -> None:
+    """Fit the 95 % intervals of every estimator on drives with truth, by regime, and store them beside a model."""
+    from pdhef_logtool.config import load_config
+    from pdhef_logtool.summary import render_calibration
+    from pdhef_logtool.training.calibrate_command import CalibrateSettings, run_calibration
+
+    config = load_config(
+        None,
+        {
+            "estimators": None if estimators is None else tuple(n.strip() for n in estimators.split(",") if n.strip()),
+            "vehicle": vehicle,
+            "model": model,
+            "mapping": mapping,
+            "start": start,
+            "end": end,
+            "sensors": sensors,
+            "prefer_truth": prefer_truth,
+        },
+    )
+    settings = CalibrateSettings(config, spread=vary, seed=seed, split=split, any_split=any_split)
+    with _progress() as progress:
+        result = run_calibration(logs, output, settings, progress=progress, warn=_warn)
+    if as_json:
+        _print_json(result.to_dict())
+    else:
+        render_calibration(result, _stdout())
     raise typer.Exit(result.exit_code)
 
 

@@ -17,7 +17,7 @@ SENSOR_SUITES = ("full", "esp")
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
 WINDOW_S = 600.0
-_FILES = ("vehicle", "mapping", "thresholds", "model")
+_FILES = ("vehicle", "mapping", "thresholds", "model", "calibration")
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +34,7 @@ class RunConfig:
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
     model : folder of a model bundle for the hybrid filters; None = the shipped one, ``none`` = no network.
+    calibration : file of ``pdhef calibrate``; None = that beside the model, if any, ``none`` = intervals as they are.
     thresholds : limits that the figures are held against; None = no gate.
     """
 
@@ -48,6 +49,7 @@ class RunConfig:
     window_s: float = WINDOW_S
     thresholds: Path | None = None
     model: Path | None = None
+    calibration: Path | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""

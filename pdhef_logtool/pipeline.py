@@ -25,6 +25,7 @@ from pdhef_logtool.errors import (
     UsageError,
 )
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
+from pdhef_logtool.estimators.calibration import Calibration, TrackCalibrator, find_calibration
 from pdhef_logtool.estimators.registry import NOT_CAUSAL, default_names, runnable
 from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
@@ -53,6 +54,7 @@ from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehic
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.reasons import ReasonFacts
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
 
 #: ``update(text, share)`` with share in [0, 1].
@@ -144,6 +146,7 @@ def run_logs(
     vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
     model = open_model(config.model)
+    calibration = find_calibration(config.calibration, config.model)
     thresholds = read_thresholds(config, junit)
     if config.vehicle is None:
         warn(f"no --vehicle: the default {vehicle.name} is assumed, so the model-based estimates are of another car")
@@ -155,7 +158,9 @@ def run_logs(
             progress(text, (number + share) / len(inputs))
 
         try:
-            result = run_log(log_input, output, config, vehicle, mapping, model, progress=of_all, warn=warn)
+            result = run_log(
+                log_input, output, config, vehicle, mapping, model, calibration, progress=of_all, warn=warn
+            )
         except Exception as error:  # one bad log never stops the others, whatever is wrong with it
             if len(inputs) == 1:
                 raise
@@ -207,6 +212,7 @@ def run_log(
     vehicle: VehicleParameters,
     mapping: Mapping | None,
     model: ModelBundle | None = None,
+    calibration: Calibration | None = None,
     *,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
@@ -221,7 +227,7 @@ def run_log(
     progress(log_input.stem, 0.0)
     log = open_log(log_input.path)
     try:
-        return _run_open_log(log, log_input, output, config, vehicle, mapping, model, progress, warn)
+        return _run_open_log(log, log_input, output, config, vehicle, mapping, model, calibration, progress, warn)
     finally:
         log.close()
 
@@ -234,6 +240,7 @@ def _run_open_log(
     vehicle: VehicleParameters,
     mapping: Mapping | None,
     model: ModelBundle | None,
+    calibration: Calibration | None,
     progress: Progress,
     warn: Callable[[str], None],
 ) -> LogResult:
@@ -269,16 +276,24 @@ def _run_open_log(
             remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
         )
     sha256 = hash_log(log_input.path)
+    intervals = TrackCalibrator(calibration, vehicle_hash(vehicle), None if model is None else model.sha256)
     folder = output / "logs" / log_input.stem
     reader = DriveReader(log, plan, config.window_s)
     sinks = _open_sinks(folder, log, log_input.stem, config, vehicle, plan, sha256)
     try:
         with TrackStore(folder) as store:
-            context = _estimate(reader, estimators, sinks, store, lambda share: progress(log_input.stem, 0.8 * share))
+            context = _estimate(
+                reader, estimators, intervals, sinks, store, lambda share: progress(log_input.stem, 0.8 * share)
+            )
             progress(log_input.stem, 0.8)
-            rows, events = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
+            rows, events, reasons = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
         losses = merge_losses([log.lost, reader.losses, *(sink.lost for sink in sinks)])
-        ran = [EstimatorFacts(e.name, causal=e.causal, notes=notes_of(e)) for e in estimators]
+        ran = [
+            EstimatorFacts(
+                e.name, causal=e.causal, notes=(*notes_of(e), *intervals.notes(e.name)), reasons=reasons[e.name]
+            )
+            for e in estimators
+        ]
         left_out = [EstimatorFacts(s.name, causal=s.name not in NOT_CAUSAL, skipped=s.reason) for s in skipped]
         report = build_report(
             report_facts(
@@ -375,6 +390,7 @@ def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
 def _estimate(
     reader: DriveReader,
     estimators: Sequence[Estimator],
+    intervals: TrackCalibrator,
     sinks: Sequence[Sink],
     store: TrackStore,
     progress: Callable[[float], None],
@@ -401,7 +417,7 @@ def _estimate(
         for estimator in estimators:
             carry = carries.get(estimator.name)
             track, carries[estimator.name] = run_window(estimator, window.signals, carry, ahead)
-            track = poses[estimator.name].add(track, start)
+            track = poses[estimator.name].add(intervals.add(track, window.signals), start)
             store.append(track)
             for sink in sinks:
                 sink.append(track)
@@ -423,16 +439,21 @@ def _evaluate(
     signals: Signals,
     plan: DrivePlan,
     vehicle: VehicleParameters,
-) -> tuple[list[MetricRow], list[Event]]:
-    """Score the stored tracks, one whole track in memory at a time besides the truth."""
+) -> tuple[list[MetricRow], list[Event], dict[str, tuple[ReasonFacts, ...] | None]]:
+    """Score the stored tracks, one whole track in memory at a time besides the truth.
+
+    Returns the figures, the events, and by estimator why it did not use its sensors as usual.
+    """
     from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
     from pdhef_logtool.evaluation.metrics import score_track, state_rows
+    from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
 
     truth = store.read(TRUTH)
     masks = segment_masks(signals, truth, vehicle)
     slow = vehicle.low_speed_blend_m_s
     rows: list[MetricRow] = []
+    reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
     events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(signals.stamps_ns, without_whole(masks))]
     for estimator in estimators:
         track = store.read(estimator.name)
@@ -442,6 +463,7 @@ def _evaluate(
         else:
             rows += state_rows(track, masks, log=stem)
         rows += whiteness_rows(track, masks, log=stem)
+        reasons[estimator.name] = summarise_reasons(track)
         events += [
             Event(f"{estimator.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
             for s in find_intervals(track.stamps_ns, {"diverged": track.diverged})
@@ -451,12 +473,17 @@ def _evaluate(
             pair = [t for t in (store.read(a), store.read(b)) if t is not None]
             rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
     rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
-    return rows, sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
+    return rows, sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name)), reasons
 
 
 def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
     """Return the masks that are worth an event: not the whole drive, nor what is only not nonlinear."""
     return {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
+
+
+def vehicle_hash(vehicle: VehicleParameters) -> str:
+    """Return the hash of everything that a vehicle file says."""
+    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()
 
 
 def report_facts(
@@ -502,7 +529,7 @@ def report_facts(
         signals=[SourceFacts(n, s.label, SIGNAL_UNITS[n], samples.get(s.label, 0)) for n, s in mapping.signals.items()],
         missing_signals=list(missing),
         vehicle_name=vehicle.name,
-        vehicle_sha256=hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest(),
+        vehicle_sha256=vehicle_hash(vehicle),
         estimators=list(estimators),
         truth=TruthFacts(
             quantities=[

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.pipeline import LogResult, RunResult
+from pdhef_logtool.sinks.report import reasons_line
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
     from pdhef_logtool.training.baselines import BaselinesResult
+    from pdhef_logtool.training.calibrate_command import CalibrateResult
     from pdhef_logtool.training.extract_command import ExtractResult
     from pdhef_logtool.training.identify_command import IdentifyResult
     from pdhef_logtool.training.train_command import TrainResult
@@ -112,6 +114,8 @@ def _render_log(one: LogResult, console: Console) -> None:
             console.print(f"  {estimator['name']} skipped: {estimator['reason']}", highlight=False)
         for note in estimator["notes"]:
             console.print(f"  {estimator['name']}: {note}", highlight=False, markup=False)
+        if found := reasons_line(estimator, report["log"]["start_ns"]):
+            console.print(f"  {estimator['name']}: {found}", highlight=False, markup=False)
     console.print()
 
 
@@ -270,6 +274,33 @@ def render_tuning(result: TuneResult, console: Console) -> None:
         highlight=False,
         soft_wrap=True,
     )
+
+
+def render_calibration(result: CalibrateResult, console: Console) -> None:
+    """Print how the 95 % intervals of sideslip stand before and after, on drives that were not fitted to."""
+    from rich.table import Table
+
+    table = Table(box=None, header_style="bold")
+    for head in ("\nestimator", "\nvehicle file", "grip\nuse"):
+        table.add_column(head)
+    for head in ("\ndrives", "RMSE\n°", "covered %\nbefore", "\nafter", "width / normal\nbefore", "\nafter"):
+        table.add_column(head, justify="right")
+    for name, fitted in result.fitted.items():
+        for c in fitted.coverage:
+            table.add_row(
+                name,
+                "made wrong" if c.wrong_vehicle else "as given",
+                c.bin,
+                str(c.drives),
+                f"{math.degrees(c.rmse_rad):.4f}",
+                f"{100.0 * c.covered_before:.1f}",
+                f"{100.0 * c.covered_after:.1f}",
+                f"{c.width_before:.2f}",
+                f"{c.width_after:.2f}",
+            )
+    console.print("95 % intervals of sideslip, each drive judged by a fit without it; width over 3.92 x RMSE")
+    console.print(table)
+    console.print(f"{len(result.drives)} drives; calibration in {result.file}", highlight=False, soft_wrap=True)
 
 
 def render_trust(result: TrustResult, console: Console) -> None:

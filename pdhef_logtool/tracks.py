@@ -28,7 +28,11 @@ TRACK_COLUMNS = (
     "nis",
     "friction",
     "valid",
+    "mixture_weight",
+    "reason",
 )
+#: Those that a source may not have at all.
+OPTIONAL_COLUMNS = ("mixture_weight", "reason")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,8 +44,7 @@ class StateTrack:
     ``valid`` is False where the source says that its state must not be used. ``diverged`` flags the stamps at
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
     ``mixture_weight`` (of an adaptive estimator's second filter) and ``reason`` (bits of
-    :mod:`pdhef_logtool.estimators.sensor_faults`, why samples were not used as usual) are [N], or of length 0 where the
-    source has none.
+    :mod:`pdhef_logtool.reasons`, why samples were not used as usual) are [N], or of length 0 where the source has none.
     """
 
     name: str
@@ -91,15 +94,19 @@ class StateTrack:
         return np.sqrt(self.covariance[:, i, i])
 
     def columns(self) -> dict[str, FloatArray | IntArray | BoolArray]:
-        """Return the columns of estimates.parquet by name, in order."""
-        return {c: getattr(self, "stamps_ns" if c == "stamp_ns" else c) for c in TRACK_COLUMNS}
+        """Return the columns of estimates.parquet by name, in order; without those that the source has not."""
+        return {
+            c: getattr(self, "stamps_ns" if c == "stamp_ns" else c)
+            for c in TRACK_COLUMNS
+            if c not in OPTIONAL_COLUMNS or len(getattr(self, c)) == len(self)
+        }
 
     def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
         """Return a copy with another pose."""
         return replace(self, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad)
 
 
-def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | BoolArray) -> StateTrack:
+def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray | BoolArray) -> StateTrack:
     """Build a track from the columns at hand; the rest is NaN (``valid`` True, ``diverged`` False).
 
     ``sideslip_rad`` is derived as atan2(v_y, v_x) when it is not given.
@@ -111,7 +118,7 @@ def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | BoolArray
             continue
         if f.name in columns:
             values[f.name] = columns[f.name]
-        elif f.name in ("mixture_weight", "reason"):
+        elif f.name in OPTIONAL_COLUMNS:
             continue
         elif f.name == "covariance":
             values[f.name] = np.empty((0, 3, 3))

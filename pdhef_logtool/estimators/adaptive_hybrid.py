@@ -32,7 +32,8 @@ from pdhef_logtool.estimators.physics import (
     PosteriorSteps,
     sideslip_std,
 )
-from pdhef_logtool.estimators.sensor_faults import AY, BURST_AY, FaultCarry, SensorFaults, find_faults
+from pdhef_logtool.estimators.sensor_faults import AY, FaultCarry, SensorFaults, find_faults
+from pdhef_logtool.reasons import BURST_AY
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack

@@ -30,19 +30,13 @@ from numba import njit
 
 from pdhef_logtool.estimators.base import without_impossible
 from pdhef_logtool.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
+from pdhef_logtool.reasons import BURST_AY, BURST_YAW_RATE, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
 
-# The two channels.
+# The two channels; the bits of the second are those of the first, shifted left by one.
 AY, YAW_RATE = 0, 1
 CHANNELS = 2
-
-# Bits of the reason mask; those of the yaw rate are those of a_y, shifted left by one.
-BURST_AY, BURST_YAW_RATE = 1, 2
-SPIKE_AY, SPIKE_YAW_RATE = 4, 8
-STUCK_AY, STUCK_YAW_RATE = 16, 32
-DEAD_AY, DEAD_YAW_RATE = 64, 128
-MISSING_AY, MISSING_YAW_RATE = 256, 512
 
 #: Noise variance over the usual one from which on it is a burst.
 BURST_RATIO = 16.0
@@ -129,7 +123,8 @@ class SensorFaults:
     Attributes
     ----------
     extra_r : [N, 2], variance beyond the usual one, m²/s⁴ and rad²/s²; 0 where the channel is as usual.
-    noise_std, usual_std : [N, 2], 1-sigma ŝ of now, and what is usual. reason : int64 [N], bit mask.
+    noise_std, usual_std : [N, 2], 1-sigma ŝ of now, and what is usual.
+    reason : int64 [N], bits of :mod:`pdhef_logtool.reasons`.
     filtered : the signals for filters; samples that are stuck, dead or a spike are missing.
     network : the signals for the network's inputs; samples of a burst are missing as well.
     """

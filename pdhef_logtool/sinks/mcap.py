@@ -218,6 +218,8 @@ def _state_batch(track: StateTrack) -> TopicBatch:
     known = track.covariance.shape[0] == n
     covariance = track.covariance.reshape(n, 9) if known else np.full((n, 9), np.nan)
     fields = {name: np.asarray(getattr(track, name)) for name in _STATE_FIELDS}
+    fields["mixture_weight"] = track.mixture_weight if len(track.mixture_weight) == n else np.full(n, np.nan)
+    fields["reason"] = track.reason if len(track.reason) == n else np.zeros(n, dtype=np.int64)
     return TopicBatch(
         topic_of(track.name, "state"),
         track.stamps_ns,

@@ -16,7 +16,7 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.signals import FloatArray, Loss, Signals
 from pdhef_logtool.sinks.base import Event, PendingFile
 from pdhef_logtool.sinks.schema import arrow_schema
-from pdhef_logtool.tracks import TRACK_COLUMNS, StateTrack, make_track
+from pdhef_logtool.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, make_track
 
 #: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
 #: estimator, and what waits of six estimators stays below 30 MB.
@@ -105,7 +105,10 @@ class EstimatesSink:
 def _table_from_track(track: StateTrack, schema: pa.Schema) -> pa.Table:
     columns: dict[str, Any] = dict(track.columns())
     columns["estimator"] = pa.DictionaryArray.from_arrays(np.zeros(len(track), dtype=np.int32), [track.name])
-    arrays = [pa.array(columns[f.name], type=f.type, from_pandas=True) for f in schema]
+    arrays = [
+        pa.array(columns[f.name], type=f.type, from_pandas=True) if f.name in columns else pa.nulls(len(track), f.type)
+        for f in schema
+    ]
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
@@ -131,7 +134,8 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     -------
     StateTrack
         In order of time. The file holds standard deviations only: ``covariance`` has them on its diagonal, NaN
-        elsewhere, and length 0 if none was read or known. ``nis_dof`` is NaN and ``diverged`` False.
+        elsewhere, and length 0 if none was read or known. ``nis_dof`` is NaN and ``diverged`` False. Optional columns
+        that were not read, or that are null throughout, have length 0.
 
     Raises
     ------
@@ -147,6 +151,9 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     tables: list[pa.Table] = []
     with _open(path) as file:
         absent = set(wanted) - set(file.schema_arrow.names)
+        if columns is None:  # a file from before these columns is whole without them
+            wanted = [c for c in wanted if c not in absent or c not in OPTIONAL_COLUMNS]
+            absent -= set(OPTIONAL_COLUMNS)
         if absent:
             raise OutputError(
                 expected="an estimates.parquet",
@@ -174,7 +181,13 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
             return np.full(table.num_rows, np.nan)
         return np.asarray(table[column].to_numpy(), dtype=np.float64)
 
-    floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", "valid", *_STD_COLUMNS)}
+    floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", "valid", *_STD_COLUMNS, *OPTIONAL_COLUMNS)}
+    optional = {c: table[c] for c in OPTIONAL_COLUMNS if c in table.column_names}
+    known: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
+    if "mixture_weight" in known:
+        known["mixture_weight"] = numbers("mixture_weight")
+    if "reason" in known:
+        known["reason"] = np.asarray(pc.fill_null(known["reason"], 0).to_numpy(), dtype=np.int64)
     valid = {"valid": np.asarray(table["valid"].to_numpy(), dtype=np.bool_)} if "valid" in table.column_names else {}
     return make_track(
         name,
@@ -182,6 +195,7 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
         covariance=_diagonal([numbers(c) for c in _STD_COLUMNS]),
         **floats,
         **valid,
+        **known,
     )
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.reasons import ReasonFacts
 from pdhef_logtool.signals import Loss
 from pdhef_logtool.sinks.base import Event, write_bytes
 
@@ -65,12 +66,16 @@ class SourceFacts:
 
 @dataclass(frozen=True, slots=True)
 class EstimatorFacts:
-    """One estimator that was asked for: ``skipped`` holds the reason if it did not run."""
+    """One estimator that was asked for: ``skipped`` holds the reason if it did not run.
+
+    ``reasons``: why it did not use its sensors as usual; None if it does not look.
+    """
 
     name: str
     causal: bool
     skipped: str | None = None
     notes: Sequence[str] = ()
+    reasons: Sequence[ReasonFacts] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +172,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
                 "outcome": "ran" if e.skipped is None else "skipped",
                 "reason": e.skipped,
                 "notes": list(e.notes),
+                "reasons": None if e.reasons is None else list(e.reasons),
             }
             for e in facts.estimators
         ],
@@ -285,7 +291,9 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal], not_causal)
     lines += ["## Estimators", ""]
     for e in report["estimators"]:
-        notes = "; ".join([*([f"skipped: {e['reason']}"] if e["reason"] else []), *e["notes"]])
+        found = reasons_line(e, log["start_ns"])
+        told = [f"skipped: {e['reason']}"] if e["reason"] else []
+        notes = "; ".join([*told, *e["notes"], *([found] if found else [])])
         kind = "causal" if e["causal"] else "not causal"
         lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
     lines += ["", "## Signals", ""]
@@ -293,6 +301,32 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     lines += [f"- {name}: missing" for name in report["mapping"]["missing"]]
     lines += ["", "Versions: " + ", ".join(f"{k} {v}" for k, v in sorted(report["versions"].items()))]
     return "\n".join(lines) + "\n"
+
+
+#: A shorter interval is shown as one time.
+_SHORT_S = 0.1
+#: Share of the stamps inside the intervals from which on a reason counts as holding throughout.
+_THROUGHOUT = 0.9
+
+
+def reasons_line(estimator: Mapping[str, Any], start_ns: int) -> str:
+    """Return why an estimator of a report did not use its sensors as usual, and when; empty if there is nothing.
+
+    ``gyro stuck 12.3-16.3 s; a_y spike 1.20 s, 3.45 s, 7.00 s and 9 more``: the longest intervals in order of time.
+    """
+    return "; ".join(_reason_text(r, start_ns) for r in estimator.get("reasons") or ())
+
+
+def _reason_text(reason: Mapping[str, Any], start_ns: int) -> str:
+    def when(interval: Mapping[str, Any]) -> str:
+        start_s, end_s = ((interval[key] - start_ns) * 1e-9 for key in ("start_ns", "end_ns"))
+        return f"{start_s:.2f} s" if end_s - start_s < _SHORT_S else f"{start_s:.1f}-{end_s:.1f} s"
+
+    more = reason["intervals"] - len(reason["longest"])
+    text = f"{reason['text']} {', '.join(map(when, reason['longest']))}" + (f" and {more} more" if more else "")
+    # A sensor at a lower rate than the stamps, or single spikes, do not hold throughout.
+    within = reason["share_within"]
+    return text if within > _THROUGHOUT else f"{text} ({within:.0%} of it)"
 
 
 def _bullets(title: str, items: Sequence[str]) -> list[str]:

@@ -12,7 +12,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from pdhef_logtool.errors import OutputError
+from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.geometry import wrap_angle
+from pdhef_logtool.reasons import REASONS
 from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Loss, Signals
 from pdhef_logtool.sinks.base import TRUTH, Event, PendingFile
 from pdhef_logtool.sinks.palette import colour_rgb
@@ -60,6 +62,7 @@ _HEALTH = (
     _Plot("nis", "nis", 1.0, sparse=True),
     _Plot("network_trust", "network_trust", 1.0),
     _Plot("r_scale", "r_scale", 1.0),
+    _Plot("mixture_weight", "mixture_weight", 1.0),
     _Plot("friction", "friction", 1.0),
 )
 _INPUTS = (
@@ -70,6 +73,7 @@ _INPUTS = (
     ("yaw_rate_deg_s", "yaw_rate_rad_s", _DEG),
 )
 _INPUT_RGB = (0x56, 0xB4, 0xE9)
+_REASON_TEXTS = {r.name: r.text for r in REASONS}
 
 
 class RerunSink:
@@ -101,6 +105,7 @@ class RerunSink:
         self._paths: dict[str, _Trajectory] = {}
         self._window: dict[str, StateTrack] = {}
         self._compared: set[str] = set()
+        self._reasons: dict[str, ReasonIntervals] = {}
         self._pending = PendingFile(path)
         self._recording = rr.RecordingStream(APPLICATION_ID, recording_id=input_hash[:32], send_properties=False)
         if not rr.is_enabled(self._recording):
@@ -140,6 +145,8 @@ class RerunSink:
         fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
         for plot in _STATES + _HEALTH:
             values = np.asarray(getattr(track, plot.column)) * plot.factor
+            if len(values) != len(track):
+                continue  # a column that this track has not
             known = track.valid if plot.from_low_speed else track.valid & fast
             values = np.where(known, values, np.nan)
             entity = f"/{plot.entity}/{track.name}"
@@ -147,6 +154,8 @@ class RerunSink:
             if plot.std is not None:
                 half = STD_OF_95_PERCENT * plot.factor * np.asarray(getattr(track, plot.std))
                 self._draw_band(f"{entity}/band95", track.name, rgb, track.stamps_ns, values, half)
+        if len(track.reason) == len(track):
+            self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
         self._draw_path(track, rgb)
         self._draw_errors()
 
@@ -158,8 +167,9 @@ class RerunSink:
                     f"/plan/{name}",
                     rr.LineStrips2D(path.strips(), colors=[colour_rgb(name)], radii=[rr.Radius.ui_points(1.5)]),
                 )
-            if events:
-                ordered = sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
+            found = self._draw_reasons()
+            if events or found:
+                ordered = sorted([*events, *found], key=lambda e: (e.start_ns, e.end_ns, e.name))
                 rr.send_columns(
                     "/events",
                     indexes=self._times(np.array([e.start_ns for e in ordered], dtype=np.int64)),
@@ -269,6 +279,23 @@ class RerunSink:
                 recording=self._recording,
                 strict=True,
             )
+
+    def _draw_reasons(self) -> list[Event]:
+        """Draw each reason as a state that holds in its intervals; return the intervals as events."""
+        events = []
+        for name, intervals in self._reasons.items():
+            for reason, spans in intervals.intervals().items():
+                text = _REASON_TEXTS[reason]
+                stamps = np.array([t for s in spans for t in (s.start_ns, s.end_ns)], dtype=np.int64)
+                rr.send_columns(
+                    f"/reasons/{name}/{reason}",
+                    indexes=self._times(stamps),
+                    columns=rr.StateChange.columns(state=[text, ""] * len(spans)),  # the empty one ends the state
+                    recording=self._recording,
+                    strict=True,
+                )
+                events += [Event(f"{name}: {text}", s.start_ns, s.end_ns, "") for s in spans]
+        return events
 
     def _draw_errors(self) -> None:
         truth = self._window.get(TRUTH)
@@ -394,6 +421,8 @@ def _blueprint() -> rrb.Blueprint:
         plot("/nis", "Normalised innovation squared"),
         plot("/network_trust", "Network trust"),
         plot("/r_scale", "Factor on R"),
+        plot("/mixture_weight", "Weight of the filter with a force scale"),
+        rrb.StateTimelineView(origin="/reasons", name="Why samples were not used as usual"),
         plot("/vx_m_s", "Longitudinal velocity [m/s]"),
         plot("/vy_m_s", "Lateral velocity [m/s]"),
         name="Filter",
