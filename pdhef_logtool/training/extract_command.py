@@ -28,6 +28,7 @@ from pdhef_logtool.errors import (
     PdhefError,
     UsageError,
 )
+from pdhef_logtool.estimators.friction_source import friction_source, friction_topic
 from pdhef_logtool.estimators.parallel_physics import parallel_filter
 from pdhef_logtool.evaluation.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.evaluation.truth import derive_truth
@@ -73,7 +74,7 @@ class ExtractSettings:
 
     Attributes
     ----------
-    config : vehicle, mapping, slice, sensors, which truth; the other entries are not used.
+    config : vehicle, mapping, slice, sensors, friction, which truth; the other entries are not used.
     truth_smoothing : ``auto`` (decided per drive from the truth's noise), ``none``, or a half window in seconds.
     split : for all drives; None = what a set's manifest says of a drive, else 70/15/15 by a hash of its content.
     seed : of that hash, and of the variation.
@@ -110,6 +111,7 @@ class ExtractSettings:
         used = ("vehicle", "mapping", "start", "end", "sensors", "prefer_truth")
         return {
             **{k: config[k] for k in used},
+            **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
             "truth_smoothing": self.truth_smoothing,
             "split": self.split,
             **({"vary": self.vary, "vary_seed": self.seed} if self.vary else {}),
@@ -361,11 +363,18 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         smoothing = _choose_smoothing(plan, job.settings)
         reader = DriveReader(log, plan, job.settings.config.window_s)
         told = vary(job.vehicle, job.settings.vary, f"{job.settings.seed}:{source}")
+        friction = friction_source(
+            job.settings.config.friction,
+            told.vehicle,
+            plan.alignment.available,
+            friction_topic(plan.mapping),
+            use_speed=job.settings.config.sensors == "full",
+            factor=told.friction_factor,
+        )
 
         def windows() -> Iterator[Any]:
-            for window in reader.windows():
-                signals = replace(window.signals, friction=window.signals.friction * told.friction_factor)
-                yield replace(window, signals=signals)
+            for window in friction.fill_windows(reader.windows()):
+                yield window
                 progress(window.share_done)
 
         writer = DriveWriter(target, split)
@@ -393,7 +402,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 "period_s": plan.alignment.grid_period_s,
                 **counts.to_dict(),
                 "truth": _truth_facts(plan, smoothing),
-                "friction_from": _friction_source(plan, job.vehicle),
+                "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
                 **({"friction_factor": told.friction_factor} if job.settings.vary else {}),
                 "losses": [
                     {"kind": x.kind, "what": x.what, "where": x.where, "count": x.count, "severity": x.severity}
@@ -436,7 +445,7 @@ class _Listed:
 def _listed(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
     """Return what the manifest of a simulated set beside a log says of it: its split and its vehicle file."""
     entry = manifest.get(path.name, {})
-    split, vehicle = entry.get("split"), entry.get("vehicle")
+    split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
     file = path.parent / vehicle if isinstance(vehicle, str) and vehicle.endswith(".toml") else None
     return _Listed(
         split=split if isinstance(split, str) and split else None,
@@ -524,13 +533,6 @@ def _truth_facts(plan: DrivePlan, smoothing: _Smoothing) -> dict[str, Any]:
         "difference_noise": _pair(smoothing.noise),
         "not_independent": dict(plan.dependent),
     }
-
-
-def _friction_source(plan: DrivePlan, vehicle: VehicleParameters) -> str:
-    source = plan.mapping.signals.get("friction")
-    if source is not None and "friction" in plan.alignment.available:
-        return source.label
-    return "the vehicle file" if vehicle.friction is not None else "assumed to be 1"
 
 
 def _pair(values: Sequence[float]) -> dict[str, float | None]:
