@@ -90,19 +90,19 @@ def sensor_noise(values: Mapping[str, float]) -> SensorNoise:
 
     Raises
     ------
-    SimulationError
+    UsageError
         There is no such value, or it is no finite number.
     """
     unknown = [name for name in values if name not in SensorNoise._fields]
     if unknown:
-        raise SimulationError(
-            expected=f"values of {', '.join(SensorNoise._fields)}", got=", ".join(unknown), where="sensor"
+        raise UsageError(
+            expected=f"values of {', '.join(SensorNoise._fields)}", got=", ".join(unknown), where="--sensor"
         )
     wrong = [
         n for n, v in values.items() if not np.isfinite(v) or (v < 0.0 and n not in ("imu_x_m", "imu_y_m", "imu_z_m"))
     ]
     if wrong:
-        raise SimulationError(expected="finite numbers of at least 0", got=", ".join(wrong), where="sensor")
+        raise UsageError(expected="finite numbers of at least 0", got=", ".join(wrong), where="--sensor")
     return SensorNoise(**values)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool import __version__
-from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.errors import SimulationError, UsageError
 from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.signals import WHEELS, FloatArray
@@ -196,12 +196,14 @@ def simulate_drive(
 
     Raises
     ------
+    UsageError
+        The manoeuvre is unknown.
     SimulationError
-        The manoeuvre is unknown, a value is outside what the simulator can do, or the car spun.
+        A value is outside what the simulator can do, or the car spun.
     """
     chosen = MANOEUVRES.get(manoeuvre)
     if chosen is None:
-        raise SimulationError(
+        raise UsageError(
             expected=f"one of {', '.join(MANOEUVRES)}",
             got=repr(manoeuvre),
             where="manoeuvre",
@@ -467,12 +469,12 @@ def write_drive(drive: Drive, path: Path, *, without: Sequence[str] = (), steeri
 
     Raises
     ------
-    SimulationError : a part is unknown.
+    UsageError : a part is unknown.
     OutputError : the file cannot be written.
     """
     unknown = [part for part in without if part not in PARTS]
     if unknown:
-        raise SimulationError(expected=f"parts of {', '.join(PARTS)}", got=", ".join(unknown), where="--without")
+        raise UsageError(expected=f"parts of {', '.join(PARTS)}", got=", ".join(unknown), where="--without")
     left_out = {name for part in without for name in PARTS[part]}
     topics = [
         topic

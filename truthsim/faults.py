@@ -30,7 +30,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.errors import UsageError
 from pdhef_logtool.signals import WHEELS, FloatArray
 from truthsim.sensors import RTK_FLOAT, RTK_LOST, Outage, SensorChannel, SensorNoise, quantised, student_t
 
@@ -80,14 +80,12 @@ def parse_fault(text: str) -> Fault:
 
     Raises
     ------
-    SimulationError
+    UsageError
         The text is no fault.
     """
 
-    def wrong(expected: str) -> SimulationError:
-        return SimulationError(
-            expected=expected, got=repr(text), where="fault", remedy="for example burst20:yaw_rate:5:8"
-        )
+    def wrong(expected: str) -> UsageError:
+        return UsageError(expected=expected, got=repr(text), where="--fault", remedy="for example burst20:yaw_rate:5:8")
 
     parts = text.split(":")
     if len(parts) != 4:

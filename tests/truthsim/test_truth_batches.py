@@ -256,5 +256,5 @@ def test_what_is_no_vehicle_is_refused(text: str) -> None:
 def test_sensor_values_are_checked_by_name_and_value() -> None:
     assert sensor_noise({"jitter_s": 0.004, "imu_x_m": -0.3}).jitter_s == 0.004
     for wrong in ({"gps": 1.0}, {"jitter_s": -1.0}, {"yaw_rate_rad_s": float("nan")}):
-        with pytest.raises(SimulationError):
+        with pytest.raises(UsageError):
             sensor_noise(wrong)

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.errors import SimulationError, UsageError
 from truthsim.drive import Drive, judge, reference_steer_rad, simulate_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import (
@@ -316,7 +316,6 @@ def test_an_amplitude_that_cannot_be_had_is_said() -> None:
 @pytest.mark.parametrize(
     ("name", "options", "words"),
     [
-        ("loop-the-loop", {}, ("dlc", "loop-the-loop", "--list")),
         ("dlc", {"speed_km_h": 900.0}, ("speed", "900")),
         ("dlc", {"friction": 0.0}, ("friction", "0")),
         ("dlc", {"friction": float("nan")}, ("friction", "nan")),
@@ -331,6 +330,11 @@ def test_bad_requests_are_one_clear_line(name: str, options: dict[str, float], w
         simulate_drive(name, **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
     assert all(word in str(caught.value) for word in words)
+
+
+def test_an_unknown_manoeuvre_is_a_usage_error() -> None:
+    with pytest.raises(UsageError, match=r"dlc.*loop-the-loop.*--list"):
+        simulate_drive("loop-the-loop")
 
 
 def test_command_makes_the_drive_again(lane_change: Drive) -> None:

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy import stats
 
-from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.errors import UsageError
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.faults import FIELDS, KINDS, TARGETS, apply_faults, parse_fault
 from truthsim.manoeuvres import Plan
@@ -162,7 +162,7 @@ def test_every_fault_reads_back_from_its_text() -> None:
     ],
 )
 def test_what_is_no_fault_is_refused_in_one_line(text: str) -> None:
-    with pytest.raises(SimulationError) as caught:
+    with pytest.raises(UsageError) as caught:
         parse_fault(text)
     assert "\n" not in str(caught.value) and "burst20:yaw_rate:5:8" in str(caught.value)
 
@@ -210,7 +210,7 @@ def test_parts_can_be_left_out(tmp_path: Path) -> None:
     write_drive(drive, tmp_path / "blind.mcap", without=["rtk", "perfect", "events"])
     messages, _ = read(tmp_path / "blind.mcap")
     assert set(messages) == {"/imu/data", "/vehicle/status/steering_status", "/vehicle/wheel_speeds"}
-    with pytest.raises(SimulationError, match="gps"):
+    with pytest.raises(UsageError, match="gps"):
         write_drive(drive, tmp_path / "x.mcap", without=["gps"])
     write_drive(drive, tmp_path / "x.mcap")
     assert {topic for part in PARTS.values() for topic in part} == set(read(tmp_path / "x.mcap")[0])
