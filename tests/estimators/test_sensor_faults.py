@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, make_signals, slalom, tanh_tyre, with_noise
 
+from pdhef_logtool import reasons
 from pdhef_logtool.estimators import sensor_faults as sf
 from pdhef_logtool.estimators.sensor_faults import SensorFaults, find_faults
 from pdhef_logtool.signals import Signals
@@ -62,7 +63,7 @@ def test_a_parabola_on_an_uneven_clock_is_no_noise(seed):
     t = np.concatenate([[0.0], np.cumsum(np.round(dt * 1e9) * 1e-9)])
     s = make_signals(dt, ay_m_s2=3.0 - 4.0 * t + 2.0 * t**2, yaw_rate_rad_s=0.2 * t**2, speed_m_s=np.full(301, 20.0))
     result = found(s)
-    assert not (result.reason & ~(sf.DEAD_AY | sf.DEAD_YAW_RATE)).any()
+    assert not (result.reason & ~(reasons.DEAD_AY | reasons.DEAD_YAW_RATE)).any()
     np.testing.assert_allclose(result.noise_std, np.broadcast_to(S0, (301, 2)), rtol=1e-9)
 
 
@@ -74,7 +75,7 @@ def test_a_burst_raises_r_within_50_ms_and_returns(channel, clean):
         noise = factor * S0[channel] * np.random.default_rng(seed).standard_normal(len(t))
         burst = (t >= 4.0) & (t < 6.0)
         result = found(with_column(clean, channel, burst, getattr(clean, COLUMNS[channel]) + noise))
-        spiked = result.reason & (sf.SPIKE_AY << channel) > 0  # not used at all
+        spiked = result.reason & (reasons.SPIKE_AY << channel) > 0  # not used at all
         raised = (result.extra_r[:, channel] > 0) | spiked
         late.append(t[np.flatnonzero(raised & (t >= 4.0))[0]] - 4.0)
         inside = burst & (t > 4.05)
@@ -83,7 +84,7 @@ def test_a_burst_raises_r_within_50_ms_and_returns(channel, clean):
         assert 0.7 * factor * S0[channel] < level < 1.6 * factor * S0[channel]
         assert not raised[(t > 6.6)].any()
         assert not result.extra_r[:, 1 - channel].any()
-        bad = result.reason & (sf.BURST_AY << channel) > 0
+        bad = result.reason & (reasons.BURST_AY << channel) > 0
         assert np.isnan(getattr(result.network, COLUMNS[channel])[bad]).all()
         assert np.isfinite(getattr(result.filtered, COLUMNS[channel])[bad & ~spiked]).all()
     assert np.quantile(late, 0.9) < 0.051
@@ -103,7 +104,7 @@ def test_a_slow_model_error_does_not_raise_r(amplitude, frequency):
 
 def test_a_biased_channel_is_not_noisy(clean):
     result = found(replace(clean, ay_m_s2=clean.ay_m_s2 + 3.0, yaw_rate_rad_s=clean.yaw_rate_rad_s - 0.05))
-    assert np.mean(result.reason & (sf.BURST_AY | sf.BURST_YAW_RATE) > 0) < 0.005
+    assert np.mean(result.reason & (reasons.BURST_AY | reasons.BURST_YAW_RATE) > 0) < 0.005
 
 
 def test_a_rough_car_becomes_usual():
@@ -111,7 +112,7 @@ def test_a_rough_car_becomes_usual():
     s = with_noise(drive(slalom(0.02, 0.3), 100.0, speed=20.0).signals, seed=1)
     t = times(s)
     more = np.where(t > 10, 5 * S0[0], 0.0) * np.random.default_rng(0).standard_normal(len(s))
-    burst = found(replace(s, ay_m_s2=s.ay_m_s2 + more)).reason & sf.BURST_AY > 0
+    burst = found(replace(s, ay_m_s2=s.ay_m_s2 + more)).reason & reasons.BURST_AY > 0
     assert burst[(t > 10) & (t < 12.5)].mean() > 0.5
     assert burst[t > 80].mean() < 0.02
 
@@ -121,7 +122,7 @@ def test_a_single_spike_is_one_missing_sample_and_no_burst(channel, clean):
     at = np.zeros(len(clean), dtype=bool)
     at[300::97] = True
     result = found(with_column(clean, channel, at, getattr(clean, COLUMNS[channel]) + 40 * S0[channel]))
-    spiked = result.reason & (sf.SPIKE_AY << channel) > 0
+    spiked = result.reason & (reasons.SPIKE_AY << channel) > 0
     np.testing.assert_array_equal(np.flatnonzero(spiked), np.flatnonzero(at))
     assert np.isnan(getattr(result.filtered, COLUMNS[channel])[at]).all()
     assert not result.extra_r[~at].any()
@@ -130,7 +131,7 @@ def test_a_single_spike_is_one_missing_sample_and_no_burst(channel, clean):
 def test_a_jump_is_followed_after_two_samples(clean):
     jumped = times(clean) >= 5.0
     result = found(with_column(clean, sf.AY, jumped, clean.ay_m_s2 + 8.0))
-    spiked = np.flatnonzero(result.reason & sf.SPIKE_AY)
+    spiked = np.flatnonzero(result.reason & reasons.SPIKE_AY)
     assert 1 <= len(spiked) <= sf.MAX_SPIKES
     assert (spiked < np.argmax(jumped) + sf.MAX_SPIKES).all()
 
@@ -143,7 +144,7 @@ def test_five_identical_samples_are_stuck_and_moving_ones_live_again(channel, va
     first = int(np.argmax(bad))
     held = getattr(clean, COLUMNS[channel])[first] if value is None else value
     result = found(with_column(clean, channel, bad, held))
-    stuck = result.reason & (sf.STUCK_AY << channel) > 0
+    stuck = result.reason & (reasons.STUCK_AY << channel) > 0
     assert not stuck[~bad].any()
     assert stuck[first + sf.STUCK_SAMPLES - 1 : first + bad.sum()].all()
     assert np.isnan(getattr(result.filtered, COLUMNS[channel])[stuck]).all()
@@ -158,7 +159,7 @@ def test_a_quantised_gyro_is_not_stuck(quantum):
     s = replace(made.signals, yaw_rate_rad_s=np.round(r / quantum) * quantum)
     s.friction[:] = 0.85
     assert (np.diff(s.yaw_rate_rad_s) == 0).mean() > 0.4
-    assert not (found(s).reason & sf.STUCK_YAW_RATE).any()
+    assert not (found(s).reason & reasons.STUCK_YAW_RATE).any()
 
 
 def test_a_quantised_gyro_that_is_stuck_is_found_once_the_car_turns():
@@ -168,7 +169,7 @@ def test_a_quantised_gyro_that_is_stuck_is_found_once_the_car_turns():
     r[(t > 20) & (t < 24)] = r[np.argmax(t > 20)]
     s = replace(made.signals, yaw_rate_rad_s=r)
     s.friction[:] = 0.85
-    stuck = found(s).reason & sf.STUCK_YAW_RATE > 0
+    stuck = found(s).reason & reasons.STUCK_YAW_RATE > 0
     assert not stuck[(t < 20) | (t > 24)].any()
     assert stuck[(t > 22) & (t < 23.9)].mean() > 0.9
 
@@ -184,7 +185,7 @@ def test_a_gyro_at_rest_may_repeat(clean):
     assert not found(still).reason.any()
 
 
-@pytest.mark.parametrize(("channel", "bit"), [(sf.AY, sf.DEAD_AY), (sf.YAW_RATE, sf.DEAD_YAW_RATE)])
+@pytest.mark.parametrize(("channel", "bit"), [(sf.AY, reasons.DEAD_AY), (sf.YAW_RATE, reasons.DEAD_YAW_RATE)])
 def test_a_dead_and_noisy_channel_is_missing_while_the_car_turns(channel, bit, clean):
     t = times(clean)
     bad = (t >= 4.0) & (t < 8.0)
@@ -194,15 +195,15 @@ def test_a_dead_and_noisy_channel_is_missing_while_the_car_turns(channel, bit, c
     assert not dead[t < 4.0].any()
     assert dead[bad].mean() > 0.6
     assert not dead[t > 9.5].any()
-    assert not (found(clean).reason & (sf.DEAD_AY | sf.DEAD_YAW_RATE)).any()
+    assert not (found(clean).reason & (reasons.DEAD_AY | reasons.DEAD_YAW_RATE)).any()
 
 
 def test_missing_samples_are_said_and_harm_nothing(clean):
     t = times(clean)
     gone = (t >= 4.0) & (t < 6.0)
     result = found(with_column(clean, sf.YAW_RATE, gone, np.nan))
-    np.testing.assert_array_equal(result.reason & sf.MISSING_YAW_RATE > 0, gone)
-    assert not (result.reason & sf.SPIKE_YAW_RATE)[t < 6.1].any()
+    np.testing.assert_array_equal(result.reason & reasons.MISSING_YAW_RATE > 0, gone)
+    assert not (result.reason & reasons.SPIKE_YAW_RATE)[t < 6.1].any()
 
 
 @pytest.fixture(scope="module")
