@@ -59,6 +59,13 @@ ThresholdsFile = Annotated[
 JunitFile = Annotated[
     Path | None, typer.Option("--junit", help="Write the verdicts of --thresholds as JUnit XML, for CI.")
 ]
+FrictionChoice = Annotated[
+    str | None,
+    typer.Option(
+        "--friction",
+        help="auto (the log's, else the vehicle file's, else estimated), file, estimate, or a number; docs/friction.md",
+    ),
+]
 TruthChoice = Annotated[
     str | None, typer.Option("--prefer-truth", help="perfect or rtk: which truth of a simulated log counts.")
 ]
@@ -142,6 +149,7 @@ def run(
     sensors: Annotated[
         str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
     ] = None,
+    friction: FrictionChoice = None,
     prefer_truth: TruthChoice = None,
     thresholds: ThresholdsFile = None,
     junit: JunitFile = None,
@@ -165,6 +173,7 @@ def run(
             "end": end,
             "annotate": annotate,
             "sensors": sensors,
+            "friction": friction,
             "prefer_truth": prefer_truth,
             "thresholds": thresholds,
         },
@@ -539,6 +548,7 @@ def extract(
     sensors: Annotated[
         str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
     ] = None,
+    friction: FrictionChoice = None,
     prefer_truth: TruthChoice = None,
     truth_smoothing: Annotated[
         str,
@@ -570,6 +580,7 @@ def extract(
             "start": start,
             "end": end,
             "sensors": sensors,
+            "friction": friction,
             "prefer_truth": prefer_truth,
         },
     )
@@ -676,6 +687,7 @@ def tune(
     sensors: Annotated[
         str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
     ] = None,
+    friction: FrictionChoice = None,
     prefer_truth: TruthChoice = None,
     jobs: Annotated[int, typer.Option("--jobs", "-j", help="Processes at work; changes no number.")] = 1,
     as_json: JsonFlag = False,
@@ -694,6 +706,7 @@ def tune(
             "start": start,
             "end": end,
             "sensors": sensors,
+            "friction": friction,
             "prefer_truth": prefer_truth,
         },
     )
@@ -750,6 +763,7 @@ def calibrate(
     sensors: Annotated[
         str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
     ] = None,
+    friction: FrictionChoice = None,
     prefer_truth: TruthChoice = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -768,6 +782,7 @@ def calibrate(
             "start": start,
             "end": end,
             "sensors": sensors,
+            "friction": friction,
             "prefer_truth": prefer_truth,
         },
     )
@@ -814,6 +829,7 @@ def trust(
     sensors: Annotated[
         str | None, typer.Option("--sensors", help="full, or esp: no wheel speeds in the filters after the start.")
     ] = None,
+    friction: FrictionChoice = None,
     prefer_truth: TruthChoice = None,
     as_json: JsonFlag = False,
 ) -> None:
@@ -831,6 +847,7 @@ def trust(
             "start": start,
             "end": end,
             "sensors": sensors,
+            "friction": friction,
             "prefer_truth": prefer_truth,
         },
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pdhef_logtool.errors import UsageError
+from pdhef_logtool.estimators.friction_source import parse_friction
 from pdhef_logtool.estimators.registry import check_names
 
 ANNOTATE = ("full", "sidecar", "none")
@@ -31,6 +32,7 @@ class RunConfig:
     start, end : slice as given (:func:`parse_time`); None = the log's own.
     annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only.
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
+    friction : ``auto`` is the log's own, else the vehicle file's, else estimated; ``file``, ``estimate``, or a number.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
     model : folder of a model bundle for the hybrid filters; None = the shipped one, ``none`` = no network.
@@ -45,6 +47,7 @@ class RunConfig:
     end: str | None = None
     annotate: Literal["full", "sidecar", "none"] = "full"
     sensors: Literal["full", "esp"] = "full"
+    friction: str | float = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: float = WINDOW_S
     thresholds: Path | None = None
@@ -78,7 +81,7 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         config = replace(config, **_read_file(path))
     config = replace(config, **{k: v for k, v in flags.items() if v is not None})
     _check(config)
-    return config
+    return replace(config, friction=parse_friction(config.friction))
 
 
 def _read_file(path: Path) -> dict[str, Any]:

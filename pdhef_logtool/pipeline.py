@@ -26,6 +26,7 @@ from pdhef_logtool.errors import (
 )
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
 from pdhef_logtool.estimators.calibration import Calibration, TrackCalibrator, find_calibration
+from pdhef_logtool.estimators.friction_source import FrictionSource, friction_source, friction_topic
 from pdhef_logtool.estimators.registry import NOT_CAUSAL, default_names, runnable
 from pdhef_logtool.geometry import dead_reckon
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
@@ -33,10 +34,11 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, choose_mapping, load_mapping, merge_losses
 from pdhef_logtool.residual_model.bundle import SHIPPED, ModelBundle, open_model
-from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Loss, Signals, join_signals
+from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, IntArray, Loss, Signals, join_signals
 from pdhef_logtool.sinks.base import TRUTH, Event, Sink
 from pdhef_logtool.sinks.report import (
     EstimatorFacts,
+    FrictionFacts,
     LogFacts,
     LogOutcome,
     ReportFacts,
@@ -275,6 +277,15 @@ def _run_open_log(
             where=str(log_input.path),
             remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
         )
+    friction = friction_source(
+        config.friction,
+        vehicle,
+        plan.alignment.available,
+        friction_topic(plan.mapping),
+        use_speed=config.sensors == "full",
+    )
+    if friction.note:
+        tell(friction.note)
     sha256 = hash_log(log_input.path)
     intervals = TrackCalibrator(calibration, vehicle_hash(vehicle), None if model is None else model.sha256)
     folder = output / "logs" / log_input.stem
@@ -283,10 +294,18 @@ def _run_open_log(
     try:
         with TrackStore(folder) as store:
             context = _estimate(
-                reader, estimators, intervals, sinks, store, lambda share: progress(log_input.stem, 0.8 * share)
+                reader,
+                estimators,
+                friction,
+                intervals,
+                sinks,
+                store,
+                lambda share: progress(log_input.stem, 0.8 * share),
             )
             progress(log_input.stem, 0.8)
             rows, events, reasons = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
+        if friction.bank is not None:
+            events = sorted([*events, *friction_events(friction, context.stamps_ns)], key=in_time)
         losses = merge_losses([log.lost, reader.losses, *(sink.lost for sink in sinks)])
         ran = [
             EstimatorFacts(
@@ -298,7 +317,7 @@ def _run_open_log(
         report = build_report(
             report_facts(
                 log, log_input, sha256, plan, missing, vehicle, [*ran, *left_out], rows, events, losses, warnings,
-                reader.samples or {},
+                reader.samples or {}, friction,
             )
         )  # fmt: skip
         from pdhef_logtool.sinks.parquet import write_metrics
@@ -390,6 +409,7 @@ def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
 def _estimate(
     reader: DriveReader,
     estimators: Sequence[Estimator],
+    friction: FrictionSource,
     intervals: TrackCalibrator,
     sinks: Sequence[Sink],
     store: TrackStore,
@@ -401,7 +421,7 @@ def _estimate(
     seen: list[Signals] = []
     start: tuple[float, float, float] | None = None
     look_ahead_s = max(map(look_ahead_of, estimators), default=0.0)
-    for window, ahead in with_look_ahead(reader.windows(), look_ahead_s):
+    for window, ahead in with_look_ahead(friction.fill_windows(reader.windows()), look_ahead_s):
         seen.append(window.signals)
         if start is None:
             start = first_pose(window.truth)
@@ -473,7 +493,20 @@ def _evaluate(
             pair = [t for t in (store.read(a), store.read(b)) if t is not None]
             rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
     rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
-    return rows, sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name)), reasons
+    return rows, sorted(events, key=in_time), reasons
+
+
+def in_time(event: Event) -> tuple[int, int, str]:
+    """Return what events are sorted by."""
+    return event.start_ns, event.end_ns, event.name
+
+
+def friction_events(friction: FrictionSource, stamps_ns: IntArray) -> list[Event]:
+    """Return when an estimated friction was observable; ``stamps_ns`` are those of all windows."""
+    from pdhef_logtool.evaluation.segments import find_intervals
+
+    found = find_intervals(stamps_ns, {"friction observable": friction.observable})
+    return [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in found]
 
 
 def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
@@ -499,6 +532,7 @@ def report_facts(
     losses: Sequence[Loss],
     warnings: Sequence[str],
     samples: dict[str, int],
+    friction: FrictionSource | None = None,
 ) -> ReportFacts:
     """Gather what report.json says of one log; ``samples`` are the messages that were used, by source."""
     mapping = plan.mapping
@@ -539,11 +573,23 @@ def report_facts(
             not_independent=sorted(plan.dependent),
             notes=notes,
         ),
+        friction=None if friction is None else friction_facts(friction),
         metrics=rows,
         segments=events,
         losses=losses,
         warnings=warnings,
         versions=tool_versions(),
+    )
+
+
+def friction_facts(friction: FrictionSource) -> FrictionFacts:
+    """Return what the report says of a run's friction, after the run."""
+    return FrictionFacts(
+        source=friction.label,
+        estimated=friction.bank is not None,
+        observable_share=friction.observable_share,
+        observable_std=friction.observable_std,
+        summary=friction.summary,
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.pipeline import LogResult, RunResult
-from pdhef_logtool.sinks.report import reasons_line
+from pdhef_logtool.sinks.report import friction_line, reasons_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -109,6 +109,8 @@ def _render_log(one: LogResult, console: Console) -> None:
                 console.print(f"  sideslip of {pair}: rms difference {row['value'] * _DEG:.3f}°", highlight=False)
     if report["truth"]["not_independent"]:
         console.print("  † the truth is an input or the estimate itself: no independent check", highlight=False)
+    if found := friction_line(report):
+        console.print(f"  friction: {found}", highlight=False, markup=False)
     for estimator in report["estimators"]:
         if estimator["outcome"] == "skipped":
             console.print(f"  {estimator['name']} skipped: {estimator['reason']}", highlight=False)

@@ -89,6 +89,20 @@ class TruthFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class FrictionFacts:
+    """The friction that every estimator was told: ``source`` in words, and what an estimate of it was worth.
+
+    ``observable_share`` of the stamps, ``observable_std`` the median 1-sigma there; NaN where nothing was estimated.
+    """
+
+    source: str
+    estimated: bool = False
+    observable_share: float = math.nan
+    observable_std: float = math.nan
+    summary: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class ReportFacts:
     """Everything that report.json says about one log."""
 
@@ -99,6 +113,7 @@ class ReportFacts:
     vehicle_sha256: str
     estimators: Sequence[EstimatorFacts]
     truth: TruthFacts
+    friction: FrictionFacts | None = None
     metrics: Sequence[MetricRow] = ()
     segments: Sequence[Event] = ()
     losses: Sequence[Loss] = ()
@@ -183,6 +198,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "not_independent": sorted(facts.truth.not_independent),
             "notes": list(facts.truth.notes),
         },
+        "friction": facts.friction,
         "metrics": [
             {
                 "log": m.log,
@@ -285,6 +301,8 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     lines += _bullets("Warnings", report["warnings"])
     lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
     lines += _truth_lines(report["truth"])
+    if found := friction_line(report):
+        lines += [f"Friction: {found}", ""]
     not_causal = {e["name"] for e in report["estimators"] if not e["causal"]}
     signals = dict.fromkeys(m["signal"] for m in report["metrics"])
     for signal in sorted(signals, key=lambda s: s != "sideslip_rad"):
@@ -327,6 +345,15 @@ def _reason_text(reason: Mapping[str, Any], start_ns: int) -> str:
     # A sensor at a lower rate than the stamps, or single spikes, do not hold throughout.
     within = reason["share_within"]
     return text if within > _THROUGHOUT else f"{text} ({within:.0%} of it)"
+
+
+def friction_line(report: Mapping[str, Any]) -> str:
+    """Return where a report's friction came from and what its estimate was worth; empty where none was needed."""
+    friction = report.get("friction")
+    if friction is None:
+        return ""
+    text: str = friction["source"]
+    return f"{text}, {friction['summary']}" if friction["summary"] else text
 
 
 def _bullets(title: str, items: Sequence[str]) -> list[str]:

@@ -24,6 +24,7 @@ from pdhef_logtool.estimators.calibration import (
     yaw_rate_terms,
 )
 from pdhef_logtool.estimators.error_features import error_terms
+from pdhef_logtool.estimators.friction_source import friction_source, friction_topic
 from pdhef_logtool.estimators.registry import default_names, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
@@ -267,7 +268,17 @@ def _run_drive(
         runs.append((told.vehicle, told.friction_factor, True))
     found: list[tuple[str, Samples]] = []
     for assumed, factor, wrong in runs:
-        seen = replace(signals, friction=signals.friction * factor)
+        friction = friction_source(
+            config.friction,
+            assumed,
+            plan.alignment.available,
+            friction_topic(chosen),
+            use_speed=config.sensors == "full",
+            factor=factor,
+        )
+        seen = friction.fill(signals)
+        if not found and "friction" not in plan.alignment.available:
+            signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
         estimators, _ = runnable(
             config.estimators or default_names(assumed, model),
             assumed,
@@ -347,7 +358,10 @@ def _document(
         "version": FORMAT_VERSION,
         "versions": tool_versions(),
         "settings": {
-            **{k: config[k] for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "prefer_truth")},
+            **{
+                k: config[k]
+                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
+            },
             "split": settings.split,
             "any_split": settings.any_split,
             "vary": settings.spread,

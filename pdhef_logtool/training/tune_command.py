@@ -374,7 +374,10 @@ def _record(
         "version": FORMAT_VERSION,
         "versions": tool_versions(),
         "settings": {
-            **{k: config[k] for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "prefer_truth")},
+            **{
+                k: config[k]
+                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
+            },
             "split": settings.split,
             "any_split": settings.any_split,
         },

@@ -19,6 +19,7 @@ import numpy as np
 from pdhef_logtool.config import RunConfig, time_slice
 from pdhef_logtool.drive_channels import DriveReader, plan_drive
 from pdhef_logtool.errors import EstimatorError, PdhefError, UsageError
+from pdhef_logtool.estimators.friction_source import friction_source, friction_topic
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator
 from pdhef_logtool.logs.discovery import LogInput, hash_log
@@ -208,8 +209,15 @@ class DriveBench:
             )
             plan = plan_drive(log, mapping, setup.vehicle, *time_slice(setup.config, log.start_ns, log.end_ns))
 
+            friction = friction_source(
+                setup.config.friction,
+                setup.vehicle,
+                plan.alignment.available,
+                friction_topic(mapping),
+                use_speed=setup.use_speed,
+            )
+
             def facts(held: int = 0, seconds: float = 0.0, scored: int = 0, left_out: str = "") -> DriveFacts:
-                friction = mapping.signals.get("friction")
                 return DriveFacts(
                     name=log_input.stem,
                     file=log_input.path.name,
@@ -217,7 +225,7 @@ class DriveBench:
                     seconds=seconds,
                     scored_stamps=scored,
                     truth=tuple(sorted({source.label for source in mapping.truth.values()})),
-                    friction_from="vehicle file" if friction is None else friction.label,
+                    friction_from=friction.label,
                     bytes_held=held,
                     warnings=tuple(warnings),
                     left_out=left_out,
@@ -247,7 +255,7 @@ class DriveBench:
         scored = sum(int(np.count_nonzero(scorable_stamps(t, low_speed))) for t in truths)
         if scored < MIN_SCORED_STAMPS:
             return facts(left_out=f"{scored} stamps with a true sideslip above {low_speed:g} m/s")
-        joined, truth = join_signals(signals), concatenate(truths)
+        joined, truth = friction.fill(join_signals(signals)), concatenate(truths)
         prepared = {name: TUNABLE[name].prepare(setup, joined) for name in setup.names}
         held += sum(getattr(value, "nbytes", 0) for value in prepared.values())
         self._drives[index] = _Drive(joined, truth, prepared)

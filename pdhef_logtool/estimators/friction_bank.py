@@ -1,0 +1,259 @@
+"""Road friction on line, from a bank of filters that each assume another one (METHOD §8).
+
+Every filter j of the bank has the state [v_y, r] at its own friction μ_j, and the speed and held inputs of one
+``phy-ukf`` beside the bank. It is an extended Kalman filter on the nominal model, a_y corrected for body roll, R at
+model-error level: below some four tenths of the grip a model error says more than friction does, and must not move it.
+
+The weights follow w_j ∝ (w_j^f · prior_j^(1−f)) · L_j^η with f = exp(−Δt/τ): what was seen is forgotten with the time
+constant τ, and where nothing tells frictions apart the dry prior comes back. L_j is the likelihood of the innovations
+of a_y and yaw rate under a Student distribution, so that no single sample decides; the power η < 1 counts neighbouring
+samples, whose model errors are the same, as fewer than they are.
+
+The estimate is the weighted mean, but not less than the lateral acceleration reached just now needs. What stands at
+step k was known before the samples of step k: a filter that uses it is not handed its own measurement back.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.estimators.base import without_impossible
+from pdhef_logtool.estimators.physics import U_STEER, VX, FilterCarry, PhysicsUkf
+from pdhef_logtool.nominal_model import (
+    measured_lateral_acceleration,
+    model_parameters,
+    state_derivative,
+    substeps,
+)
+from pdhef_logtool.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
+
+#: Frictions of the bank, and how likely each is on a road that nothing is known of: mean 0.86, 1-sigma 0.23.
+GRID = (0.12, 0.2, 0.3, 0.42, 0.56, 0.72, 0.9, 1.1)
+PRIOR = (0.015, 0.02, 0.025, 0.03, 0.05, 0.12, 0.45, 0.29)
+#: Process 1-sigma per √s of v_y (m/s) and r (rad/s); measurement 1-sigma of a_y (m/s²) and r (rad/s), at model-error
+#: level; all by the sideslip errors that follow, on simulated drives that no table is made of.
+Q_VY, Q_YAW_RATE = 0.3, 0.1
+R_AY, R_YAW_RATE = 1.0, 0.006
+#: Degrees of freedom of the Student distribution, the power η, and the forgetting time τ.
+STUDENT_DOF, LIKELIHOOD_POWER, FORGETTING_S = 4.0, 0.3, 2.0
+INITIAL_VY_STD, INITIAL_YAW_RATE_STD = 0.5, 0.1
+#: Slower than this many times the low-speed blend, or behind a longer step, the bank waits and keeps its weights.
+LEAST_SPEED_BLENDS = 1.67
+LONGEST_STEP_S = 0.1
+#: A filter that assumes too little grip drifts off; it is held within this |v_y| / v_x.
+MAX_VY_SHARE = 0.7
+#: The lower bound is this share of what the a_y of the last tenth of a second needs.
+BOUND_SHARE, BOUND_SMOOTHING_S = 0.9, 0.1
+#: Friction is observable where the 1-sigma of the weights is below this; that of the prior is 0.23.
+OBSERVABLE_STD = 0.12
+
+# Scalars that are carried: whether the states are started, smoothed |a_y|, and of the step before steering and speed.
+_STARTED, _AY, _STEER, _SPEED = range(4)
+_MEMORY = 4
+_NOT_MEASURED = 1e12  # variance of a channel without a sample
+_STEP_VY, _STEP_YAW_RATE = 0.02, 0.002  # for difference quotients
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrictionCarry:
+    """What the bank takes from window to window; ``speed_filter`` is the carry of the ``phy-ukf`` beside it."""
+
+    weights: FloatArray
+    x: FloatArray
+    P: FloatArray
+    memory: FloatArray
+    last_stamp_ns: int
+    speed_filter: FilterCarry
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrictionEstimate:
+    """Friction at each stamp, [N] each: estimate, 1-sigma of the bank's weights, and whether the drive shows it."""
+
+    friction: FloatArray
+    std: FloatArray
+    observable: BoolArray
+
+
+@njit(cache=True)
+def _advance(v, vy, r, steer, friction, dt, n, p):  # type: ignore[no-untyped-def]
+    """Advance [v_y, r] at constant speed by ``dt`` s in ``n`` Heun steps."""
+    h = dt / n
+    for _ in range(n):
+        _, a1, b1 = state_derivative(v, vy, r, steer, 0.0, friction, p)
+        _, a2, b2 = state_derivative(v, vy + h * a1, r + h * b1, steer, 0.0, friction, p)
+        vy += 0.5 * h * (a1 + a2)
+        r += 0.5 * h * (b1 + b2)
+    return vy, r
+
+
+@njit(cache=True)
+def _step(x, P, v, v_now, steer, steer_now, friction, dt, ay, yaw_rate, p):  # type: ignore[no-untyped-def]
+    """Take one filter over a step, x [2] and P [3] (vv, vr, rr) in place; return the log-likelihood of its innovations.
+
+    ``v``, ``steer`` hold over the step, ``v_now``, ``steer_now`` at its end; a measurement may be NaN.
+    """
+    limit = MAX_VY_SHARE * v
+    vy, r = min(limit, max(-limit, x[0])), x[1]
+    n = substeps(v, dt, friction, p)
+    vy_next, r_next = _advance(v, vy, r, steer, friction, dt, n, p)
+    vy_v, r_v = _advance(v, vy + _STEP_VY, r, steer, friction, dt, n, p)
+    vy_r, r_r = _advance(v, vy, r + _STEP_YAW_RATE, steer, friction, dt, n, p)
+    f00, f10 = (vy_v - vy_next) / _STEP_VY, (r_v - r_next) / _STEP_VY
+    f01, f11 = (vy_r - vy_next) / _STEP_YAW_RATE, (r_r - r_next) / _STEP_YAW_RATE
+    t00, t01 = f00 * P[0] + f01 * P[1], f00 * P[1] + f01 * P[2]
+    t10, t11 = f10 * P[0] + f11 * P[1], f10 * P[1] + f11 * P[2]
+    p0 = t00 * f00 + t01 * f01 + Q_VY * Q_VY * dt
+    p1 = t00 * f10 + t01 * f11
+    p2 = t10 * f10 + t11 * f11 + Q_YAW_RATE * Q_YAW_RATE * dt
+    vy, r = vy_next, r_next
+
+    z = measured_lateral_acceleration(v_now, vy, r, steer_now, friction, p)
+    h0 = (measured_lateral_acceleration(v_now, vy + _STEP_VY, r, steer_now, friction, p) - z) / _STEP_VY
+    h1 = (measured_lateral_acceleration(v_now, vy, r + _STEP_YAW_RATE, steer_now, friction, p) - z) / _STEP_YAW_RATE
+    has_ay, has_rate = math.isfinite(ay), math.isfinite(yaw_rate)
+    nu_a = ay - z if has_ay else 0.0
+    nu_r = yaw_rate - r if has_rate else 0.0
+    dof = (1.0 if has_ay else 0.0) + (1.0 if has_rate else 0.0)
+    if dof == 0.0:
+        x[0], x[1], P[0], P[1], P[2] = vy, r, p0, p1, p2
+        return 0.0
+    var_a = R_AY * R_AY if has_ay else _NOT_MEASURED
+    var_r = R_YAW_RATE * R_YAW_RATE if has_rate else _NOT_MEASURED
+    c0, c1 = p0 * h0 + p1 * h1, p1 * h0 + p2 * h1  # P Hᵀ of a_y; that of r is (p1, p2)
+    s00, s01, s11 = h0 * c0 + h1 * c1 + var_a, c1, p2 + var_r
+    det = s00 * s11 - s01 * s01
+    square = (s11 * nu_a * nu_a - 2.0 * s01 * nu_a * nu_r + s00 * nu_r * nu_r) / det
+    log_likelihood = -0.5 * (STUDENT_DOF + dof) * math.log(1.0 + square / STUDENT_DOF) - 0.5 * math.log(det)
+
+    # An outlier of the Student distribution is a sample with a larger R.
+    inflation = (STUDENT_DOF + square) / (STUDENT_DOF + dof)
+    if inflation > 1.0:
+        s00 += (inflation - 1.0) * var_a
+        s11 += (inflation - 1.0) * var_r
+        det = s00 * s11 - s01 * s01
+    k00, k01 = (c0 * s11 - p1 * s01) / det, (p1 * s00 - c0 * s01) / det
+    k10, k11 = (c1 * s11 - p2 * s01) / det, (p2 * s00 - c1 * s01) / det
+    x[0] = vy + k00 * nu_a + k01 * nu_r
+    x[1] = r + k10 * nu_a + k11 * nu_r
+    P[0] = p0 - (k00 * c0 + k01 * p1)
+    P[1] = p1 - (k00 * c1 + k01 * p2)
+    P[2] = p2 - (k10 * c1 + k11 * p2)
+    return log_likelihood
+
+
+@njit(cache=True)
+def _bank(  # type: ignore[no-untyped-def]
+    dt, vx, steer, usable, ay, yaw_rate, grid, prior, p, ay_per_friction, weights, x, P, memory, out_mu, out_std
+):  # fmt: skip
+    """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory are updated in place."""
+    count = grid.shape[0]
+    likelihood = np.empty(count)
+    for k in range(dt.shape[0]):
+        mean = 0.0
+        square = 0.0
+        for j in range(count):
+            mean += weights[j] * grid[j]
+            square += weights[j] * grid[j] * grid[j]
+        out_std[k] = math.sqrt(max(0.0, square - mean * mean))
+        out_mu[k] = max(mean, BOUND_SHARE * abs(memory[_AY]) / ay_per_friction)
+        if not dt[k] <= LONGEST_STEP_S or not usable[k]:
+            memory[_STARTED] = 0.0
+            memory[_AY] = 0.0
+        elif math.isfinite(ay[k]):
+            memory[_AY] += (1.0 - math.exp(-dt[k] / BOUND_SMOOTHING_S)) * (ay[k] - memory[_AY])
+        if usable[k]:
+            if memory[_STARTED] == 0.0:
+                rate = yaw_rate[k] if math.isfinite(yaw_rate[k]) else 0.0
+                for j in range(count):
+                    x[j, 0], x[j, 1] = p.rear_m * rate, rate  # the rear axle rolls without slip
+                    P[j, 0], P[j, 1], P[j, 2] = INITIAL_VY_STD**2, 0.0, INITIAL_YAW_RATE_STD**2
+                memory[_STARTED] = 1.0
+            else:
+                v = 0.5 * (memory[_SPEED] + vx[k])
+                angle = 0.5 * (memory[_STEER] + steer[k])
+                best = -math.inf
+                for j in range(count):
+                    likelihood[j] = LIKELIHOOD_POWER * _step(
+                        x[j], P[j], v, vx[k], angle, steer[k], grid[j], dt[k], ay[k], yaw_rate[k], p
+                    )
+                    best = max(best, likelihood[j])
+                keep = math.exp(-dt[k] / FORGETTING_S)
+                total = 0.0
+                for j in range(count):
+                    weights[j] = weights[j] ** keep * prior[j] ** (1.0 - keep) * math.exp(likelihood[j] - best)
+                    total += weights[j]
+                for j in range(count):
+                    weights[j] = max(weights[j] / total, 1e-12)
+            memory[_STEER] = steer[k]
+            memory[_SPEED] = vx[k]
+
+
+@dataclass(frozen=True, slots=True)
+class FrictionBank:
+    """The bank of this file; immutable, its only memory is the carry.
+
+    Parameters
+    ----------
+    vehicle : parameters; its friction is not looked at by the bank.
+    use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter that gives the speed.
+    """
+
+    vehicle: VehicleParameters
+    use_speed: bool = True
+
+    @property
+    def needs(self) -> frozenset[str]:
+        """Aligned signals without which nothing can be estimated."""
+        return self._speed_filter.needs
+
+    @property
+    def _speed_filter(self) -> PhysicsUkf:
+        return PhysicsUkf(self.vehicle, use_speed=self.use_speed)
+
+    @property
+    def ay_per_friction(self) -> float:
+        """Largest accelerometer reading on a level road at friction 1, m/s²."""
+        front, rear = (self.vehicle.magic_formula(f, 1.0)[2] for f in (True, False))
+        roll_gain = max(0.0, GRAVITY_M_S2 * self.vehicle.roll_gradient_rad_per_m_s2)
+        return (1.0 + roll_gain) * (front + rear) / self.vehicle.mass_kg
+
+    def run(self, signals: Signals, carry: FrictionCarry | None) -> tuple[FrictionEstimate, FrictionCarry]:
+        """Estimate over one window; windows join bit for bit. ``signals.friction`` is not looked at."""
+        signals = without_impossible(signals)
+        steps, speed_carry = self._speed_filter.filter_steps(
+            _without_friction(signals), None if carry is None else carry.speed_filter
+        )
+        parameters = model_parameters(self.vehicle, roll_correction=True)
+        grid, prior = np.array(GRID), np.array(PRIOR)
+        count = len(signals)
+        if carry is None:
+            weights, x, P, memory = prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY)
+            first_dt, last = math.nan, 0
+        else:
+            weights, x, P, memory = carry.weights.copy(), carry.x.copy(), carry.P.copy(), carry.memory.copy()
+            last = carry.last_stamp_ns
+            first_dt = (int(signals.stamps_ns[0]) - last) * 1e-9 if count else math.nan
+        dt = np.empty(count)
+        if count:
+            dt[0] = first_dt
+            dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+            last = int(signals.stamps_ns[-1])
+        vx = steps.x[:, VX].copy()
+        usable = steps.valid & ~steps.diverged & (vx > LEAST_SPEED_BLENDS * parameters.blend_high_m_s)
+        friction, std = np.empty(count), np.empty(count)
+        _bank(
+            dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ay_m_s2, signals.yaw_rate_rad_s, grid, prior,
+            parameters, self.ay_per_friction, weights, x, P, memory, friction, std,
+        )  # fmt: skip
+        after = FrictionCarry(weights, x, P, memory, last, speed_carry)
+        return FrictionEstimate(friction, std, std < OBSERVABLE_STD), after
+
+
+def _without_friction(signals: Signals) -> Signals:
+    return replace(signals, friction=np.full(len(signals), np.nan))
