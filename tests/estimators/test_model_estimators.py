@@ -167,7 +167,7 @@ def test_linear_regression_is_its_equation():
 def test_what_the_model_has_not_is_skipped_with_the_reason():
     bare = replace(MODEL, pure_lstm=None, linear_regression=None)
     estimators, skipped = runnable(NAMES, VEHICLE, frozenset(ALIGNED_SIGNALS), model=bare)
-    assert [e.name for e in estimators] == ["pd-hef-paper"]
+    assert [e.name for e in estimators] == ["pd-hef", "pd-hef-paper"]
     assert [s.name for s in skipped] == ["pure-lstm", "linear-regression"]
     assert all("--baselines" in s.reason for s in skipped)
     with pytest.raises(UsageError, match="--baselines"):

@@ -15,6 +15,7 @@ from pdhef_logtool.mapping import (
     Mapping,
     SignalSource,
     apply_clock,
+    auto_map,
     check_mapping,
     clock_key,
     fit_clocks,
@@ -22,6 +23,7 @@ from pdhef_logtool.mapping import (
     load_mapping,
     read_signals,
 )
+from pdhef_logtool.mapping.choosing import choose_mapping
 
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
 
@@ -119,3 +121,21 @@ def test_instrument_units_and_invalid_steering(shared_dir: Path) -> None:
     course = np.arctan2(lat[20:] - lat[:-20], (lon[20:] - lon[:-20]) * np.cos(lat[:-20]))
     slip = np.angle(np.exp(1j * (course - got.truth["yaw_rad"].values[10:2384])))
     assert np.corrcoef(slip, np.arctan2(vy, vx)[10:2384])[0, 1] > 0.85
+
+
+def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_path: Path) -> None:
+    text = '[signals.friction]\ntopic = "/truth/perfect/state"\nfield = "friction"\n'
+    log_path = next(Path("sample_logs").glob("dlc*.mcap"))
+    log = open_log(log_path)
+    recognised = auto_map(log).mapping
+    for filled in (False, True):
+        (tmp_path / "mapping.toml").write_text(("fill_recognised = true\n" if filled else "") + text)
+        mapping, missing = choose_mapping(
+            log, load_mapping(tmp_path / "mapping.toml"), pytest.fail, prefer_truth="perfect", tell_notes=False
+        )
+        assert mapping.signals["friction"].topic == "/truth/perfect/state"
+        others = {n: s for n, s in mapping.signals.items() if n != "friction"}
+        assert others == ({n: s for n, s in recognised.signals.items() if n != "friction"} if filled else {})
+        assert mapping.truth == (recognised.truth if filled else {})
+        assert ("yaw_rate_rad_s" in missing) is not filled
+    log.close()

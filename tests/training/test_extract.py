@@ -205,8 +205,16 @@ def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Pa
 def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
     frame = pl.read_parquet(dataset.output / "drives/dlc.parquet")
     assert frame.columns == [
-        "stamp_ns", *FEATURES, "target_dvy_m_s", "target_dyaw_rate_rad_s", "truth_vx_m_s", "truth_vy_m_s", "weight", "segment", "split"
-    ]  # fmt: skip
+        "stamp_ns",
+        *FEATURES,
+        "target_dvy_m_s",
+        "target_dyaw_rate_rad_s",
+        "truth_vx_m_s",
+        "truth_vy_m_s",
+        "weight",
+        "segment",
+        "split",
+    ]
     assert frame["stamp_ns"].diff().drop_nulls().min() > 0  # type: ignore[operator]
     entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
     assert (len(frame), int(frame["weight"].sum())) == (entry["rows"], entry["usable_rows"])
