@@ -114,11 +114,19 @@ def _render_log(one: LogResult, console: Console) -> None:
     for estimator in report["estimators"]:
         if estimator["outcome"] == "skipped":
             console.print(f"  {estimator['name']} skipped: {estimator['reason']}", highlight=False)
-        for note in estimator["notes"]:
-            console.print(f"  {estimator['name']}: {note}", highlight=False, markup=False)
-        if found := reasons_line(estimator, report["log"]["start_ns"]):
-            console.print(f"  {estimator['name']}: {found}", highlight=False, markup=False)
+    for note, names in _notes(report).items():
+        console.print(f"  {', '.join(names)}: {note}", highlight=False, markup=False)
     console.print()
+
+
+def _notes(report: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return what the estimators have to say, reasons last, with the names of all that say the same."""
+    told: dict[str, list[str]] = {}
+    for estimator in report["estimators"]:
+        found = reasons_line(estimator, report["log"]["start_ns"])
+        for note in [*estimator["notes"], *([found] if found else [])]:
+            told.setdefault(note, []).append(estimator["name"])
+    return told
 
 
 def _table(report: Mapping[str, Any], width: int) -> Table:

@@ -125,7 +125,7 @@ class ReasonIntervals:
 
 def summarise_reasons(track: StateTrack) -> tuple[ReasonFacts, ...] | None:
     """Return the summary of a whole track; None where the source gives no reasons."""
-    if len(track.reason) == 0:
+    if not len(track.reason) == len(track) > 0:
         return None
     found = ReasonIntervals()
     found.append(track.stamps_ns, track.reason)

@@ -330,9 +330,10 @@ _THROUGHOUT = 0.9
 def reasons_line(estimator: Mapping[str, Any], start_ns: int) -> str:
     """Return why an estimator of a report did not use its sensors as usual, and when; empty if there is nothing.
 
-    ``gyro stuck 12.3-16.3 s; a_y spike 1.20 s, 3.45 s, 7.00 s and 9 more``: the longest intervals in order of time.
+    ``a_y spike 1.20 s, 3.45 s, 7.00 s and 9 more; gyro stuck 12.3-16.3 s``: in order of time, the longest intervals.
     """
-    return "; ".join(_reason_text(r, start_ns) for r in estimator.get("reasons") or ())
+    reasons = sorted(estimator.get("reasons") or (), key=lambda r: r["first_ns"])
+    return "; ".join(_reason_text(r, start_ns) for r in reasons)
 
 
 def _reason_text(reason: Mapping[str, Any], start_ns: int) -> str:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from pdhef_logtool.reasons import SPIKE_AY, STUCK_YAW_RATE
 from pdhef_logtool.signals import Signals
 from pdhef_logtool.tracks import StateTrack, make_track
 
@@ -17,11 +18,19 @@ SIDESLIP_RAD = 0.05
 TrackMaker = Callable[..., StateTrack]
 
 
+def adaptive_columns(at: np.ndarray) -> dict[str, np.ndarray]:
+    """Return what an adaptive estimator says besides: its gyro stuck at 100 to 149, spikes of a_y at 30 and 400."""
+    reason = np.where((at >= 100) & (at < 150), STUCK_YAW_RATE, 0) | np.where(np.isin(at, [30, 400]), SPIKE_AY, 0)
+    return {"mixture_weight": np.where(at % 50 == 49, np.nan, 0.5 + 0.4 * np.sin(at / 50)), "reason": reason}
+
+
 @pytest.fixture
 def circle() -> TrackMaker:
     """Return a maker of a window of a steady circle drive; rows [first, first + n) of it."""
 
-    def make(name: str, first: int = 0, n: int = 200, bias: float = 0.0, covariance: bool = True) -> StateTrack:
+    def make(
+        name: str, first: int = 0, n: int = 200, bias: float = 0.0, covariance: bool = True, adaptive: bool = False
+    ) -> StateTrack:
         at = np.arange(first, first + n)
         stamps_ns = START_NS + STEP_NS * at.astype(np.int64)
         rate = SPEED_M_S / RADIUS_M
@@ -49,6 +58,7 @@ def circle() -> TrackMaker:
             friction=np.full(n, 0.85),
             valid=at % 50 != 49,
             diverged=at == 120,
+            **(adaptive_columns(at) if adaptive else {}),
         )
 
     return make

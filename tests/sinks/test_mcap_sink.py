@@ -13,6 +13,7 @@ from source_log import write_source
 
 from pdhef_logtool.errors import OutputError
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.reasons import REASONS
 from pdhef_logtool.sinks.mcap import AnnotatedMcapSink, topic_of
 from pdhef_logtool.tracks import concatenate, make_track
 
@@ -231,6 +232,19 @@ def ros_only(tmp_path, source, circle) -> Path:
     return path
 
 
+def test_weights_reasons_and_their_names_are_in_the_message(tmp_path, circle):
+    path = tmp_path / "sidecar.mcap"
+    sink = AnnotatedMcapSink(path, None)
+    for k in range(2):
+        sink.append(circle("pd-hef", 300 * k, 300, adaptive=True))
+    sink.finish(REPORT)
+    track = circle("pd-hef", 0, 600, adaptive=True)
+    rows = [m for _, m in decoded(path, "/pdhef/pd_hef/state")]
+    np.testing.assert_array_equal([m.mixture_weight for m in rows], track.mixture_weight)
+    np.testing.assert_array_equal([m.reason for m in rows], track.reason)
+    assert {r.name: getattr(rows[0], f"REASON_{r.name.upper()}") for r in REASONS} == {r.name: r.bit for r in REASONS}
+
+
 @pytest.mark.parametrize("token", NAMES)
 def test_rosbags_reads_every_state(ros_only, circle, token):
     track = circle(NAMES[token], 0, 600)
@@ -253,6 +267,7 @@ def test_rosbags_reads_every_state(ros_only, circle, token):
         "diverged",
     ):
         np.testing.assert_array_equal([getattr(m, field) for _, m in rows], getattr(track, field), err_msg=field)
+    assert np.isnan([m.mixture_weight for _, m in rows]).all() and not any(m.reason for _, m in rows)
     covariance = np.array([m.covariance for _, m in rows])
     if token == "truth":
         assert np.isnan(covariance).all()

@@ -35,7 +35,11 @@ ESTIMATE_COLUMNS = {
     "nis": pl.Float64,
     "friction": pl.Float64,
     "valid": pl.Boolean,
+    "mixture_weight": pl.Float64,
+    "reason": pl.Int32,
 }
+#: Those that none of these tracks has.
+OPTIONAL = {"mixture_weight", "reason"}
 UNITS = {
     "stamp_ns": "ns",
     "estimator": "",
@@ -56,6 +60,8 @@ UNITS = {
     "nis": "1",
     "friction": "1",
     "valid": "",
+    "mixture_weight": "1",
+    "reason": "",
 }
 METRIC_COLUMNS = {
     "log": pl.String,
@@ -88,8 +94,9 @@ def test_polars_reads_every_column_with_its_type(tmp_path, circle):
         rows = frame.filter(pl.col("estimator") == name)
         whole = circle(name, 0, 600)
         assert_array_equal(rows["stamp_ns"].to_numpy(), whole.stamps_ns)
-        for column in set(ESTIMATE_COLUMNS) - {"stamp_ns", "estimator"}:
+        for column in set(ESTIMATE_COLUMNS) - {"stamp_ns", "estimator"} - OPTIONAL:
             assert_array_equal(rows[column].to_numpy(), getattr(whole, column), err_msg=column)
+        assert all(rows[column].null_count() == rows.height for column in OPTIONAL)
 
 
 def test_unknown_is_null_for_polars(tmp_path, circle):
@@ -149,6 +156,37 @@ def test_one_track_comes_back(tmp_path, circle, name):
         assert track.covariance.shape == (0, 3, 3)
     else:
         assert np.isnan(track.covariance[:, 0, 1]).all()
+
+
+def test_weights_and_reasons_come_back_where_there_are_some(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    sink = EstimatesSink(path, 256)
+    for k in range(3):
+        sink.append(circle("zero", 200 * k, 200))
+        sink.append(circle("pd-hef", 200 * k, 200, adaptive=True))
+    sink.finish({})
+    whole = circle("pd-hef", 0, 600, adaptive=True)
+    track = read_track(path, "pd-hef")
+    assert_array_equal(track.mixture_weight, whole.mixture_weight)
+    assert_array_equal(track.reason, whole.reason)
+    assert track.reason.dtype == np.int64 and set(track.reason.tolist()) == {0, 4, 32}
+    assert_array_equal(read_track(path, "pd-hef", ["reason"]).reason, whole.reason)
+    other = read_track(path, "zero")
+    assert (len(other), len(other.mixture_weight), len(other.reason)) == (600, 0, 0)
+    rows = pl.read_parquet(path).filter(pl.col("estimator") == "zero")
+    assert rows["mixture_weight"].null_count() == rows["reason"].null_count() == 600
+
+
+def test_a_file_from_before_weights_and_reasons_is_read(tmp_path, circle):
+    path = tmp_path / "estimates.parquet"
+    write(path, circle)
+    old = tmp_path / "old.parquet"
+    pl.read_parquet(path).drop("mixture_weight", "reason").write_parquet(old)
+    track = read_track(old, "phy-ukf")
+    assert_array_equal(track.sideslip_rad, circle("phy-ukf", 0, 600).sideslip_rad)
+    assert len(track.reason) == len(track.mixture_weight) == 0
+    with pytest.raises(OutputError, match="reason"):
+        read_track(old, "phy-ukf", ["reason"])
 
 
 def test_only_the_row_groups_of_the_estimator_are_read(tmp_path, circle, monkeypatch):

@@ -9,6 +9,7 @@ import pytest
 
 from pdhef_logtool.errors import OutputError
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.evaluation.reasons import Interval, ReasonFacts
 from pdhef_logtool.signals import Loss
 from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.report import (
@@ -107,6 +108,31 @@ def test_report_follows_its_schema_and_keeps_what_it_was_told(tmp_path):
     assert report["losses"][0]["severity"] == "lost"
     assert report["warnings"] == ["steering contradicts the yaw rate"]
     assert report["versions"]["pdhef-logtool"]
+
+
+def test_reasons_are_in_the_document_and_in_words():
+    start_ns = 1_700_000_000_000_000_001
+    spans = [Interval(start_ns + int(a * 1e9), start_ns + int(b * 1e9)) for a, b in ((1.2, 1.21), (3.45, 3.46), (7, 8))]
+    stuck = ReasonFacts("stuck_yaw_rate", "gyro stuck", 0.4, 1.0, 1, spans[2].start_ns, spans[2].end_ns, (spans[2],))
+    spike = ReasonFacts("spike_ay", "a_y spike", 0.1, 0.5, 12, spans[0].start_ns, spans[2].end_ns, tuple(spans))
+    some = [
+        EstimatorFacts("pd-hef", causal=True, notes=["a note"], reasons=(stuck, spike)),
+        EstimatorFacts("pd-hef-smoothed", causal=False, reasons=()),
+        EstimatorFacts("phy-ukf", causal=True),
+    ]
+    report = build_report(facts(estimators=some))
+    validate(report, "report.schema.json")
+    assert [e["reasons"] and len(e["reasons"]) for e in report["estimators"]] == [2, [], None]
+    assert report["estimators"][0]["reasons"][0]["longest"] == [
+        {"start_ns": spans[2].start_ns, "end_ns": spans[2].end_ns}
+    ]
+    lines = report_markdown(report).splitlines()
+    words = "a_y spike 1.20 s, 3.45 s, 7.0-8.0 s and 9 more (50% of it); gyro stuck 7.0-8.0 s"
+    assert f"- **pd-hef** (causal): a note; {words}" in lines
+    assert "- **phy-ukf** (causal)" in lines
+    report["estimators"][0]["reasons"][0]["name"] = "stuck_steer"
+    with pytest.raises(jsonschema.ValidationError, match="stuck_steer"):
+        validate(report, "report.schema.json")
 
 
 def test_report_without_truth_follows_its_schema_too():

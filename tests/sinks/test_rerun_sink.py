@@ -168,6 +168,8 @@ def test_blueprint_shows_every_view(recording):
             "/nis",
             "/network_trust",
             "/r_scale",
+            "/mixture_weight",
+            "/reasons",
             "/vx_m_s",
             "/vy_m_s",
             "/report",
@@ -175,7 +177,7 @@ def test_blueprint_shows_every_view(recording):
     )
     assert "Sideslip [deg]" in names
     drawn = set(ROWS) | STATIC
-    for origin in origins:
+    for origin in set(origins) - {"/mixture_weight", "/reasons"}:  # of an adaptive estimator only
         assert any(e == origin or e.startswith(origin + "/") for e in drawn), origin
 
 
@@ -229,6 +231,29 @@ def test_events_and_report_are_text(recording):
     (batch,) = static["/report"]
     assert batch["TextDocument:media_type"].to_pylist() == [["text/markdown"]]
     assert batch["TextDocument:text"].to_pylist()[0][0].startswith("# drive\n")
+
+
+def test_weights_and_reasons_are_drawn_over_windows(tmp_path, circle):
+    path = tmp_path / "recording.rrd"
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    for k in range(5):
+        sink.append(circle("pd-hef", 120 * k, 120, adaptive=True))  # the gyro is stuck over the first cut
+        sink.append(circle("zero", 120 * k, 120))
+    sink.finish(REPORT)
+    timed, _ = tables(path)
+    track = circle("pd-hef", 0, 600, adaptive=True)
+    _, weights = series(timed["/mixture_weight/pd-hef"])
+    np.testing.assert_allclose([w[0] for w in weights if w], track.mixture_weight[track.valid])
+    assert {e for e in timed if e.startswith(("/mixture_weight", "/reasons"))} == {
+        *("/mixture_weight/pd-hef", "/reasons/pd-hef/stuck_yaw_rate", "/reasons/pd-hef/spike_ay")
+    }
+    stuck = timed["/reasons/pd-hef/stuck_yaw_rate"]
+    assert stuck["StateChange:state"].to_pylist() == [["gyro stuck"], [""]]
+    assert plain(stuck)["time"] == [int(track.stamps_ns[100]), int(track.stamps_ns[149]) + 1]
+    spikes = plain(timed["/reasons/pd-hef/spike_ay"])
+    assert spikes["time"][::2] == [int(track.stamps_ns[30]), int(track.stamps_ns[400])]
+    texts = [t[0] for t in timed["/events"]["TextLog:text"].to_pylist()]
+    assert texts == ["pd-hef: a_y spike, 0.00 s", "pd-hef: gyro stuck, 0.49 s", "pd-hef: a_y spike, 0.00 s"]
 
 
 def test_same_input_gives_the_same_content(tmp_path, circle, circle_signals):

@@ -1,0 +1,108 @@
+"""Intervals of reasons: the same however the track is cut, merged over short breaks only, named by the longest."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.evaluation.reasons import MERGE_S, NAMED_INTERVALS, Interval, ReasonIntervals, summarise_reasons
+from pdhef_logtool.reasons import MISSING_AY, REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
+from pdhef_logtool.tracks import make_track
+
+STEP_NS = 10_000_000
+START_NS = 1_700_000_000_000_000_123
+
+
+def gathered(stamps_ns: np.ndarray, reason: np.ndarray, cuts: tuple[int, ...] = ()) -> ReasonIntervals:
+    found = ReasonIntervals()
+    for a, b in pairwise((0, *cuts, len(reason))):
+        found.append(stamps_ns[a:b], reason[a:b])
+    return found
+
+
+def stamps(count: int) -> np.ndarray:
+    return START_NS + STEP_NS * np.arange(count, dtype=np.int64)
+
+
+def by_hand(stamps_ns: np.ndarray, reason: np.ndarray, bit: int) -> list[Interval]:
+    """One stamp after the other."""
+    spans: list[list[int]] = []
+    for t, mask in zip(stamps_ns.tolist(), reason.tolist(), strict=True):
+        if mask & bit:
+            if spans and t - spans[-1][1] <= MERGE_S * 1e9:
+                spans[-1][1] = t
+            else:
+                spans.append([t, t])
+    return [Interval(a, b + 1) for a, b in spans]
+
+
+@settings(max_examples=200, derandomize=True, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(1, 40), st.integers(0, 15)), min_size=1, max_size=60),
+    st.lists(st.integers(0, 60), max_size=4),
+)
+def test_intervals_are_those_found_by_hand_however_the_track_is_cut(
+    samples: list[tuple[int, int]], cuts: list[int]
+) -> None:
+    # Steps of 20 to 800 ms, masks of the first four bits; a cut may leave an empty window.
+    steps, masks = zip(*samples, strict=True)
+    stamps_ns = START_NS + np.cumsum(np.array(steps, dtype=np.int64)) * 20_000_000
+    reason = np.array(masks, dtype=np.int64)
+    whole = gathered(stamps_ns, reason)
+    cut = gathered(stamps_ns, reason, tuple(sorted(min(c, len(masks)) for c in cuts)))
+    assert cut.intervals() == whole.intervals()
+    assert cut.summary() == whole.summary()
+    expected = {r.name: by_hand(stamps_ns, reason, r.bit) for r in REASONS}
+    assert whole.intervals() == {name: spans for name, spans in expected.items() if spans}
+    for facts in whole.summary():
+        bit = next(r.bit for r in REASONS if r.name == facts.name)
+        inside = np.zeros(len(reason), dtype=np.bool_)
+        for span in expected[facts.name]:
+            inside |= (stamps_ns >= span.start_ns) & (stamps_ns < span.end_ns)
+        held = reason & bit > 0
+        assert facts.share == pytest.approx(held.mean())
+        assert facts.share_within == pytest.approx(held[inside].mean())
+        assert (facts.first_ns, facts.end_ns) == (expected[facts.name][0].start_ns, expected[facts.name][-1].end_ns)
+        length = sorted((s.end_ns - s.start_ns for s in expected[facts.name]), reverse=True)
+        assert sorted((s.end_ns - s.start_ns for s in facts.longest), reverse=True) == length[:NAMED_INTERVALS]
+
+
+def test_a_break_longer_than_half_a_second_parts_two_intervals() -> None:
+    for samples, intervals in ((49, 1), (50, 2)):
+        # So many stamps without the bit between two with it: 0.5 s and 0.51 s apart.
+        reason = np.array([STUCK_AY, *[0] * samples, STUCK_AY])
+        assert len(gathered(stamps(len(reason)), reason).intervals()["stuck_ay"]) == intervals
+
+
+def test_a_sensor_of_half_the_rate_is_missing_at_half_of_the_stamps() -> None:
+    reason = np.where(np.arange(1001) % 2 == 1, MISSING_AY, 0)
+    (facts,) = gathered(stamps(1001), reason).summary()
+    assert (facts.name, facts.intervals) == ("missing_ay", 1)
+    assert (facts.share, facts.share_within) == (pytest.approx(500 / 1001), pytest.approx(500 / 999))
+
+
+def test_the_three_longest_are_named_in_order_of_time() -> None:
+    reason = np.zeros(1000, dtype=np.int64)
+    for at, length in ((0, 5), (100, 2), (200, 9), (300, 1), (400, 7)):
+        reason[at : at + length] = SPIKE_AY
+    (facts,) = gathered(stamps(1000), reason).summary()
+    assert facts.intervals == 5
+    assert [(i.start_ns - START_NS) // STEP_NS for i in facts.longest] == [0, 200, 400]
+
+
+def test_an_estimator_that_does_not_look_has_none_and_one_that_found_nothing_an_empty_list() -> None:
+    assert summarise_reasons(make_track("phy-ukf", stamps(5))) is None
+    assert summarise_reasons(make_track("pd-hef", stamps(5), reason=np.zeros(5, dtype=np.int64))) == ()
+    (facts,) = summarise_reasons(make_track("pd-hef", stamps(5), reason=np.full(5, STUCK_YAW_RATE))) or ()
+    assert (facts.text, facts.share) == ("gyro stuck", 1.0)
+
+
+def test_every_bit_is_one_of_its_own_with_its_pair_beside_it() -> None:
+    assert [r.bit for r in REASONS] == [1 << i for i in range(10)]
+    for ay, rate in zip(REASONS[::2], REASONS[1::2], strict=True):
+        assert rate.bit == ay.bit << 1
+        assert (ay.name.removesuffix("_ay"), "gyro") == (rate.name.removesuffix("_yaw_rate"), rate.text.split()[0])
