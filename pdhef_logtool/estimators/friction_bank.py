@@ -6,8 +6,10 @@ model-error level: below some four tenths of the grip a model error says more th
 
 The weights follow w_j ∝ (w_j^f · prior_j^(1−f)) · L_j^η with f = exp(−Δt/τ): what was seen is forgotten with the time
 constant τ, and where nothing tells frictions apart the dry prior comes back. L_j is the likelihood of the innovations
-of a_y and yaw rate under a Student distribution, so that no single sample decides; the power η < 1 counts neighbouring
-samples, whose model errors are the same, as fewer than they are.
+of a_y and yaw rate under a Student distribution, so that no single sample decides, without its normalising factor: R is
+much larger than the noise, and a filter that claims a smaller covariance is not the better one for it (with the factor
+a straight road would look slippery). The power η < 1 counts neighbouring samples, whose model errors are the same, as
+fewer than they are.
 
 The estimate is the weighted mean, but not less than the lateral acceleration reached just now needs. What stands at
 step k was known before the samples of step k: a filter that uses it is not handed its own measurement back.
@@ -35,10 +37,11 @@ from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
 #: Frictions of the bank, and how likely each is on a road that nothing is known of: mean 0.86, 1-sigma 0.23.
 GRID = (0.12, 0.2, 0.3, 0.42, 0.56, 0.72, 0.9, 1.1)
 PRIOR = (0.015, 0.02, 0.025, 0.03, 0.05, 0.12, 0.45, 0.29)
+USUAL_FRICTION = sum(mu * weight for mu, weight in zip(GRID, PRIOR, strict=True))
 #: Process 1-sigma per √s of v_y (m/s) and r (rad/s); measurement 1-sigma of a_y (m/s²) and r (rad/s), at model-error
 #: level; all by the sideslip errors that follow, on simulated drives that no table is made of.
 Q_VY, Q_YAW_RATE = 0.3, 0.1
-R_AY, R_YAW_RATE = 1.0, 0.006
+R_AY, R_YAW_RATE = 1.5, 0.006
 #: Degrees of freedom of the Student distribution, the power η, and the forgetting time τ.
 STUDENT_DOF, LIKELIHOOD_POWER, FORGETTING_S = 4.0, 0.3, 2.0
 INITIAL_VY_STD, INITIAL_YAW_RATE_STD = 0.5, 0.1
@@ -94,7 +97,7 @@ def _advance(v, vy, r, steer, friction, dt, n, p):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def _step(x, P, v, v_now, steer, steer_now, friction, dt, ay, yaw_rate, p):  # type: ignore[no-untyped-def]
-    """Take one filter over a step, x [2] and P [3] (vv, vr, rr) in place; return the log-likelihood of its innovations.
+    """Take one filter over a step, x [2] and P [3] (vv, vr, rr) in place; return its log-likelihood, not normalised.
 
     ``v``, ``steer`` hold over the step, ``v_now``, ``steer_now`` at its end; a measurement may be NaN.
     """
@@ -129,7 +132,7 @@ def _step(x, P, v, v_now, steer, steer_now, friction, dt, ay, yaw_rate, p):  # t
     s00, s01, s11 = h0 * c0 + h1 * c1 + var_a, c1, p2 + var_r
     det = s00 * s11 - s01 * s01
     square = (s11 * nu_a * nu_a - 2.0 * s01 * nu_a * nu_r + s00 * nu_r * nu_r) / det
-    log_likelihood = -0.5 * (STUDENT_DOF + dof) * math.log(1.0 + square / STUDENT_DOF) - 0.5 * math.log(det)
+    log_likelihood = -0.5 * (STUDENT_DOF + dof) * math.log(1.0 + square / STUDENT_DOF)
 
     # An outlier of the Student distribution is a sample with a larger R.
     inflation = (STUDENT_DOF + square) / (STUDENT_DOF + dof)
@@ -162,12 +165,14 @@ def _bank(  # type: ignore[no-untyped-def]
             square += weights[j] * grid[j] * grid[j]
         out_std[k] = math.sqrt(max(0.0, square - mean * mean))
         out_mu[k] = max(mean, BOUND_SHARE * abs(memory[_AY]) / ay_per_friction)
-        if not dt[k] <= LONGEST_STEP_S or not usable[k]:
+        if not dt[k] <= LONGEST_STEP_S:
             memory[_STARTED] = 0.0
             memory[_AY] = 0.0
         elif math.isfinite(ay[k]):
             memory[_AY] += (1.0 - math.exp(-dt[k] / BOUND_SMOOTHING_S)) * (ay[k] - memory[_AY])
-        if usable[k]:
+        if not usable[k]:
+            memory[_STARTED] = 0.0
+        else:
             if memory[_STARTED] == 0.0:
                 rate = yaw_rate[k] if math.isfinite(yaw_rate[k]) else 0.0
                 for j in range(count):
@@ -214,7 +219,8 @@ class FrictionBank:
 
     @property
     def _speed_filter(self) -> PhysicsUkf:
-        return PhysicsUkf(self.vehicle, use_speed=self.use_speed)
+        told = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
+        return PhysicsUkf(told, use_speed=self.use_speed)
 
     @property
     def ay_per_friction(self) -> float:

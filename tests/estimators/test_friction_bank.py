@@ -1,0 +1,195 @@
+"""The bank against drives on roads of known friction, its silence where nothing shows, and where a run gets it from."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, cut, drive, keep, slalom, tanh_tyre, with_noise
+
+from pdhef_logtool.errors import UsageError
+from pdhef_logtool.estimators.friction_bank import BOUND_SHARE, FORGETTING_S, FrictionBank, FrictionEstimate
+from pdhef_logtool.estimators.friction_source import friction_source, parse_friction
+from pdhef_logtool.signals import Signals
+from pdhef_logtool.vehicle import AxleTyre, Tyres, default_vehicle
+
+G = 9.80665
+VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
+NO_FRICTION = VEHICLE.model_copy(update={"friction": None})
+STIFFNESS_VEHICLE = VEHICLE.model_copy(
+    update={
+        "tyres": Tyres(
+            front=AxleTyre(cornering_stiffness_n_per_rad=105_000.0),
+            rear=AxleTyre(cornering_stiffness_n_per_rad=96_000.0),
+        )
+    }
+)
+ALL = frozenset({"steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
+
+
+def estimate(signals: Signals, vehicle=VEHICLE) -> FrictionEstimate:
+    return FrictionBank(vehicle).run(signals, None)[0]
+
+
+def excited(mu: float, duration_s: float = 8.0) -> Signals:
+    """A slalom that uses most of the grip, from the start."""
+    amplitude = 0.055 * mu / 0.6 * (20.0 / 22.0) ** 2
+    return with_noise(drive(slalom(amplitude, 0.6), duration_s, speed=20.0, mu=mu).signals, seed=4)
+
+
+@pytest.mark.parametrize("mu", [0.3, 0.6, 0.9])
+def test_friction_is_found_after_three_seconds_of_excitation(mu):
+    signals = excited(mu)
+    found = estimate(signals)
+    after = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9 > 3.0
+    assert abs(found.friction[after].mean() - mu) < 0.1
+    assert found.observable[after].mean() > 0.8
+
+
+@pytest.mark.parametrize("mu", [0.3, 0.6])
+def test_tyres_that_keep_their_stiffness_show_friction_near_the_limit(mu):
+    """There friction shows in the curve's bend alone."""
+    steer = slalom(0.15 * mu, 0.5)
+    signals = with_noise(drive(steer, 8.0, speed=20.0, mu=mu, tyre=tanh_tyre).signals, seed=2)
+    found = estimate(signals, STIFFNESS_VEHICLE)
+    after = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9 > 3.0
+    assert abs(np.median(found.friction[after]) - mu) < 0.15
+
+
+@pytest.mark.parametrize("mu", [0.3, 0.9])
+def test_a_straight_shows_nothing(mu):
+    found = estimate(with_noise(drive(lambda _t: 0.0, 20.0, mu=mu).signals, seed=1))
+    assert not found.observable.any()
+    assert found.friction.min() > 0.75
+
+
+def test_what_was_seen_is_forgotten_on_a_straight():
+    there = drive(lambda t: slalom(0.05, 0.6)(t) if t < 6.0 else 0.0, 30.0, speed=20.0, mu=0.3)
+    signals = with_noise(there.signals, seed=3)
+    found = estimate(signals)
+    at = np.searchsorted(there.time_s, [6.0, 6.0 + 8.0 * FORGETTING_S])
+    assert found.friction[at[0]] < 0.5
+    assert found.friction[at[1]] > 0.75
+    assert not found.observable[at[1]]
+
+
+def test_friction_is_never_below_what_the_acceleration_needs():
+    signals = excited(0.9, 6.0)
+    found = estimate(signals)
+    capacity = (FRONT_TYRE[2] + REAR_TYRE[2]) / MASS_KG
+    smooth = np.convolve(np.abs(signals.ay_m_s2), np.ones(5) / 5, mode="same")
+    # The bound looks back over a tenth of a second; this is looser by what a_y can fall in that time.
+    behind = np.minimum.reduce([np.roll(smooth, k) for k in range(30)])[40:]
+    assert np.all(found.friction[40:] >= BOUND_SHARE * (behind - 0.3) / capacity)
+
+
+def test_the_bound_holds_beyond_the_bank():
+    """A steady turn that needs more friction than any filter of the bank has."""
+    signals = drive(lambda _t: 0.09, 4.0, speed=25.0, mu=1.8).signals
+    ay = np.abs(signals.ay_m_s2[-1])
+    capacity = (FRONT_TYRE[2] + REAR_TYRE[2]) / MASS_KG
+    assert ay / capacity > 1.25
+    assert estimate(signals).friction[-1] == pytest.approx(BOUND_SHARE * ay / capacity, rel=0.02)
+
+
+def rough() -> Signals:
+    rng = np.random.default_rng(5)
+    dt = rng.uniform(0.004, 0.022, 400)
+    s = with_noise(drive(slalom(0.05, 0.6), speed=20.0, step_s=dt, mu=0.5).signals, seed=6)
+    for column in (s.steer_rad, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s):
+        column[rng.random(len(s)) < 0.05] = np.nan
+    t = (s.stamps_ns - s.stamps_ns[0]) * 1e-9
+    return keep(s, (t < 3.0) | (t > 3.8))
+
+
+ROUGH = rough()
+
+
+@settings(derandomize=True, deadline=None, max_examples=25)
+@given(st.lists(st.integers(0, len(ROUGH)), max_size=8))
+def test_windows_of_any_cut_join_bit_for_bit(inner):
+    bank = FrictionBank(VEHICLE)
+    whole, _ = bank.run(ROUGH, None)
+    parts, carry = [], None
+    for first, end in pairwise([0, *sorted(inner), len(ROUGH)]):
+        part, carry = bank.run(cut(ROUGH, first, end), carry)
+        parts.append(part)
+    for name in ("friction", "std", "observable"):
+        np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(st.integers(0, len(ROUGH) - 1), st.sampled_from([math.nan, 3.0]))
+def test_an_estimate_is_made_before_its_own_samples(j, value):
+    columns = {c: getattr(ROUGH, c).copy() for c in ("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")}
+    for column in columns.values():
+        column[j:] = value
+    a, b = estimate(ROUGH), estimate(replace(ROUGH, **columns))
+    np.testing.assert_array_equal(a.friction[: j + 1], b.friction[: j + 1])
+
+
+def test_the_friction_that_is_told_plays_no_part():
+    told = replace(ROUGH, friction=np.full(len(ROUGH), 0.2))
+    np.testing.assert_array_equal(estimate(ROUGH).friction, estimate(told).friction)
+    np.testing.assert_array_equal(estimate(ROUGH).friction, estimate(ROUGH, NO_FRICTION).friction)
+
+
+def test_left_and_right_are_the_same():
+    mirrored = replace(ROUGH, steer_rad=-ROUGH.steer_rad, ay_m_s2=-ROUGH.ay_m_s2, yaw_rate_rad_s=-ROUGH.yaw_rate_rad_s)
+    np.testing.assert_allclose(estimate(ROUGH).friction, estimate(mirrored).friction, atol=2e-3)
+
+
+# --- where a run gets its friction from ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("choice", "vehicle", "available", "label"),
+    [
+        ("auto", VEHICLE, ALL | {"friction"}, "topic /road.mu"),
+        ("auto", VEHICLE, ALL, "vehicle file, 0.85"),
+        ("auto", NO_FRICTION, ALL, "estimate"),
+        ("auto", NO_FRICTION, ALL - {"ay_m_s2"}, "assumed, 1"),
+        ("file", VEHICLE, ALL | {"friction"}, "vehicle file, 0.85"),
+        ("estimate", VEHICLE, ALL | {"friction"}, "estimate"),
+        (0.4, VEHICLE, ALL | {"friction"}, "option, 0.4"),
+    ],
+)
+def test_the_source_is_named(choice, vehicle, available, label):
+    source = friction_source(choice, vehicle, available, "/road.mu")
+    assert source.label == label
+    assert source.from_log == label.startswith("topic")
+
+
+def test_the_source_tells_what_it_says():
+    told = replace(ROUGH, friction=np.full(len(ROUGH), 0.2))
+    with_topic = ALL | {"friction"}
+    assert friction_source("auto", VEHICLE, with_topic).fill(told) is told
+    assert np.all(friction_source("file", VEHICLE, with_topic).fill(told).friction == 0.85)
+    assert np.all(friction_source(0.4, VEHICLE, with_topic).fill(told).friction == 0.4)
+    source = friction_source("estimate", VEHICLE, with_topic)
+    np.testing.assert_array_equal(source.fill(told).friction, estimate(ROUGH).friction)
+    assert source.stamps == len(ROUGH) == len(source.observable)
+    assert f"{100 * source.observable.mean():.0f} % of the time" in source.summary
+
+
+def test_what_is_not_there_is_refused():
+    with pytest.raises(UsageError, match="friction"):
+        friction_source("file", NO_FRICTION, ALL)
+    with pytest.raises(UsageError, match="ay_m_s2"):
+        friction_source("estimate", VEHICLE, ALL - {"ay_m_s2"})
+
+
+@pytest.mark.parametrize("text", ["wet", "", "nan", "-0.3", "0", "6", "inf"])
+def test_what_is_no_friction_is_refused(text):
+    with pytest.raises(UsageError, match="--friction"):
+        parse_friction(text)
+
+
+@pytest.mark.parametrize(("text", "want"), [("auto", "auto"), ("0.3", 0.3), (0.85, 0.85), ("estimate", "estimate")])
+def test_choices_and_numbers_are_understood(text, want):
+    assert parse_friction(text) == want
