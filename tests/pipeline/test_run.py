@@ -12,7 +12,7 @@ import pytest
 
 from pdhef_logtool.config import RunConfig
 from pdhef_logtool.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
-from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS
+from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, DEFAULT_MODEL_ESTIMATORS, TUNED_ESTIMATORS
 from pdhef_logtool.pipeline import run_logs
 from pdhef_logtool.sinks.schema import load_schema
 
@@ -77,7 +77,10 @@ def test_documents_follow_their_schemas(dlc_run: Path) -> None:
     jsonschema.validate(report, load_schema("report.schema.json"))
     jsonschema.validate(run, load_schema("run.schema.json"))
     assert run["logs"][0]["outcome"] == "ok"
-    assert [e["name"] for e in report["estimators"]] == list(DEFAULT_ESTIMATORS)  # the file is not an identified one
+    names = [e["name"] for e in report["estimators"]]
+    assert names[: len(DEFAULT_ESTIMATORS)] == list(DEFAULT_ESTIMATORS)
+    assert set(names[len(DEFAULT_ESTIMATORS) :]) <= set(DEFAULT_MODEL_ESTIMATORS)  # where a network is shipped
+    assert not set(names) & set(TUNED_ESTIMATORS)  # the file is not an identified one
 
 
 def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> None:
