@@ -1,14 +1,18 @@
 """Fit of calibrated intervals: coefficients of the terms, so that 95 % of the errors lie inside, in every regime.
 
-Error e, terms t_i ≥ 0, s² = Σ (k_i t_i)². With r = log |e| − log(1.96 s) the pinball loss of the 95 % quantile,
+Error e, terms t_i ≥ 0, s² = s_0² + Σ (k_i t_i)². With r = log |e| − log(1.96 s) the pinball loss of the quantile q,
 
-    ρ(r) = 0.95 r for r > 0, −0.05 r else,
+    ρ(r) = q r for r > 0, −(1 − q) r else,
 
-is minimal where a share of 0.95 of the errors lies inside; taken on the logarithm it weighs a straight road like a
-limit manoeuvre. Bins of grip use weigh alike, and drives with a vehicle file made wrong have a share of their own.
+is minimal where a share q of the errors lies inside; taken on the logarithm it weighs a straight road like a limit
+manoeuvre. Bins of grip use weigh alike.
+
+1. Drives with the vehicle file as given: s_0 = 0, q = 0.95.
+2. The same drives with the vehicle file made wrong: s_0 is the 1-sigma of 1, q = 0.85. What is added is what a vehicle
+   that differs from its file asks for; the sensors often cannot tell, so that it is added whether it differs or not.
 
 Errors of one drive are alike, so that the drives are the unit: what a fit is worth is found on drives that it has not
-seen (five folds of drives), and a last factor on all coefficients makes 95 % of *those* errors lie inside.
+seen (five folds of drives), and a last factor on a part's coefficients makes a share q of *those* errors lie inside.
 """
 
 from __future__ import annotations
@@ -21,13 +25,13 @@ import numpy as np
 from pdhef_logtool.estimators.calibration import Inflation, combined
 from pdhef_logtool.signals import BoolArray, FloatArray, IntArray
 
+#: Share inside with the vehicle file as given, and at least with one that is wrong.
 COVERED = 0.95
+COVERED_WRONG = 0.85
 #: 95 % of a normal distribution lie within this many 1-sigma.
 NORMAL_95 = 1.959963984540054
 #: Bins of true abs a_y over μ g (METHOD §10), by name: lower and upper limit.
 BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
-#: Weight of the drives whose vehicle file was made wrong, where there are any.
-WRONG_SHARE = 0.3
 FOLDS = 5
 #: A fit on fewer drives says nothing of a further one.
 MIN_DRIVES = 5
@@ -94,11 +98,24 @@ class Coverage:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """The coefficients of one estimator, the factor that unseen drives asked for, and how its intervals stand."""
+    """The coefficients of one estimator, the factors that unseen drives asked for, and how its intervals stand.
+
+    ``wrong_factor``: that on the part that is added for a wrong vehicle file; 0 if there is none.
+    """
 
     inflation: Inflation
     unseen_factor: float
+    wrong_factor: float
     coverage: tuple[Coverage, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """One part of the variance: its coefficients with the factor in them, and its 1-sigma on drives not seen [n]."""
+
+    coefficients: tuple[float, ...]
+    factor: float
+    unseen: FloatArray
 
 
 def fit_inflation(samples: Samples) -> Fitted:
@@ -107,47 +124,80 @@ def fit_inflation(samples: Samples) -> Fitted:
     Raises
     ------
     ValueError
-        There are fewer than :data:`MIN_DRIVES` drives.
+        There are fewer than :data:`MIN_DRIVES` drives with the vehicle file as given.
     """
-    if np.unique(samples.drive).size < MIN_DRIVES:
+    if np.unique(samples.drive[~samples.wrong]).size < MIN_DRIVES:
         raise ValueError(f"at least {MIN_DRIVES} drives are needed")
     samples = samples.where(samples.bin >= 0)
-    weight = sample_weights(samples.bin, samples.wrong)
-    unseen = np.empty(len(samples))
-    unseen_rate = np.empty(len(samples))
-    for seen, held in folds(samples.drive):
-        k = fit_coefficients(samples.terms[seen], samples.sideslip_error[seen], weight[seen])
-        unseen[held] = combined(samples.terms[held], k)
-        k = fit_coefficients(samples.yaw_rate_terms[seen], samples.yaw_rate_error[seen], weight[seen])
-        unseen_rate[held] = combined(samples.yaw_rate_terms[held], k)
-    factor = covering_factor(samples.sideslip_error, unseen, weight)
-    rate_factor = covering_factor(samples.yaw_rate_error, unseen_rate, weight)
-    vy_factor = covering_factor(samples.vy_error, factor * unseen * samples.vy_per_sideslip, weight)
+    right, added = _fit_parts(samples, samples.terms, samples.sideslip_error)
+    right_rate, added_rate = _fit_parts(samples, samples.yaw_rate_terms, samples.yaw_rate_error)
+    given = ~samples.wrong
+    vy_factor = covering_factor(
+        samples.vy_error[given], (right.unseen * samples.vy_per_sideslip)[given], bin_weights(samples.bin[given])
+    )
     inflation = Inflation(
-        sideslip=_times(fit_coefficients(samples.terms, samples.sideslip_error, weight), factor),
-        yaw_rate=_times(fit_coefficients(samples.yaw_rate_terms, samples.yaw_rate_error, weight), rate_factor),
+        sideslip=_joined(right.coefficients, added.coefficients),
+        yaw_rate=_joined(right_rate.coefficients, added_rate.coefficients),
         vy_factor=vy_factor,
     )
-    return Fitted(inflation, factor, tuple(coverage_rows(samples, factor * unseen)))
+    rows = coverage_rows(samples, np.hypot(right.unseen, added.unseen))
+    return Fitted(inflation, right.factor, added.factor, tuple(rows))
 
 
-def fit_coefficients(terms: FloatArray, error: FloatArray, weight: FloatArray) -> tuple[float, ...]:
+def _fit_parts(samples: Samples, terms: FloatArray, error: FloatArray) -> tuple[_Part, _Part]:
+    """Return the part for the vehicle file as given, and what is added for a wrong one."""
+    nothing = np.zeros(len(samples))
+    right = _fit_part(samples, terms, error, ~samples.wrong, COVERED, nothing, nothing)
+    if np.unique(samples.drive[samples.wrong]).size < MIN_DRIVES:
+        return right, _Part((0.0,) * terms.shape[1], 0.0, nothing)
+    known = combined(terms, right.coefficients)
+    return right, _fit_part(samples, terms, error, samples.wrong, COVERED_WRONG, known, right.unseen)
+
+
+def _fit_part(
+    samples: Samples,
+    terms: FloatArray,
+    error: FloatArray,
+    use: BoolArray,
+    covered: float,
+    known: FloatArray,
+    known_unseen: FloatArray,
+) -> _Part:
+    """Fit one part on the samples of a mask [n]; ``known*`` [n]: 1-sigma that is there already, fitted and unseen."""
+    weight = np.zeros(len(samples))
+    weight[use] = bin_weights(samples.bin[use])
+    unseen = np.empty(len(samples))
+    for seen, held in folds(samples.drive):
+        fit = seen & use
+        unseen[held] = combined(terms[held], fit_coefficients(terms[fit], error[fit], weight[fit], covered, known[fit]))
+    factor = covering_factor(error[use], unseen[use], weight[use], covered, known_unseen[use])
+    coefficients = fit_coefficients(terms[use], error[use], weight[use], covered, known[use])
+    return _Part(tuple(factor * k for k in coefficients), factor, factor * unseen)
+
+
+def fit_coefficients(
+    terms: FloatArray,
+    error: FloatArray,
+    weight: FloatArray,
+    covered: float = COVERED,
+    known: FloatArray | float = 0.0,
+) -> tuple[float, ...]:
     """Return the coefficients k [m] ≥ 0 that minimise the loss of this file's head.
 
     Parameters
     ----------
-    terms : [n, m], not all 0 in any row. error : [n]. weight : [n], sum 1.
+    terms : [n, m], not all 0 in any row. error, weight : [n]. covered : q. known : s_0, [n].
     """
     from scipy.optimize import minimize
 
-    squares = terms**2
+    squares, there = terms**2, np.square(known)
     size = np.log(np.maximum(np.abs(error), LEAST_ERROR)) - np.log(NORMAL_95)
 
     def loss(log_k: FloatArray) -> tuple[float, FloatArray]:
         k2 = np.exp(2.0 * log_k)
-        variance = squares @ k2
+        variance = there + squares @ k2
         r = size - 0.5 * np.log(variance)
-        slope = np.where(r > 0.0, COVERED, COVERED - 1.0)
+        slope = np.where(r > 0.0, covered, covered - 1.0)
         share = (weight * slope / variance) @ squares * k2  # d loss = −slope d log s, d log s = k² t² / s² d log k
         return float(np.sum(weight * slope * r)), -share
 
@@ -160,26 +210,25 @@ def fit_coefficients(terms: FloatArray, error: FloatArray, weight: FloatArray) -
     return tuple(float(k) if k >= LEAST_COEFFICIENT or i == 0 else 0.0 for i, k in enumerate(best))
 
 
-def covering_factor(error: FloatArray, std: FloatArray, weight: FloatArray) -> float:
-    """Return the factor on ``std`` [n] at which a weight of 95 % of the errors [n] lies within 1.96 of it."""
-    ratio = np.abs(error) / (NORMAL_95 * std)
+def covering_factor(
+    error: FloatArray,
+    std: FloatArray,
+    weight: FloatArray,
+    covered: float = COVERED,
+    known: FloatArray | float = 0.0,
+) -> float:
+    """Return the factor g on ``std`` [n] at which a weighted share ``covered`` has e² ≤ 1.96² (s_0² + g² std²)."""
+    ratio = np.sqrt(np.maximum((error / NORMAL_95) ** 2 - np.square(known), 0.0)) / std
     order = np.argsort(ratio, kind="stable")
     below = np.cumsum(weight[order]) / np.sum(weight)
-    return float(ratio[order][min(int(np.searchsorted(below, COVERED)), len(order) - 1)])
+    return float(ratio[order][min(int(np.searchsorted(below, covered)), len(order) - 1)])
 
 
-def sample_weights(bins: IntArray, wrong: BoolArray) -> FloatArray:
-    """Return weights [n], sum 1: bins count alike, wrong vehicle files as :data:`WRONG_SHARE` of each."""
-    weight = np.zeros(bins.shape[0])
-    for number in np.unique(bins):
-        here = bins == number
-        parts = [(here & ~wrong, 1.0 - WRONG_SHARE), (here & wrong, WRONG_SHARE)]
-        for mask, share in parts:
-            if mask.any():
-                weight[mask] = share / np.count_nonzero(mask)
-        weight[here] /= weight[here].sum()
-    total: FloatArray = weight / weight.sum()
-    return total
+def bin_weights(bins: IntArray) -> FloatArray:
+    """Return weights [n], sum 1, at which every bin that occurs counts alike."""
+    _, place, count = np.unique(bins, return_inverse=True, return_counts=True)
+    weight: FloatArray = 1.0 / (count[place] * count.size)
+    return weight
 
 
 def folds(drive: IntArray) -> Iterator[tuple[BoolArray, BoolArray]]:
@@ -222,5 +271,6 @@ def bin_numbers(grip_share: FloatArray) -> IntArray:
     return number
 
 
-def _times(coefficients: tuple[float, ...], factor: float) -> tuple[float, ...]:
-    return tuple(k * factor for k in coefficients)
+def _joined(right: tuple[float, ...], added: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the coefficients of the sum of two variances over the same terms."""
+    return tuple(float(np.hypot(a, b)) for a, b in zip(right, added, strict=True))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -38,9 +39,9 @@ from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.tracks import StateTrack, concatenate
 from pdhef_logtool.training.calibrate import (
     COVERED,
+    COVERED_WRONG,
     FOLDS,
     MIN_DRIVES,
-    WRONG_SHARE,
     Fitted,
     Samples,
     bin_numbers,
@@ -50,7 +51,7 @@ from pdhef_logtool.training.calibrate import (
 from pdhef_logtool.training.extract_command import MAX_VARIATION
 from pdhef_logtool.training.extract_command import _set_manifest as set_manifest
 from pdhef_logtool.training.tune_command import HELD_OUT
-from pdhef_logtool.training.variation import vary
+from pdhef_logtool.training.variation import Variation, vary
 from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle
 
 DEFAULT_SPREAD = 0.1
@@ -71,7 +72,7 @@ class CalibrateSettings:
     Attributes
     ----------
     config : vehicle, mapping, model, estimators, slice, sensors, which truth; the other entries are not used.
-    spread : by which friction and vehicle are made wrong in a second run of a part of the drives; 0 = none.
+    spread : by which friction and vehicle are made wrong in a second run of every drive; 0 = none.
     seed : of that. split : only drives that their set's manifest puts into this split.
     any_split : do not refuse held-out drives.
     """
@@ -164,7 +165,7 @@ def run_calibration(
     for number, (name, parts) in enumerate(samples.items()):
         progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
         joined = join_samples(parts)
-        count = int(np.unique(joined.drive).size)
+        count = int(np.unique(joined.drive[~joined.wrong]).size)
         if count < MIN_DRIVES:
             warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
             continue
@@ -236,6 +237,12 @@ def _check(settings: CalibrateSettings) -> None:
         raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
 
 
+def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Variation:
+    """Return the first of a key's draws that leaves nothing as it is; ``spread`` > 0."""
+    draws = (vary(vehicle, spread, f"{key}:{number}") for number in itertools.count())
+    return next(told for told in draws if told.vehicle is not vehicle)
+
+
 def _run_drive(
     log_input: LogInput,
     number: int,
@@ -244,7 +251,7 @@ def _run_drive(
     mapping: SignalMapping | None,
     model: ModelBundle | None,
 ) -> tuple[DriveEntry, list[tuple[str, Samples]]]:
-    """Run the estimators on a drive, once as told and perhaps once with a wrong vehicle; return errors and terms."""
+    """Run the estimators on a drive, once as told and once with a wrong vehicle; return errors and terms."""
     config = settings.config
     sha256 = hash_log(log_input.path) if log_input.path.exists() else ""
     entry = DriveEntry(log_input.stem, log_input.path.name, sha256, "", 0)
@@ -263,8 +270,8 @@ def _run_drive(
     signals = join_signals([w.signals for w in windows])
     truth = concatenate([replace(w.truth, covariance=np.empty((0, 3, 3))) for w in windows if w.truth is not None])
     runs = [(vehicle, 1.0, False)]
-    told = vary(vehicle, settings.spread, f"{settings.seed}:{sha256}")
-    if told.vehicle is not vehicle:
+    if settings.spread > 0.0:
+        told = made_wrong(vehicle, settings.spread, f"{settings.seed}:{sha256}")
         runs.append((told.vehicle, told.friction_factor, True))
     found: list[tuple[str, Samples]] = []
     for assumed, factor, wrong in runs:
@@ -377,7 +384,7 @@ def _document(
         "fit": {
             "covered": COVERED,
             "folds": FOLDS,
-            "wrong_vehicle_share": WRONG_SHARE,
+            "covered_with_wrong_vehicle": COVERED_WRONG,
             "sample_every_s": SAMPLE_EVERY_S,
         },
         "drives_sha256": hashlib.sha256("".join(sorted(d.sha256 for d in drives)).encode()).hexdigest(),
@@ -387,6 +394,7 @@ def _document(
             name: {
                 **coefficients[name],
                 "unseen_factor": f.unseen_factor,
+                "wrong_vehicle_factor": f.wrong_factor,
                 "coverage": [asdict(c) for c in f.coverage],
             }
             for name, f in fitted.items()

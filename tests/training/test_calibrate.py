@@ -18,16 +18,16 @@ from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.pipeline import run_logs
 from pdhef_logtool.signals import FloatArray
 from pdhef_logtool.training.calibrate import (
+    COVERED_WRONG,
     FOLDS,
-    WRONG_SHARE,
     Samples,
     bin_numbers,
+    bin_weights,
     coverage_rows,
     covering_factor,
     fit_coefficients,
     fit_inflation,
     folds,
-    sample_weights,
 )
 from pdhef_logtool.training.calibrate_command import CalibrateSettings, choose_drives, run_calibration
 
@@ -46,7 +46,7 @@ def _samples(rng: np.random.Generator, std: FloatArray, terms: FloatArray, drive
         vy_error=20.0 * error,
         yaw_rate_error=2.0 * terms[:, 1] * rng.standard_normal(n),
         own_std=terms[:, 1],
-        bin=rng.integers(0, 3, n),
+        bin=np.asarray(rng.integers(0, 3, n)),
         drive=drive,
         wrong=drive % 3 == 0,
     )
@@ -99,6 +99,33 @@ def test_new_drives_are_covered_where_errors_are_small_and_where_they_are_large(
     assert fitted.inflation.vy_factor == pytest.approx(1.0, abs=1e-9)
 
 
+def test_a_wrong_vehicle_widens_by_what_it_asks_for() -> None:
+    """Its errors grow with the sideslip; with the file as given they do not, and the filter's 1-sigma says it all."""
+    rng = np.random.default_rng(7)
+
+    def drives(n: int, count: int) -> Samples:
+        terms = _terms(rng, n)
+        samples = _samples(rng, 1.5 * terms[:, 1], terms, count)
+        extra = 3.0 * terms[:, 2] * rng.standard_normal(n)
+        return replace(samples, sideslip_error=samples.sideslip_error + np.where(samples.wrong, extra, 0.0))
+
+    samples = drives(30_000, 60)
+    fitted = fit_inflation(samples)
+    narrow = fit_inflation(samples.where(~samples.wrong))
+    fresh = drives(60_000, 300)
+    covered = {}
+    for name, one in (("both", fitted), ("given", narrow)):
+        inside = np.abs(fresh.sideslip_error) <= 1.96 * combined(fresh.terms, one.inflation.sideslip)
+        covered[name] = [np.mean(inside[fresh.wrong == wrong]) for wrong in (False, True)]
+    assert covered["given"][0] == pytest.approx(0.95, abs=0.015)
+    assert covered["given"][1] < 0.7
+    assert covered["both"][1] == pytest.approx(COVERED_WRONG, abs=0.02)
+    assert narrow.wrong_factor == 0.0
+    assert fitted.unseen_factor == pytest.approx(narrow.unseen_factor, rel=0.1)
+    k, given = np.array(fitted.inflation.sideslip), np.array(narrow.inflation.sideslip)
+    assert int(np.argmax(k - given)) == 2
+
+
 def test_unseen_drives_decide_the_factor() -> None:
     """Terms that know each drive's own error size by chance fit it, and mean nothing on another drive."""
     rng = np.random.default_rng(4)
@@ -129,14 +156,11 @@ def test_the_covering_factor_is_the_weighted_quantile() -> None:
     assert covering_factor(error, std, np.where(error <= 10.0, 0.1, 0.0)) == pytest.approx(10.0)
 
 
-def test_bins_count_alike_and_wrong_vehicles_have_their_share() -> None:
-    bins = np.array([0] * 90 + [1] * 10)
-    wrong = np.zeros(100, dtype=np.bool_)
-    wrong[:5] = True
-    weight = sample_weights(bins, wrong)
+def test_bins_count_alike() -> None:
+    weight = bin_weights(np.array([0] * 90 + [2] * 10))
     assert weight.sum() == pytest.approx(1.0)
     assert weight[:90].sum() == pytest.approx(0.5)
-    assert weight[:5].sum() == pytest.approx(0.5 * WRONG_SHARE)
+    assert np.ptp(weight[90:]) == 0.0
 
 
 def test_a_drive_is_never_on_both_sides() -> None:
@@ -196,6 +220,7 @@ def test_the_file_says_where_it_is_from(calibration: Path) -> None:
     assert document["vehicle"]["file"] == "vehicle.toml"
     assert str(calibration.parent) not in calibration.read_text()
     assert {c["wrong_vehicle"] for c in document["estimators"]["phy-ukf"]["coverage"]} == {False, True}
+    assert [d["runs"] for d in document["drives"]] == [2] * 5
 
 
 def test_a_run_uses_it_says_so_and_windows_change_nothing(
