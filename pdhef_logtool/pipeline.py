@@ -55,6 +55,7 @@ from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle
 
 if TYPE_CHECKING:
+    from pdhef_logtool.estimators.divergence import DivergenceWatch
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.reasons import ReasonFacts
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
@@ -246,6 +247,7 @@ def _run_open_log(
     progress: Progress,
     warn: Callable[[str], None],
 ) -> LogResult:
+    from pdhef_logtool.estimators.divergence import DivergenceWatch
     from pdhef_logtool.inspection import plausibility_warnings
 
     warnings: list[str] = []
@@ -297,6 +299,7 @@ def _run_open_log(
                 reader,
                 estimators,
                 friction,
+                DivergenceWatch(vehicle),
                 intervals,
                 sinks,
                 store,
@@ -410,6 +413,7 @@ def _estimate(
     reader: DriveReader,
     estimators: Sequence[Estimator],
     friction: FrictionSource,
+    watch: DivergenceWatch,
     intervals: TrackCalibrator,
     sinks: Sequence[Sink],
     store: TrackStore,
@@ -437,7 +441,8 @@ def _estimate(
         for estimator in estimators:
             carry = carries.get(estimator.name)
             track, carries[estimator.name] = run_window(estimator, window.signals, carry, ahead)
-            track = poses[estimator.name].add(intervals.add(track, window.signals), start)
+            track = intervals.add(watch.add(track, window.signals), window.signals)
+            track = poses[estimator.name].add(track, start)
             store.append(track)
             for sink in sinks:
                 sink.append(track)
