@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.pipeline import LogResult, RunResult
-from pdhef_logtool.sinks.report import friction_line, reasons_line
+from pdhef_logtool.sinks.report import diverged_line, friction_line, reasons_line
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -123,8 +123,8 @@ def _notes(report: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return what the estimators have to say, reasons last, with the names of all that say the same."""
     told: dict[str, list[str]] = {}
     for estimator in report["estimators"]:
-        found = reasons_line(estimator, report["log"]["start_ns"])
-        for note in [*estimator["notes"], *([found] if found else [])]:
+        found = [diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])]
+        for note in [*estimator["notes"], *filter(None, found)]:
             told.setdefault(note, []).append(estimator["name"])
     return told
 

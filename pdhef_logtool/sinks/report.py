@@ -309,9 +309,9 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal], not_causal)
     lines += ["## Estimators", ""]
     for e in report["estimators"]:
-        found = reasons_line(e, log["start_ns"])
+        found = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
         told = [f"skipped: {e['reason']}"] if e["reason"] else []
-        notes = "; ".join([*told, *e["notes"], *([found] if found else [])])
+        notes = "; ".join([*told, *e["notes"], *filter(None, found)])
         kind = "causal" if e["causal"] else "not causal"
         lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
     lines += ["", "## Signals", ""]
@@ -319,6 +319,17 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     lines += [f"- {name}: missing" for name in report["mapping"]["missing"]]
     lines += ["", "Versions: " + ", ".join(f"{k} {v}" for k, v in sorted(report["versions"].items()))]
     return "\n".join(lines) + "\n"
+
+
+def diverged_line(report: Mapping[str, Any], name: str) -> str:
+    """Return when an estimator of a report diverged by its own account; empty if it did not."""
+    spans = [s for s in report["segments"] if s["name"] == f"{name} diverged"]
+    if not spans:
+        return ""
+    seconds = sum(s["end_ns"] - s["start_ns"] for s in spans) / 1e9
+    first = (min(s["start_ns"] for s in spans) - report["log"]["start_ns"]) / 1e9
+    often = "" if len(spans) == 1 else f" in {len(spans)} intervals"
+    return f"diverged for {seconds:.2f} s{often}, first at {first:.2f} s"
 
 
 #: A shorter interval is shown as one time.
