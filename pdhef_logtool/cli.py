@@ -748,7 +748,7 @@ def calibrate(
     ] = None,
     vary: Annotated[
         float,
-        typer.Option("--vary", help="Run each drive again with friction and vehicle wrong by this spread."),
+        typer.Option("--vary", help="Run each drive twice more with friction and vehicle wrong by this spread."),
     ] = 0.1,
     seed: Annotated[int, typer.Option("--seed", help="Seed of --vary.")] = 0,
     split: Annotated[

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -57,6 +57,8 @@ from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle
 DEFAULT_SPREAD = 0.1
 #: Neighbouring errors are alike: one sample in this time is kept.
 SAMPLE_EVERY_S = 0.05
+#: Runs of each drive with friction and vehicle made wrong.
+WRONG_RUNS = 2
 #: A drive with fewer kept samples does not count.
 MIN_SAMPLES = 20
 #: Share of the progress that running the estimators takes.
@@ -72,7 +74,7 @@ class CalibrateSettings:
     Attributes
     ----------
     config : vehicle, mapping, model, estimators, slice, sensors, which truth; the other entries are not used.
-    spread : by which friction and vehicle are made wrong in a second run of every drive; 0 = none.
+    spread : by which friction and vehicle are made wrong in further runs of every drive; 0 = none.
     seed : of that. split : only drives that their set's manifest puts into this split.
     any_split : do not refuse held-out drives.
     """
@@ -237,10 +239,10 @@ def _check(settings: CalibrateSettings) -> None:
         raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
 
 
-def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Variation:
-    """Return the first of a key's draws that leaves nothing as it is; ``spread`` > 0."""
+def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
+    """Yield the draws of a key that do not leave everything as it is; ``spread`` > 0."""
     draws = (vary(vehicle, spread, f"{key}:{number}") for number in itertools.count())
-    return next(told for told in draws if told.vehicle is not vehicle)
+    return (told for told in draws if told.vehicle is not vehicle)
 
 
 def _run_drive(
@@ -251,7 +253,7 @@ def _run_drive(
     mapping: SignalMapping | None,
     model: ModelBundle | None,
 ) -> tuple[DriveEntry, list[tuple[str, Samples]]]:
-    """Run the estimators on a drive, once as told and once with a wrong vehicle; return errors and terms."""
+    """Run the estimators on a drive, once as told and some times with a wrong vehicle; return errors and terms."""
     config = settings.config
     sha256 = hash_log(log_input.path) if log_input.path.exists() else ""
     entry = DriveEntry(log_input.stem, log_input.path.name, sha256, "", 0)
@@ -271,8 +273,8 @@ def _run_drive(
     truth = concatenate([replace(w.truth, covariance=np.empty((0, 3, 3))) for w in windows if w.truth is not None])
     runs = [(vehicle, 1.0, False)]
     if settings.spread > 0.0:
-        told = made_wrong(vehicle, settings.spread, f"{settings.seed}:{sha256}")
-        runs.append((told.vehicle, told.friction_factor, True))
+        told = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{sha256}"), WRONG_RUNS)
+        runs += [(one.vehicle, one.friction_factor, True) for one in told]
     found: list[tuple[str, Samples]] = []
     for assumed, factor, wrong in runs:
         friction = friction_source(
@@ -385,6 +387,7 @@ def _document(
             "covered": COVERED,
             "folds": FOLDS,
             "covered_with_wrong_vehicle": COVERED_WRONG,
+            "wrong_runs": WRONG_RUNS,
             "sample_every_s": SAMPLE_EVERY_S,
         },
         "drives_sha256": hashlib.sha256("".join(sorted(d.sha256 for d in drives)).encode()).hexdigest(),

@@ -220,7 +220,7 @@ def test_the_file_says_where_it_is_from(calibration: Path) -> None:
     assert document["vehicle"]["file"] == "vehicle.toml"
     assert str(calibration.parent) not in calibration.read_text()
     assert {c["wrong_vehicle"] for c in document["estimators"]["phy-ukf"]["coverage"]} == {False, True}
-    assert [d["runs"] for d in document["drives"]] == [2] * 5
+    assert [d["runs"] for d in document["drives"]] == [3] * 5
 
 
 def test_a_run_uses_it_says_so_and_windows_change_nothing(
