@@ -61,7 +61,7 @@ class Calibration:
     ----------
     inflations : by estimator. vehicle_sha256, vehicle_name : of the vehicle file that it was made with.
     roll_gradient_rad_per_m_s2 : of that file. name, sha256 : of the calibration file.
-    model_sha256 : of the network, None without.
+    model_sha256 : of the network, None without. spread : by which friction and vehicle were made wrong too; 0, not.
     """
 
     inflations: Mapping[str, Inflation]
@@ -69,6 +69,7 @@ class Calibration:
     vehicle_sha256: str
     roll_gradient_rad_per_m_s2: float
     model_sha256: str | None = None
+    spread: float = 0.0
     name: str = FILE
     sha256: str = ""
 
@@ -102,7 +103,8 @@ class TrackCalibrator:
         made = self.calibration
         if made is None or name not in made.inflations:
             return ("intervals not calibrated",)
-        said = [f"intervals calibrated by {made.name} ({made.sha256[:8]})"]
+        of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
+        said = [f"intervals calibrated by {made.name} ({made.sha256[:8]}) for friction and vehicle {of}"]
         if made.vehicle_sha256 != self.vehicle_sha256:
             said.append(f"that calibration was made for another vehicle file ({made.vehicle_name})")
         if made.model_sha256 is not None and made.model_sha256 != self.model_sha256:
@@ -209,6 +211,7 @@ def load_calibration(path: Path) -> Calibration:
             vehicle_sha256=str(said["vehicle"]["sha256"]),
             roll_gradient_rad_per_m_s2=_finite(said["vehicle"]["roll_gradient_rad_per_m_s2"], low=-math.inf),
             model_sha256=None if said.get("model_sha256") is None else str(said["model_sha256"]),
+            spread=_finite(said["settings"]["vary"]),
             name=file.name,
             sha256=hashlib.sha256(data).hexdigest(),
         )

@@ -198,7 +198,9 @@ def test_the_notes_say_for_what_a_calibration_was_made() -> None:
         calibrator.add(track, signals)
         return "; ".join(calibrator.notes("e"))
 
-    assert notes(replace(CALIBRATION, sha256="1234567890"), None) == f"intervals calibrated by {FILE} (12345678)"
+    made = f"intervals calibrated by {FILE} (12345678) for friction and vehicle"
+    assert notes(replace(CALIBRATION, sha256="1234567890"), None) == f"{made} as told"
+    assert notes(replace(CALIBRATION, sha256="1234567890", spread=0.2), None) == f"{made} wrong by 0.2"
     assert "another vehicle file (car)" in notes(replace(CALIBRATION, vehicle_sha256="cd" * 32), None)
     assert "another network" in notes(replace(CALIBRATION, model_sha256="1"), "2")
     assert "another" not in notes(replace(CALIBRATION, model_sha256="1"), "1")
@@ -213,6 +215,7 @@ def _document() -> dict[str, Any]:
         "version": 1,
         "vehicle": {"name": "car", "sha256": "ab" * 32, "roll_gradient_rad_per_m_s2": 0.009},
         "model_sha256": None,
+        "settings": {"vary": 0.0},
         "estimators": inflations_document({"e": INFLATION}),
     }
 
@@ -235,6 +238,7 @@ def test_round_trip(tmp_path: Path) -> None:
         {"estimators": inflations_document({"e": replace(INFLATION, vy_factor=-1.0)})},
         {"estimators": inflations_document({"e": replace(INFLATION, yaw_rate=(1.0, float("nan"), 1.0))})},
         {"estimators": []},
+        {"settings": {}},
     ],
 )
 def test_a_wrong_file_is_one_clear_error(tmp_path: Path, change: dict[str, Any]) -> None:

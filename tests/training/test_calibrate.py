@@ -226,7 +226,7 @@ def test_the_file_says_where_it_is_from(calibration: Path) -> None:
 def test_a_run_uses_it_says_so_and_windows_change_nothing(
     calibration: Path, sample_logs_dir: Path, tmp_path: Path
 ) -> None:
-    tables = {}
+    tables, figures = {}, {}
     for name, made, window_s in (
         ("plain", Path("none"), 600.0),
         ("whole", calibration, 600.0),
@@ -248,7 +248,20 @@ def test_a_run_uses_it_says_so_and_windows_change_nothing(
         assert "calibrated" not in notes["zero"]
         assert "another vehicle" not in notes["phy-ukf"]
         tables[name] = pl.read_parquet(tmp_path / name / "logs" / "dlc" / "estimates.parquet")
+        metrics = pl.read_parquet(tmp_path / name / "metrics.parquet").filter(pl.col("estimator") == "phy-ukf")
+        figures[name] = {
+            metric: metrics.filter(pl.col("metric") == metric)["value"].to_list()
+            for metric in ("rmse", "nis", "coverage95", "nees")
+        }
     assert tables["whole"].equals(tables["cut"])
+    # Coverage and NEES are those of the calibrated covariance; the filter's own innovations know nothing of it.
+    assert {m: figures["whole"][m] == figures["plain"][m] for m in figures["plain"]} == {
+        "rmse": True,
+        "nis": True,
+        "coverage95": False,
+        "nees": False,
+    }
+    assert all(figures["plain"].values())
     same = [c for c in tables["whole"].columns if c not in ("vy_std_m_s", "yaw_rate_std_rad_s", "sideslip_std_rad")]
     assert tables["whole"].select(same).equals(tables["plain"].select(same))
     assert not tables["whole"]["sideslip_std_rad"].equals(tables["plain"]["sideslip_std_rad"])
