@@ -18,6 +18,7 @@ import numpy as np
 from benchmarks.table_maths import interval_score
 from pdhef_logtool.drive_channels import DriveReader, plan_drive
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.calibration import Calibration, calibrated
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
 from pdhef_logtool.logs.open_log import open_log
@@ -136,12 +137,18 @@ def interval_rows(
 
 
 def run_and_score(
-    estimators: Sequence[Estimator], signals: Signals, drive: ConditionDrive, low_speed_m_s: float
+    estimators: Sequence[Estimator],
+    signals: Signals,
+    drive: ConditionDrive,
+    low_speed_m_s: float,
+    calibration: Calibration | None = None,
 ) -> list[MetricRow]:
-    """Run estimators on signals and score each against the drive's truth."""
+    """Run estimators on signals and score each against the drive's truth, with calibrated intervals if any."""
     rows: list[MetricRow] = []
     for estimator in estimators:
         track, _ = estimator.run(signals, None)
+        if calibration is not None and track.name in calibration.inflations:
+            track, _ = calibrated(track, signals, calibration)
         rows += score(track, drive, low_speed_m_s)
     return rows
 

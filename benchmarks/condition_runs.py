@@ -26,6 +26,7 @@ import pyarrow.parquet as pq
 from benchmarks import error_budget, fixed_grid
 from benchmarks.condition_drives import SIDESLIP, read_drive, run_and_score, told
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.calibration import Calibration, find_calibration
 from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.estimators.registry import make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow, signal_error, summarise_errors
@@ -69,9 +70,11 @@ class Setup:
     def identity(self) -> dict[str, Any]:
         """What the setup is, by content."""
         _, model = _loaded(self.vehicle, self.model)
+        calibration = _calibration(self.model)
         return {
             "vehicle": hashlib.sha256(self.vehicle.read_bytes()).hexdigest(),
             "model": None if model is None else model.sha256,
+            "calibration": None if calibration is None else calibration.sha256,
             "estimators": list(self.estimators),
         }
 
@@ -221,6 +224,12 @@ def _loaded(vehicle: Path, model: Path | None) -> tuple[VehicleParameters, Model
 
 
 @cache
+def _calibration(model: Path | None) -> Calibration | None:
+    """Return the calibration in the model's folder, as ``pdhef run`` takes it."""
+    return None if model is None else find_calibration(None, model)
+
+
+@cache
 def _estimators(setup: Setup, available: frozenset[str], use_speed: bool) -> tuple[tuple[Estimator, ...], list[str]]:
     """Build estimators once a process: they are immutable, and the network takes longer to build than to run."""
     vehicle, model = _loaded(setup.vehicle, setup.model)
@@ -247,7 +256,7 @@ def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     rows: list[MetricRow] = []
     for estimator in estimators:
         try:
-            rows += run_and_score([estimator], signals, drive, vehicle.low_speed_blend_m_s)
+            rows += run_and_score([estimator], signals, drive, vehicle.low_speed_blend_m_s, _calibration(setup.model))
         except Exception as error:  # noqa: BLE001 (one estimator's failure on one drive is a result, not an end)
             notes.append(f"{estimator.name} failed on {task.row}/{drive.name}: {type(error).__name__}: {error}")
     base = _grid_base(setup, use_speed)

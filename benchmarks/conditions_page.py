@@ -198,6 +198,8 @@ def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Seque
     model = facts.setup["model"]
     used = f"`{facts.setup['vehicle_file']}` (sha256 {facts.setup['vehicle'][:12]})"
     network = "none: no hybrid filter ran" if model is None else f"sha256 {model[:12]}"
+    calibration = facts.setup.get("calibration")
+    intervals = "as the estimators give them" if calibration is None else f"calibrated, sha256 {calibration[:12]}"
     drives = {r: max(figures.get(r, n)[0].size for n in figures.estimators(r)) for r in rows}
     lines = [
         "# Condition table",
@@ -205,6 +207,7 @@ def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Seque
         f"Written by `{facts.command}`; every figure comes from that command.",
         "",
         f"Vehicle file {used}; network {network}; pdhef-logtool {facts.versions.get('pdhef-logtool', '?')}.",
+        f"95 % intervals {intervals}.",
         "The vehicle file stays the same in all rows, whatever car is driven. Friction is told to every estimator from",
         "the drive, times the factor of the row, or not at all where the row says so. Truth is the simulator's state.",
         "",
