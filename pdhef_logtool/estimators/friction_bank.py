@@ -35,8 +35,8 @@ from pdhef_logtool.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
 
 #: Frictions of the bank, and how likely each is on a road that nothing is known of: mean 0.86, 1-sigma 0.23.
-GRID = (0.12, 0.2, 0.3, 0.42, 0.56, 0.72, 0.9, 1.1)
-PRIOR = (0.015, 0.02, 0.025, 0.03, 0.05, 0.12, 0.45, 0.29)
+GRID = (0.12, 0.2, 0.3, 0.4, 0.5, 0.62, 0.75, 0.88, 1.0, 1.12)
+PRIOR = (0.015, 0.02, 0.025, 0.025, 0.03, 0.055, 0.14, 0.27, 0.27, 0.15)
 USUAL_FRICTION = sum(mu * weight for mu, weight in zip(GRID, PRIOR, strict=True))
 #: Process 1-sigma per √s of v_y (m/s) and r (rad/s); measurement 1-sigma of a_y (m/s²) and r (rad/s), at model-error
 #: level; all by the sideslip errors that follow, on simulated drives that no table is made of.
@@ -45,7 +45,7 @@ R_AY, R_YAW_RATE = 1.5, 0.006
 #: Degrees of freedom of the Student distribution, the power η, and the forgetting time τ.
 STUDENT_DOF, LIKELIHOOD_POWER, FORGETTING_S = 4.0, 0.3, 2.0
 INITIAL_VY_STD, INITIAL_YAW_RATE_STD = 0.5, 0.1
-#: Slower than this many times the low-speed blend, or behind a longer step, the bank waits and keeps its weights.
+#: Slower than this many times the low-speed blend, or behind a longer step, the bank waits and forgets.
 LEAST_SPEED_BLENDS = 1.67
 LONGEST_STEP_S = 0.1
 #: A filter that assumes too little grip drifts off; it is held within this |v_y| / v_x.
@@ -55,9 +55,14 @@ BOUND_SHARE, BOUND_SMOOTHING_S = 0.9, 0.1
 #: Friction is observable where the 1-sigma of the weights is below this; that of the prior is 0.23.
 OBSERVABLE_STD = 0.12
 
-# Scalars that are carried: whether the states are started, smoothed |a_y|, and of the step before steering and speed.
-_STARTED, _AY, _STEER, _SPEED = range(4)
-_MEMORY = 4
+#: A speed that changes by this much more or less than a_x + v_y r says, smoothed over the time beside it (no hill is so
+#: steep), is that of wheels that spin or lock; the bank then waits for the last time.
+WHEEL_SLIP_M_S2, WHEEL_SLIP_SMOOTHING_S, WHEEL_SLIP_WAIT_S = 3.0, 0.2, 2.0
+
+# Scalars that are carried: whether the states are started, smoothed a_y, of the step before steering and speed, the
+# smoothed rate of the speed beyond a_x, and how long to wait yet.
+_STARTED, _AY, _STEER, _SPEED, _EXCESS, _WAIT = range(6)
+_MEMORY = 6
 _NOT_MEASURED = 1e12  # variance of a channel without a sample
 _STEP_VY, _STEP_YAW_RATE = 0.02, 0.002  # for difference quotients
 
@@ -151,12 +156,24 @@ def _step(x, P, v, v_now, steer, steer_now, friction, dt, ay, yaw_rate, p):  # t
 
 
 @njit(cache=True)
+def _weigh(weights, prior, log_likelihood, keep):  # type: ignore[no-untyped-def]
+    """Move the weights [M] by a share 1 - ``keep`` towards the prior [M], and by the log-likelihoods [M]; in place."""
+    total = 0.0
+    best = log_likelihood.max()
+    for j in range(weights.shape[0]):
+        weights[j] = weights[j] ** keep * prior[j] ** (1.0 - keep) * math.exp(log_likelihood[j] - best)
+        total += weights[j]
+    for j in range(weights.shape[0]):
+        weights[j] = max(weights[j] / total, 1e-12)
+
+
+@njit(cache=True)
 def _bank(  # type: ignore[no-untyped-def]
-    dt, vx, steer, usable, ay, yaw_rate, grid, prior, p, ay_per_friction, weights, x, P, memory, out_mu, out_std
+    dt, vx, steer, usable, ax, ay, yaw_rate, grid, prior, p, ay_per_friction, weights, x, P, memory, out_mu, out_std
 ):  # fmt: skip
     """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory are updated in place."""
     count = grid.shape[0]
-    likelihood = np.empty(count)
+    likelihood = np.zeros(count)
     for k in range(dt.shape[0]):
         mean = 0.0
         square = 0.0
@@ -168,35 +185,40 @@ def _bank(  # type: ignore[no-untyped-def]
         if not dt[k] <= LONGEST_STEP_S:
             memory[_STARTED] = 0.0
             memory[_AY] = 0.0
-        elif math.isfinite(ay[k]):
-            memory[_AY] += (1.0 - math.exp(-dt[k] / BOUND_SMOOTHING_S)) * (ay[k] - memory[_AY])
-        if not usable[k]:
-            memory[_STARTED] = 0.0
+            memory[_EXCESS] = 0.0
         else:
-            if memory[_STARTED] == 0.0:
-                rate = yaw_rate[k] if math.isfinite(yaw_rate[k]) else 0.0
-                for j in range(count):
-                    x[j, 0], x[j, 1] = p.rear_m * rate, rate  # the rear axle rolls without slip
-                    P[j, 0], P[j, 1], P[j, 2] = INITIAL_VY_STD**2, 0.0, INITIAL_YAW_RATE_STD**2
-                memory[_STARTED] = 1.0
-            else:
-                v = 0.5 * (memory[_SPEED] + vx[k])
-                angle = 0.5 * (memory[_STEER] + steer[k])
-                best = -math.inf
-                for j in range(count):
-                    likelihood[j] = LIKELIHOOD_POWER * _step(
-                        x[j], P[j], v, vx[k], angle, steer[k], grid[j], dt[k], ay[k], yaw_rate[k], p
-                    )
-                    best = max(best, likelihood[j])
-                keep = math.exp(-dt[k] / FORGETTING_S)
-                total = 0.0
-                for j in range(count):
-                    weights[j] = weights[j] ** keep * prior[j] ** (1.0 - keep) * math.exp(likelihood[j] - best)
-                    total += weights[j]
-                for j in range(count):
-                    weights[j] = max(weights[j] / total, 1e-12)
-            memory[_STEER] = steer[k]
-            memory[_SPEED] = vx[k]
+            if math.isfinite(ay[k]):
+                memory[_AY] += (1.0 - math.exp(-dt[k] / BOUND_SMOOTHING_S)) * (ay[k] - memory[_AY])
+            if math.isfinite(ax[k]) and math.isfinite(vx[k]) and math.isfinite(memory[_SPEED]):
+                turning = 0.0  # v_y r, by the bank
+                if memory[_STARTED] != 0.0:
+                    for j in range(count):
+                        turning += weights[j] * x[j, 0] * x[j, 1]
+                excess = (vx[k] - memory[_SPEED]) / dt[k] - ax[k] - turning
+                memory[_EXCESS] += (1.0 - math.exp(-dt[k] / WHEEL_SLIP_SMOOTHING_S)) * (excess - memory[_EXCESS])
+            memory[_WAIT] = max(0.0, memory[_WAIT] - dt[k])
+            if abs(memory[_EXCESS]) > WHEEL_SLIP_M_S2:
+                memory[_WAIT] = WHEEL_SLIP_WAIT_S
+        if not usable[k] or memory[_WAIT] > 0.0:
+            memory[_STARTED] = 0.0
+        elif memory[_STARTED] == 0.0:
+            rate = yaw_rate[k] if math.isfinite(yaw_rate[k]) else 0.0
+            for j in range(count):
+                x[j, 0], x[j, 1] = p.rear_m * rate, rate  # the rear axle rolls without slip
+                P[j, 0], P[j, 1], P[j, 2] = INITIAL_VY_STD**2, 0.0, INITIAL_YAW_RATE_STD**2
+            memory[_STARTED] = 1.0
+        else:
+            v = 0.5 * (memory[_SPEED] + vx[k])
+            angle = 0.5 * (memory[_STEER] + steer[k])
+            for j in range(count):
+                likelihood[j] = LIKELIHOOD_POWER * _step(
+                    x[j], P[j], v, vx[k], angle, steer[k], grid[j], dt[k], ay[k], yaw_rate[k], p
+                )
+        if dt[k] > 0.0:  # not at the very first stamp
+            _weigh(weights, prior, likelihood, math.exp(-dt[k] / FORGETTING_S))
+        likelihood[:] = 0.0
+        memory[_STEER] = steer[k]
+        memory[_SPEED] = vx[k]
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,12 +272,12 @@ class FrictionBank:
             dt[0] = first_dt
             dt[1:] = np.diff(signals.stamps_ns) * 1e-9
             last = int(signals.stamps_ns[-1])
-        vx = steps.x[:, VX].copy()
-        usable = steps.valid & ~steps.diverged & (vx > LEAST_SPEED_BLENDS * parameters.blend_high_m_s)
+        vx = np.where(steps.valid, steps.x[:, VX], np.nan)
+        usable = np.asarray(vx > LEAST_SPEED_BLENDS * parameters.blend_high_m_s)
         friction, std = np.empty(count), np.empty(count)
         _bank(
-            dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ay_m_s2, signals.yaw_rate_rad_s, grid, prior,
-            parameters, self.ay_per_friction, weights, x, P, memory, friction, std,
+            dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s,
+            grid, prior, parameters, self.ay_per_friction, weights, x, P, memory, friction, std,
         )  # fmt: skip
         after = FrictionCarry(weights, x, P, memory, last, speed_carry)
         return FrictionEstimate(friction, std, std < OBSERVABLE_STD), after

@@ -97,6 +97,16 @@ def test_the_bound_holds_beyond_the_bank():
     assert estimate(signals).friction[-1] == pytest.approx(BOUND_SHARE * ay / capacity, rel=0.02)
 
 
+def test_spinning_wheels_are_not_a_slippery_road():
+    """A bend at low speed, in which the wheels turn for a second as if the car were twice as fast."""
+    signals = with_noise(drive(lambda t: 0.06 * min(1.0, t), 12.0, speed=7.0, mu=0.85).signals, seed=7)
+    t = (signals.stamps_ns - signals.stamps_ns[0]) * 1e-9
+    spin = np.interp(t, [4.0, 4.3, 5.0, 5.3], [0.0, 7.0, 7.0, 0.0])
+    found = estimate(replace(signals, speed_m_s=signals.speed_m_s + spin))
+    assert not found.observable.any()
+    assert found.friction.min() > 0.7
+
+
 def rough() -> Signals:
     rng = np.random.default_rng(5)
     dt = rng.uniform(0.004, 0.022, 400)
