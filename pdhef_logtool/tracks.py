@@ -28,6 +28,7 @@ TRACK_COLUMNS = (
     "nis",
     "friction",
     "valid",
+    "diverged",
     "mixture_weight",
     "reason",
 )

@@ -22,6 +22,9 @@ from pdhef_logtool.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, ma
 #: estimator, and what waits of six estimators stays below 30 MB.
 ROWS_A_GROUP = 32768
 
+#: Columns that files of earlier versions have not.
+_LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
+_FLAGS = ("valid", "diverged")
 _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
 
@@ -128,14 +131,15 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     ----------
     path : an estimates.parquet.
     estimator : name of the track.
-    columns : of :data:`pdhef_logtool.tracks.TRACK_COLUMNS`; the others stay NaN (``valid`` True). All when None.
+    columns : of :data:`pdhef_logtool.tracks.TRACK_COLUMNS`; the others stay NaN (``valid`` True,
+        ``diverged`` False). All when None.
 
     Returns
     -------
     StateTrack
         In order of time. The file holds standard deviations only: ``covariance`` has them on its diagonal, NaN
-        elsewhere, and length 0 if none was read or known. ``nis_dof`` is NaN and ``diverged`` False. Optional columns
-        that were not read, or that are null throughout, have length 0.
+        elsewhere, and length 0 if none was read or known. ``nis_dof`` is NaN. Optional columns that were not read, or
+        that are null throughout, have length 0.
 
     Raises
     ------
@@ -152,8 +156,8 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     with _open(path) as file:
         absent = set(wanted) - set(file.schema_arrow.names)
         if columns is None:  # a file from before these columns is whole without them
-            wanted = [c for c in wanted if c not in absent or c not in OPTIONAL_COLUMNS]
-            absent -= set(OPTIONAL_COLUMNS)
+            wanted = [c for c in wanted if c not in absent or c not in _LATER_COLUMNS]
+            absent -= set(_LATER_COLUMNS)
         if absent:
             raise OutputError(
                 expected="an estimates.parquet",
@@ -181,20 +185,20 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
             return np.full(table.num_rows, np.nan)
         return np.asarray(table[column].to_numpy(), dtype=np.float64)
 
-    floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", "valid", *_STD_COLUMNS, *OPTIONAL_COLUMNS)}
+    floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", *_FLAGS, *_STD_COLUMNS, *OPTIONAL_COLUMNS)}
     optional = {c: table[c] for c in OPTIONAL_COLUMNS if c in table.column_names}
     known: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
     if "mixture_weight" in known:
         known["mixture_weight"] = numbers("mixture_weight")
     if "reason" in known:
         known["reason"] = np.asarray(pc.fill_null(known["reason"], 0).to_numpy(), dtype=np.int64)
-    valid = {"valid": np.asarray(table["valid"].to_numpy(), dtype=np.bool_)} if "valid" in table.column_names else {}
+    flags = {c: np.asarray(table[c].to_numpy(), dtype=np.bool_) for c in _FLAGS if c in table.column_names}
     return make_track(
         name,
         np.asarray(table["stamp_ns"].to_numpy(), dtype=np.int64),
         covariance=_diagonal([numbers(c) for c in _STD_COLUMNS]),
         **floats,
-        **valid,
+        **flags,
         **known,
     )
 

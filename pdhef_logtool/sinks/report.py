@@ -309,9 +309,9 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         lines += _metric_table(signal, [m for m in report["metrics"] if m["signal"] == signal], not_causal)
     lines += ["## Estimators", ""]
     for e in report["estimators"]:
-        found = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
+        happened = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
         told = [f"skipped: {e['reason']}"] if e["reason"] else []
-        notes = "; ".join([*told, *e["notes"], *filter(None, found)])
+        notes = "; ".join([*told, *e["notes"], *filter(None, happened)])
         kind = "causal" if e["causal"] else "not causal"
         lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
     lines += ["", "## Signals", ""]

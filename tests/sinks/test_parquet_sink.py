@@ -35,6 +35,7 @@ ESTIMATE_COLUMNS = {
     "nis": pl.Float64,
     "friction": pl.Float64,
     "valid": pl.Boolean,
+    "diverged": pl.Boolean,
     "mixture_weight": pl.Float64,
     "reason": pl.Int32,
 }
@@ -60,6 +61,7 @@ UNITS = {
     "nis": "1",
     "friction": "1",
     "valid": "",
+    "diverged": "",
     "mixture_weight": "1",
     "reason": "",
 }
@@ -177,14 +179,16 @@ def test_weights_and_reasons_come_back_where_there_are_some(tmp_path, circle):
     assert rows["mixture_weight"].null_count() == rows["reason"].null_count() == 600
 
 
-def test_a_file_from_before_weights_and_reasons_is_read(tmp_path, circle):
+def test_a_file_from_before_the_later_columns_is_read(tmp_path, circle):
     path = tmp_path / "estimates.parquet"
     write(path, circle)
     old = tmp_path / "old.parquet"
-    pl.read_parquet(path).drop("mixture_weight", "reason").write_parquet(old)
+    pl.read_parquet(path).drop("mixture_weight", "reason", "diverged").write_parquet(old)
     track = read_track(old, "phy-ukf")
     assert_array_equal(track.sideslip_rad, circle("phy-ukf", 0, 600).sideslip_rad)
     assert len(track.reason) == len(track.mixture_weight) == 0
+    assert circle("phy-ukf", 0, 600).diverged.any()
+    assert not track.diverged.any()
     with pytest.raises(OutputError, match="reason"):
         read_track(old, "phy-ukf", ["reason"])
 
