@@ -16,6 +16,7 @@ term          unit  definition
 
 The sensors' samples of a stamp arrive later than the stamp. So the terms are computed on measurement time and each
 scored stamp takes those of the newest step that had arrived (``base.released_steps``), as the estimates themselves do.
+Samples that the estimator says are faulty leave the terms as they are.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 from numba import njit
 
 from pdhef_logtool.estimators.base import released_steps, without_impossible
+from pdhef_logtool.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import GRAVITY_M_S2
@@ -44,6 +46,8 @@ RESTART_GAP_S = 0.5
 MIN_SPEED_M_S = 3.0
 #: Without a friction from log or estimator.
 ASSUMED_FRICTION = 1.0
+#: Those of the yaw rate are the same, shifted left by one.
+_AY_BITS = BURST_AY | SPIKE_AY | STUCK_AY | DEAD_AY | MISSING_AY
 
 # Entries of the memory.
 AY, GRIP, KIN, VY_SLOW, W_SLOW, W_SQUARE, RATE, RATE_SQUARE, HAS_VY, HAS_AY = range(10)
@@ -83,8 +87,9 @@ def error_terms(
     friction = np.where(np.isfinite(friction), friction, ASSUMED_FRICTION)
     memory = np.zeros(MEMORY_SIZE) if carry is None else carry.memory.copy()
     steps = np.empty((count, STEP_SIZE))
+    ay, yaw_rate = believed(track, signals)
     _advance(
-        dt, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
+        dt, ay, yaw_rate, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
         1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2, memory, steps,
     )  # fmt: skip
     ready = signals.ready_ns
@@ -108,6 +113,17 @@ def error_terms(
         axis=1,
     )
     return terms, FeatureCarry(memory, last, ready[newest:], steps[newest:])
+
+
+def believed(track: StateTrack, signals: Signals) -> tuple[FloatArray, FloatArray]:
+    """Return a_y and yaw rate [N] without the samples that the estimator itself says it did not use as usual.
+
+    A stuck gyro disagrees with a right estimate. The estimator tells so once the sample has arrived, a few steps late.
+    """
+    if len(track.reason) != len(track):
+        return signals.ay_m_s2, signals.yaw_rate_rad_s
+    bad = [np.bitwise_and(track.reason, bits) != 0 for bits in (_AY_BITS, _AY_BITS << 1)]
+    return np.where(bad[0], np.nan, signals.ay_m_s2), np.where(bad[1], np.nan, signals.yaw_rate_rad_s)
 
 
 def _known(values: FloatArray) -> FloatArray:

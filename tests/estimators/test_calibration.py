@@ -26,6 +26,7 @@ from pdhef_logtool.estimators.calibration import (
     load_calibration,
 )
 from pdhef_logtool.estimators.error_features import FLOOR_RAD, TERMS, error_terms
+from pdhef_logtool.reasons import STUCK_AY, STUCK_YAW_RATE
 from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.tracks import StateTrack, concatenate, make_track
 
@@ -82,6 +83,7 @@ def _cut(record: Any, a: int, b: int) -> Any:
 @pytest.mark.parametrize("cuts", [(0, 1, 2, 450, 900), (0, 7, 449, 451, 452, 899, 900), (0, 300, 300, 900)])
 def test_joined_windows_equal_the_whole(cuts: tuple[int, ...]) -> None:
     signals, track = _drive()
+    track = replace(track, reason=np.where(np.arange(900) % 250 < 40, STUCK_AY, 0))
     whole, _ = calibrated(track, signals, CALIBRATION)
     carry, parts = None, []
     for a, b in pairwise(cuts):
@@ -179,6 +181,18 @@ def test_nothing_is_made_of_missing_samples() -> None:
     terms, _ = error_terms(track, blind, 0.009, None)
     assert np.all(np.isfinite(terms))
     assert np.all(terms[:, 3:] == 0.0)
+
+
+def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
+    signals, track = _drive()
+    stuck = np.arange(900) >= 200
+    signals = replace(signals, yaw_rate_rad_s=np.where(stuck, 0.4, signals.yaw_rate_rad_s))
+    told = replace(track, reason=np.where(stuck, STUCK_YAW_RATE, 0))
+    blind, seeing = (error_terms(t, signals, 0.009, None)[0][300:440, 5:] for t in (track, told))
+    assert np.all(seeing < 0.1 * blind)
+    # A faulty accelerometer leaves the yaw rate's term alone.
+    other = replace(track, reason=np.where(stuck, STUCK_AY, 0))
+    assert np.array_equal(error_terms(other, signals, 0.009, None)[0][300:440, 6], blind[:, 1])
 
 
 def test_without_an_entry_a_track_stays_as_it_is() -> None:
