@@ -20,8 +20,8 @@ import numpy as np
 from numba import njit
 
 from pdhef_logtool.estimators.base import released_steps
+from pdhef_logtool.estimators.checked_inputs import InputCarry, check_inputs, r_scale
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
-from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import (
     VX,
     VY,
@@ -32,9 +32,9 @@ from pdhef_logtool.estimators.physics import (
     PosteriorSteps,
     sideslip_std,
 )
-from pdhef_logtool.estimators.sensor_faults import AY, FaultCarry, SensorFaults, find_faults
+from pdhef_logtool.estimators.sensor_faults import AY, SensorFaults
 from pdhef_logtool.reasons import BURST_AY
-from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
+from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack
 from pdhef_logtool.vehicle import VehicleParameters
@@ -88,11 +88,9 @@ class MixtureSteps:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdaptiveCarry:
-    """What the detector, the filters, the network and the mixture take from window to window."""
+    """What the inputs, the filters and the mixture take from window to window."""
 
-    faults: FaultCarry
-    physics: FilterCarry
-    network: NetworkCarry
+    inputs: InputCarry
     plain: FilterCarry
     scaled: FilterCarry
     memory: FloatArray
@@ -233,18 +231,10 @@ class AdaptiveHybridUkf:
     def run(self, signals: Signals, carry: AdaptiveCarry | None) -> tuple[StateTrack, AdaptiveCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         c = carry
-        faults, fault_carry = find_faults(signals, self.vehicle, c.faults if c else None)
+        checked, inputs = check_inputs(self.hybrid, signals, c.inputs if c else None)
+        faults = checked.faults
         given, extra = faults.filtered, faults.extra_r
-        features, physics_steps, physics = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed),
-            given,
-            c.physics if c else None,
-            seen=faults.network,
-            extra_r=extra,
-        )
-        starts = ~np.isfinite(physics_steps.prior[:, 0])
-        rate, network = self.network.run(features, starts, c.network if c else None)
-        rate = self.trust * rate
+        rate = self.trust * checked.rate
         plain, scaled = self.filters
         plain_steps, plain_after = plain.filter_steps(given, c.plain if c else None, rate, extra)
         scaled_steps, scaled_after = scaled.filter_steps(given, c.scaled if c else None, rate, extra)
@@ -255,7 +245,7 @@ class AdaptiveHybridUkf:
         first, plain_carry = plain.outputs(given, c.plain if c else None, plain_steps, plain_after)
         second, scaled_carry = scaled.outputs(given, c.scaled if c else None, scaled_steps, scaled_after)
 
-        steps = MixtureSteps(signals.ready_ns, weight, _r_scale(extra, self.r_std), faults.reason)
+        steps = MixtureSteps(signals.ready_ns, weight, r_scale(extra, self.r_std), faults.reason)
         if c is not None:
             steps = c.waiting.joined(steps)
         index = released_steps(steps.ready_ns, signals.stamps_ns)
@@ -271,9 +261,7 @@ class AdaptiveHybridUkf:
         )
         newest = int(index[-1]) if count else -1
         last = int(signals.stamps_ns[-1]) if count else (c.last_stamp_ns if c else -1)
-        after = AdaptiveCarry(
-            fault_carry, physics, network, plain_carry, scaled_carry, memory, last, steps.since(max(newest, 0))
-        )
+        after = AdaptiveCarry(inputs, plain_carry, scaled_carry, memory, last, steps.since(max(newest, 0)))
         return track, after
 
     def _mixture(
@@ -297,12 +285,6 @@ class AdaptiveHybridUkf:
             self.evidence_high, memory, out,
         )  # fmt: skip
         return out, memory
-
-
-def _r_scale(extra_r: FloatArray, r_std: tuple[float, float]) -> FloatArray:
-    """Return the larger factor by which the detector raised R of a_y or yaw rate, [N]."""
-    factor: FloatArray = 1.0 + (extra_r / np.square(r_std)).max(axis=1, initial=0.0)
-    return factor
 
 
 def adaptive_hybrid_ukf(

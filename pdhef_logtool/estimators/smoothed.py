@@ -1,6 +1,7 @@
 """``pd-hef-smoothed``: Rauch-Tung-Striebel smoothing over the hybrid filter (METHOD §12, §14). Not causal.
 
-Forward runs the hybrid unscented filter; backward, from the last step that is seen,
+Forward runs the hybrid unscented filter on checked signals, as the F1 of ``pd-hef`` does (:mod:`~.checked_inputs`);
+backward, from the last step that is seen,
 
     G_k = C_{k,k+1} P_{k+1|k}⁻¹
     x^s_k = x_k + G_k (x^s_{k+1} − x_{k+1|k})
@@ -13,6 +14,7 @@ is a known input of the step, so that it stands in x_{k+1|k} and needs no term o
 - A standstill overwrites v_x, v_y and r with zero. That is no measurement, so none of it goes back; only the biases,
   which it does not touch, tie the step to the one before.
 - Where the gate opened, the inflated covariance counts as that of the prediction: process noise of that step.
+- The detector is causal: what comes later does not make it find a fault sooner.
 
 A log is smoothed in blocks of fixed time, counted from its first step: each with all that follows up to the end of the
 next block. So a step sees from one to two blocks ahead, memory is bounded, and no window changes a bit.
@@ -25,19 +27,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale
 from pdhef_logtool.estimators.hybrid import TABLE as FILTER_TABLE
-from pdhef_logtool.estimators.hybrid import HybridCarry, HybridUkf, hybrid_ukf
+from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import (
     AX_BIAS,
     LINK_BIASES,
     LINK_NONE,
+    FilterCarry,
     PhysicsUkf,
     PosteriorSteps,
     StepLinks,
 )
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import FloatArray, Signals, cut_signals, join_signals
+from pdhef_logtool.signals import FloatArray, IntArray, Signals, cut_signals, join_signals
 from pdhef_logtool.tracks import StateTrack, concatenate
 from pdhef_logtool.vehicle import FilterTuning, VehicleParameters
 
@@ -148,12 +152,47 @@ def smooth_steps(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SmoothedCarry:
-    """State of the forward pass, the steps that it took ahead of the output, and where the blocks begin."""
+class ForwardSteps:
+    """Steps of the forward pass: posteriors, what ties them, and what was wrong with their samples.
 
-    forward: HybridCarry
-    steps: PosteriorSteps
+    ``extra_r`` [K, 2] and ``reason`` [K] are those of :class:`~.sensor_faults.SensorFaults`.
+    """
+
+    posterior: PosteriorSteps
     links: StepLinks
+    extra_r: FloatArray
+    reason: IntArray
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.reason)
+
+    def joined(self, other: ForwardSteps) -> ForwardSteps:
+        """Append the steps that follow."""
+        return ForwardSteps(
+            self.posterior.joined(other.posterior),
+            self.links.joined(other.links),
+            np.concatenate([self.extra_r, other.extra_r]),
+            np.concatenate([self.reason, other.reason]),
+        )
+
+    def since(self, index: int) -> ForwardSteps:
+        """Keep the steps from ``index`` on."""
+        return ForwardSteps(
+            self.posterior.since(index), self.links.since(index), self.extra_r[index:], self.reason[index:]
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedCarry:
+    """State of the inputs and of the forward filter behind all steps that are taken; those ahead of the output.
+
+    ``inputs`` is None where all inputs are known beforehand. ``origin_ns`` is where the blocks begin.
+    """
+
+    inputs: InputCarry | None
+    forward: FilterCarry
+    ahead: ForwardSteps
     origin_ns: int | None
 
 
@@ -192,12 +231,20 @@ class SmoothedHybrid:
         return replace(self.hybrid.filter, bias_states=self.bias_states, name=self.name)
 
     def run(
-        self, signals: Signals, carry: SmoothedCarry | None, ahead: Signals | None = None
+        self,
+        signals: Signals,
+        carry: SmoothedCarry | None,
+        ahead: Signals | None = None,
+        known: CheckedInputs | None = None,
     ) -> tuple[StateTrack, SmoothedCarry]:
         """Process one window (see :class:`~.base.LookingAhead`).
 
-        ``ahead``: what follows the window, at least ``look_ahead_s`` of it or all that there is; the next window
-        begins with it. Without it the log ends here for all that the smoother knows.
+        Parameters
+        ----------
+        ahead : what follows the window, at least ``look_ahead_s`` of it or all that there is; the next window begins
+            with it. Without it the log ends here for all that the smoother knows.
+        known : what :func:`~.checked_inputs.check_inputs` returns for a whole log that is given as one window; it is
+            then not called.
         """
         given = signals if ahead is None else join_signals([signals, ahead])
         parts = []
@@ -207,37 +254,47 @@ class SmoothedHybrid:
             if end < len(signals):
                 horizon_ns = given.stamps_ns[end - 1] + round(self.look_ahead_s * 1e9)
                 seen = int(np.searchsorted(given.stamps_ns, horizon_ns, side="right"))
-            track, carry = self._run_part(cut_signals(given, first, seen), end - first, carry)
-            parts.append(track)
+            taken = first + (0 if carry is None else len(carry.ahead))
+            fresh = cut_signals(given, taken, seen)
+            inputs = None if carry is None else carry.inputs
+            if known is None:
+                checked, inputs = check_inputs(self.hybrid, fresh, inputs)
+            else:
+                checked = known.cut(taken, seen)
+            steps, forward = self._filtered(checked, None if carry is None else carry.forward)
+            if carry is not None:
+                steps = carry.ahead.joined(steps)
+            origin_ns = carry.origin_ns if carry else None
+            if origin_ns is None and len(given):
+                origin_ns = int(given.stamps_ns[0])
+            parts.append(self._smoothed(cut_signals(given, first, end), steps, forward, origin_ns or 0))
+            carry = SmoothedCarry(inputs, forward, steps.since(end - first), origin_ns)
         assert carry is not None
         return concatenate(parts), carry
 
-    def _run_part(self, given: Signals, count: int, carry: SmoothedCarry | None) -> tuple[StateTrack, SmoothedCarry]:
-        """Filter what of ``given`` is not filtered yet, and smooth its first ``count`` stamps with all of it."""
-        fresh = cut_signals(given, 0 if carry is None else len(carry.steps.stamps_ns), len(given))
-        before = carry.forward if carry else None
-        rate, physics, network = self.hybrid.residual_rate(fresh, before)
+    def _filtered(self, checked: CheckedInputs, carry: FilterCarry | None) -> tuple[ForwardSteps, FilterCarry]:
+        """Run the filter forward over steps that it has not taken yet."""
+        faults = checked.faults
         steps, after, links = self.filter.linked_steps(
-            fresh, before.hybrid if before else None, self.hybrid.trust * rate
+            faults.filtered, carry, self.hybrid.trust * checked.rate, faults.extra_r
         )
-        if carry is not None:
-            steps, links = carry.steps.joined(steps), carry.links.joined(links)
-        origin_ns = carry.origin_ns if carry else None
-        if origin_ns is None and len(given):
-            origin_ns = int(given.stamps_ns[0])
-        signals = cut_signals(given, 0, count)
-        x, P = smooth_steps(steps, links, count, origin_ns or 0, round(self.block_s * 1e9))
-        here = replace(steps.until(count), x=x, P=P, ready_ns=signals.stamps_ns)
+        return ForwardSteps(steps, links, faults.extra_r, faults.reason), after
+
+    def _smoothed(self, signals: Signals, steps: ForwardSteps, after: FilterCarry, origin_ns: int) -> StateTrack:
+        """Smooth the steps of ``signals``, which are the first of ``steps``, with all of them."""
+        count = len(signals)
+        x, P = smooth_steps(steps.posterior, steps.links, count, origin_ns, round(self.block_s * 1e9))
+        here = replace(steps.posterior.until(count), x=x, P=P, ready_ns=signals.stamps_ns)
         # Known at its own stamp, a step is not predicted: what comes back is the step itself.
         track, _ = self.filter.outputs(signals, None, here, after)
-        track = replace(
+        return replace(
             track,
             network_trust=np.where(track.valid, self.hybrid.trust, np.nan),
+            r_scale=np.where(track.valid, r_scale(steps.extra_r[:count], self.hybrid.r_std), 1.0),
             nis=np.full(count, np.nan),  # a smoothed state has no innovation
             nis_dof=np.zeros(count),
+            reason=steps.reason[:count],
         )
-        forward = HybridCarry(physics, network, after)
-        return track, SmoothedCarry(forward, steps.since(count), links.since(count), origin_ns)
 
 
 def smoothed_hybrid(

@@ -23,7 +23,9 @@ from rich.console import Console
 from pdhef_logtool.config import RunConfig
 from pdhef_logtool.drive_channels import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
+from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of, run_window
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, check_inputs
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf
 from pdhef_logtool.estimators.physics import (
     AX_BIAS,
@@ -37,6 +39,15 @@ from pdhef_logtool.estimators.physics import (
 from pdhef_logtool.estimators.registry import MODEL_ESTIMATORS, NOT_CAUSAL, make_estimator
 from pdhef_logtool.estimators.smoothed import SMOOTHED_Q_STD, SmoothedHybrid, smooth_steps, smoothed_hybrid
 from pdhef_logtool.pipeline import run_logs
+from pdhef_logtool.reasons import (
+    BURST_AY,
+    BURST_YAW_RATE,
+    DEAD_YAW_RATE,
+    MISSING_AY,
+    MISSING_YAW_RATE,
+    SPIKE_AY,
+    STUCK_YAW_RATE,
+)
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -252,6 +263,20 @@ def rough() -> Signals:
 
 
 @pytest.fixture(scope="module")
+def faulty(rough) -> Signals:
+    """The same with a stuck gyro, a burst on both sensors and spikes."""
+    rng = np.random.default_rng(3)
+    t = (rough.stamps_ns - rough.stamps_ns[0]) * 1e-9
+    ay, yaw_rate = rough.ay_m_s2.copy(), rough.yaw_rate_rad_s.copy()
+    yaw_rate[(t > 1.2) & (t < 2.2)] = 0.06
+    burst = (t > 6.2) & (t < 7.2)
+    ay[burst] += 2.4 * rng.standard_normal(burst.sum())
+    yaw_rate[burst] += 0.08 * rng.standard_normal(burst.sum())
+    ay[np.searchsorted(t, (0.7, 2.5, 4.4))] += 8.0
+    return replace(rough, ay_m_s2=ay, yaw_rate_rad_s=yaw_rate)
+
+
+@pytest.fixture(scope="module")
 def stopping() -> Signals:
     """Rolls, stands for three seconds, rolls on."""
     made = rolling_drive(lambda t: 4.0 * np.clip(np.abs(t - 5.5) - 1.5, 0.0, 1.0), lambda t: 0.05 * np.sin(t), 11.0)
@@ -271,28 +296,40 @@ def in_windows(estimator: SmoothedHybrid, signals: Signals, edges: list[int]) ->
 
 @settings(derandomize=True, deadline=None, max_examples=25)
 @given(data=st.data(), block_s=st.sampled_from([0.3, 1.1]))
-def test_windows_of_any_cut_join_bit_for_bit(rough, data, block_s):
-    inner = data.draw(st.lists(st.integers(0, len(rough)), max_size=8))
+def test_windows_of_any_cut_join_bit_for_bit(faulty, data, block_s):
+    inner = data.draw(st.lists(st.integers(0, len(faulty)), max_size=8))
     estimator = smoother(block_s)
-    whole, _ = estimator.run(rough, None)
-    properties.same_bits(in_windows(estimator, rough, [0, *sorted(inner), len(rough)]), whole)
+    whole, _ = estimator.run(faulty, None)
+    kinds = (STUCK_YAW_RATE, BURST_AY, BURST_YAW_RATE, SPIKE_AY, MISSING_AY, MISSING_YAW_RATE)
+    assert all((whole.reason & kind).any() for kind in kinds), "the cuts must fall into faults"
+    properties.same_bits(in_windows(estimator, faulty, [0, *sorted(inner), len(faulty)]), whole)
 
 
-def test_steps_at_once_change_no_bit(rough, monkeypatch):
+def test_steps_at_once_change_no_bit(faulty, monkeypatch):
     estimator = smoother(0.4)
-    whole, carry = estimator.run(cut(rough, 0, 400), None, cut(rough, 400, 600))
+    whole, carry = estimator.run(cut(faulty, 0, 400), None, cut(faulty, 400, 600))
     monkeypatch.setattr(smoothed, "STEPS_AT_ONCE", 37)
-    again, _ = estimator.run(cut(rough, 0, 400), None, cut(rough, 400, 600))
+    again, _ = estimator.run(cut(faulty, 0, 400), None, cut(faulty, 400, 600))
     properties.same_bits(again, whole)
-    assert len(carry.steps.stamps_ns) == 200, "what was filtered ahead is kept and not filtered twice"
+    assert len(carry.ahead) == 200, "what was filtered ahead is kept and not filtered twice"
 
 
-def test_a_carry_can_be_used_twice(rough):
+def test_a_carry_can_be_used_twice(faulty):
     estimator = smoother(0.4)
-    _, carry = estimator.run(cut(rough, 0, 100), None, cut(rough, 100, 250))
-    first, _ = estimator.run(cut(rough, 100, 400), carry)
-    again, _ = estimator.run(cut(rough, 100, 400), carry)
+    _, carry = estimator.run(cut(faulty, 0, 100), None, cut(faulty, 100, 250))
+    first, _ = estimator.run(cut(faulty, 100, 400), carry)
+    again, _ = estimator.run(cut(faulty, 100, 400), carry)
     properties.same_bits(first, again)
+
+
+def test_inputs_that_are_known_are_those_that_it_makes_itself(faulty, monkeypatch):
+    estimator = smoother(0.4)
+    whole, _ = estimator.run(faulty, None)
+    checked, _ = check_inputs(estimator.hybrid, faulty, None)
+    monkeypatch.setattr(smoothed, "STEPS_AT_ONCE", 37)
+    monkeypatch.setattr(smoothed, "check_inputs", None)
+    again, _ = estimator.run(faulty, None, known=checked)
+    properties.same_bits(again, whole)
 
 
 def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):
@@ -357,7 +394,8 @@ def test_nothing_behind_a_gap_tells_of_before(rough):
     whole, _ = smoother().run(rough, None)
     before, _ = smoother().run(cut(rough, 0, gap), None)
     properties.same_bits(whole, before, gap)
-    filtered = smoother().filter.filter_steps(cut(rough, 0, gap), None, smoother().hybrid.residual_rate(rough, None)[0])
+    checked, _ = check_inputs(smoother().hybrid, cut(rough, 0, gap), None)
+    filtered = smoother().filter.filter_steps(checked.faults.filtered, None, checked.rate, checked.faults.extra_r)
     assert whole.vy_m_s[gap - 1] == filtered[0].x[-1, 1], "at the end of a stretch it is the filter"
 
 
@@ -379,6 +417,75 @@ def test_it_is_nearer_to_the_truth_than_its_filter(bias_states):
     smoothed_rmse, filtered_rmse = np.sqrt(np.array(errors)).T
     assert (smoothed_rmse < filtered_rmse).sum() >= 5
     assert np.sqrt(np.mean(smoothed_rmse**2)) < 0.93 * np.sqrt(np.mean(filtered_rmse**2))
+
+
+@pytest.fixture(scope="module")
+def slalom_drive():
+    return drive(slalom(0.035, 0.5), 12.0, speed=22.0)
+
+
+def flat_smoother() -> SmoothedHybrid:
+    """For the reference car, which does not roll, without network."""
+    flat = VEHICLE.model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
+    return SmoothedHybrid(HybridUkf(flat, NetworkService(BUNDLE), 0.0, SMOOTHED_Q_STD))
+
+
+def unchecked(estimator: SmoothedHybrid, signals: Signals) -> StateTrack:
+    """The estimate without the detector: signals as they are, no extra noise."""
+    checked, _ = check_inputs(estimator.hybrid, signals, None)
+    faults = replace(
+        checked.faults, filtered=signals, extra_r=np.zeros((len(signals), 2)), reason=np.zeros(len(signals), np.int64)
+    )
+    rate, _, _ = estimator.hybrid.residual_rate(signals, None)
+    return estimator.run(signals, None, known=CheckedInputs(faults, rate))[0]
+
+
+def test_without_a_fault_it_is_what_it_is_without_the_detector(slalom_drive):
+    estimator = smoother()  # with network
+    track, _ = estimator.run(slalom_drive.signals, None)
+    assert not track.reason.any()
+    assert (track.r_scale == 1.0).all()
+    properties.same_bits(track, unchecked(estimator, slalom_drive.signals))
+    for seed in range(4):  # false alarms cost next to nothing
+        signals = with_noise(slalom_drive.signals, seed)
+        a, _ = estimator.run(signals, None)
+        away = np.abs(a.sideslip_rad - unchecked(estimator, signals).sideslip_rad)
+        assert np.sqrt(np.mean(away**2)) < np.radians(0.01)
+
+
+@pytest.mark.parametrize("kind", ["stuck", "dead", "burst"])
+def test_a_faulty_gyro_costs_little_and_is_told(slalom_drive, kind):
+    t = slalom_drive.time_s
+    during = (t > 4.0) & (t < 7.0)
+    clean = with_noise(slalom_drive.signals, seed=1)
+    rng = np.random.default_rng(2)
+    held = clean.yaw_rate_rad_s[np.searchsorted(t, 4.0)]
+    bad, bit = {
+        "stuck": (np.full(len(t), held), STUCK_YAW_RATE),
+        "dead": (0.002 * rng.standard_normal(len(t)), DEAD_YAW_RATE),
+        "burst": (clean.yaw_rate_rad_s + 0.08 * rng.standard_normal(len(t)), BURST_YAW_RATE),
+    }[kind]
+    signals = replace(clean, yaw_rate_rad_s=np.where(during, bad, clean.yaw_rate_rad_s))
+    estimator = flat_smoother()
+    track, before = estimator.run(signals, None)[0], unchecked(estimator, signals)
+    told = track.reason & bit > 0
+    assert told[during & (t > 5.5)].mean() > 0.9
+    assert not told[(t < 3.9) | (t > 8.0)].any()
+    assert (np.median(track.r_scale[told]) > 20.0) == (kind == "burst")
+    rmse, without = (np.sqrt(np.mean((x.sideslip_rad - slalom_drive.sideslip) ** 2)) for x in (track, before))
+    assert rmse < (0.5 if kind == "burst" else 0.2) * without
+
+
+def test_it_starts_from_what_the_adaptive_filter_starts_from(faulty):
+    """The reasons are those of pd-hef, at the step itself; a factor on R is over this filter's own."""
+    hybrid = HybridUkf(VEHICLE, NetworkService(BUNDLE), r_std=(0.5, 0.006))
+    track, _ = SmoothedHybrid(hybrid).run(faulty, None)
+    at_once = replace(faulty, ready_ns=faulty.stamps_ns)
+    adaptive, _ = AdaptiveHybridUkf(VEHICLE, hybrid.network, r_std=hybrid.r_std).run(at_once, None)
+    np.testing.assert_array_equal(track.reason, adaptive.reason)
+    np.testing.assert_array_equal(track.r_scale, adaptive.r_scale)
+    assert track.r_scale.max() > 5.0
+    assert len(track.mixture_weight) == 0, "it has no second filter"
 
 
 def test_links_cost_the_filter_no_bit(rough):
