@@ -668,7 +668,11 @@ def tune(
     model: Annotated[Path | None, typer.Option("--model", help="Folder of a model bundle; adds pd-hef.")] = None,
     estimators: Annotated[
         str | None,
-        typer.Option("--estimators", "-e", help="Out of phy-ukf-tuned, physics-plus, pd-hef; default: all that can."),
+        typer.Option(
+            "--estimators",
+            "-e",
+            help="Out of phy-ukf-tuned, physics-plus, pd-hef, pd-hef-smoothed; default: all that can but the last.",
+        ),
     ] = None,
     trials: Annotated[int, typer.Option("--trials", help="Of each estimator.")] = 128,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the search.")] = 0,

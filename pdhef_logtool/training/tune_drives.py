@@ -19,9 +19,11 @@ import numpy as np
 from pdhef_logtool.config import RunConfig, time_slice
 from pdhef_logtool.drive_channels import DriveReader, plan_drive
 from pdhef_logtool.errors import EstimatorError, PdhefError, UsageError
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, check_inputs
 from pdhef_logtool.estimators.friction_source import friction_source, friction_topic
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator
+from pdhef_logtool.estimators.smoothed import SmoothedHybrid, smoothed_hybrid
 from pdhef_logtool.logs.discovery import LogInput, hash_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
@@ -130,16 +132,44 @@ class Hybrid:
         return hybrid.filter.run(signals, None, hybrid.trust * prepared)[0]
 
 
+@dataclass(frozen=True, slots=True)
+class Smoothed:
+    """The smoother at trust 1 as the filter; its detector and network run once a drive."""
+
+    name: str
+    needs_model: bool = True
+
+    def _make(self, setup: TuneSetup, tuning: FilterTuning) -> SmoothedHybrid:
+        assert setup.model is not None
+        vehicle = tuned_vehicle(setup.vehicle, self.name, tuning)
+        return smoothed_hybrid(vehicle, NetworkService(setup.model), use_speed=setup.use_speed)
+
+    def needs(self, setup: TuneSetup) -> frozenset[str]:
+        """What the filter needs."""
+        return self._make(setup, FilterTuning()).needs
+
+    def prepare(self, setup: TuneSetup, signals: Signals) -> CheckedInputs:
+        """Return what the forward filter starts from."""
+        return check_inputs(self._make(setup, FilterTuning()).hybrid, signals, None)[0]
+
+    def run(self, setup: TuneSetup, tuning: FilterTuning, signals: Signals, prepared: CheckedInputs) -> StateTrack:
+        """Filter and smooth with inputs that are known."""
+        return self._make(setup, tuning).run(signals, None, known=prepared)[0]
+
+
 #: Every estimator that can be tuned, in the order of the tables.
 TUNABLE: dict[str, Tunable] = {
     "phy-ukf-tuned": Registered("phy-ukf-tuned"),
     "physics-plus": Registered("physics-plus"),
     "pd-hef": Hybrid("pd-hef"),
+    "pd-hef-smoothed": Smoothed("pd-hef-smoothed"),
 }
+#: Tuned only where they are named: not causal, and a trial takes about twice as long as the filter's.
+ON_REQUEST = ("pd-hef-smoothed",)
 
 
 def choose_names(names: Sequence[str] | None, model: ModelBundle | None) -> tuple[str, ...]:
-    """Return the estimators to tune; None = all that this version has and that the given model suits.
+    """Return the estimators to tune; None = all that the given model suits, but for those of :data:`ON_REQUEST`.
 
     Raises
     ------
@@ -148,7 +178,8 @@ def choose_names(names: Sequence[str] | None, model: ModelBundle | None) -> tupl
     """
     here = [n for n, t in TUNABLE.items() if t.needs_model or n in DESCRIPTIONS]
     if names is None:
-        return tuple(n for n in here if model is not None or not TUNABLE[n].needs_model)
+        suited = (n for n in here if model is not None or not TUNABLE[n].needs_model)
+        return tuple(n for n in suited if n not in ON_REQUEST)
     wrong = sorted({n for n in names if n not in here or names.count(n) > 1})
     if wrong or not names:
         raise UsageError(

@@ -44,7 +44,7 @@ from pdhef_logtool.training.tune import (
 )
 from pdhef_logtool.training.tune_command import TuneSettings, choose_drives, read_comments, run_tuning
 from pdhef_logtool.training.tune_drives import Hybrid, TuneSetup, choose_names
-from pdhef_logtool.vehicle import default_vehicle, load_vehicle, vehicle_to_toml
+from pdhef_logtool.vehicle import Network, default_vehicle, load_vehicle, vehicle_to_toml
 
 OPTIMA = {"a": (0.3, 0.05, 1.5, 0.004), "b": (0.02, 0.4, 0.2, 0.02)}
 
@@ -247,6 +247,35 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
         assert math.degrees(rmse[runnable[name]]) == pytest.approx(
             record["estimators"][name]["rmse_deg"]["dlc"], rel=1e-12
         )
+
+
+def test_the_smoother_is_tuned_only_when_it_is_named_and_by_its_own_error(
+    sample_logs_dir: Path, drives: Path, tmp_path: Path
+) -> None:
+    bundle = _bundle()
+    assert "pd-hef-smoothed" not in choose_names(None, bundle)
+    with pytest.raises(UsageError, match="a model bundle"):
+        choose_names(("pd-hef-smoothed",), None)
+    bundle.save(tmp_path / "model")
+    vehicle = load_vehicle(sample_logs_dir / "vehicle.toml")
+    trusted = vehicle.model_copy(update={"network": Network(trust_cap=1.0, evidence="a test")})
+    (tmp_path / "trusted.toml").write_text(vehicle_to_toml(trusted, {}))
+    names = ("pd-hef", "pd-hef-smoothed")
+    config = RunConfig(vehicle=tmp_path / "trusted.toml", model=tmp_path / "model")
+    run_tuning([str(drives)], tmp_path / "car.toml", TuneSettings(config, names, trials=4, split="validation"))
+    record = json.loads((tmp_path / "car.tuning.json").read_text())["estimators"]
+    explored = {n: [t["values"] for t in record[n]["trials"] if t["stage"] == "sobol"] for n in names}
+    assert explored["pd-hef"] == explored["pd-hef-smoothed"]
+    assert [len(record[n]["trials"]) for n in names] == [4, 4]
+    tuned = load_vehicle(tmp_path / "car.toml").filter
+    best = record["pd-hef-smoothed"]["trials"][record["pd-hef-smoothed"]["best_trial"]]
+    assert tuned["pd-hef-smoothed"] == filter_tuning(tuple(best["values"].values()))
+
+    config = replace(config, vehicle=tmp_path / "car.toml", estimators=("pd-hef-smoothed",), annotate="none")
+    rows = run_logs([str(drives / "dlc.mcap")], tmp_path / "out", config).results[0].rows
+    (rmse,) = [r.value for r in rows if (r.signal, r.segment, r.metric) == ("sideslip_rad", "all", "rmse")]
+    assert math.degrees(rmse) == pytest.approx(record["pd-hef-smoothed"]["rmse_deg"]["dlc"], rel=1e-12)
+    assert record["pd-hef-smoothed"]["rmse_deg"] != record["pd-hef"]["rmse_deg"]
 
 
 def test_processes_change_nothing_and_the_command_prints_json(
