@@ -12,7 +12,8 @@ manoeuvre. Bins of grip use weigh alike.
    that differs from its file asks for; the sensors often cannot tell, so that it is added whether it differs or not.
 
 Errors of one drive are alike, so that the drives are the unit: what a fit is worth is found on drives that it has not
-seen (five folds of drives), and a last factor on a part's coefficients makes a share q of *those* errors lie inside.
+seen (five folds of drives), and a last factor on a part's coefficients makes a share of *those* errors lie inside. That
+share is q (n + 1) / n of n drives, as in conformal prediction: the next drive is one more that may be the worst.
 """
 
 from __future__ import annotations
@@ -132,8 +133,9 @@ def fit_inflation(samples: Samples) -> Fitted:
     right, added = _fit_parts(samples, samples.terms, samples.sideslip_error)
     right_rate, added_rate = _fit_parts(samples, samples.yaw_rate_terms, samples.yaw_rate_error)
     given = ~samples.wrong
+    share = share_for(COVERED, int(np.unique(samples.drive[given]).size))
     vy_factor = covering_factor(
-        samples.vy_error[given], (right.unseen * samples.vy_per_sideslip)[given], bin_weights(samples.bin[given])
+        samples.vy_error[given], (right.unseen * samples.vy_per_sideslip)[given], bin_weights(samples.bin[given]), share
     )
     inflation = Inflation(
         sideslip=_joined(right.coefficients, added.coefficients),
@@ -170,9 +172,18 @@ def _fit_part(
     for seen, held in folds(samples.drive):
         fit = seen & use
         unseen[held] = combined(terms[held], fit_coefficients(terms[fit], error[fit], weight[fit], covered, known[fit]))
-    factor = covering_factor(error[use], unseen[use], weight[use], covered, known_unseen[use])
+    share = share_for(covered, int(np.unique(samples.drive[use]).size))
+    factor = covering_factor(error[use], unseen[use], weight[use], share, known_unseen[use])
     coefficients = fit_coefficients(terms[use], error[use], weight[use], covered, known[use])
     return _Part(tuple(factor * k for k in coefficients), factor, factor * unseen)
+
+
+def share_for(covered: float, drives: int) -> float:
+    """Return the share of known drives that must lie inside for ``covered`` of the next one, q (n + 1) / n.
+
+    No more than half of what q leaves out is added: few drives say little of such far quantiles.
+    """
+    return min(covered * (drives + 1) / drives, 0.5 * (1.0 + covered))
 
 
 def fit_coefficients(

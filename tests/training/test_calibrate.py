@@ -28,6 +28,7 @@ from pdhef_logtool.training.calibrate import (
     fit_coefficients,
     fit_inflation,
     folds,
+    share_for,
 )
 from pdhef_logtool.training.calibrate_command import CalibrateSettings, choose_drives, run_calibration
 
@@ -83,7 +84,7 @@ def test_new_drives_are_covered_where_errors_are_small_and_where_they_are_large(
     rng = np.random.default_rng(3)
     terms = _terms(rng, 30_000)
     std = np.hypot(1.5 * terms[:, 1], 0.6 * terms[:, 2])
-    fitted = fit_inflation(_samples(rng, std, terms))
+    fitted = fit_inflation(_samples(rng, std, terms, drives=300))
     fresh_terms = _terms(rng, 60_000)
     fresh_std = np.hypot(1.5 * fresh_terms[:, 1], 0.6 * fresh_terms[:, 2])
     fresh = _samples(rng, fresh_std, fresh_terms, drives=200)
@@ -109,7 +110,7 @@ def test_a_wrong_vehicle_widens_by_what_it_asks_for() -> None:
         extra = 3.0 * terms[:, 2] * rng.standard_normal(n)
         return replace(samples, sideslip_error=samples.sideslip_error + np.where(samples.wrong, extra, 0.0))
 
-    samples = drives(30_000, 60)
+    samples = drives(60_000, 400)
     fitted = fit_inflation(samples)
     narrow = fit_inflation(samples.where(~samples.wrong))
     fresh = drives(60_000, 300)
@@ -154,6 +155,13 @@ def test_the_covering_factor_is_the_weighted_quantile() -> None:
     assert covering_factor(error, std, alike) == pytest.approx(95.0)
     assert covering_factor(-error, 2.0 * std, alike) == pytest.approx(47.5)
     assert covering_factor(error, std, np.where(error <= 10.0, 0.1, 0.0)) == pytest.approx(10.0)
+
+
+def test_few_drives_must_be_covered_further() -> None:
+    assert share_for(0.95, 10**6) == pytest.approx(0.95, abs=1e-5)
+    assert share_for(0.95, 60) == pytest.approx(0.95 * 61 / 60)
+    assert share_for(0.95, 5) == 0.975
+    assert share_for(0.85, 5) == 0.925
 
 
 def test_bins_count_alike() -> None:
