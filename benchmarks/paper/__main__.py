@@ -18,7 +18,7 @@ from benchmarks.measuring import ROOT
 from benchmarks.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from benchmarks.paper.page import write_page
 from benchmarks.paper.pictures import draw
-from benchmarks.paper.results import document, gather
+from benchmarks.paper.results import VEHICLE_FILE, document, gather
 from pdhef_logtool.errors import PdhefError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, load_bundle
 from pdhef_logtool.vehicle import load_vehicle
@@ -29,7 +29,6 @@ SHIPPED = ROOT / "pdhef_logtool" / "models" / "default"
 TRAINED = ROOT / "out" / "paper"
 TRAINING_SEEDS = (0, 1, 2)
 #: A vehicle file beside the weights belongs to them; without one it is that of the sample logs.
-VEHICLE_FILE = "vehicle.toml"
 SAMPLE_VEHICLE = ROOT / "sample_logs" / VEHICLE_FILE
 
 

@@ -27,7 +27,7 @@ from pdhef_logtool.mapping import choose_mapping
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.signals import Signals, join_signals
 from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.vehicle import Network, VehicleParameters
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import MANOEUVRES
@@ -112,10 +112,18 @@ class Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """A trained network with the seed that it was trained with."""
+    """A trained network, the seed of its training, and how far it may be trusted on which evidence (``pdhef trust``).
+
+    ``trust`` is that of the vehicle file beside it; None leaves what the nominal vehicle file says.
+    """
 
     seed: int
     bundle: ModelBundle
+    trust: Network | None = None
+
+    def on(self, vehicle: VehicleParameters) -> VehicleParameters:
+        """Return a vehicle file with the evidence about this network."""
+        return vehicle if self.trust is None else vehicle.model_copy(update={"network": self.trust})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,7 +268,7 @@ def run_experiment(
             first_drive = scenario.name not in drives
             drives.setdefault(scenario.name, drive)
             for model in models:
-                schemes, skipped = schemes_for(names, drive.vehicle, drive.available, model.bundle)
+                schemes, skipped = schemes_for(names, model.on(drive.vehicle), drive.available, model.bundle)
                 missing.update(skipped)
                 networks.update(s.name for s in schemes if s.uses_network)
                 for scheme in schemes:

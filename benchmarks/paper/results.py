@@ -37,10 +37,12 @@ from benchmarks.paper.schemes import SCHEMES
 from benchmarks.paper.step_time import StepTime, step_times
 from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.sinks.report import tool_versions
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.vehicle import Network, VehicleParameters, load_vehicle
 from truthsim.suite import is_held_out
 
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
+#: Beside a model: the vehicle file that its filter noise and the evidence about it stand in.
+VEHICLE_FILE = "vehicle.toml"
 #: Schemes whose trust or factor on R may move.
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
 BASELINES = ("phy-ukf", "phy-ukf-tuned", "physics-plus", "linear-regression", "pure-lstm", "pd-hef-paper")
@@ -90,7 +92,12 @@ class Results:
 
 def load_models(folders: Mapping[int, Path]) -> tuple[Model, ...]:
     """Load model folders by training seed, in the order given."""
-    return tuple(Model(seed, load_bundle(folder)) for seed, folder in folders.items())
+
+    def trust(folder: Path) -> Network | None:
+        beside = folder / VEHICLE_FILE
+        return load_vehicle(beside).network if beside.is_file() else None
+
+    return tuple(Model(seed, load_bundle(folder), trust(folder)) for seed, folder in folders.items())
 
 
 def gather(
