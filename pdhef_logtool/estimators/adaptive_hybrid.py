@@ -193,7 +193,7 @@ class AdaptiveHybridUkf:
     Parameters
     ----------
     trust : share of the network's residual that both filters take, in [0, 1]; the cap of METHOD §14 goes here.
-    q_std, r_std : as for :class:`~.hybrid.HybridUkf`.
+    q_std, r_std, slip_gate : as for :class:`~.hybrid.HybridUkf`.
     evidence_low, evidence_high : between which F2 gains its weight, over the noise variance of a_y.
     notes : what the report says of it, such as the reason for its trust.
     """
@@ -206,6 +206,7 @@ class AdaptiveHybridUkf:
     evidence_low: float = EVIDENCE_LOW
     evidence_high: float = EVIDENCE_HIGH
     use_speed: bool = True
+    slip_gate: bool = True
     name: str = "pd-hef"
     causal: bool = True
     notes: tuple[str, ...] = ()
@@ -219,7 +220,14 @@ class AdaptiveHybridUkf:
     def hybrid(self) -> HybridUkf:
         """The fixed filter that F1 is when nothing is wrong."""
         return HybridUkf(
-            self.vehicle, self.network, self.trust, self.q_std, self.r_std, use_speed=self.use_speed, name=self.name
+            self.vehicle,
+            self.network,
+            self.trust,
+            self.q_std,
+            self.r_std,
+            use_speed=self.use_speed,
+            slip_gate=self.slip_gate,
+            name=self.name,
         )
 
     @property

@@ -59,7 +59,7 @@ def check_inputs(hybrid: HybridUkf, signals: Signals, carry: InputCarry | None) 
     """
     faults, fault_carry = find_faults(signals, hybrid.vehicle, carry.faults if carry else None)
     features, steps, physics = run_features(
-        parallel_filter(hybrid.vehicle, use_speed=hybrid.use_speed),
+        parallel_filter(hybrid.vehicle, use_speed=hybrid.use_speed, slip_gate=hybrid.slip_gate),
         faults.filtered,
         carry.physics if carry else None,
         seen=faults.network,

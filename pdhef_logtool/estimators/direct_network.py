@@ -65,6 +65,7 @@ class DirectNetwork:
     vehicle: VehicleParameters
     network: NetworkService
     use_speed: bool = True
+    slip_gate: bool = True
     name: str = "pure-lstm"
     causal: bool = True
 
@@ -81,7 +82,9 @@ class DirectNetwork:
     def run(self, signals: Signals, carry: DirectCarry | None) -> tuple[StateTrack, DirectCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed), signals, carry.physics if carry else None
+            parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
+            signals,
+            carry.physics if carry else None,
         )
         starts = ~np.isfinite(physics.prior[:, 0])
         output, network = self.network.run(features, starts, carry.network if carry else None)

@@ -242,7 +242,8 @@ class FrictionBank:
     @property
     def _speed_filter(self) -> PhysicsUkf:
         told = self.vehicle.model_copy(update={"friction": USUAL_FRICTION})
-        return PhysicsUkf(told, use_speed=self.use_speed)
+        # The bank looks for slipping wheels itself and waits.
+        return PhysicsUkf(told, use_speed=self.use_speed, slip_gate=False)
 
     @property
     def ay_per_friction(self) -> float:

@@ -37,7 +37,7 @@ class HybridUkf:
     Parameters
     ----------
     trust : β of Eq 19 in [0, 1].
-    q_std, r_std : as for :class:`~.physics.PhysicsUkf`; ``r_std`` without the speed's.
+    q_std, r_std, slip_gate : as for :class:`~.physics.PhysicsUkf`; ``r_std`` without the speed's.
     """
 
     vehicle: VehicleParameters
@@ -46,6 +46,7 @@ class HybridUkf:
     q_std: tuple[float, float, float, float] = HYBRID_Q_STD
     r_std: tuple[float, float] = HYBRID_R_STD
     use_speed: bool = True
+    slip_gate: bool = True
     name: str = "pd-hef-fixed-r"
     causal: bool = True
 
@@ -62,6 +63,7 @@ class HybridUkf:
             q_std=self.q_std,
             r_std=(*self.r_std, self.vehicle.sensors.speed_std_m_s),
             use_speed=self.use_speed,
+            slip_gate=self.slip_gate,
             roll_correction=True,
             name=self.name,
         )
@@ -78,7 +80,9 @@ class HybridUkf:
     ) -> tuple[FloatArray, FilterCarry, NetworkCarry]:
         """Return the network's residual rate [N, 2] in m/s² and rad/s², which no noise of this filter changes."""
         features, steps, physics = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed), signals, carry.physics if carry else None
+            parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
+            signals,
+            carry.physics if carry else None,
         )
         starts = ~np.isfinite(steps.prior[:, 0])
         rate, network = self.network.run(features, starts, carry.network if carry else None)

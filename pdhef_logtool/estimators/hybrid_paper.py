@@ -11,7 +11,7 @@ It is on record for comparison and is not the filter to use: METHOD §7 says wha
 - C_k = θ C_{k−1} + (1 − θ) ν νᵀ and R_k = max(R_0, C_k − P_zz) on the diagonal (Eq 22, 23). C starts at P_zz + R_0.
 
 What the paper does not say is as in ``phy-ukf``: state [v_x, v_y, r, b_ax], Q_0, wheel speed as a measurement, start
-and gaps. It has no gate, no standstill and no roll correction: the paper has none.
+and gaps. It has no gate of innovations, no standstill and no roll correction: the paper has none.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import (
@@ -35,6 +35,7 @@ from pdhef_logtool.estimators.physics import (
     U_AX,
     U_AX_KNOWN,
     U_FRICTION,
+    U_SPEED,
     U_STEER,
     VX,
     VY,
@@ -44,8 +45,10 @@ from pdhef_logtool.estimators.physics import (
     Z_YAW_RATE,
     FilterCarry,
     PosteriorSteps,
+    rolls_forward,
     sideslip_std,
 )
+from pdhef_logtool.estimators.speed_slip import SlipCarry, believable
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -82,7 +85,7 @@ MEMORY = M_INNOVATION + MEASUREMENTS
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperSteps:
-    """Posteriors on measurement time, [K] each; state [K, 4], covariance [K, 4, 4], inputs [K, 4].
+    """Posteriors on measurement time, [K] each; state [K, 4], covariance [K, 4, 4], inputs [K, 5].
 
     ``residual_rate`` [K, 2] is the network's at the step, before β; ``trust`` is β_k, ``r_scale`` R_k / R_0 of a_y.
     """
@@ -120,6 +123,7 @@ class PaperCarry:
     memory: FloatArray
     last_stamp_ns: int
     steps: PaperSteps
+    slip: SlipCarry | None = None
 
 
 @njit(cache=True)
@@ -186,7 +190,7 @@ def _filter(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Run over one window; x [4], P [4, 4] and memory are updated in place.
 
-    ``inputs`` [K, 4], ``start_x`` [K, ≥4], ``start_ok`` [K] and ``prior`` [K, ≥3] are the parallel filter's: where its
+    ``inputs`` [K, 5], ``start_x`` [K, ≥4], ``start_ok`` [K] and ``prior`` [K, ≥3] are the parallel filter's: where its
     prior is missing it starts, and this filter with it.
     """
     n = STATES
@@ -323,12 +327,14 @@ class PaperHybridUkf:
     ----------
     q_std : Q_0 as process 1-sigma per √s of [v_x, v_y, r, b_ax].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
+    slip_gate : as for ``phy-ukf``: leave out the speed of wheels that spin or lock.
     """
 
     vehicle: VehicleParameters
     network: NetworkService
     q_std: tuple[float, float, float, float] = PHY_UKF_Q_STD
     use_speed: bool = True
+    slip_gate: bool = True
     name: str = "pd-hef-paper"
     causal: bool = True
 
@@ -361,22 +367,26 @@ class PaperHybridUkf:
     def run(self, signals: Signals, carry: PaperCarry | None) -> tuple[StateTrack, PaperCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed), signals, carry.physics if carry else None
+            parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
+            signals,
+            carry.physics if carry else None,
         )
         starts = ~np.isfinite(physics.prior[:, VX])
         rate, network = self.network.run(features, starts, carry.network if carry else None)
-        steps, x, P, memory = self._filter_steps(signals, physics, rate, carry)
+        usable, slip = believable(
+            signals, self.vehicle.sensors.speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate
+        )
+        steps, x, P, memory = self._filter_steps(usable, physics, rate, carry)
         last = int(signals.stamps_ns[-1]) if len(signals) else (carry.last_stamp_ns if carry else 0)
         if carry is not None:
             steps = carry.steps.joined(steps)
         track, newest = self._outputs(signals.stamps_ns, steps)
-        return track, PaperCarry(after, network, x, P, memory, last, steps.since(max(newest, 0)))
+        return track, PaperCarry(after, network, x, P, memory, last, steps.since(max(newest, 0)), slip)
 
     def _filter_steps(
         self, signals: Signals, physics: PosteriorSteps, rate: FloatArray, carry: PaperCarry | None
     ) -> tuple[PaperSteps, FloatArray, FloatArray, FloatArray]:
-        """Filter on measurement time; the steps, then x, P and memory after them."""
-        usable = without_impossible(signals)
+        """Filter believable signals on measurement time; the steps, then x, P and memory after them."""
         count = len(signals)
         if carry is None:
             x, P, memory = np.zeros(STATES), np.eye(STATES), np.zeros(MEMORY)
@@ -400,7 +410,7 @@ class PaperHybridUkf:
         )
         wm, wc, scale = unscented_weights(STATES)
         _filter(
-            dt, physics.inputs, usable.ay_m_s2, usable.yaw_rate_rad_s, usable.speed_m_s, self.use_speed, physics.x,
+            dt, physics.inputs, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, self.use_speed, physics.x,
             physics.valid, physics.prior, rate, self._parameters, np.array(self.q_std), self.measurement_variance,
             wm, wc, scale[0], x, P, memory, steps.x, steps.P, steps.trust, steps.r_scale, steps.nis, steps.nis_dof,
             steps.valid, steps.diverged,
@@ -423,6 +433,8 @@ class PaperHybridUkf:
             self._parameters, np.array(self.q_std), wm, wc, scale[0], x, P, ay,
         )  # fmt: skip
         usable &= np.isfinite(x[:, VX])
+        if len(steps.stamps_ns):
+            usable &= rolls_forward(x[:, VX], steps.inputs[at, U_SPEED])
 
         def where_usable(column: FloatArray | BoolArray, otherwise: float) -> FloatArray:
             out = np.full(count, otherwise)

@@ -52,6 +52,7 @@ class Kinematic:
     """The integrator of this file as an estimator; needs no vehicle at all."""
 
     leak_s: float = LEAK_S
+    slip_gate: bool = True
     name: str = "kinematic"
     causal: bool = True
 
@@ -70,4 +71,4 @@ class Kinematic:
                 dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, self.leak_s, state, values, rates, valid
             )
 
-        return run_stepwise(self.name, signals, carry, 4, step)
+        return run_stepwise(self.name, signals, carry, 4, step, slip_gate=self.slip_gate)

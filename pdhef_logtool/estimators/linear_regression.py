@@ -32,6 +32,7 @@ class LinearRegression:
     vehicle: VehicleParameters
     model: LinearModel
     use_speed: bool = True
+    slip_gate: bool = True
     name: str = "linear-regression"
     causal: bool = True
 
@@ -48,7 +49,9 @@ class LinearRegression:
     def run(self, signals: Signals, carry: RegressionCarry | None) -> tuple[StateTrack, RegressionCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
-            parallel_filter(self.vehicle, use_speed=self.use_speed), signals, carry.physics if carry else None
+            parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
+            signals,
+            carry.physics if carry else None,
         )
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
         starts = ~np.isfinite(physics.prior[:, VX])

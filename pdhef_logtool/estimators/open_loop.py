@@ -77,6 +77,7 @@ class OpenLoop:
     """The model of this file as an estimator."""
 
     vehicle: VehicleParameters
+    slip_gate: bool = True
     name: str = "open-loop"
     causal: bool = True
 
@@ -97,4 +98,5 @@ class OpenLoop:
                 dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction, mu, p, state, values, rates, valid
             )  # fmt: skip
 
-        return run_stepwise(self.name, signals, carry, 6, step)
+        std = self.vehicle.sensors.speed_std_m_s
+        return run_stepwise(self.name, signals, carry, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)

@@ -8,7 +8,16 @@ import numpy as np
 from numba import njit
 
 from pdhef_logtool.estimators.base import without_impossible
-from pdhef_logtool.estimators.physics import U_FRICTION, U_STEER, FilterCarry, PhysicsUkf, PosteriorSteps
+from pdhef_logtool.estimators.physics import (
+    U_FRICTION,
+    U_SPEED,
+    U_STEER,
+    VX,
+    FilterCarry,
+    PhysicsUkf,
+    PosteriorSteps,
+    rolls_forward,
+)
 from pdhef_logtool.nominal_model import measured_lateral_acceleration, model_parameters
 from pdhef_logtool.residual_model.features import make_features
 from pdhef_logtool.signals import FloatArray, Signals
@@ -41,9 +50,9 @@ def car_features(vehicle: VehicleParameters, friction: FloatArray) -> FloatArray
     return np.stack(columns, axis=1)
 
 
-def parallel_filter(vehicle: VehicleParameters, *, use_speed: bool = True) -> PhysicsUkf:
+def parallel_filter(vehicle: VehicleParameters, *, use_speed: bool = True, slip_gate: bool = True) -> PhysicsUkf:
     """Return the filter whose steps the features are made of: ``phy-ukf`` as it is frozen."""
-    return PhysicsUkf(vehicle, use_speed=use_speed, name="parallel")
+    return PhysicsUkf(vehicle, use_speed=use_speed, slip_gate=slip_gate, name="parallel")
 
 
 def run_features(
@@ -63,7 +72,8 @@ def run_features(
 
     Returns
     -------
-    features : [K, 17], NaN where the filter has no state. steps, carry : of the filter.
+    features : [K, 17], NaN where the filter has no state, or one that goes backwards against the speed sensor.
+    steps, carry : of the filter.
     """
     steps, after = physics.filter_steps(signals, carry, extra_r=extra_r)
     usable = without_impossible(signals if seen is None else seen)
@@ -74,5 +84,5 @@ def run_features(
         steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior, predicted,
         friction, usable.ax_m_s2, car_features(physics.vehicle, friction),
     )  # fmt: skip
-    features[~steps.valid] = np.nan
+    features[~(steps.valid & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
     return features, steps, after

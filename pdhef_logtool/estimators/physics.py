@@ -19,7 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.estimators.speed_slip import SlipCarry, believable
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -46,9 +47,9 @@ STATES = 4
 BIAS_STATES = 3
 Z_AY, Z_YAW_RATE, Z_SPEED = 0, 1, 2
 MEASUREMENTS = 3
-# Inputs of a step; a_x is 0 where U_AX_KNOWN is 0.
-U_STEER, U_AX, U_FRICTION, U_AX_KNOWN = 0, 1, 2, 3
-INPUTS = 4
+# Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was believed, 0 before any.
+U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED = 0, 1, 2, 3, 4
+INPUTS = 5
 
 #: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
 #: over simulated drives (``benchmarks/tune_physics_q.py``, its result beside it) and frozen: the drives were those of
@@ -84,12 +85,15 @@ DIVERGED_NIS_RATIO = 25.0
 DIVERGED_NIS_CAP = 4.0 * GATE_SIGMA**2
 DIVERGED_AVERAGE_S = 1.0
 DIVERGED_SIDESLIP_RAD = math.radians(60.0)
+#: A car whose speed sensor last read more than this does not roll backwards: a v_x below zero is then no estimate.
+FORWARD_M_S = 0.5
 
 # Entries of the filter's scalar memory.
 M_INITIALISED, M_STEER, M_AX, M_AX_KNOWN, M_FRICTION, M_STEER_AGE, M_STILL, M_SPEED_AGE, M_NIS = range(9)
 M_RATE_VY, M_RATE_R = 9, 10  # residual of the step before
 M_REJECTED = 11  # and the two after it, one a measurement: time since the first sample of an unbroken rejection
-MEMORY = 14
+M_SPEED = 14  # last speed sample
+MEMORY = 15
 #: What M_REJECTED holds at the first rejected sample itself; 0 is "the last sample was accepted".
 JUST_REJECTED_S = 1e-9
 
@@ -107,11 +111,12 @@ class FilterCarry:
     memory: FloatArray
     last_stamp_ns: int
     steps: PosteriorSteps
+    slip: SlipCarry | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSteps:
-    """Filter posteriors on measurement time: [K] each, state [K, 4], covariance [K, 4, 4], inputs [K, 4].
+    """Filter posteriors on measurement time: [K] each, state [K, 4], covariance [K, 4, 4], inputs [K, 5].
 
     ``prior`` [K, 4] is the state before the update, NaN where the filter starts. ``residual_rate``
     [K, 2] is what is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
@@ -303,6 +308,8 @@ def _filter(  # type: ignore[no-untyped-def]
         z[Z_AY] = ay[k]
         z[Z_YAW_RATE] = yaw_rate[k]
         z[Z_SPEED] = speed[k] if (use_speed or memory[M_INITIALISED] == 0.0) else math.nan
+        if math.isfinite(z[Z_SPEED]):
+            memory[M_SPEED] = z[Z_SPEED]
         out_nis[k] = math.nan
         out_dof[k] = 0.0
         out_ll[k] = 0.0
@@ -440,6 +447,7 @@ def _filter(  # type: ignore[no-untyped-def]
         out_u[k, U_AX] = ax_k
         out_u[k, U_FRICTION] = mu_k
         out_u[k, U_AX_KNOWN] = memory[M_AX_KNOWN]
+        out_u[k, U_SPEED] = memory[M_SPEED] if use_speed else 0.0
 
 
 @njit(cache=True)
@@ -480,6 +488,12 @@ def _predict_outputs(  # type: ignore[no-untyped-def]
         out_ay[m] = ay + force * dynamic_share(xm[VX], p) * residual_rate[k, 0]
 
 
+def rolls_forward(vx_m_s: FloatArray, last_speed_m_s: FloatArray) -> BoolArray:
+    """Return where v_x [N] does not contradict the last speed sample: the sideslip would stand at 180 degrees there."""
+    against: BoolArray = (vx_m_s < 0.0) & (last_speed_m_s > FORWARD_M_S)
+    return ~against
+
+
 def sideslip_std(vx_m_s: FloatArray, vy_m_s: FloatArray, covariance: FloatArray) -> FloatArray:
     """Return the 1-sigma of β = atan2(v_y, v_x) in rad, [N], to first order from the covariance [N, ≥2, ≥2]."""
     v2 = np.maximum(vx_m_s**2 + vy_m_s**2, 1e-6)
@@ -499,6 +513,7 @@ class PhysicsUkf:
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     bias_states : estimate the biases of a_y, yaw rate and steering angle; their priors stand in ``sensors``.
     force_scale : estimate a factor on all lateral forces.
+    slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
     """
 
     vehicle: VehicleParameters
@@ -508,6 +523,7 @@ class PhysicsUkf:
     roll_correction: bool = False
     bias_states: bool = False
     force_scale: bool = False
+    slip_gate: bool = True
     name: str = "phy-ukf"
     causal: bool = True
 
@@ -577,7 +593,9 @@ class PhysicsUkf:
         links: StepLinks,
     ) -> tuple[PosteriorSteps, FilterCarry]:
         """Run the filter; ``links`` are written in place if they have a row a step."""
-        signals = without_impossible(signals)
+        signals, slip = believable(
+            signals, self.vehicle.sensors.speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate
+        )
         count = len(signals)
         initial_std = self._initial_std
         n = initial_std.shape[0]
@@ -616,7 +634,7 @@ class PhysicsUkf:
             steps.valid, steps.diverged, steps.prior, links.kind, links.predicted_P, links.cross,
         )  # fmt: skip
         last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
-        return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count))
+        return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count), slip=slip)
 
     def run(
         self,
@@ -650,6 +668,8 @@ class PhysicsUkf:
         )  # fmt: skip
         usable &= np.isfinite(x[:, VX])
         at = np.maximum(chosen, 0)
+        if len(steps.nis):
+            usable &= rolls_forward(x[:, VX], steps.inputs[at, U_SPEED])
         nan = np.full(count, np.nan)
         covariance = P[:, :3, :3]
         track = StateTrack(
@@ -674,7 +694,8 @@ class PhysicsUkf:
             diverged=np.where(usable, steps.diverged[at], False) if len(steps.nis) else usable,
         )
         newest = int(index[-1]) if count else -1
-        return track, FilterCarry(after.x, after.P, after.memory, after.last_stamp_ns, steps.since(max(newest, 0)))
+        waiting = steps.since(max(newest, 0))
+        return track, FilterCarry(after.x, after.P, after.memory, after.last_stamp_ns, waiting, after.slip)
 
 
 def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.estimators.lagged_forces import (
     ForceParameters,
     force_parameters,
@@ -44,6 +44,7 @@ from pdhef_logtool.estimators.physics import (
     M_INITIALISED,
     M_NIS,
     M_REJECTED,
+    M_SPEED,
     M_SPEED_AGE,
     M_STEER,
     M_STEER_AGE,
@@ -61,6 +62,7 @@ from pdhef_logtool.estimators.physics import (
     U_AX,
     U_AX_KNOWN,
     U_FRICTION,
+    U_SPEED,
     U_STEER,
     VX,
     VY,
@@ -70,9 +72,11 @@ from pdhef_logtool.estimators.physics import (
     Z_YAW_RATE,
     FilterCarry,
     PosteriorSteps,
+    rolls_forward,
     sideslip_std,
 )
 from pdhef_logtool.estimators.physics import INITIAL_STD as PHYSICS_INITIAL_STD
+from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -306,6 +310,8 @@ def _filter(  # type: ignore[no-untyped-def]
         z[Z_AY] = ay[k]
         z[Z_YAW_RATE] = yaw_rate[k]
         z[Z_SPEED] = speed[k] if (use_speed or memory[M_INITIALISED] == 0.0) else math.nan
+        if math.isfinite(z[Z_SPEED]):
+            memory[M_SPEED] = z[Z_SPEED]
 
         if memory[M_INITIALISED] == 0.0:
             if math.isfinite(z[Z_SPEED]) and math.isfinite(steer[k]):
@@ -371,6 +377,7 @@ def _filter(  # type: ignore[no-untyped-def]
         out_u[k, U_AX] = ax_k
         out_u[k, U_FRICTION] = mu_k
         out_u[k, U_AX_KNOWN] = memory[M_AX_KNOWN]
+        out_u[k, U_SPEED] = memory[M_SPEED] if use_speed else 0.0
 
 
 @njit(cache=True)
@@ -416,6 +423,7 @@ class PhysicsPlusUkf:
     r_std : 1-sigma of [a_y, r, v_x].
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     bias_states : estimate the biases of a_y, yaw rate and steering angle, whose priors stand in ``sensors``.
+    slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
     """
 
     vehicle: VehicleParameters
@@ -424,6 +432,7 @@ class PhysicsPlusUkf:
     use_speed: bool = True
     roll_correction: bool = True
     bias_states: bool = True
+    slip_gate: bool = True
     name: str = NAME
     causal: bool = True
 
@@ -454,7 +463,9 @@ class PhysicsPlusUkf:
 
     def filter_steps(self, signals: Signals, carry: FilterCarry | None) -> tuple[PosteriorSteps, FilterCarry]:
         """Run the filter on measurement time only; the steps and the carry with no pending steps in it."""
-        signals = without_impossible(signals)
+        signals, slip = believable(
+            signals, self.vehicle.sensors.speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate
+        )
         count = len(signals)
         n = STATES + (BIAS_STATES if self.bias_states else 0)
         if carry is None:
@@ -490,7 +501,7 @@ class PhysicsPlusUkf:
             steps.nis, steps.nis_dof, steps.log_likelihood, steps.innovation, steps.valid, steps.diverged, steps.prior,
         )  # fmt: skip
         last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
-        return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count))
+        return steps, FilterCarry(x=x, P=P, memory=memory, last_stamp_ns=last, steps=steps.since(count), slip=slip)
 
     def run(self, signals: Signals, carry: FilterCarry | None) -> tuple[StateTrack, FilterCarry]:
         """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
@@ -511,6 +522,8 @@ class PhysicsPlusUkf:
         )  # fmt: skip
         usable &= np.isfinite(x[:, VX])
         at = np.maximum(chosen, 0)
+        if len(steps.nis):
+            usable &= rolls_forward(x[:, VX], steps.inputs[at, U_SPEED])
         nan = np.full(count, np.nan)
         covariance = P[:, :3, :3]
         track = StateTrack(
@@ -535,7 +548,8 @@ class PhysicsPlusUkf:
             diverged=np.where(usable, steps.diverged[at], False) if len(steps.nis) else usable,
         )
         newest = int(index[-1]) if count else -1
-        return track, FilterCarry(after.x, after.P, after.memory, after.last_stamp_ns, steps.since(max(newest, 0)))
+        waiting = steps.since(max(newest, 0))
+        return track, FilterCarry(after.x, after.P, after.memory, after.last_stamp_ns, waiting, after.slip)
 
 
 def physics_plus(vehicle: VehicleParameters, *, use_speed: bool = True) -> PhysicsPlusUkf:

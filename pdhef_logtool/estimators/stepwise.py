@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
+from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.estimators.speed_slip import ASSUMED_STD_M_S, SlipCarry, believable
 from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack, make_track
 
@@ -48,6 +49,7 @@ class StepCarry:
     state: FloatArray
     last_stamp_ns: int
     steps: Steps
+    slip: SlipCarry | None = None
 
 
 #: (dt [K], signals, state, values [K, 4], rates [K, 4], valid [K]) -> None; writes the last four in place.
@@ -55,13 +57,21 @@ StepFunction = Callable[[FloatArray, Signals, FloatArray, FloatArray, FloatArray
 
 
 def run_stepwise(
-    name: str, signals: Signals, carry: StepCarry | None, state_size: int, step: StepFunction
+    name: str,
+    signals: Signals,
+    carry: StepCarry | None,
+    state_size: int,
+    step: StepFunction,
+    *,
+    slip_gate: bool = False,
+    speed_std_m_s: float = ASSUMED_STD_M_S,
 ) -> tuple[StateTrack, StepCarry]:
     """Run ``step`` over a window and extrapolate the newest arrived step to each scored stamp, to first order.
 
-    ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log.
+    ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_gate`` the dead-reckoned speed stands
+    in place of that of slipping wheels.
     """
-    signals = without_impossible(signals)
+    signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=slip_gate, reckoned=True)
     count = len(signals)
     state = np.full(state_size, np.nan) if carry is None else carry.state.copy()
     dt = np.empty(count)
@@ -96,7 +106,7 @@ def run_stepwise(
     )
     last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
     newest = int(index[-1]) if count else -1
-    return track, StepCarry(state, last, steps.since(max(newest, 0)))
+    return track, StepCarry(state, last, steps.since(max(newest, 0)), slip)
 
 
 @njit(cache=True)
