@@ -4,6 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
+# The simulated car of the sample logs, with the filter noise that belongs to the shipped network.
+CAR := pdhef_logtool/models/default/vehicle.toml
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
@@ -37,8 +39,8 @@ $(VENV)/installed-dev: $(VENV)/installed pyproject.toml
 	@touch $@
 
 demo: $(VENV)/installed $(VENV)/compiled
-	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --vehicle sample_logs/vehicle.toml
-	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --vehicle sample_logs/vehicle_mu03.toml
+	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --vehicle $(CAR)
+	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --vehicle $(CAR) --friction 0.3
 	@echo
 	@echo "Outputs: $(OUT)/ and $(OUT)-low-friction/"
 	@echo "  logs/<log>/annotated.mcap   for Foxglove, PlotJuggler or ros2 bag"
