@@ -22,6 +22,7 @@ from pathlib import Path
 import torch
 
 from pdhef_logtool.errors import EXIT_OK, EXIT_PARTIAL
+from pdhef_logtool.estimators.calibration import FILE, UNSURE_FILE
 from pdhef_logtool.residual_model.bundle import PAPER_FOLDER
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.training.dataset import read_dataset
@@ -38,6 +39,8 @@ OTHER_DRIVES = {"other_cars": 200, "evidence": 60}
 EPOCHS = 40
 PAPER_EPOCHS = 15
 TRIALS = 64
+#: Wrong frictions and vehicle files that the intervals for an unsure car allow for.
+UNSURE_SPREAD = 0.2
 MAPPING = """# Recognised types, and the friction that the simulator drove on.
 fill_recognised = true
 
@@ -100,6 +103,11 @@ def main(arguments: list[str] | None = None) -> int:
     say("evidence that the network helps on this car")
     trusted = ["--vehicle", vehicle, "--model", model, "--mapping", mapping]
     _pdhef("trust", work / "evidence", *trusted, "--any-split", "-o", model / "vehicle.toml")
+    if given.seed == 0:
+        say("calibrate the intervals: for a car that is as its file says, and for one that may have changed")
+        drives = [work / "one_car", "--split", "validation", "--vehicle", vehicle, "--mapping", mapping]
+        for spread, file in ((0, FILE), (UNSURE_SPREAD, UNSURE_FILE)):
+            _pdhef("calibrate", *drives, "--model", model, "--vary", spread, "-o", model / file)
     say(f"done: {model}")
     return 0
 

@@ -136,7 +136,10 @@ def run(
     ] = None,
     calibration: Annotated[
         Path | None,
-        typer.Option("--calibration", help="File of pdhef calibrate, or none. Default: the one in the model's folder."),
+        typer.Option(
+            "--calibration",
+            help="File of pdhef calibrate, none, or unsure (wide: the car may have changed). Default: the model folder's.",
+        ),
     ] = None,
     vehicle: Annotated[Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml.")] = None,
     mapping: MappingFile = None,

@@ -19,6 +19,8 @@ SENSOR_SUITES = ("full", "esp")
 NANOSECONDS_FROM = 10**15
 WINDOW_S = 600.0
 _FILES = ("vehicle", "mapping", "thresholds", "model", "calibration")
+#: What may stand in place of a file.
+_KEYWORDS = {"model": ("default", "none"), "calibration": ("none", "unsure")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,8 @@ class RunConfig:
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
     model : folder of a model bundle for the hybrid filters; None = the shipped one, ``none`` = no network.
-    calibration : file of ``pdhef calibrate``; None = that beside the model, if any, ``none`` = intervals as they are.
+    calibration : file of ``pdhef calibrate``; None = that beside the model, if any; ``none`` = intervals as they
+        are; ``unsure`` = the wide one beside the model, for a car that may have changed since its file was made.
     thresholds : limits that the figures are held against; None = no gate.
     """
 
@@ -98,7 +101,8 @@ def _read_file(path: Path) -> dict[str, Any]:
         raw["estimators"] = tuple(names.split(",") if isinstance(names, str) else names)
     for key in _FILES:
         if key in raw:
-            raw[key] = path.parent / str(raw[key])
+            value = str(raw[key])
+            raw[key] = Path(value) if value in _KEYWORDS.get(key, ()) else path.parent / value
     for key in ("start", "end"):
         if key in raw:
             raw[key] = str(raw[key])

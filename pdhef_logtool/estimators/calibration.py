@@ -37,6 +37,8 @@ FORMAT_VERSION = 1
 FILE = "calibration.json"
 #: Instead of a file: leave all intervals as the estimators give them.
 NO_CALIBRATION = "none"
+#: Instead of a file: the wide one beside the model, for a car that may not be as its vehicle file says.
+UNSURE, UNSURE_FILE = "unsure", "calibration_unsure_vehicle.json"
 #: Terms of the sideslip's variance; those of the yaw rate's, where ``filter`` is its own 1-sigma.
 SIDESLIP_TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate")
 YAW_RATE_TERMS = ("floor", "filter", "yaw_rate")
@@ -239,6 +241,8 @@ def _finite(value: Any, low: float = 0.0) -> float:
 def find_calibration(chosen: Path | None, model: Path | None) -> Calibration | None:
     """Return the calibration of a run: the chosen file's, nothing for ``none``, else that beside its model if any.
 
+    ``unsure`` is the wide one beside the model.
+
     Parameters
     ----------
     model : as :func:`~pdhef_logtool.residual_model.bundle.open_model` takes it.
@@ -248,9 +252,16 @@ def find_calibration(chosen: Path | None, model: Path | None) -> Calibration | N
     ModelError
         The file is missing or wrong.
     """
+    beside = model_folder(model)
+    if str(chosen) == UNSURE:
+        if beside is None:
+            raise ModelError(
+                expected=f"a model folder with {UNSURE_FILE}", got="no model", where="--calibration unsure",
+                remedy="name the file itself",
+            )  # fmt: skip
+        return load_calibration(beside / UNSURE_FILE)
     if chosen is not None:
         return None if str(chosen) == NO_CALIBRATION else load_calibration(chosen)
-    beside = model_folder(model)
     return load_calibration(beside) if beside is not None and (beside / FILE).is_file() else None
 
 

@@ -105,3 +105,11 @@ def test_configuration_in_outputs_holds_no_folders(tmp_path: Path) -> None:
     document = RunConfig(vehicle=tmp_path / "car.toml").to_dict()
     assert document["vehicle"] == "car.toml"
     assert str(tmp_path) not in str(document)
+
+
+def test_words_that_stand_for_files_stay_words(tmp_path: Path) -> None:
+    file = tmp_path / "pdhef.toml"
+    file.write_text('model = "none"\ncalibration = "unsure"\nvehicle = "none"\n')
+    config = load_config(file, {})
+    assert (config.model, config.calibration) == (Path("none"), Path("unsure"))
+    assert config.vehicle == tmp_path / "none"

@@ -15,6 +15,7 @@ from pdhef_logtool.errors import ModelError
 from pdhef_logtool.estimators.calibration import (
     FILE,
     SIDESLIP_TERMS,
+    UNSURE_FILE,
     YAW_RATE_TERMS,
     Calibration,
     Inflation,
@@ -283,3 +284,9 @@ def test_which_calibration_a_run_takes(tmp_path: Path) -> None:
     assert find_calibration(Path("none"), model) is None
     assert find_calibration(model / FILE, Path("none")) is not None
     assert find_calibration(None, Path("none")) is None
+    with pytest.raises(ModelError, match="unsure"):
+        find_calibration(Path("unsure"), model)
+    (model / UNSURE_FILE).write_text(json.dumps(_document()))
+    assert find_calibration(Path("unsure"), model) is not None
+    with pytest.raises(ModelError, match="no model"):
+        find_calibration(Path("unsure"), Path("none"))
