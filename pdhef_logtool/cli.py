@@ -138,7 +138,7 @@ def run(
         Path | None,
         typer.Option(
             "--calibration",
-            help="File of pdhef calibrate, none, or unsure (wide: the car may have changed). Default: the model folder's.",
+            help="File of pdhef calibrate, none, or unsure (wide, for a changed car). Default: the model folder's.",
         ),
     ] = None,
     vehicle: Annotated[Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml.")] = None,
