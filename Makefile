@@ -9,7 +9,7 @@ CAR := pdhef_logtool/models/default/vehicle.toml
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: train-default help demo test check lint format bench samples docs-truthsim paper clean
+.PHONY: train-default help demo test check lint format bench samples docs-truthsim paper switches clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -20,6 +20,7 @@ help:
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions VEHICLE=car.toml MODEL=model  docs/conditions.md: every estimator on the condition table"
 	@echo "make real MODEL=model  docs/real.md: every estimator on the recorded drives in ../shared"
+	@echo "make switches  docs/switches.md: bias states, roll, standstill, slip gate, latency of the filters, on and off"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make clean    remove the virtual environment and everything that was built"
@@ -93,6 +94,9 @@ conditions: $(VENV)/installed-dev $(VENV)/compiled
 
 real: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.real $(if $(MODEL),--model $(MODEL))
+
+switches: $(VENV)/installed-dev $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.switches
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -266,9 +266,9 @@ def _all_finite(x, P):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _filter(  # type: ignore[no-untyped-def]
-    dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, default_friction, p, q_std, r_std, wm, wc, scale,
-    layout, initial_std, x, P, memory, residual_rate, extra_r, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu,
-    out_valid, out_diverged, out_prior, out_link, out_predicted_P, out_cross,
+    dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, still_after_s, default_friction, p, q_std, r_std, wm, wc,
+    scale, layout, initial_std, x, P, memory, residual_rate, extra_r, out_x, out_P, out_u, out_nis, out_dof, out_ll,
+    out_nu, out_valid, out_diverged, out_prior, out_link, out_predicted_P, out_cross,
 ):  # fmt: skip
     """Run over one window; x [n], P [n, n] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start.
 
@@ -415,7 +415,7 @@ def _filter(  # type: ignore[no-untyped-def]
                     memory[M_SPEED_AGE] += dt[k]
                     still = memory[M_SPEED_AGE] <= STANDSTILL_SILENCE_S and not turns
                     memory[M_STILL] = memory[M_STILL] + dt[k] if still else 0.0
-                if memory[M_STILL] >= STANDSTILL_AFTER_S:
+                if memory[M_STILL] >= still_after_s:
                     for i in range(AX_BIAS):
                         x[i] = 0.0
                         for j in range(n):
@@ -424,7 +424,7 @@ def _filter(  # type: ignore[no-untyped-def]
                         P[i, i] = STANDSTILL_STD[i] ** 2
                 alive = _all_finite(x, P)
             if linked and alive:
-                out_link[k] = LINK_BIASES if memory[M_STILL] >= STANDSTILL_AFTER_S else LINK_WHOLE
+                out_link[k] = LINK_BIASES if memory[M_STILL] >= still_after_s else LINK_WHOLE
             if alive:
                 out_valid[k] = steer_ok
                 out_diverged[k] = memory[M_NIS] > DIVERGED_NIS_RATIO or (
@@ -514,6 +514,7 @@ class PhysicsUkf:
     bias_states : estimate the biases of a_y, yaw rate and steering angle; their priors stand in ``sensors``.
     force_scale : estimate a factor on all lateral forces.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
+    standstill : hold v_x, v_y and r at zero while the car stands.
     """
 
     vehicle: VehicleParameters
@@ -524,6 +525,7 @@ class PhysicsUkf:
     bias_states: bool = False
     force_scale: bool = False
     slip_gate: bool = True
+    standstill: bool = True
     name: str = "phy-ukf"
     causal: bool = True
 
@@ -627,7 +629,8 @@ class PhysicsUkf:
         wm, wc, scale = unscented_weights(n)
         _filter(
             dt, signals.steer_rad, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s,
-            signals.friction, self.use_speed, self.vehicle.assumed_friction, self._parameters,
+            signals.friction, self.use_speed, STANDSTILL_AFTER_S if self.standstill else math.inf,
+            self.vehicle.assumed_friction, self._parameters,
             np.array(self.q_std), self.measurement_std, wm, wc, scale[0], self.layout, initial_std, x, P, memory,
             steps.residual_rate, np.zeros((count, 2)) if extra_r is None else extra_r,
             steps.x, steps.P, steps.inputs, steps.nis, steps.nis_dof, steps.log_likelihood, steps.innovation,

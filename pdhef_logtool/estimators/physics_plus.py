@@ -224,7 +224,7 @@ def _judge(nu, S, z_ok, dt, memory, at_gate, use):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _stands(speed, yaw_rate, dt, memory):  # type: ignore[no-untyped-def]
+def _stands(speed, yaw_rate, dt, after_s, memory):  # type: ignore[no-untyped-def]
     """Return whether the vehicle has stood for long enough: the speed sensor reads zero and nothing turns."""
     turns = abs(yaw_rate) > STANDSTILL_YAW_RATE_RAD_S
     if math.isfinite(speed):
@@ -235,7 +235,7 @@ def _stands(speed, yaw_rate, dt, memory):  # type: ignore[no-untyped-def]
         memory[M_SPEED_AGE] += dt
         still = memory[M_SPEED_AGE] <= STANDSTILL_SILENCE_S and not turns
         memory[M_STILL] = memory[M_STILL] + dt if still else 0.0
-    return memory[M_STILL] >= STANDSTILL_AFTER_S
+    return memory[M_STILL] >= after_s
 
 
 @njit(cache=True)
@@ -266,9 +266,9 @@ def _predicted_measurement(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _filter(  # type: ignore[no-untyped-def]
-    dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, default_friction, p, f, q_std, r_std, initial_std,
-    wm, wc, scale, x, P, memory, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu, out_valid, out_diverged,
-    out_prior,
+    dt, steer, ax, ay, yaw_rate, speed, friction, use_speed, still_after_s, default_friction, p, f, q_std, r_std,
+    initial_std, wm, wc, scale, x, P, memory, out_x, out_P, out_u, out_nis, out_dof, out_ll, out_nu, out_valid,
+    out_diverged, out_prior,
 ):  # fmt: skip
     """Run over one window; x [n], P [n, n] and memory are updated in place. ``dt[k]`` ends at step k, NaN = start."""
     n = x.shape[0]
@@ -356,7 +356,7 @@ def _filter(  # type: ignore[no-untyped-def]
                         out_ll[k] = log_likelihood
                 if seen > 0:
                     memory[M_NIS] += min(1.0, dt[k] / DIVERGED_AVERAGE_S) * (squares / seen - memory[M_NIS])
-                if _stands(z[Z_SPEED], z[Z_YAW_RATE], dt[k], memory):
+                if _stands(z[Z_SPEED], z[Z_YAW_RATE], dt[k], still_after_s, memory):
                     _nail_down(x, P)
                 alive = _all_finite(x, P)
             if alive:
@@ -424,6 +424,7 @@ class PhysicsPlusUkf:
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     bias_states : estimate the biases of a_y, yaw rate and steering angle, whose priors stand in ``sensors``.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
+    standstill : hold the motion at zero while the car stands.
     """
 
     vehicle: VehicleParameters
@@ -433,6 +434,7 @@ class PhysicsPlusUkf:
     roll_correction: bool = True
     bias_states: bool = True
     slip_gate: bool = True
+    standstill: bool = True
     name: str = NAME
     causal: bool = True
 
@@ -496,7 +498,8 @@ class PhysicsPlusUkf:
         wm, wc, scale = unscented_weights(n)
         _filter(
             dt, signals.steer_rad, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s,
-            signals.friction, self.use_speed, self.vehicle.assumed_friction, *self._parameters, self._process_std,
+            signals.friction, self.use_speed, STANDSTILL_AFTER_S if self.standstill else math.inf,
+            self.vehicle.assumed_friction, *self._parameters, self._process_std,
             self.measurement_std, self._initial_std, wm, wc, scale[0], x, P, memory, steps.x, steps.P, steps.inputs,
             steps.nis, steps.nis_dof, steps.log_likelihood, steps.innovation, steps.valid, steps.diverged, steps.prior,
         )  # fmt: skip

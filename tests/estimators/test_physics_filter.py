@@ -23,6 +23,7 @@ from reference_car import (
 )
 
 from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood, sideslip_std
+from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.signals import Signals
 from pdhef_logtool.vehicle import default_vehicle
@@ -185,6 +186,16 @@ def test_standstill_holds_and_lets_go(bias):
     assert np.abs(steps.x[going, 2] - made.r[going]).max() < 0.05 + bias
     assert (np.linalg.eigvalsh(steps.P) > 0).all()
     assert steps.valid.all()
+
+
+@pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsPlusUkf])
+def test_standstill_can_be_switched_off(maker):
+    made = stop_and_go()
+    still = (made.time_s >= 5.0) & (made.time_s <= 9.0)
+    signals = still_noise(made.signals, still)
+    standing = (made.time_s > 5.45) & (made.time_s <= 9.0)
+    assert (posteriors(signals, maker(VEHICLE)).x[standing, :3] == 0.0).all()
+    assert (posteriors(signals, maker(VEHICLE, standstill=False)).x[standing, 2] != 0.0).all()
 
 
 def test_standstill_learns_the_bias_of_the_accelerometer():
