@@ -73,10 +73,10 @@ def main(arguments: list[str] | None = None) -> int:
         count = min(given.drives, OTHER_DRIVES.get(name, given.drives))
         say(f"simulate {count} drives: {name}")
         what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", given.jobs]
-        _pdhef("simulate", "suite", *what, "-o", work / name)
+        pdhef("simulate", "suite", *what, "-o", work / name)
     say("extract")
     told = ["--vehicle", VEHICLE, "--mapping", mapping, "--jobs", given.jobs]
-    _pdhef("extract", work / "one_car", "-o", work / "dataset", *told, "--resume")
+    pdhef("extract", work / "one_car", "-o", work / "dataset", *told, "--resume")
     say("train the residual network, and beside it the baselines on the same rows")
     arguments = ["-o", model, "--baselines", "--seed", given.seed, "--epochs", given.epochs]
     beside = _start("train", work / "dataset", *arguments)
@@ -99,15 +99,15 @@ def main(arguments: list[str] | None = None) -> int:
         say("tune the noise of all tuned estimators alike, on validation drives")
         search = ["--split", "validation", "--trials", TRIALS, "--model", model]
         vehicle = model / "vehicle.toml"
-        _pdhef("tune", work / "one_car", *search, *told, "-o", vehicle)
+        pdhef("tune", work / "one_car", *search, *told, "-o", vehicle)
     say("evidence that the network helps on this car")
     trusted = ["--vehicle", vehicle, "--model", model, "--mapping", mapping]
-    _pdhef("trust", work / "evidence", *trusted, "--any-split", "-o", model / "vehicle.toml")
+    pdhef("trust", work / "evidence", *trusted, "--any-split", "-o", model / "vehicle.toml")
     if given.seed == 0:
         say("calibrate the intervals: for a car that is as its file says, and for one that may have changed")
         drives = [work / "one_car", "--split", "validation", "--vehicle", vehicle, "--mapping", mapping]
         for spread, file in ((0, FILE), (UNSURE_SPREAD, UNSURE_FILE)):
-            _pdhef("calibrate", *drives, "--model", model, "--vary", spread, "-o", model / file)
+            pdhef("calibrate", *drives, "--model", model, "--vary", spread, "-o", model / file)
     say(f"done: {model}")
     return 0
 
@@ -123,7 +123,8 @@ def _finish(process: subprocess.Popen[bytes]) -> None:
         raise SystemExit(f"failed ({process.returncode}): {process.args!r}")
 
 
-def _pdhef(*words: object) -> None:
+def pdhef(*words: object) -> None:
+    """Run one command of the tool; a failure ends the program."""
     _finish(_start(*words))
 
 
