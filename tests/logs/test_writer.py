@@ -137,31 +137,34 @@ def test_odometry_bytes_equal_an_independent_serialiser(
 @given(
     stamp=_stamps,
     frame=_texts,
-    values=hnp.arrays(np.float64, 19, elements=_floats),
+    values=hnp.arrays(np.float64, 20, elements=_floats),
     flags=st.tuples(*[st.booleans()] * 2),
+    reason=st.integers(0, 2**32 - 1),
 )
 def test_own_message_bytes_equal_an_independent_serialiser(
-    stamp: int, frame: str, values: np.ndarray, flags: tuple[bool, bool]
+    stamp: int, frame: str, values: np.ndarray, flags: tuple[bool, bool], reason: int
 ) -> None:
     names = [
         *("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"),
-        *("sideslip_std_rad", "network_trust", "r_scale", "nis", "friction"),
+        *("sideslip_std_rad", "network_trust", "r_scale", "nis", "friction", "mixture_weight"),
     ]
-    scalars = dict(zip(names, values[:10].tolist(), strict=True))
+    scalars = dict(zip(names, values[:11].tolist(), strict=True))
     message = _message(
         ESTIMATE,
         header=_header(stamp, frame),
         **scalars,
-        covariance=values[10:],
+        covariance=values[11:],
         valid=flags[0],
         diverged=flags[1],
+        reason=reason,
     )
     fields: dict[str, np.ndarray] = {
         "header.stamp": np.array([stamp]),
         **{name: np.array([v]) for name, v in scalars.items()},
-        "covariance": values[None, 10:],
+        "covariance": values[None, 11:],
         "valid": np.array([flags[0]]),
         "diverged": np.array([flags[1]]),
+        "reason": np.array([reason], dtype=np.uint32),
     }
     assert _encoded(ESTIMATE, fields, {"header.frame_id": frame}) == _serialised(message, ESTIMATE)
 
