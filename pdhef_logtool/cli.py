@@ -132,7 +132,8 @@ def run(
         str | None, typer.Option("--estimators", "-e", help="Comma-separated names; see pdhef estimators.")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Folder of a model bundle, or none. Default: the shipped model.")
+        Path | None,
+        typer.Option("--model", help="Folder of a model bundle, many-cars, or none. Default: the shipped model."),
     ] = None,
     calibration: Annotated[
         Path | None,
@@ -611,7 +612,9 @@ An interrupted training goes on from its last whole epoch when the same command 
 def train(
     dataset: Annotated[Path, typer.Argument(help="Folder that pdhef extract wrote.")],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder of the model bundle to write.")],
-    init: Annotated[Path | None, typer.Option("--init", help="Model bundle to fine-tune.")] = None,
+    init: Annotated[
+        Path | None, typer.Option("--init", help="Model bundle to fine-tune, or many-cars, or default.")
+    ] = None,
     baselines: Annotated[
         bool, typer.Option("--baselines", help="Train pure-lstm and linear-regression into the model instead.")
     ] = False,
@@ -748,7 +751,8 @@ def calibrate(
         Path | None, typer.Option("--vehicle", "-v", help="vehicle.toml that the estimators run with.")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Folder of a model bundle, or none. Default: the shipped model.")
+        Path | None,
+        typer.Option("--model", help="Folder of a model bundle, many-cars, or none. Default: the shipped model."),
     ] = None,
     estimators: Annotated[
         str | None, typer.Option("--estimators", "-e", help="Comma-separated names; default: as for run.")

@@ -20,7 +20,7 @@ NANOSECONDS_FROM = 10**15
 WINDOW_S = 600.0
 _FILES = ("vehicle", "mapping", "thresholds", "model", "calibration")
 #: What may stand in place of a file.
-_KEYWORDS = {"model": ("default", "none"), "calibration": ("none", "unsure")}
+_KEYWORDS = {"model": ("default", "many-cars", "none"), "calibration": ("none", "unsure")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,8 @@ class RunConfig:
     friction : ``auto`` is the log's own, else the vehicle file's, else estimated; ``file``, ``estimate``, or a number.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
-    model : folder of a model bundle for the hybrid filters; None = the shipped one, ``none`` = no network.
+    model : folder of a model bundle for the hybrid filters; None = the shipped one, ``many-cars`` = the shipped one for
+        any car, ``none`` = no network.
     calibration : file of ``pdhef calibrate``; None = that beside the model, if any; ``none`` = intervals as they
         are; ``unsure`` = the wide one beside the model, for a car that may have changed since its file was made.
     thresholds : limits that the figures are held against; None = no gate.

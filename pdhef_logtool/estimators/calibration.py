@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pdhef_logtool.errors import ModelError
-from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED, SHIPPED_FOLDER
+from pdhef_logtool.residual_model.bundle import model_folder
 from pdhef_logtool.signals import FloatArray, Signals
 from pdhef_logtool.tracks import StateTrack
 
@@ -263,10 +263,3 @@ def find_calibration(chosen: Path | None, model: Path | None) -> Calibration | N
     if chosen is not None:
         return None if str(chosen) == NO_CALIBRATION else load_calibration(chosen)
     return load_calibration(beside) if beside is not None and (beside / FILE).is_file() else None
-
-
-def model_folder(model: Path | None) -> Path | None:
-    """Return the folder of a run's model, None without one."""
-    if model is not None and str(model) == NO_MODEL:
-        return None
-    return SHIPPED_FOLDER if model is None or str(model) == SHIPPED else model

@@ -26,8 +26,8 @@ LINEAR_REGRESSION_FILE = "baselines/linear-regression.json"
 PAPER_FOLDER = "baselines/paper-network"
 
 #: Names instead of a folder: the network that comes with the package, and no network.
-SHIPPED, NO_MODEL = "default", "none"
-SHIPPED_FOLDER = Path(__file__).parents[1] / "models" / "default"
+SHIPPED, MANY_CARS, NO_MODEL = "default", "many-cars", "none"
+SHIPPED_FOLDERS = {name: Path(__file__).parents[1] / "models" / name for name in (SHIPPED, MANY_CARS)}
 
 #: What a network may predict, and how many numbers that is: rates of v_y and r that f_nom lacks, or v_y itself.
 RESIDUAL = "residual_rates"
@@ -130,18 +130,24 @@ class ModelBundle:
 
 
 def open_model(model: Path | None) -> ModelBundle | None:
-    """Return the network of a run: the shipped one for None or ``default``, no network for ``none``, or a folder's.
+    """Return the network of a run: a shipped one by its name (None is ``default``), none for ``none``, or a folder's.
 
     Raises
     ------
     ModelError
         The folder holds no model.
     """
+    folder = model_folder(model)
+    if folder is None or (model is None and not (folder / DOCUMENT_FILE).is_file()):
+        return None
+    return load_bundle(folder)
+
+
+def model_folder(model: Path | None) -> Path | None:
+    """Return the folder of a run's model, None without one; ``model`` as :func:`open_model` takes it."""
     if model is not None and str(model) == NO_MODEL:
         return None
-    if model is None or str(model) == SHIPPED:
-        return load_bundle(SHIPPED_FOLDER) if (SHIPPED_FOLDER / DOCUMENT_FILE).is_file() else None
-    return load_bundle(model)
+    return SHIPPED_FOLDERS.get(SHIPPED if model is None else str(model), model)
 
 
 def load_bundle(folder: Path) -> ModelBundle:

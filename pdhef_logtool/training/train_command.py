@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.errors import ModelError, OutputError, UsageError
-from pdhef_logtool.residual_model.bundle import RESIDUAL, ModelBundle, load_bundle
+from pdhef_logtool.residual_model.bundle import RESIDUAL, ModelBundle, open_model
 from pdhef_logtool.sinks.base import PendingFile
 from pdhef_logtool.training.dataset import Dataset, DatasetDrive, read_dataset
 from pdhef_logtool.training.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
@@ -74,7 +74,7 @@ def run_training(
         read_dataset(dataset),
         output,
         recipe,
-        init=None if init is None else load_bundle(init),
+        init=None if init is None else open_model(init),
         device=device,
         progress=progress,
     )
