@@ -128,13 +128,11 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
         return DirectNetwork(vehicle, NetworkService(model.pure_lstm), use_speed=use_speed)
 
     if name == "pd-hef":
-        from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
+        from pdhef_logtool.estimators.cautious import at_trust
         from pdhef_logtool.estimators.trust_policy import allowed_trust
 
         allowed = allowed_trust(vehicle, model)
-        return adaptive_hybrid_ukf(
-            vehicle, NetworkService(model), trust=allowed.cap, use_speed=use_speed, notes=(allowed.note,)
-        )
+        return at_trust(vehicle, NetworkService(model), allowed.cap, use_speed=use_speed, notes=(allowed.note,))
     if name == "pd-hef-smoothed":
         from pdhef_logtool.estimators.smoothed import smoothed_hybrid
         from pdhef_logtool.estimators.trust_policy import allowed_trust

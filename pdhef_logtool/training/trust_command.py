@@ -16,6 +16,7 @@ import numpy as np
 from pdhef_logtool.config import NANOSECONDS_FROM, RunConfig, parse_time
 from pdhef_logtool.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
+from pdhef_logtool.estimators.cautious import at_trust
 from pdhef_logtool.estimators.trust_policy import SHOWN_DIGITS
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.logs.discovery import LogInput, find_logs
@@ -253,7 +254,7 @@ def errors_by_trust(
     errors = np.stack(
         [
             signal_error(
-                adaptive_hybrid_ukf(vehicle, network, trust=trust, use_speed=use_speed).run(signals, None)[0],
+                at_trust(vehicle, network, trust, use_speed=use_speed).run(signals, None)[0],
                 truth,
                 "sideslip_rad",
                 slow,
