@@ -2,11 +2,12 @@
 
     python -m benchmarks.real [--model model/] [--out docs] [--trials 64] [--cases 250lm,...]
 
-Where a case has a part to fit on, the vehicle is identified there, the filters' noise is tuned there with the same
-trials for each, a linear regression is fitted there, and the network is trained there: alone, and from ``--model`` as
-its start. Every figure is on the other part, with an interval by bootstrap of blocks. The other cases are scored with
-their catalogue vehicle and ``--model`` as they are. The drives lie in ``../shared`` and may not be redistributed: where
-they are absent it says so and ends with 0, and the page holds figures only.
+Where a case has a part to fit on, the vehicle is identified there, a linear regression is fitted there, and the network
+is trained on the first 80 % of it: alone, and from ``--model`` as its start. The rest of the part says how far each
+network may be trusted. The filters' noise is then tuned on the part with the same trials for each. Every figure is on
+the other part, with an interval by bootstrap of blocks. The other cases are scored with their catalogue vehicle and
+``--model`` as they are. The drives lie in ``../shared`` and may not be redistributed: where they are absent it says so
+and ends with 0, and the page holds figures only.
 """
 
 from __future__ import annotations
@@ -30,16 +31,20 @@ from pdhef_logtool.errors import PdhefError
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator, runnable
+from pdhef_logtool.estimators.trust_policy import allowed_trust
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference, block_bootstrap_interval
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
+from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.signals import FloatArray, Signals, join_signals
 from pdhef_logtool.sinks.base import write_bytes
 from pdhef_logtool.tracks import StateTrack, concatenate
 from pdhef_logtool.training.fit_data import FitDrive, load_fit_drive
-from pdhef_logtool.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.training.trust import decide_cap
+from pdhef_logtool.training.trust_command import errors_by_trust
+from pdhef_logtool.vehicle import Network, VehicleParameters, load_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
 DRIVES = ROOT.parent / "shared" / "data" / "drives"
@@ -166,7 +171,7 @@ def read_part(part: Part, mapping_file: Path, vehicle: VehicleParameters) -> Sco
     return Scored(signals, truth, tuple(sorted(plan.dependent)), plan.alignment.available)
 
 
-def run_case(case: Case, model: ModelBundle | None, model_folder: Path | None, trials: int, say: Say) -> list[Result]:
+def run_case(case: Case, model: ModelBundle | None, trials: int, say: Say) -> list[Result]:
     """Fit what is to be fitted and return the errors of everything on the scored part."""
     mapping_file, catalogue_file = files(case)
     results: list[Result] = []
@@ -182,6 +187,8 @@ def run_case(case: Case, model: ModelBundle | None, model_folder: Path | None, t
             track, _ = e.run(part.signals, None)
             error = signal_error(track, part.truth, "sideslip_rad", case.min_speed_m_s)
             shown = e.name if e.causal else f"{e.name} (not causal)"
+            if network is not None and e.name in ("pd-hef", "pd-hef-smoothed"):
+                shown += f" at trust {allowed_trust(vehicle, network).cap:g}"
             results.append(Result(f"{shown}, {label}" if label else shown, error, part.truth.stamps_ns))
 
     catalogue = load_vehicle(catalogue_file)
@@ -201,17 +208,42 @@ def run_case(case: Case, model: ModelBundle | None, model_folder: Path | None, t
         identified = load_vehicle(identified_file)
         results += regressions(case, case.fit, mapping_file, catalogue)
         add("identified", identified, physics, None)
-        tuned_file = tune(case, case.fit, identified_file, model_folder, trials, folder, say)
-        tuned = load_vehicle(tuned_file)
-        add("tuned", tuned, [n for n in physics if n in ("phy-ukf-tuned", "physics-plus")], None)
-        if model is not None:
-            add("tuned, given network", tuned, networks, model)
+        hybrids = [n for n in networks if n.startswith("pd-hef")]
+        tried: dict[str, ModelBundle] = {} if model is None else {"given network": model}
         for label, start in (("network of this part", None), ("network fine-tuned", model)):
             if label == "network fine-tuned" and start is None:
                 continue
-            bundle = train(case, case.fit, tuned_file, folder / label.replace(" ", "-"), start, say)
-            add(f"tuned, {label}", tuned, [n for n in networks if n.startswith("pd-hef")], bundle)
+            tried[label] = train(case, case.fit, identified_file, folder / label.replace(" ", "-"), start, say)
+        for label, bundle in tried.items():
+            say(f"{case.name}: trust in the {label}")
+            add(f"identified, {label}", with_evidence(case, identified, bundle), hybrids, bundle)
+        last, bundle = list(tried.items())[-1]
+        bundle.save(folder / "last")
+        tuned = load_vehicle(tune(case, case.fit, identified_file, folder / "last", trials, folder, say))
+        add("tuned", tuned, [n for n in physics if n in ("phy-ukf-tuned", "physics-plus")], None)
+        add(f"tuned, {last}", with_evidence(case, tuned, bundle), hybrids, bundle)
     return results
+
+
+def split_at_s(part: Part) -> tuple[float, float]:
+    """Return where the network's share of the fit part ends, and where that part ends, in seconds."""
+    with closing(open_log(DRIVES / part.log)) as log:
+        end_s = part.end_s if part.end_s is not None else (log.end_ns - log.start_ns) * 1e-9
+    return part.start_s + TRAIN_SHARE * (end_s - part.start_s), end_s
+
+
+def with_evidence(case: Case, vehicle: VehicleParameters, network: ModelBundle) -> VehicleParameters:
+    """Return the vehicle file with the trust that the end of the fit part allows, which no network was fitted to.
+
+    The vehicle and the filters' noise were fitted to that end as well: there is no more driving to have.
+    """
+    assert case.fit is not None
+    cut, end_s = split_at_s(case.fit)
+    held = read_part(replace(case.fit, start_s=cut + GUARD_S, end_s=end_s), files(case)[0], vehicle)
+    errors = errors_by_trust(vehicle, NetworkService(network), held.signals, held.truth, use_speed=True)
+    decision = decide_cap(errors)
+    found = Network(trust_cap=decision.cap, evidence=decision.reason, model_sha256=network.sha256)
+    return vehicle.model_copy(update={"network": found})
 
 
 def half_trust(ready: Sequence[Estimator], model: ModelBundle | None, vehicle: VehicleParameters) -> list[Estimator]:
@@ -253,9 +285,7 @@ def train(case: Case, part: Part, vehicle: Path, folder: Path, init: ModelBundle
     from pdhef_logtool.training.train_command import make_recipe, train_on
 
     say(f"{case.name}: training {folder.name}")
-    with closing(open_log(DRIVES / part.log)) as log:
-        end_s = part.end_s if part.end_s is not None else (log.end_ns - log.start_ns) * 1e-9
-    cut = part.start_s + TRAIN_SHARE * (end_s - part.start_s)
+    cut, end_s = split_at_s(part)
     blocks = {"train": replace(part, end_s=cut), "validation": replace(part, start_s=cut + GUARD_S, end_s=end_s)}
     sets: list[Dataset] = []
     for split, block in blocks.items():
@@ -353,7 +383,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         lines += [f"## {case.title}", "", f"Scored above {case.min_speed_m_s:g} m/s. {case.remark}", ""]
         try:
-            lines += [case_table(run_case(case, model, given.model, given.trials, say))]
+            lines += [case_table(run_case(case, model, given.trials, say))]
         except PdhefError as error:
             say(str(error))
             lines += [f"Not done: {error}", ""]

@@ -19,13 +19,17 @@ import numpy as np
 from pdhef_logtool.estimators.adaptive_hybrid import MixtureSteps, adaptive_hybrid_ukf
 from pdhef_logtool.estimators.base import Estimator, released_steps
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.physics_plus import NAME as PLUS
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
+from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
 from pdhef_logtool.estimators.sensor_faults import FaultCarry, find_faults
+from pdhef_logtool.estimators.smoothed import TABLE as SMOOTHED
+from pdhef_logtool.estimators.smoothed import SmoothedHybrid, smoothed_hybrid
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.signals import Signals
 from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.vehicle import FilterTuning, VehicleParameters
 
 _SCORE = re.compile(r"(?P<name>[a-z-]+): (?P<deg>[0-9.]+) deg\b.*")
 
@@ -77,17 +81,16 @@ class CautiousPhysics:
 
 def strongest_physics(vehicle: VehicleParameters, *, use_speed: bool = True) -> PhysicsUkf | PhysicsPlusUkf:
     """Return the filter on physics that drives with truth say is the best on this car (see the head of the file)."""
-    tuned, plus = "phy-ukf-tuned", "physics-plus"
     listed = vehicle.identification.get("tuning_scores", [])
     found = [m for text in (listed if isinstance(listed, list) else []) if (m := _SCORE.fullmatch(text))]
     scores = {m["name"]: float(m["deg"]) for m in found}
-    if tuned not in vehicle.filter:
-        better = plus
-    elif plus not in vehicle.filter or not {tuned, plus} <= scores.keys():
-        better = tuned
+    if TUNED not in vehicle.filter:
+        better = PLUS
+    elif PLUS not in vehicle.filter or not {TUNED, PLUS} <= scores.keys():
+        better = TUNED
     else:
-        better = min(tuned, plus, key=lambda name: scores[name])
-    if better == tuned:
+        better = min(TUNED, PLUS, key=lambda name: scores[name])
+    if better == TUNED:
         return physics_ukf_tuned(vehicle, use_speed=use_speed)
     return physics_plus(vehicle, use_speed=use_speed)
 
@@ -106,3 +109,28 @@ def at_trust(
         said = f"without trust in its network it is {physics.name}, with faulty samples of a_y and gyro left out"
         return CautiousPhysics(physics, notes=(*notes, said))
     return adaptive_hybrid_ukf(vehicle, network, trust=trust, use_speed=use_speed, notes=notes)
+
+
+def smoothed_at_trust(
+    vehicle: VehicleParameters,
+    network: NetworkService,
+    trust: float,
+    *,
+    use_speed: bool = True,
+    notes: tuple[str, ...] = (),
+) -> SmoothedHybrid:
+    """Return ``pd-hef-smoothed`` at a trust in [0, 1]; where it is 0 and ``phy-ukf-tuned`` is best, that one smoothed.
+
+    ``physics-plus`` has no smoother: where it is best, the hybrid filter at trust 0 is smoothed.
+    """
+    if trust > 0.0 or strongest_physics(vehicle).name != TUNED:
+        return smoothed_hybrid(vehicle, network, trust=trust, use_speed=use_speed, notes=notes)
+    forward = physics_ukf_tuned(vehicle)
+    assert forward.r_std is not None  # it has every measurement
+    ay_std, yaw_rate_std, speed_std = forward.r_std
+    noise = FilterTuning(q_std=forward.q_std, r_std={"ay_m_s2": ay_std, "yaw_rate_rad_s": yaw_rate_std})
+    sensors = vehicle.sensors.model_copy(update={"speed_std_m_s": speed_std})
+    own = vehicle.model_copy(update={"filter": {SMOOTHED: noise}, "sensors": sensors})
+    said = f"without trust in its network it is {TUNED}, smoothed"
+    smoothed = smoothed_hybrid(own, network, trust=0.0, use_speed=use_speed, notes=(*notes, said))
+    return replace(smoothed, bias_states=False)  # as the filter whose noise it has

@@ -134,12 +134,12 @@ def _model_estimator(name: str, vehicle: VehicleParameters, use_speed: bool, mod
         allowed = allowed_trust(vehicle, model)
         return at_trust(vehicle, NetworkService(model), allowed.cap, use_speed=use_speed, notes=(allowed.note,))
     if name == "pd-hef-smoothed":
-        from pdhef_logtool.estimators.smoothed import smoothed_hybrid
+        from pdhef_logtool.estimators.cautious import smoothed_at_trust
         from pdhef_logtool.estimators.trust_policy import allowed_trust
 
         allowed = allowed_trust(vehicle, model)
-        return smoothed_hybrid(
-            vehicle, NetworkService(model), trust=allowed.cap, use_speed=use_speed, notes=(allowed.note,)
+        return smoothed_at_trust(
+            vehicle, NetworkService(model), allowed.cap, use_speed=use_speed, notes=(allowed.note,)
         )
     if name == "pd-hef-paper":
         from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf

@@ -7,13 +7,19 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, slalom, with_noise
 
-from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
+from pdhef_logtool.estimators.cautious import CautiousPhysics, smoothed_at_trust, strongest_physics
+from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
 from pdhef_logtool.reasons import STUCK_YAW_RATE
+from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.signals import Signals
 from pdhef_logtool.tracks import concatenate
 from pdhef_logtool.vehicle import FilterTuning, default_vehicle
@@ -91,3 +97,25 @@ def test_drives_with_truth_choose_the_filter(tables: tuple[str, ...], scores: li
     chosen = strongest_physics(vehicle)
     assert chosen.name == name
     assert isinstance(chosen, PhysicsPlusUkf) == (name == "physics-plus")
+
+
+def test_the_smoothed_one_has_the_noise_of_the_tuned_filter(faulty: Signals) -> None:
+    tuned = VEHICLE.model_copy(update={"filter": {"phy-ukf-tuned": TABLES["phy-ukf-tuned"]}})
+    model = bundle()
+    smoothed = smoothed_at_trust(tuned, NetworkService(model), 0.0)
+    forward = smoothed.filter
+    filtered = strongest_physics(tuned)
+    assert isinstance(filtered, PhysicsUkf)
+    assert (forward.q_std, forward.r_std, forward.bias_states) == (filtered.q_std, filtered.r_std, False)
+    assert smoothed_at_trust(tuned, NetworkService(model), 1.0).filter.r_std != filtered.r_std
+    assert smoothed_at_trust(VEHICLE, NetworkService(model), 0.0).filter.r_std != filtered.r_std
+    track, _ = smoothed.run(faulty, None)
+    assert np.isfinite(track.sideslip_rad[track.valid]).all()
+
+
+def bundle() -> ModelBundle:
+    torch.manual_seed(0)
+    network = ResidualNetwork(Architecture(len(FEATURES), 8, 1, (4,)))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    n = len(FEATURES)
+    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
