@@ -31,11 +31,23 @@ from pdhef_logtool.estimators.unscented import (
 from pdhef_logtool.nominal_model import (
     ModelParameters,
     dynamic_share,
-    measured_lateral_acceleration,
     model_parameters,
     planar_lateral_acceleration,
-    rk4_step,
     substeps,
+)
+from pdhef_logtool.nominal_points import (
+    AT_AX,
+    AT_AY,
+    AT_FORCE,
+    AT_STEER,
+    AT_VX,
+    AT_VY,
+    AT_YAW_RATE,
+    advance_points,
+    measure_points,
+    place,
+    place_count,
+    work_size,
 )
 from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.tracks import StateTrack
@@ -184,39 +196,55 @@ class StateLayout(NamedTuple):
 
 
 @njit(cache=True)
-def _propagate(chi, steer, ax, friction, rate_vy, rate_r, dt, layout, p):  # type: ignore[no-untyped-def]
+def _propagate(chi, steer, ax, friction, rate_vy, rate_r, dt, layout, p, points):  # type: ignore[no-untyped-def]
     """Move sigma points [s, n] by ``dt`` through the nominal model and add the residual (Eq 19), in place.
 
     Half of the residual's increment goes in before the model's step and half after it: all of it at the end, as Eq 19
     has it, would leave the tyres' answer to it out of the step, 3 % of a residual at 25 m/s and 10 ms. A residual
-    counts where the model is dynamic: it knows nothing of the kinematic range.
+    counts where the model is dynamic: it knows nothing of the kinematic range. ``points`` [work_size(s)] is work space.
     """
     share = 0.5 * dynamic_share(chi[0, 0], p) * dt
-    n = substeps(chi[0, 0], dt, friction, p)
-    keep = math.exp(-dt / FORCE_SCALE_TIME_S)
+    _set_points(chi, steer, ax, share * rate_vy, share * rate_r, layout, points)
+    advance_points(points, friction, dt, substeps(chi[0, 0], dt, friction, p), p)
+    keep = math.exp(-dt / FORCE_SCALE_TIME_S) if layout.force_scale >= 0 else 1.0
     for i in range(chi.shape[0]):
-        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
-        angle = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
-        half = share * force
-        vy = chi[i, 1] + half * rate_vy
-        r = chi[i, 2] + half * rate_r
-        vx, vy, r = rk4_step(chi[i, 0], vy, r, angle, ax - chi[i, 3], friction, dt, n, p, force)
-        chi[i, 0] = vx
-        chi[i, 1] = vy + half * rate_vy
-        chi[i, 2] = r + half * rate_r
+        at = place(i)
+        half = share * points[at + AT_FORCE]
+        chi[i, VX] = points[at + AT_VX]
+        chi[i, VY] = points[at + AT_VY] + half * rate_vy
+        chi[i, YAW_RATE] = points[at + AT_YAW_RATE] + half * rate_r
         if layout.force_scale >= 0:
             chi[i, layout.force_scale] *= keep
 
 
 @njit(cache=True)
-def _measure(chi, steer, friction, rate_vy, layout, p, zeta):  # type: ignore[no-untyped-def]
+def _set_points(chi, steer, ax, more_vy, more_r, layout, points):  # type: ignore[no-untyped-def]
+    """Write sigma points [s, n] to ``points``, with the increments of v_y and r times their force; the rest is filled.
+
+    What is left of the last block is the first point again: numbers that cannot overflow.
+    """
+    s = chi.shape[0]
+    for column in range(place_count(points)):
+        i = column if column < s else 0
+        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
+        at = place(column)
+        points[at + AT_VX] = chi[i, VX]
+        points[at + AT_VY] = chi[i, VY] + more_vy * force
+        points[at + AT_YAW_RATE] = chi[i, YAW_RATE] + more_r * force
+        points[at + AT_STEER] = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
+        points[at + AT_AX] = ax - chi[i, AX_BIAS]
+        points[at + AT_FORCE] = force
+
+
+@njit(cache=True)
+def _measure(chi, steer, friction, rate_vy, layout, p, points, zeta):  # type: ignore[no-untyped-def]
     """Write what the sensors would read at sigma points chi [s, n] to zeta [s, 3]; the residual belongs to a_y too."""
     residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, 0], p) * rate_vy
+    _set_points(chi, steer, 0.0, 0.0, 0.0, layout, points)
+    measure_points(points, friction, p)
     for i in range(chi.shape[0]):
-        force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
-        angle = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
-        ay = measured_lateral_acceleration(chi[i, 0], chi[i, 1], chi[i, 2], angle, friction, p, force)
-        zeta[i, Z_AY] = ay + force * residual
+        at = place(i)
+        zeta[i, Z_AY] = points[at + AT_AY] + points[at + AT_FORCE] * residual
         zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
         zeta[i, Z_SPEED] = chi[i, VX]
         if layout.bias >= 0:
@@ -278,6 +306,7 @@ def _filter(  # type: ignore[no-untyped-def]
     linked = out_link.shape[0] > 0
     chi = np.empty((2 * n + 1, n))
     chi_before = np.empty((2 * n + 1, n))
+    points = np.empty(work_size(2 * n + 1))
     L = np.empty((n, n))
     zeta = np.empty((2 * n + 1, MEASUREMENTS))
     z_hat = np.empty(MEASUREMENTS)
@@ -340,7 +369,7 @@ def _filter(  # type: ignore[no-untyped-def]
             ax_known = has_ax or memory[M_AX_KNOWN] > 0.0
             _propagate(
                 chi, 0.5 * (memory[M_STEER] + steer_k), ax_step, 0.5 * (memory[M_FRICTION] + mu_k),
-                memory[M_RATE_VY], memory[M_RATE_R], dt[k], layout, p,
+                memory[M_RATE_VY], memory[M_RATE_R], dt[k], layout, p, points,
             )  # fmt: skip
             mean_and_covariance(chi, wm, wc, x, P)
             if linked:
@@ -353,7 +382,7 @@ def _filter(  # type: ignore[no-untyped-def]
                 out_prior[k, i] = x[i]
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
-                _measure(chi, steer_k, mu_k, memory[M_RATE_VY], layout, p, zeta)
+                _measure(chi, steer_k, mu_k, memory[M_RATE_VY], layout, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 opens = False
                 outside = False
@@ -390,7 +419,7 @@ def _filter(  # type: ignore[no-untyped-def]
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
                     draw_sigma_points(x, P, scale, L, chi)
-                    _measure(chi, steer_k, mu_k, memory[M_RATE_VY], layout, p, zeta)
+                    _measure(chi, steer_k, mu_k, memory[M_RATE_VY], layout, p, points, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                     for i in range(MEASUREMENTS):
                         S[i, i] += r_std[i] * r_std[i] + (extra_r[k, i] if i < Z_SPEED else 0.0)
@@ -457,6 +486,7 @@ def _predict_outputs(  # type: ignore[no-untyped-def]
     """Predict step ``step[m]`` by ``horizon_s[m]`` with its inputs held; writes state, covariance and planar a_y."""
     n = x.shape[1]
     chi = np.empty((2 * n + 1, n))
+    points = np.empty(work_size(2 * n + 1))
     L = np.empty((n, n))
     xm = np.empty(n)
     Pm = np.empty((n, n))
@@ -473,7 +503,7 @@ def _predict_outputs(  # type: ignore[no-untyped-def]
             draw_sigma_points(xm, Pm, scale, L, chi)
             _propagate(
                 chi, inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_FRICTION], residual_rate[k, 0],
-                residual_rate[k, 1], horizon_s[m], layout, p,
+                residual_rate[k, 1], horizon_s[m], layout, p, points,
             )  # fmt: skip
             mean_and_covariance(chi, wm, wc, xm, Pm)
             _add_process_noise(Pm, q_std, inputs[k, U_AX_KNOWN] > 0.0, horizon_s[m], layout)
