@@ -289,7 +289,8 @@ def _run_open_log(
     if friction.note:
         tell(friction.note)
     sha256 = hash_log(log_input.path)
-    intervals = TrackCalibrator(calibration, vehicle_hash(vehicle), None if model is None else model.sha256)
+    stands_for = {e.name: getattr(e, "calibrated_as", e.name) for e in estimators}
+    intervals = TrackCalibrator(calibration, vehicle_hash(vehicle), None if model is None else model.sha256, stands_for)
     folder = output / "logs" / log_input.stem
     reader = DriveReader(log, plan, config.window_s)
     sinks = _open_sinks(folder, log, log_input.stem, config, vehicle, plan, sha256)

@@ -80,12 +80,14 @@ class Calibration:
 class TrackCalibrator:
     """Applies a calibration, or none, to the tracks of a drive window by window.
 
-    ``vehicle_sha256`` and ``model_sha256`` are those of the run, for the notes.
+    ``vehicle_sha256`` and ``model_sha256`` are those of the run, for the notes. ``stands_for`` says by name which
+    estimator's coefficients are used where they are not its own.
     """
 
     calibration: Calibration | None
     vehicle_sha256: str
     model_sha256: str | None = None
+    stands_for: Mapping[str, str] = field(default_factory=dict)
     _carries: dict[str, FeatureCarry] = field(default_factory=dict)
     _has_interval: set[str] = field(default_factory=set)
 
@@ -93,9 +95,12 @@ class TrackCalibrator:
         """Return the next window of a track with calibrated intervals, or as it is where it has no entry."""
         if np.isfinite(track.sideslip_std_rad).any():
             self._has_interval.add(track.name)
-        if self.calibration is None or track.name not in self.calibration.inflations:
+        like = self.stands_for.get(track.name, track.name)
+        if self.calibration is None or like not in self.calibration.inflations:
             return track
-        track, self._carries[track.name] = calibrated(track, signals, self.calibration, self._carries.get(track.name))
+        track, self._carries[track.name] = calibrated(
+            track, signals, self.calibration, self._carries.get(track.name), like=like
+        )
         return track
 
     def notes(self, name: str) -> tuple[str, ...]:
@@ -103,7 +108,7 @@ class TrackCalibrator:
         if name not in self._has_interval:
             return ()
         made = self.calibration
-        if made is None or name not in made.inflations:
+        if made is None or self.stands_for.get(name, name) not in made.inflations:
             return ("intervals not calibrated",)
         of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
         said = [f"intervals calibrated by {made.name} ({made.sha256[:8]}) for friction and vehicle {of}"]
@@ -115,13 +120,19 @@ class TrackCalibrator:
 
 
 def calibrated(
-    track: StateTrack, signals: Signals, calibration: Calibration, carry: FeatureCarry | None = None
+    track: StateTrack,
+    signals: Signals,
+    calibration: Calibration,
+    carry: FeatureCarry | None = None,
+    *,
+    like: str | None = None,
 ) -> tuple[StateTrack, FeatureCarry]:
     """Return a track with calibrated 1-sigmas and covariance; joined windows equal the whole bit for bit.
 
     Parameters
     ----------
-    track, signals : [N] at the same stamps; the track's name has an entry. carry : of the previous window.
+    track, signals : [N] at the same stamps. carry : of the previous window.
+    like : name with an entry; None is the track's.
 
     Raises
     ------
@@ -130,7 +141,7 @@ def calibrated(
     """
     from pdhef_logtool.estimators.error_features import error_terms
 
-    inflation = calibration.inflations[track.name]
+    inflation = calibration.inflations[track.name if like is None else like]
     terms, carry = error_terms(track, signals, calibration.roll_gradient_rad_per_m_s2, carry)
     return inflated(track, terms, inflation), carry
 

@@ -63,6 +63,11 @@ class CautiousPhysics:
         """What the filter needs."""
         return self.physics.needs
 
+    @property
+    def calibrated_as(self) -> str:
+        """Whose calibrated intervals hold for it."""
+        return self.physics.name
+
     def run(self, signals: Signals, carry: CautiousCarry | None) -> tuple[StateTrack, CautiousCarry]:
         """Filter one window; joined windows give the same bits as one call over the whole log."""
         faults, fault_carry = find_faults(signals, self.physics.vehicle, carry.faults if carry else None)

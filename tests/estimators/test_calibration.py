@@ -290,3 +290,14 @@ def test_which_calibration_a_run_takes(tmp_path: Path) -> None:
     assert find_calibration(Path("unsure"), model) is not None
     with pytest.raises(ModelError, match="no model"):
         find_calibration(Path("unsure"), Path("none"))
+
+
+def test_an_estimator_that_is_another_one_has_its_intervals() -> None:
+    signals, track = _drive()
+    renamed = replace(track, name="hybrid")
+    as_it_is = TrackCalibrator(CALIBRATION, "x").add(renamed, signals)
+    as_another = TrackCalibrator(CALIBRATION, "x", stands_for={"hybrid": "e"}).add(renamed, signals)
+    np.testing.assert_array_equal(as_it_is.sideslip_std_rad, track.sideslip_std_rad)
+    own = TrackCalibrator(CALIBRATION, "x").add(track, signals)
+    np.testing.assert_array_equal(as_another.sideslip_std_rad, own.sideslip_std_rad)
+    assert as_another.name == "hybrid"
