@@ -14,7 +14,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,17 +25,19 @@ from benchmarks.independent_sim_logs import write_run
 from benchmarks.measuring import ROOT
 from benchmarks.table_maths import Bound, median_ratio, pooled_rmse
 from benchmarks.train_default import HOME, MAPPING, pdhef
+from pdhef_logtool.config import RunConfig
 from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
+from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, ModelBundle, load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.signals import FloatArray
 from pdhef_logtool.training.dataset import read_dataset
+from pdhef_logtool.training.extract_command import ExtractSettings, run_extraction
 from pdhef_logtool.training.fit import Recipe
-from pdhef_logtool.training.train_command import train_on
+from pdhef_logtool.training.train_command import make_recipe, train_on
 from pdhef_logtool.vehicle import VehicleParameters, load_vehicle, vehicle_to_toml
 
-DATA, MODEL = ROOT / "out" / "many-cars-data", ROOT / "out" / "many-cars-model"
+DATA, MODEL = ROOT / "out" / "many-cars-data", SHIPPED_FOLDERS["many-cars"]
 CARS, UNSEEN = ROOT / "out" / "many-cars", ROOT / "out" / "many-cars-unseen"
 INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
 #: Runs of the independent simulator that its car is identified on; the others are scored.
@@ -52,6 +54,11 @@ COLUMNS = {
     "many cars": ("pd-hef-trust1", "many"),
 }
 LEAST_SAMPLES = 100
+#: Fine-tuning: hatchbacks of their own, how many drives of each are fitted to, the last of these to stop by, and how
+#: gently (as ``benchmarks.real``).
+TUNED_SET = ROOT / "out" / "many-cars-fine-tuned"
+TUNED_SEED, TUNED_CARS, TUNED_DRIVES, FIT_DRIVES, STOP_DRIVES = 4200, 6, 20, 10, 2
+FINE_EPOCHS, FINE_RATE = 15, 5e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +107,46 @@ def independent_cases(work: Path) -> Iterator[Case]:
     vehicle = load_vehicle(found).model_copy(update={"filter": noise})
     for log, friction in logs.items():
         yield Case(log, vehicle, friction)
+
+
+def fine_tuned(network: ModelBundle, work: Path) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Fine-tune on the first drives of each car, and score before and after on its others."""
+    many_cars.write_cars(TUNED_SET, cars=TUNED_CARS, drives=TUNED_DRIVES, seed=TUNED_SEED, jobs=2, kinds=("hatchback",))
+    mapping = work / "mapping.toml"
+    mapping.write_text(MAPPING, encoding="utf-8")
+    drives: dict[int, list[tuple[Path, Path]]] = {}
+    for entry in json.loads((TUNED_SET / "manifest.json").read_text(encoding="utf-8"))["drives"]:
+        if "sha256" in entry:
+            pair = (TUNED_SET / entry["file"], TUNED_SET / entry["vehicle_file"])
+            drives.setdefault(entry["car"], []).append(pair)
+    noise = load_vehicle(HOME / "vehicle.toml").filter
+    found: dict[str, list[tuple[float, float]]] = {}
+    for car, pairs in drives.items():
+        vehicle_file = pairs[0][1]
+        parts = {"train": pairs[: FIT_DRIVES - STOP_DRIVES], "validation": pairs[FIT_DRIVES - STOP_DRIVES : FIT_DRIVES]}
+        sets = []
+        for split, logs in parts.items():
+            folder = work / f"{car}-{split}"
+            config = RunConfig(vehicle=vehicle_file, mapping=mapping)
+            run_extraction([str(log) for log, _ in logs], folder, ExtractSettings(config, split=split))
+            sets.append(read_dataset(folder))
+        both = replace(sets[0], drives=sets[0].drives + sets[1].drives)
+        recipe = replace(make_recipe(paper=False, seed=0, epochs=None, device="cpu"), learning_rate=FINE_RATE)
+        recipe = replace(recipe, epochs=FINE_EPOCHS)
+        own = train_on(both, work / f"{car}-model", recipe, init=network).bundle
+        vehicle = load_vehicle(vehicle_file).model_copy(update={"filter": noise})
+        columns = {
+            "phy-ukf-tuned": ("phy-ukf-tuned", network),
+            "physics-plus": ("physics-plus", network),
+            "many cars": ("pd-hef-trust1", network),
+            "many cars, fine-tuned": ("pd-hef-trust1", own),
+        }
+        for log, _ in pairs[FIT_DRIVES:]:
+            case = Case(log, vehicle)
+            drive = read_drive(log, vehicle, log.name)
+            for column, (name, model) in columns.items():
+                found.setdefault(column, []).append(error_of(name, case, drive, model))
+    return {c: (np.array([v[0] for v in f]), np.array([v[1] for v in f])) for c, f in found.items()}
 
 
 def error_of(name: str, case: Case, drive: ConditionDrive, model: ModelBundle) -> tuple[float, float]:
@@ -154,6 +201,10 @@ def main() -> int:
         if INDEPENDENT.is_dir():
             parts["The independent simulator's car, identified on two of its runs"] = independent_cases(Path(folder))
         found = {title: score(cases, models) for title, cases in parts.items()}
+        title = (
+            f"Hatchbacks, fine-tuned on {FIT_DRIVES} drives of {many_cars.DRIVE_S:g} s each, scored on their others"
+        )
+        found[title] = fine_tuned(models["many"], Path(folder))
     given.out.mkdir(parents=True, exist_ok=True)
     (given.out / "many_cars.md").write_text(page(found, models), encoding="utf-8")
     print(given.out / "many_cars.md")
