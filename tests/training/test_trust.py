@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from pdhef_logtool.config import RunConfig
 from pdhef_logtool.errors import EstimatorError, UsageError
 from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
+from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.logs.discovery import find_logs
@@ -230,7 +231,9 @@ def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, mon
     blocks = errors_by_trust(vehicle, RepeatedNetwork(bundle, {}), signals, truth, use_speed=True)
     assert len(passes) == 1
     for row, trust in zip(blocks.squares, TRUSTS, strict=True):
-        track = adaptive_hybrid_ukf(vehicle, NetworkService(bundle), trust=trust).run(signals, None)[0]
+        hybrid = adaptive_hybrid_ukf(vehicle, NetworkService(bundle), trust=trust)
+        estimator = hybrid if trust > 0.0 else CautiousPhysics(strongest_physics(vehicle))
+        track = estimator.run(signals, None)[0]
         error = signal_error(track, truth, "sideslip_rad", vehicle.low_speed_blend_m_s)
         assert row.sum() == pytest.approx(np.nansum(error**2), rel=1e-12)
     assert len({float(row.sum()) for row in blocks.squares}) == len(TRUSTS)
