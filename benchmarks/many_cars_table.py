@@ -201,9 +201,7 @@ def main() -> int:
         if INDEPENDENT.is_dir():
             parts["The independent simulator's car, identified on two of its runs"] = independent_cases(Path(folder))
         found = {title: score(cases, models) for title, cases in parts.items()}
-        title = (
-            f"Hatchbacks, fine-tuned on {FIT_DRIVES} drives of {many_cars.DRIVE_S:g} s each, scored on their others"
-        )
+        title = f"Hatchbacks, fine-tuned on {FIT_DRIVES} drives of {many_cars.DRIVE_S:g} s each, scored on their others"
         found[title] = fine_tuned(models["many"], Path(folder))
     given.out.mkdir(parents=True, exist_ok=True)
     (given.out / "many_cars.md").write_text(page(found, models), encoding="utf-8")

@@ -7,7 +7,6 @@ import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +47,8 @@ from pdhef_logtool.training.calibrate import (
     fit_inflation,
     join_samples,
 )
+from pdhef_logtool.training.choosing_drives import Refusal, choose_drives
 from pdhef_logtool.training.extract_command import MAX_VARIATION
-from pdhef_logtool.training.extract_command import _set_manifest as set_manifest
 from pdhef_logtool.training.tune_command import HELD_OUT
 from pdhef_logtool.training.variation import Variation, vary
 from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle
@@ -65,6 +64,13 @@ MIN_SAMPLES = 20
 RUNNING = 0.9
 
 Warn = Callable[[str], None]
+#: Drives that this command refuses.
+REFUSED = Refusal(
+    HELD_OUT,
+    "drives that no figure is reported on",
+    "calibrate",
+    "coverage on drives that the intervals were fitted to is no test: take --split validation, or say --any-split",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +154,7 @@ def run_calibration(
     vehicle = load_vehicle(config.vehicle)
     model = open_model(config.model)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
-    inputs, splits = choose_drives(find_logs(arguments), settings)
+    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     if model is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")
     samples: dict[str, list[Samples]] = {}
@@ -183,37 +189,6 @@ def run_calibration(
     document = _document(settings, vehicle, model, fitted, used, left_out)
     write_json(file, document)
     return CalibrateResult(file, fitted, used, left_out, document)
-
-
-def choose_drives(inputs: Sequence[LogInput], settings: CalibrateSettings) -> tuple[list[LogInput], dict[str, str]]:
-    """Return the logs to calibrate on, and by name the split that the manifest of a set beside a log gives it.
-
-    Raises
-    ------
-    UsageError
-        A drive is held out, or none is left.
-    """
-    manifests = cache(set_manifest)
-    splits = {i.stem: str(manifests(i.path.parent).get(i.path.name, {}).get("split") or "") for i in inputs}
-    if settings.split is not None:
-        inputs = [i for i in inputs if splits[i.stem] == settings.split]
-        if not inputs:
-            there = ", ".join(sorted({s for s in splits.values() if s}))
-            raise UsageError(
-                expected=f"drives of split {settings.split}",
-                got=f"drives of {there}" if there else "drives without a set's manifest beside them",
-                where="--split",
-            )
-    held_out = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in HELD_OUT]
-    if held_out and not settings.any_split:
-        raise UsageError(
-            expected="drives that no figure is reported on",
-            got=", ".join(held_out[:3]) + (f" and {len(held_out) - 3} more" if len(held_out) > 3 else ""),
-            where="calibrate",
-            remedy="coverage on drives that the intervals were fitted to is no test: take --split validation, "
-            "or say --any-split",
-        )
-    return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
 
 def _output_file(output: Path) -> Path:

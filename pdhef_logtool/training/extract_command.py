@@ -276,7 +276,7 @@ def _plan_jobs(
     warn: Warn,
 ) -> Iterator[_Job]:
     chosen = None if settings.config.vehicle is None else load_vehicle(settings.config.vehicle)
-    files, manifests = cache(load_vehicle), cache(_set_manifest)
+    files, manifests = cache(load_vehicle), cache(set_manifest)
     told = False
     for log_input in inputs:
         listed = _listed(log_input.path, manifests(log_input.path.parent))
@@ -453,7 +453,7 @@ def _listed(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
     )
 
 
-def _set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
+def set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
     """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
     documents: list[Any] = []
     for name, parse in ((MANIFEST, json.loads), ("manifest.toml", tomllib.loads)):

@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
 from pdhef_logtool.estimators.cautious import at_trust
 from pdhef_logtool.estimators.trust_policy import SHOWN_DIGITS
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
@@ -27,7 +26,7 @@ from pdhef_logtool.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.sinks.base import write_bytes
 from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.training.extract_command import _set_manifest as set_manifest
+from pdhef_logtool.training.choosing_drives import Refusal, choose_drives
 from pdhef_logtool.training.trust import (
     BLOCK_S,
     EXCITED_M_S2,
@@ -56,6 +55,13 @@ SEEN = ("train", "validation")
 _SPAN = re.compile(r"(?P<name>.+): (?P<start>-?[\d.]+) to (?P<end>-?[\d.]+) s")
 
 Warn = Callable[[str], None]
+#: Drives that this command refuses.
+REFUSED = Refusal(
+    SEEN,
+    "drives that no network was trained on",
+    "trust",
+    "take --split test, or say --any-split if this network has not seen them",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +162,7 @@ def run_trust(
     config = settings.config
     source, model = _check(output, settings)
     vehicle = load_vehicle(source)
-    inputs, splits = choose_drives(find_logs(arguments), settings)
+    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
     bench = DriveBench(TuneSetup(config, vehicle, mapping, model, ()))
     network = RepeatedNetwork(model, {})
@@ -208,38 +214,6 @@ def run_trust(
     write_json(result.record_file, record)
     progress("done", 1.0)
     return result
-
-
-def choose_drives(inputs: Sequence[LogInput], settings: TrustSettings) -> tuple[list[LogInput], dict[str, str]]:
-    """Return the logs to try the network on, and by name the split that the manifest of a set beside a log gives it.
-
-    Raises
-    ------
-    UsageError
-        A drive is of a split that networks are trained on, or none is left.
-    """
-    manifests = cache(set_manifest)
-    splits = {i.stem: str(manifests(i.path.parent).get(i.path.name, {}).get("split") or "") for i in inputs}
-    if settings.split is not None:
-        chosen = [i for i in inputs if splits[i.stem] == settings.split]
-        if not chosen:
-            there = sorted({s for s in splits.values() if s})
-            raise UsageError(
-                expected=f"drives of split {settings.split}",
-                got=f"drives of {', '.join(there)}" if there else "drives without a set's manifest beside them",
-                where="--split",
-            )
-        inputs = chosen
-    seen = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in SEEN]
-    if seen and not settings.any_split:
-        shown = ", ".join(seen[:3]) + (f" and {len(seen) - 3} more" if len(seen) > 3 else "")
-        raise UsageError(
-            expected="drives that no network was trained on",
-            got=shown,
-            where="trust",
-            remedy="take --split test, or say --any-split if this network has not seen them",
-        )
-    return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
 
 def errors_by_trust(

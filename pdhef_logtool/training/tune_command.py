@@ -6,7 +6,6 @@ import hashlib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +13,12 @@ import numpy as np
 
 from pdhef_logtool.config import RunConfig
 from pdhef_logtool.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.residual_model.bundle import open_model
 from pdhef_logtool.sinks.base import PendingFile, write_bytes
 from pdhef_logtool.sinks.report import tool_versions, write_json
-from pdhef_logtool.training.extract_command import _set_manifest as set_manifest
+from pdhef_logtool.training.choosing_drives import Refusal, choose_drives
 from pdhef_logtool.training.tune import (
     EXPLORING_SHARE,
     FACTORS,
@@ -51,6 +50,13 @@ READING = 0.2
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 Warn = Callable[[str], None]
+#: Drives that this command refuses.
+REFUSED = Refusal(
+    HELD_OUT,
+    "drives that no figure is reported on",
+    "tune",
+    "noise tuned on drives of the test makes the test's figures too good: take --split validation, or say --any-split",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +168,7 @@ def run_tuning(
     vehicle = load_vehicle(config.vehicle)
     model = None if config.model is None else open_model(config.model)
     names = choose_names(settings.names, model)
-    inputs, splits = choose_drives(find_logs(arguments), settings)
+    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     if model is not None and "train" in splits.values():
         warn(
             "drives of split train: a network is better there than in service, and its filter's noise is tuned to that"
@@ -219,38 +225,6 @@ def run_tuning(
     write_json(result.tuning_file, record)
     _plot(result)
     return result
-
-
-def choose_drives(inputs: Sequence[LogInput], settings: TuneSettings) -> tuple[list[LogInput], dict[str, str]]:
-    """Return the logs to tune on, and by name the split that the manifest of a set beside a log gives it.
-
-    Raises
-    ------
-    UsageError
-        A drive is held out, or none is left.
-    """
-    manifests = cache(set_manifest)
-    splits = {i.stem: str(manifests(i.path.parent).get(i.path.name, {}).get("split") or "") for i in inputs}
-    if settings.split is not None:
-        inputs = [i for i in inputs if splits[i.stem] == settings.split]
-        if not inputs:
-            there = sorted({s for s in splits.values() if s})
-            raise UsageError(
-                expected=f"drives of split {settings.split}",
-                got=f"drives of {', '.join(there)}" if there else "drives without a set's manifest beside them",
-                where="--split",
-            )
-    held_out = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in HELD_OUT]
-    if held_out and not settings.any_split:
-        shown = ", ".join(held_out[:3]) + (f" and {len(held_out) - 3} more" if len(held_out) > 3 else "")
-        raise UsageError(
-            expected="drives that no figure is reported on",
-            got=shown,
-            where="tune",
-            remedy="noise tuned on drives of the test makes the test's figures too good: take --split validation, "
-            "or say --any-split",
-        )
-    return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
 
 def tuned_toml(source: Path, vehicle: VehicleParameters, tuned: Sequence[Tuned], record: Mapping[str, Any]) -> str:

@@ -30,7 +30,8 @@ from pdhef_logtool.training.calibrate import (
     folds,
     share_for,
 )
-from pdhef_logtool.training.calibrate_command import CalibrateSettings, choose_drives, run_calibration
+from pdhef_logtool.training.calibrate_command import REFUSED, CalibrateSettings, run_calibration
+from pdhef_logtool.training.choosing_drives import choose_drives
 
 
 def _samples(rng: np.random.Generator, std: FloatArray, terms: FloatArray, drives: int = 30) -> Samples:
@@ -291,13 +292,13 @@ def test_held_out_drives_are_refused(sample_logs_dir: Path, tmp_path: Path) -> N
     settings = _settings(sample_logs_dir)
     inputs = find_logs([str(tmp_path)])
     with pytest.raises(UsageError, match=r"step \(test\)"):
-        choose_drives(inputs, settings)
-    chosen, splits = choose_drives(inputs, replace(settings, split="validation"))
+        choose_drives(inputs, settings, REFUSED)
+    chosen, splits = choose_drives(inputs, replace(settings, split="validation"), REFUSED)
     assert [i.stem for i in chosen] == ["dlc"]
     assert splits == {"dlc": "validation"}
-    assert len(choose_drives(inputs, replace(settings, any_split=True))[0]) == 2
+    assert len(choose_drives(inputs, replace(settings, any_split=True), REFUSED)[0]) == 2
     with pytest.raises(UsageError, match="train"):
-        choose_drives(inputs, replace(settings, split="train"))
+        choose_drives(inputs, replace(settings, split="train"), REFUSED)
 
 
 def test_wrong_options(sample_logs_dir: Path, tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.training.choosing_drives import choose_drives
 from pdhef_logtool.training.trust import (
     MIN_BLOCKS,
     MIN_EXCITED_S,
@@ -38,9 +39,9 @@ from pdhef_logtool.training.trust import (
     join_blocks,
 )
 from pdhef_logtool.training.trust_command import (
+    REFUSED,
     RepeatedNetwork,
     TrustSettings,
-    choose_drives,
     errors_by_trust,
     run_trust,
     seen_by_identification,
@@ -284,11 +285,11 @@ def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path,
     logs = find_logs([str(tmp_path / "set")])
     options = TrustSettings(RunConfig())
     with pytest.raises(UsageError, match=r"dlc \(train\).*--split test"):
-        choose_drives(logs, options)
+        choose_drives(logs, options, REFUSED)
     with pytest.raises(UsageError, match="drives of split extrapolation, got drives of test, train"):
-        choose_drives(logs, replace(options, split="extrapolation"))
-    assert [i.stem for i in choose_drives(logs, replace(options, split="test"))[0]] == ["step"]
-    assert [i.stem for i in choose_drives(logs, replace(options, any_split=True))[0]] == ["dlc", "step"]
+        choose_drives(logs, replace(options, split="extrapolation"), REFUSED)
+    assert [i.stem for i in choose_drives(logs, replace(options, split="test"), REFUSED)[0]] == ["step"]
+    assert [i.stem for i in choose_drives(logs, replace(options, any_split=True), REFUSED)[0]] == ["dlc", "step"]
 
 
 def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:

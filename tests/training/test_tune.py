@@ -28,6 +28,7 @@ from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.tracks import StateTrack, make_track
 from pdhef_logtool.training import tune_drives
+from pdhef_logtool.training.choosing_drives import choose_drives
 from pdhef_logtool.training.tune import (
     FACTORS,
     DriveError,
@@ -42,7 +43,7 @@ from pdhef_logtool.training.tune import (
     search,
     tuned_vehicle,
 )
-from pdhef_logtool.training.tune_command import TuneSettings, choose_drives, read_comments, run_tuning
+from pdhef_logtool.training.tune_command import REFUSED, TuneSettings, read_comments, run_tuning
 from pdhef_logtool.training.tune_drives import Hybrid, TuneSetup, choose_names
 from pdhef_logtool.vehicle import Network, default_vehicle, load_vehicle, vehicle_to_toml
 
@@ -305,10 +306,10 @@ def test_held_out_drives_are_refused(sample_logs_dir: Path, drives: Path, tmp_pa
     assert not list(tmp_path.iterdir())
     logs = find_logs([str(drives)])
     with pytest.raises(UsageError, match=r"fishhook \(test\)"):
-        choose_drives(logs, _settings(sample_logs_dir, split="test"))
+        choose_drives(logs, _settings(sample_logs_dir, split="test"), REFUSED)
     with pytest.raises(UsageError, match="expected drives of split train, got drives of extrapolation, test"):
-        choose_drives(logs, _settings(sample_logs_dir, split="train"))
-    chosen, splits = choose_drives(logs, _settings(sample_logs_dir, split=None, any_split=True))
+        choose_drives(logs, _settings(sample_logs_dir, split="train"), REFUSED)
+    chosen, splits = choose_drives(logs, _settings(sample_logs_dir, split=None, any_split=True), REFUSED)
     assert [c.stem for c in chosen] == ["dlc", "fishhook", "step", "sweep"]
     assert splits["fishhook"] == "test"
 
