@@ -90,6 +90,8 @@ def _peer_messages(
             friction=0.0,
             valid=False,
             diverged=False,
+            mixture_weight=0.0,
+            reason=0,
             **dict(zip(_STATE_FIELDS, v, strict=True)),
         )
         odometry = types[ODOMETRY_TYPE](
