@@ -75,7 +75,8 @@ def run_filterpy(signals: Signals, x: FloatArray, n: int) -> FloatArray:
     states = np.empty((n, 4))
     states[0] = ukf.x
     for k in range(1, n):
-        ukf.predict(dt=0.01, u=(signals.steer_rad[k - 1], signals.ax_m_s2[k - 1]))
+        steer, ax = (0.5 * (u[k - 1] + u[k]) for u in (signals.steer_rad, signals.ax_m_s2))
+        ukf.predict(dt=0.01, u=(steer, ax))
         ukf.update(z[k], steer=signals.steer_rad[k])
         states[k] = ukf.x
     return states
