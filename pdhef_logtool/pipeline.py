@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -52,7 +51,7 @@ from pdhef_logtool.sinks.report import (
 )
 from pdhef_logtool.track_store import TrackStore
 from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle
+from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_sha256
 
 if TYPE_CHECKING:
     from pdhef_logtool.estimators.divergence import DivergenceWatch
@@ -290,7 +289,9 @@ def _run_open_log(
         tell(friction.note)
     sha256 = hash_log(log_input.path)
     stands_for = {e.name: getattr(e, "calibrated_as", e.name) for e in estimators}
-    intervals = TrackCalibrator(calibration, vehicle_hash(vehicle), None if model is None else model.sha256, stands_for)
+    intervals = TrackCalibrator(
+        calibration, vehicle_sha256(vehicle), None if model is None else model.sha256, stands_for
+    )
     folder = output / "logs" / log_input.stem
     reader = DriveReader(log, plan, config.window_s)
     sinks = _open_sinks(folder, log, log_input.stem, config, vehicle, plan, sha256)
@@ -520,11 +521,6 @@ def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
     return {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
 
 
-def vehicle_hash(vehicle: VehicleParameters) -> str:
-    """Return the hash of everything that a vehicle file says."""
-    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()
-
-
 def report_facts(
     log: DriveLog,
     log_input: LogInput,
@@ -569,7 +565,7 @@ def report_facts(
         signals=[SourceFacts(n, s.label, SIGNAL_UNITS[n], samples.get(s.label, 0)) for n, s in mapping.signals.items()],
         missing_signals=list(missing),
         vehicle_name=vehicle.name,
-        vehicle_sha256=vehicle_hash(vehicle),
+        vehicle_sha256=vehicle_sha256(vehicle),
         estimators=list(estimators),
         truth=TruthFacts(
             quantities=[

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import tomllib
@@ -182,6 +183,11 @@ class VehicleParameters(_Record):
         cr = self.cornering_stiffness_n_per_rad(False, friction)
         lf, lr = self.cg_to_front_axle_m, self.cg_to_rear_axle_m
         return self.mass_kg * (lr * cr - lf * cf) / (self.wheelbase_m * cf * cr)
+
+
+def vehicle_sha256(vehicle: VehicleParameters) -> str:
+    """Return the hash of everything that a vehicle file says, whatever its layout and comments."""
+    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()
 
 
 def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:

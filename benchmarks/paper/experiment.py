@@ -7,7 +7,6 @@ vehicle file is told that of the drive. Noise seeds change the sensors alone; tr
 
 from __future__ import annotations
 
-import hashlib
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
@@ -281,8 +280,3 @@ def run_experiment(
                         tracks[scenario.name, scheme.name] = track
             progress(f"scenario {scenario.name}, noise seed {noise_seed}")
     return Experiment(tuple(runs), missing, frozenset(networks), drives, tracks, tuple(facts))
-
-
-def vehicle_sha256(vehicle: VehicleParameters) -> str:
-    """Return the hash of a vehicle file's values."""
-    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()

@@ -20,7 +20,6 @@ from benchmarks.paper.experiment import (
     Model,
     Scenario,
     run_experiment,
-    vehicle_sha256,
 )
 from benchmarks.paper.figures import hybrid_of
 from benchmarks.paper.probes import (
@@ -37,7 +36,7 @@ from benchmarks.paper.schemes import SCHEMES
 from benchmarks.paper.step_time import StepTime, step_times
 from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.sinks.report import tool_versions
-from pdhef_logtool.vehicle import Network, VehicleParameters, load_vehicle
+from pdhef_logtool.vehicle import Network, VehicleParameters, load_vehicle, vehicle_sha256
 from truthsim.suite import is_held_out
 
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)

@@ -51,7 +51,7 @@ from pdhef_logtool.training.choosing_drives import Refusal, choose_drives
 from pdhef_logtool.training.extract_command import MAX_VARIATION
 from pdhef_logtool.training.tune_command import HELD_OUT
 from pdhef_logtool.training.variation import Variation, vary
-from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle
+from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle, vehicle_sha256
 
 DEFAULT_SPREAD = 0.1
 #: Neighbouring errors are alike: one sample in this time is kept.
@@ -354,7 +354,7 @@ def _document(
         "vehicle": {
             "name": vehicle.name,
             "file": config["vehicle"],
-            "sha256": hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest(),
+            "sha256": vehicle_sha256(vehicle),
             "roll_gradient_rad_per_m_s2": vehicle.roll_gradient_rad_per_m_s2,
         },
         "model_sha256": None if model is None else model.sha256,

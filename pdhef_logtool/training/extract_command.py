@@ -57,7 +57,7 @@ from pdhef_logtool.training.residuals import (
     residual_windows,
 )
 from pdhef_logtool.training.variation import vary
-from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle
+from pdhef_logtool.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_sha256
 
 #: Upper ends of the shares of train and validation in [0, 1); the rest is test.
 SPLIT_ENDS = (0.70, 0.85)
@@ -223,7 +223,7 @@ def run_extraction(
         progress(result.log, done / len(work))
     results = tuple(by_log[job.log_input.stem] for job in work)
     used = {r.entry["vehicle_sha256"] for r in results if r.entry is not None}
-    vehicles = {_vehicle_sha256(job.vehicle): job.vehicle for job in work}
+    vehicles = {vehicle_sha256(job.vehicle): job.vehicle for job in work}
     manifest = write_manifest(
         output,
         [r.entry for r in results if r.entry is not None],
@@ -397,7 +397,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 "source": {"file": name, "sha256": source},
                 "split": split,
                 "split_from": split_from,
-                "vehicle_sha256": _vehicle_sha256(job.vehicle),
+                "vehicle_sha256": vehicle_sha256(job.vehicle),
                 "settings_sha256": fingerprint,
                 "period_s": plan.alignment.grid_period_s,
                 **counts.to_dict(),
@@ -572,10 +572,6 @@ class _Counts:
         }
 
 
-def _vehicle_sha256(vehicle: VehicleParameters) -> str:
-    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()
-
-
 def _fingerprint(job: _Job, split: str) -> str:
     """Return the hash of everything beside the log that decides a drive's file."""
     mapping = job.settings.config.mapping
@@ -583,7 +579,7 @@ def _fingerprint(job: _Job, split: str) -> str:
         "format": FORMAT_VERSION,
         "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "vehicle", "mapping")},
         "split": split,
-        "vehicle": _vehicle_sha256(job.vehicle),
+        "vehicle": vehicle_sha256(job.vehicle),
         "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
         "versions": tool_versions(),
     }

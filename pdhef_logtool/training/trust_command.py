@@ -45,7 +45,7 @@ from pdhef_logtool.training.trust import (
 )
 from pdhef_logtool.training.tune_command import read_comments
 from pdhef_logtool.training.tune_drives import MAX_BYTES, DriveBench, DriveFacts, TuneSetup
-from pdhef_logtool.vehicle import Network, VehicleParameters, load_vehicle, vehicle_to_toml
+from pdhef_logtool.vehicle import Network, VehicleParameters, load_vehicle, vehicle_sha256, vehicle_to_toml
 
 FORMAT = "pdhef-trust"
 FORMAT_VERSION = 1
@@ -346,7 +346,7 @@ def _record(
             "any_split": settings.any_split,
             "seed": settings.seed,
         },
-        "vehicle": {"name": vehicle.name, "sha256": hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()},
+        "vehicle": {"name": vehicle.name, "sha256": vehicle_sha256(vehicle)},
         "model_sha256": result.network.model_sha256,
         "rule": {
             "block_s": BLOCK_S,

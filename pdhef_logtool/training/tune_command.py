@@ -38,7 +38,7 @@ from pdhef_logtool.training.tune import (
     tuned_vehicle,
 )
 from pdhef_logtool.training.tune_drives import Benches, DriveFacts, TuneSetup, choose_names
-from pdhef_logtool.vehicle import VehicleParameters, load_vehicle, vehicle_to_toml
+from pdhef_logtool.vehicle import VehicleParameters, load_vehicle, vehicle_sha256, vehicle_to_toml
 
 FORMAT = "pdhef-tuning"
 FORMAT_VERSION = 1
@@ -355,7 +355,7 @@ def _record(
             "split": settings.split,
             "any_split": settings.any_split,
         },
-        "vehicle": {"name": vehicle.name, "sha256": hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()},
+        "vehicle": {"name": vehicle.name, "sha256": vehicle_sha256(vehicle)},
         "model_sha256": model_sha256,
         "search": {
             "trials": settings.trials,
