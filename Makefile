@@ -50,7 +50,7 @@ demo: $(VENV)/installed $(VENV)/compiled
 
 # Numba's cache watches the file of a compiled function, not those of the functions that it calls: after an edit of any
 # of our sources all of it goes.
-$(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/*/*.py truthsim/*.py)
+$(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/*/*.py pdhef_logtool/*/*/*.py truthsim/*.py)
 	@find pdhef_logtool truthsim -name '*.nb[ic]' -delete
 	@touch $@
 
@@ -73,30 +73,30 @@ bench: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m benchmarks
 
 train-default: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/python -m benchmarks.train_default
-	$(BIN)/python -m benchmarks.model_card
+	$(BIN)/python -m studies.defaults.train_default
+	$(BIN)/python -m studies.model_card
 
 samples: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/python -m truthsim.samples sample_logs
 
 docs-truthsim: $(VENV)/installed
-	$(BIN)/python -m benchmarks.truthsim_docs
+	$(BIN)/python -m studies.truthsim_docs
 
 # One core: step times are measured in the same run.
 paper: $(VENV)/installed $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.paper
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.paper
 
 # Every estimator on the condition table; MODEL is the bundle of the network, VEHICLE the file that it belongs to.
 DRIVES ?= 30
 conditions: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.conditions --drives $(DRIVES) --jobs $(JOBS) \
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.conditions --drives $(DRIVES) --jobs $(JOBS) \
 	  $(if $(VEHICLE),--vehicle $(VEHICLE)) $(if $(MODEL),--model $(MODEL))
 
 real: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.real $(if $(MODEL),--model $(MODEL))
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.real $(if $(MODEL),--model $(MODEL))
 
 switches: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.switches
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.measuring import Figure, best_seconds
+from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.physics import INITIAL_STD, PHY_UKF_Q_STD, PhysicsUkf
-from pdhef_logtool.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
-from pdhef_logtool.signals import FloatArray, Signals
-from pdhef_logtool.vehicle import default_vehicle
+from pdhef_logtool.records.signals import FloatArray, Signals
 
 STEPS = 60_000
 PEER_STEPS = 2_000

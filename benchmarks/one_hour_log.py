@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.measuring import CACHE
-from pdhef_logtool.geometry import quat_from_yaw
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
-from pdhef_logtool.signals import FloatArray, IntArray
+from pdhef_logtool.records.geometry import quat_from_yaw
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 START_NS = 1_700_000_000_000_000_000
 HOUR_S = 3600

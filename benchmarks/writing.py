@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from benchmarks.measuring import CACHE, Figure, best_seconds
-from pdhef_logtool.geometry import quat_from_yaw
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
-from pdhef_logtool.signals import FloatArray, IntArray
+from pdhef_logtool.records.geometry import quat_from_yaw
+from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.sinks.mcap import BODY_FRAME, MAP_FRAME, ODOMETRY_TYPE, STATE_TYPE, topic_of
 
 START_NS = 1_700_000_000_000_000_000

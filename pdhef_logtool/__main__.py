@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pdhef_logtool.cli import main
+from pdhef_logtool.cli.app import main
 
 if __name__ == "__main__":
     main()

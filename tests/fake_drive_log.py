@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
-from pdhef_logtool.signals import IntArray, Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
 
 @dataclass

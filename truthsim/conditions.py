@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.records.errors import UsageError
 from truthsim.batch import BINS, DriveSpec, Job, run_jobs
 from truthsim.manoeuvres import MANOEUVRES
 from truthsim.suite import is_held_out

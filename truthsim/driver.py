@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from numba.extending import register_jitable
 
-from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 
 class Driver(NamedTuple):

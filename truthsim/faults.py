@@ -30,8 +30,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.errors import UsageError
-from pdhef_logtool.signals import WHEELS, FloatArray
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import WHEELS, FloatArray
 from truthsim.sensors import RTK_FLOAT, RTK_LOST, Outage, SensorChannel, SensorNoise, quantised, student_t
 
 BoolArray: TypeAlias = NDArray[np.bool_]

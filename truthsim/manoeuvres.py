@@ -13,7 +13,7 @@ from functools import cache
 
 import numpy as np
 
-from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray
 from truthsim.road_course import (
     CROSSFALL_RAD,
     LANE_M,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.writer import TopicBatch
-from pdhef_logtool.signals import WHEELS, FloatArray, IntArray
+from pdhef_logtool.records.signals import WHEELS, FloatArray, IntArray
 from truthsim.faults import KINDS, TARGETS, Fault
 from truthsim.sensors import IMU_PERIOD_S, RTK_FIXED, RTK_LOST, SensorChannel, SensorNoise
 

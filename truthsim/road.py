@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray
 from truthsim.manoeuvres import ROAD_BANK, ROAD_FRICTION_LEFT, ROAD_FRICTION_RIGHT, ROAD_GRADE
 from truthsim.vehicle import BANK, BANK_PER_M, FRICTION, GRADE, GRADE_PER_M
 

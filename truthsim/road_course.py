@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 LANE_M = 3.5
 #: Drainage: a road leans to its right edge where nothing else is needed.

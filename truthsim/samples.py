@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from pdhef_logtool.errors import OutputError
+from pdhef_logtool.records.errors import OutputError
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 

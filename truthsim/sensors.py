@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pdhef_logtool.geometry import ecef_from_geodetic, enu_from_ecef_rotation, geodetic_from_ecef
-from pdhef_logtool.signals import WHEELS, FloatArray, IntArray
+from pdhef_logtool.records.geometry import ecef_from_geodetic, enu_from_ecef_rotation, geodetic_from_ecef
+from pdhef_logtool.records.signals import WHEELS, FloatArray, IntArray
 from truthsim.motion import Motion
 from truthsim.vehicle import Vehicle
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.records.errors import UsageError
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.drive import DEFAULT_VEHICLE
 from truthsim.manoeuvres import MANOEUVRES

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray
 from truthsim.tyres import Tyre, damped_slips, forces_n, slip_rates
 
 GRAVITY_M_S2 = 9.80665

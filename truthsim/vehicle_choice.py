@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.records.errors import SimulationError
 from truthsim.randomisation import randomise
 from truthsim.vehicle import Vehicle
 from truthsim.vehicle_files import load_vehicle

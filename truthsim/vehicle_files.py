@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
 
-from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.records.errors import SimulationError
 from truthsim.tyres import Tyre
 from truthsim.vehicle import GRAVITY_M_S2, Vehicle
 

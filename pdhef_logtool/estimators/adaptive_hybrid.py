@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import released_steps
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.checked_inputs import InputCarry, check_inputs, r_scale
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import (
@@ -32,12 +32,12 @@ from pdhef_logtool.estimators.physics import (
     PosteriorSteps,
     sideslip_std,
 )
-from pdhef_logtool.estimators.sensor_faults import AY, SensorFaults
-from pdhef_logtool.reasons import BURST_AY
+from pdhef_logtool.records.reasons import BURST_AY
+from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.watches.sensor_faults import AY, SensorFaults
 
 # The constants below were chosen on simulated condition drives (``pdhef simulate conditions --drives 8 --seed 1``) and
 # checked on others (``--drives 12 --seed 5``): in no row more than 4 % above the fixed filter, in those with a wrong

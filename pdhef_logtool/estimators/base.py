@@ -2,29 +2,10 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-
-from pdhef_logtool.signals import BoolArray, IntArray, Signals
-from pdhef_logtool.tracks import StateTrack
-
-#: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
-MAX_PREDICTION_S = 0.3
-
-#: Magnitudes beyond which a reading is no motion of a ground vehicle (10 g; eight turns a second; 540 km/h; wheels
-#: across): an input has no innovation that a gate could judge, and one such value would end a filter.
-POSSIBLE_MAGNITUDE = {
-    "steer_rad": 0.5 * math.pi,
-    "ax_m_s2": 100.0,
-    "ay_m_s2": 100.0,
-    "yaw_rate_rad_s": 50.0,
-    "speed_m_s": 150.0,
-}
-#: Friction below ice or above any tyre is no friction.
-POSSIBLE_FRICTION = (0.01, 5.0)
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 
 class Estimator(Protocol):
@@ -94,28 +75,3 @@ def run_window(
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Return what a reader of the report must know of an estimator; only some have something to say."""
     return tuple(getattr(estimator, "notes", ()))
-
-
-def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
-    """Return for each scored stamp the newest step whose data had arrived by then, −1 for none.
-
-    ``ready_ns`` [K] is non-decreasing, ``stamps_ns`` [M]; the result is int64 [M] (METHOD §1, §6 "Delay").
-    """
-    return np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
-
-
-def impossible_readings(signals: Signals) -> dict[str, BoolArray]:
-    """Return by column where a reading is one that no vehicle can have, [N]; columns without any are left out."""
-    bad = {c: ~(np.abs(getattr(signals, c)) <= limit) for c, limit in POSSIBLE_MAGNITUDE.items()}
-    low, high = POSSIBLE_FRICTION
-    bad["friction"] = ~((signals.friction >= low) & (signals.friction <= high))
-    read = {c: mask & ~np.isnan(getattr(signals, c)) for c, mask in bad.items()}
-    return {c: mask for c, mask in read.items() if mask.any()}
-
-
-def without_impossible(signals: Signals) -> Signals:
-    """Return the signals with impossible readings as missing; the same object where there are none."""
-    changed: dict[str, Any] = {
-        c: np.where(mask, np.nan, getattr(signals, c)) for c, mask in impossible_readings(signals).items()
-    }
-    return replace(signals, **changed) if changed else signals

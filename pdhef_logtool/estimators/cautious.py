@@ -16,20 +16,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
 from pdhef_logtool.estimators.adaptive_hybrid import MixtureSteps, adaptive_hybrid_ukf
-from pdhef_logtool.estimators.base import Estimator, released_steps
+from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
 from pdhef_logtool.estimators.physics_plus import NAME as PLUS
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
-from pdhef_logtool.estimators.sensor_faults import FaultCarry, find_faults
 from pdhef_logtool.estimators.smoothed import TABLE as SMOOTHED
 from pdhef_logtool.estimators.smoothed import SmoothedHybrid, smoothed_hybrid
+from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import FilterTuning, VehicleParameters
+from pdhef_logtool.watches.sensor_faults import FaultCarry, find_faults
 
 _SCORE = re.compile(r"(?P<name>[a-z-]+): (?P<deg>[0-9.]+) deg\b.*")
 

@@ -14,9 +14,9 @@ import numpy as np
 from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry
-from pdhef_logtool.estimators.sensor_faults import FaultCarry, SensorFaults, find_faults
+from pdhef_logtool.records.signals import FloatArray, Signals, cut_signals
 from pdhef_logtool.residual_model.service import NetworkCarry
-from pdhef_logtool.signals import FloatArray, Signals, cut_signals
+from pdhef_logtool.watches.sensor_faults import FaultCarry, SensorFaults, find_faults
 
 
 @dataclass(frozen=True, slots=True, eq=False)

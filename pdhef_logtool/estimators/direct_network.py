@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.estimators.stepwise import AY, VX, VY, YAW_RATE, StepCarry, run_stepwise
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
 
 _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
 

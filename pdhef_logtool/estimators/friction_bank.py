@@ -23,16 +23,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import without_impossible
-from pdhef_logtool.estimators.physics import U_STEER, VX, FilterCarry, PhysicsUkf
-from pdhef_logtool.nominal_model import (
+from pdhef_logtool.car.nominal_model import (
     measured_lateral_acceleration,
     model_parameters,
     state_derivative,
     substeps,
 )
-from pdhef_logtool.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.estimators.physics import U_STEER, VX, FilterCarry, PhysicsUkf
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 
 #: Frictions of the bank, and how likely each is on a road that nothing is known of: mean 0.86, 1-sigma 0.23.
 GRID = (0.12, 0.2, 0.3, 0.4, 0.5, 0.62, 0.75, 0.88, 1.0, 1.12)

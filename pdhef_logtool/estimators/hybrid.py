@@ -6,12 +6,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.signals import FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import FilterTuning, VehicleParameters
 
 #: Table of the vehicle file that holds this filter's noise.
 TABLE = "pd-hef"

@@ -22,7 +22,16 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.car.nominal_model import (
+    ModelParameters,
+    dynamic_share,
+    measured_lateral_acceleration,
+    model_parameters,
+    planar_lateral_acceleration,
+    rk4_step,
+    substeps,
+)
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import (
@@ -48,7 +57,6 @@ from pdhef_logtool.estimators.physics import (
     rolls_forward,
     sideslip_std,
 )
-from pdhef_logtool.estimators.speed_slip import SlipCarry, believable
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -56,20 +64,12 @@ from pdhef_logtool.estimators.unscented import (
     mean_and_covariance,
     unscented_weights,
 )
-from pdhef_logtool.nominal_model import (
-    ModelParameters,
-    dynamic_share,
-    measured_lateral_acceleration,
-    model_parameters,
-    planar_lateral_acceleration,
-    rk4_step,
-    substeps,
-)
+from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.watches.speed_slip import SlipCarry, believable
 
 STATES = 4
 #: θ of Eq 22 and γ of Eq 26: the paper names no values, METHOD §7 fixes these.

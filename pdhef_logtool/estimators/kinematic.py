@@ -17,8 +17,8 @@ from pdhef_logtool.estimators.stepwise import (
     advance_speed,
     run_stepwise,
 )
-from pdhef_logtool.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
 #: Chosen against the truth of simulated drives by ``benchmarks/tune_kinematic_leak.py``, which is to its advantage.

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from numba import njit
 
-from pdhef_logtool.nominal_model import (
+from pdhef_logtool.car.nominal_model import (
     KINEMATIC_TIME_CONSTANT_S,
     MAX_STEP_TIMES_POLE,
     MAX_SUBSTEPS,
@@ -31,11 +31,11 @@ from pdhef_logtool.nominal_model import (
     magic_formula_force,
     substeps,
 )
-from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 
 
 class ForceParameters(NamedTuple):
-    """What the compiled model needs beside :class:`~pdhef_logtool.nominal_model.ModelParameters`."""
+    """What the compiled model needs beside :class:`~pdhef_logtool.car.nominal_model.ModelParameters`."""
 
     relaxation_length_m: float
     load_sensitivity: float  # s

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.direct_network import write_direct_steps
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import VX, FilterCarry
 from pdhef_logtool.estimators.stepwise import StepCarry, run_stepwise
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
-from pdhef_logtool.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,6 +7,14 @@ from dataclasses import dataclass
 
 from numba import njit
 
+from pdhef_logtool.car.nominal_model import (
+    model_parameters,
+    planar_lateral_acceleration,
+    rk4_step,
+    state_derivative,
+    substeps,
+)
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.stepwise import (
     AY,
     RESTART_GAP_S,
@@ -17,16 +25,8 @@ from pdhef_logtool.estimators.stepwise import (
     advance_speed,
     run_stepwise,
 )
-from pdhef_logtool.nominal_model import (
-    model_parameters,
-    planar_lateral_acceleration,
-    rk4_step,
-    state_derivative,
-    substeps,
-)
-from pdhef_logtool.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 #: The rate of a_y is taken along the motion over this time.
 AY_RATE_STEP_S = 0.001

@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import without_impossible
+from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.physics import (
     U_FRICTION,
     U_SPEED,
@@ -18,10 +19,9 @@ from pdhef_logtool.estimators.physics import (
     PosteriorSteps,
     rolls_forward,
 )
-from pdhef_logtool.nominal_model import measured_lateral_acceleration, model_parameters
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.features import make_features
-from pdhef_logtool.signals import FloatArray, Signals
-from pdhef_logtool.vehicle import VehicleParameters
 
 
 @njit(cache=True)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from numba import njit
 
 from pdhef_logtool.estimators.stepwise import StepCarry, advance_speed, run_stepwise
-from pdhef_logtool.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 
 @njit(cache=True)

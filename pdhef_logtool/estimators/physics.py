@@ -19,23 +19,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
-from pdhef_logtool.estimators.speed_slip import SlipCarry, believable
-from pdhef_logtool.estimators.unscented import (
-    draw_sigma_points,
-    innovation_moments,
-    kalman_update,
-    mean_and_covariance,
-    unscented_weights,
-)
-from pdhef_logtool.nominal_model import (
+from pdhef_logtool.car.nominal_model import (
     ModelParameters,
     dynamic_share,
     model_parameters,
     planar_lateral_acceleration,
     substeps,
 )
-from pdhef_logtool.nominal_points import (
+from pdhef_logtool.car.nominal_points import (
     AT_AX,
     AT_AY,
     AT_FORCE,
@@ -49,9 +40,18 @@ from pdhef_logtool.nominal_points import (
     place_count,
     work_size,
 )
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.unscented import (
+    draw_sigma_points,
+    innovation_moments,
+    kalman_update,
+    mean_and_covariance,
+    unscented_weights,
+)
+from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.watches.speed_slip import SlipCarry, believable
 
 # State entries and measurement entries, by name.
 VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.lagged_forces import (
     ForceParameters,
     force_parameters,
@@ -76,7 +77,6 @@ from pdhef_logtool.estimators.physics import (
     sideslip_std,
 )
 from pdhef_logtool.estimators.physics import INITIAL_STD as PHYSICS_INITIAL_STD
-from pdhef_logtool.estimators.speed_slip import believable
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -84,10 +84,10 @@ from pdhef_logtool.estimators.unscented import (
     mean_and_covariance,
     unscented_weights,
 )
-from pdhef_logtool.nominal_model import ModelParameters, model_parameters
-from pdhef_logtool.signals import FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import VehicleParameters
+from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.watches.speed_slip import believable
 
 NAME = "physics-plus"
 

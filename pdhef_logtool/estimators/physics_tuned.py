@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
-from pdhef_logtool.vehicle import VehicleParameters
 
 NAME = "phy-ukf-tuned"
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.vehicle import VehicleParameters
 
 #: Name and one line on each, in the order of the tables.
 DESCRIPTIONS: dict[str, str] = {

@@ -27,6 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale
 from pdhef_logtool.estimators.hybrid import TABLE as FILTER_TABLE
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
@@ -40,10 +41,9 @@ from pdhef_logtool.estimators.physics import (
     StepLinks,
 )
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, cut_signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import FloatArray, IntArray, Signals, cut_signals, join_signals
-from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import FilterTuning, VehicleParameters
 
 #: Table of the vehicle file that holds this estimator's noise; without it that of the filter is used.
 TABLE = "pd-hef-smoothed"

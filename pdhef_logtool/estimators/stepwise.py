@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps
-from pdhef_logtool.estimators.speed_slip import ASSUMED_STD_M_S, SlipCarry, believable
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.tracks import StateTrack, make_track
+from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack, make_track
+from pdhef_logtool.watches.speed_slip import ASSUMED_STD_M_S, SlipCarry, believable
 
 #: A speed sample is carried on by a_x for this long.
 SPEED_HOLD_S = 0.5

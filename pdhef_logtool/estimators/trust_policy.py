@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.vehicle import VehicleParameters
 
 #: Cap without evidence: METHOD §14's guard on a car without a truth drive.
 CAP_WITHOUT_EVIDENCE = 0.0

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 #: Smallest variance that a repaired covariance keeps on its diagonal.
 COVARIANCE_FLOOR = 1e-12

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)

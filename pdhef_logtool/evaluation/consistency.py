@@ -22,12 +22,12 @@ from itertools import combinations
 
 import numpy as np
 
-from pdhef_logtool.evaluation.interpolation import Bracket
+from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.evaluation.metrics import MetricRow, state_rows
 from pdhef_logtool.evaluation.segments import smooth
-from pdhef_logtool.geometry import wrap_angle
-from pdhef_logtool.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 SENSORS = "sensors"
 SMOOTHING_HZ = 1.0

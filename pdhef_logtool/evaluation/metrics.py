@@ -34,10 +34,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.evaluation.correlation import find_shift, on_common_grid
-from pdhef_logtool.geometry import dead_reckon, wrap_angle
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.drive.correlation import find_shift, on_common_grid
+from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Signals compared sample by sample, with their unit.
 SCORED_SIGNALS: dict[str, str] = {
@@ -88,10 +88,10 @@ def score_track(
 
     Parameters
     ----------
-    estimate, truth : [N] at the same stamps (:func:`pdhef_logtool.evaluation.truth.truth_at`).
+    estimate, truth : [N] at the same stamps (:func:`pdhef_logtool.drive.truth.truth_at`).
     masks : bool [N] by segment; ``all`` is added when it is absent.
     low_speed_m_s : sideslip is scored above this truth speed.
-    not_independent : by signal, from :func:`pdhef_logtool.evaluation.truth.dependent_signals`; other keys are ignored.
+    not_independent : by signal, from :func:`pdhef_logtool.drive.truth.dependent_signals`; other keys are ignored.
 
     Raises
     ------

@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pdhef_logtool.reasons import REASONS
-from pdhef_logtool.signals import IntArray
-from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Stamps with the same reason up to this far apart are one interval.
 MERGE_S = 0.5

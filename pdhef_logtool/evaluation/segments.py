@@ -27,9 +27,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.tracks import StateTrack
-from pdhef_logtool.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 SEGMENTS = (
     "all",

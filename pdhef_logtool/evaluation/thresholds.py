@@ -17,10 +17,10 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pdhef_logtool.errors import UsageError
 from pdhef_logtool.evaluation.consistency import SENSORS
 from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, MetricRow
 from pdhef_logtool.evaluation.segments import SEGMENTS
+from pdhef_logtool.records.errors import UsageError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Name = Annotated[str, Field(min_length=1)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pdhef_logtool.inspection.plausibility import PlausibilityWarning, plausibility_warnings
 from pdhef_logtool.inspection.rendering import render_inspection
 from pdhef_logtool.inspection.report import (
     ClockReport,
@@ -18,13 +17,11 @@ from pdhef_logtool.inspection.report import (
 __all__ = [
     "ClockReport",
     "Inspection",
-    "PlausibilityWarning",
     "SignalReport",
     "TopicReport",
     "inspect_drive_log",
     "inspect_log",
     "mapping_comments",
-    "plausibility_warnings",
     "render_inspection",
     "write_mapping",
 ]

@@ -10,8 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pdhef_logtool.errors import OutputError
-from pdhef_logtool.inspection.plausibility import GRID_S, PlausibilityWarning, plausibility_warnings
+from pdhef_logtool.drive.plausibility import GRID_S, PlausibilityWarning, plausibility_warnings
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
@@ -32,7 +31,8 @@ from pdhef_logtool.mapping import (
     resolve_mapping,
 )
 from pdhef_logtool.mapping.mapping_file import missing_signals
-from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
 
 WINDOW_NS = 600_000_000_000
 #: Kinds of loss that are counted by topic and concern all its signals.

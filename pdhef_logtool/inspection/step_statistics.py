@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pdhef_logtool.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Each window adds at most this many values to the quantiles; counts, extremes and gaps see all of them.
 KEPT_PER_WINDOW = 20_000

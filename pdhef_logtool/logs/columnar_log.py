@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
@@ -23,7 +22,8 @@ from pdhef_logtool.logs.decoding import (
 )
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
 from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves
-from pdhef_logtool.signals import BoolArray, IntArray, Loss
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 #: Neighbouring windows share the span at their border; this many decoded spans are kept for the next window.
 _KEPT_SPANS = 2

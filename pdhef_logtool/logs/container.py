@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from pdhef_logtool.signals import IntArray, Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
 #: Log times above this (unsigned in the file) cannot be held in int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
@@ -118,7 +118,7 @@ class MetadataRecord:
 
 
 class SpanDamageError(Exception):
-    """A span cannot be decoded; caught inside this package and turned into a :class:`~pdhef_logtool.signals.Loss`."""
+    """A span cannot be decoded; caught inside this package and turned into a loss."""
 
 
 class Container(Protocol):

@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.message_schema import (
     TIME_MEMBERS,
@@ -41,7 +40,8 @@ from pdhef_logtool.logs.wire_layout import (
     NoLayoutError,
     layout_of_message,
 )
-from pdhef_logtool.signals import IntArray
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import IntArray
 
 #: Stands in a time column where the message lacks the time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)

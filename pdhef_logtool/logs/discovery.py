@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.records.errors import UsageError
 
 #: Suffixes that a search through folders takes for logs; a file that is named outright may have any.
 LOG_SUFFIXES = (".mcap", ".bag", ".db3")

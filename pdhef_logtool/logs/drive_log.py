@@ -9,7 +9,7 @@ from typing import Protocol
 
 from numpy.typing import NDArray
 
-from pdhef_logtool.signals import IntArray, Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
 
 @dataclass(frozen=True, slots=True)

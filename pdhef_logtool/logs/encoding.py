@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.message_schema import (
     MessageSchema,
     Node,
@@ -23,6 +22,7 @@ from pdhef_logtool.logs.message_schema import (
     ros_schema,
 )
 from pdhef_logtool.logs.wire_layout import Leaf, NoLayoutError, Steps, WireLayout, build_layout
+from pdhef_logtool.records.errors import MappingError
 
 
 class CdrEncoder:

@@ -22,7 +22,6 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Metadata, Schema
 
-from pdhef_logtool.errors import LogError
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
     Attachment,
@@ -35,7 +34,8 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.signals import IntArray, Loss
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import IntArray, Loss
 
 if TYPE_CHECKING:
     import zstandard

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.drive_log import FieldInfo
+from pdhef_logtool.records.errors import MappingError
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore

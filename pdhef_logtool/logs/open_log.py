@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.errors import LogError
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import (
     Attachment,
@@ -22,7 +21,8 @@ from pdhef_logtool.logs.container import (
     SpanDamageError,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.signals import Loss
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import Loss
 
 _MCAP = b"\x89MCAP0\r\n"
 _ROSBAG1 = b"#ROSBAG V2.0\n"

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.errors import LogError
 from pdhef_logtool.logs.container import (
     Attachment,
     Block,
@@ -26,7 +25,8 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.signals import Loss
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import Loss
 
 MAGIC = b"#ROSBAG V2.0\n"
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CONNECTION = 2, 3, 4, 5, 7

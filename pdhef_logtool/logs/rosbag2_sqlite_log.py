@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from pdhef_logtool.errors import LogError
 from pdhef_logtool.logs.container import (
     Attachment,
     Block,
@@ -21,7 +20,8 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.signals import Loss
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import Loss
 
 MAGIC = b"SQLite format 3\0"
 _PAGE_ROWS = 8192

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.errors import LogError
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, Container, MetadataRecord, RawChunk, Span
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -23,7 +22,8 @@ from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.message_schema import SchemaError, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
-from pdhef_logtool.signals import Loss
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import Loss
 
 _LARGEST_ID = 0xFFFF
 _HEADER = "std_msgs/msg/Header"

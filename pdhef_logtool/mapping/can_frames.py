@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Loss
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal

@@ -12,7 +12,7 @@ from pdhef_logtool.mapping.can_frames import CanSignalLog, with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping
 from pdhef_logtool.mapping.clocks import ClockModel, apply_clock, clock_key, raw_stamps, stamp_request
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
-from pdhef_logtool.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
 
 #: A gate sample holds for this many of its periods, then the truth's quality is unknown.
 GATE_HOLD_PERIODS = 2.0

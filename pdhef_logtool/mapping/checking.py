@@ -6,10 +6,10 @@ import re
 from dataclasses import replace
 from difflib import get_close_matches
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, SignalSource
+from pdhef_logtool.records.errors import MappingError
 
 #: Where messages keep their measurement time, best first.
 STAMP_PATHS = ("header.stamp", "stamp", "timestamp")

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping.checking import check_mapping
 from pdhef_logtool.mapping.recognition import auto_map
 from pdhef_logtool.mapping.records import Mapping
-from pdhef_logtool.signals import ALIGNED_SIGNALS
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 
 
 def _filled(mapping: Mapping, found: Mapping) -> Mapping:

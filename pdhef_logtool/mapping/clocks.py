@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Clock, Mapping, SignalSource, StampUnit
-from pdhef_logtool.signals import FloatArray, IntArray
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import FloatArray, IntArray
 
 NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 

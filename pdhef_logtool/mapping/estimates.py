@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-from pdhef_logtool.errors import MappingError, UsageError
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.mapping_file import RESERVED_NAMES
 from pdhef_logtool.mapping.recognition import TWIST_COVARIANCES, TWIST_FIELDS
 from pdhef_logtool.mapping.records import CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.signals import ESTIMATE_UNITS
+from pdhef_logtool.records.errors import MappingError, UsageError
+from pdhef_logtool.records.signals import ESTIMATE_UNITS
 
 STATE_TYPE = "pdhef_msgs/VehicleStateEstimate"
 #: Quantities that set the estimate's stamps, best first; any other is interpolated to them.

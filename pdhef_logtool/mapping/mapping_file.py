@@ -12,7 +12,6 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.mapping.records import (
     AUTO_STAMP,
     CAN_PREFIX,
@@ -26,7 +25,8 @@ from pdhef_logtool.mapping.records import (
     SignalSource,
     StampUnit,
 )
-from pdhef_logtool.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 
 #: Names in the tables that are no estimator's.
 RESERVED_NAMES = ("truth", "sensors")

@@ -13,7 +13,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
-from pdhef_logtool.signals import WHEELS, FloatArray
+from pdhef_logtool.records.signals import WHEELS, FloatArray
 
 #: Words of a topic's name that make it a reference to score against; never an input.
 TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys"})

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pdhef_logtool.signals import FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 #: Name and order of the features. The paper's six come first; a network for one car uses all but the last seven,
 #: which tell cars apart.

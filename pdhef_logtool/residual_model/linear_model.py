@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.errors import ModelError
+from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.signals import FloatArray
 
 FORMAT = "pdhef.linear-regression"
 FORMAT_VERSION = 1

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, OUTPUT_COUNT, RESIDUAL, ModelBundle
-from pdhef_logtool.signals import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from pdhef_logtool.residual_model.network import ResidualNetwork

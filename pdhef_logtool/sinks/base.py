@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from pdhef_logtool.errors import OutputError
-from pdhef_logtool.signals import Loss, Signals
-from pdhef_logtool.tracks import StateTrack
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.signals import Loss, Signals
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the track that holds the truth.
 TRUTH = "truth"

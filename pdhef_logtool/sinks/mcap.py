@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.errors import OutputError
-from pdhef_logtool.geometry import quat_from_yaw
 from pdhef_logtool.logs.container import Attachment, RawChunk
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.source_copy import (
@@ -22,10 +20,12 @@ from pdhef_logtool.logs.source_copy import (
     source_profile,
 )
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
-from pdhef_logtool.signals import BoolArray, FloatArray, Loss, Signals
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.geometry import quat_from_yaw
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Loss, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.report import json_bytes
-from pdhef_logtool.tracks import StateTrack
 
 #: Everything below this name in a source log is ours and is replaced.
 NAMESPACE = "/pdhef/"

@@ -11,12 +11,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from pdhef_logtool.errors import OutputError
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.signals import FloatArray, Loss, Signals
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.signals import FloatArray, Loss, Signals
+from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, make_track
 from pdhef_logtool.sinks.base import Event, PendingFile
 from pdhef_logtool.sinks.schema import arrow_schema
-from pdhef_logtool.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, make_track
 
 #: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
 #: estimator, and what waits of six estimators stays below 30 MB.
@@ -131,7 +131,7 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     ----------
     path : an estimates.parquet.
     estimator : name of the track.
-    columns : of :data:`pdhef_logtool.tracks.TRACK_COLUMNS`; the others stay NaN (``valid`` True,
+    columns : of :data:`pdhef_logtool.records.tracks.TRACK_COLUMNS`; the others stay NaN (``valid`` True,
         ``diverged`` False). All when None.
 
     Returns

@@ -16,7 +16,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import ReasonFacts
-from pdhef_logtool.signals import Loss
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.sinks.base import Event, write_bytes
 
 if TYPE_CHECKING:

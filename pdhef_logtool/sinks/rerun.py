@@ -11,15 +11,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from pdhef_logtool.errors import OutputError
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
-from pdhef_logtool.geometry import wrap_angle
-from pdhef_logtool.reasons import REASONS
-from pdhef_logtool.signals import BoolArray, FloatArray, IntArray, Loss, Signals
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.sinks.base import TRUTH, Event, PendingFile
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
-from pdhef_logtool.tracks import StateTrack
 
 APPLICATION_ID = "pdhef-logtool"
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks import filtering, writing
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
-from pdhef_logtool.vehicle import default_vehicle
 
 
 def test_the_peer_filter_has_our_posteriors() -> None:

@@ -40,7 +40,7 @@ def test_help_says_what_the_command_does(command: tuple[str, ...]) -> None:
 
 def test_help_imports_nothing_heavy() -> None:
     code = (
-        "import sys\nfrom pdhef_logtool.cli import app\n"
+        "import sys\nfrom pdhef_logtool.cli.app import app\n"
         "try:\n    app(['run', '--help'])\nexcept SystemExit:\n    pass\n"
         "heavy = {'numpy', 'numba', 'torch', 'polars', 'pyarrow', 'rerun', 'scipy', 'rosbags', 'mcap'}\n"
         "print('loaded:', sorted(heavy & set(sys.modules)))"
@@ -188,7 +188,7 @@ def test_view_says_what_is_missing(tmp_path: Path) -> None:
 
 
 def test_view_finds_the_recording(tmp_path: Path) -> None:
-    from pdhef_logtool.viewer import find_recording
+    from pdhef_logtool.cli.viewer import find_recording
 
     for name in ("b", "a"):
         (tmp_path / "logs" / name).mkdir(parents=True)
@@ -200,10 +200,10 @@ def test_view_finds_the_recording(tmp_path: Path) -> None:
 
 def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path) -> None:
     code = (
-        "import pdhef_logtool.pipeline as p\n"
+        "import pdhef_logtool.run.pipeline as p\n"
         "def broken(*a, **k): raise RuntimeError('on purpose')\n"
         "p.plan_drive = broken\n"
-        "import sys; from pdhef_logtool.cli import main\n"
+        "import sys; from pdhef_logtool.cli.app import main\n"
         f"sys.argv = ['pdhef', 'run', {str(sample_logs_dir / 'dlc.mcap')!r}, '-o', {str(tmp_path)!r}]\nmain()"
     )
     plain = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.errors import UsageError
 from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.records.errors import UsageError
 
 
 def _touch(root: Path, *names: str) -> None:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, slalom, tanh_tyre, with_noise
 
+from pdhef_logtool.car.vehicle import FilterTuning, default_vehicle
 from pdhef_logtool.estimators.adaptive_hybrid import (
     SIDESLIP_TO_RAD,
     AdaptiveHybridUkf,
@@ -19,13 +20,12 @@ from pdhef_logtool.estimators.adaptive_hybrid import (
     mix,
 )
 from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.tracks import StateTrack, concatenate, make_track
-from pdhef_logtool.vehicle import FilterTuning, default_vehicle
 
 #: The reference car does not roll.
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})

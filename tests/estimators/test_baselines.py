@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from reference_car import FRICTION, REAR_M, WHEELBASE_M, drive, keep, make_signals, slalom
 
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.open_loop import OpenLoop
 from pdhef_logtool.estimators.pass_through import PassThrough
-from pdhef_logtool.vehicle import default_vehicle
 
 ZERO = PassThrough("zero", claims_zero_sideslip=True)
 

@@ -12,17 +12,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, slalom, with_noise
 
+from pdhef_logtool.car.vehicle import FilterTuning, default_vehicle
 from pdhef_logtool.estimators.cautious import CautiousPhysics, smoothed_at_trust, strongest_physics
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
-from pdhef_logtool.reasons import STUCK_YAW_RATE
+from pdhef_logtool.records.reasons import STUCK_YAW_RATE
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.tracks import concatenate
-from pdhef_logtool.vehicle import FilterTuning, default_vehicle
 
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
 TABLES = {n: FilterTuning(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics-plus")}

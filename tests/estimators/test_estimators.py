@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, keep, make_signals, rolling_drive, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.errors import UsageError
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S, released_steps, without_impossible
+from pdhef_logtool.car.vehicle import AxleTyre, FilterTuning, Tyres, default_vehicle
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, MODEL_ESTIMATORS, check_names, make_estimator, runnable
-from pdhef_logtool.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
-from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import AxleTyre, FilterTuning, Tyres, default_vehicle
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 #: With the noise that ``phy-ukf-tuned`` looks for in the vehicle file.
 TUNING = FilterTuning(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})

@@ -12,11 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, cut, drive, keep, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, default_vehicle
+from pdhef_logtool.drive.friction import friction_source, parse_friction
 from pdhef_logtool.estimators.friction_bank import BOUND_SHARE, FORGETTING_S, FrictionBank, FrictionEstimate
-from pdhef_logtool.estimators.friction_source import friction_source, parse_friction
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.vehicle import AxleTyre, Tyres, default_vehicle
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import Signals
 
 G = 9.80665
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})

@@ -11,19 +11,19 @@ import polars as pl
 import pytest
 import torch
 
-from pdhef_logtool.config import RunConfig
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.car.vehicle import FilterTuning, default_vehicle
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.registry import make_estimator, runnable
-from pdhef_logtool.pipeline import run_logs
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import FilterTuning, default_vehicle
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.pipeline import run_logs
 
 VEHICLE = default_vehicle()
 COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis", "valid")

@@ -13,19 +13,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, forces, runge_kutta, slalom, with_noise
 
-from pdhef_logtool.errors import UsageError
-from pdhef_logtool.estimators.base import without_impossible
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
 from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf, adapted_noise
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.registry import check_names, runnable
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.tracks import concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.tracks import concatenate
-from pdhef_logtool.vehicle import default_vehicle
 
 VEHICLE = default_vehicle()
 GRAVITY = 9.80665

@@ -14,16 +14,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, keep, make_signals, slalom, with_noise
 
-from pdhef_logtool.errors import UsageError
-from pdhef_logtool.estimators.base import MAX_PREDICTION_S
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.registry import make_estimator, runnable
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.release import MAX_PREDICTION_S
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import default_vehicle
 
 VEHICLE = default_vehicle()
 NAMES = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from reference_car import FRICTION, FRONT_M, MASS_KG, REAR_M, WHEELBASE_M, YAW_INERTIA, derivative, forces
 from scipy.integrate import solve_ivp
 
-from pdhef_logtool import nominal_model
-from pdhef_logtool.nominal_model import model_parameters
-from pdhef_logtool.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car import nominal_model
+from pdhef_logtool.car.nominal_model import model_parameters
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 
 SEDAN = default_vehicle()
 P = model_parameters(SEDAN)

@@ -10,10 +10,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from pdhef_logtool import nominal_model
-from pdhef_logtool.estimators import physics
-from pdhef_logtool.nominal_model import model_parameters
-from pdhef_logtool.nominal_points import (
+from pdhef_logtool.car import nominal_model
+from pdhef_logtool.car.nominal_model import model_parameters
+from pdhef_logtool.car.nominal_points import (
     AT_AX,
     AT_AY,
     AT_FORCE,
@@ -30,7 +29,8 @@ from pdhef_logtool.nominal_points import (
     sine,
     work_size,
 )
-from pdhef_logtool.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators import physics
 
 FORMULA_CAR = default_vehicle().model_copy(
     update={"imu_position_m": (0.4, -0.3), "roll_gradient_rad_per_m_s2": 0.009, "low_speed_blend_m_s": 4.0}

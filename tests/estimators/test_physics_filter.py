@@ -22,11 +22,11 @@ from reference_car import (
     with_noise,
 )
 
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood, sideslip_std
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from pdhef_logtool.estimators.registry import make_estimator
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.vehicle import default_vehicle
+from pdhef_logtool.records.signals import Signals
 
 VEHICLE = default_vehicle()
 UKF = PhysicsUkf(VEHICLE)

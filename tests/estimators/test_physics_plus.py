@@ -24,6 +24,8 @@ from reference_car import (
     with_noise,
 )
 
+from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step
+from pdhef_logtool.car.vehicle import AxleTyre, FilterTuning, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.lagged_forces import (
     force_parameters,
     lagged_measured_ay,
@@ -44,9 +46,7 @@ from pdhef_logtool.estimators.physics_plus import (
     physics_plus,
 )
 from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, make_estimator
-from pdhef_logtool.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.vehicle import AxleTyre, FilterTuning, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.records.signals import Signals
 
 VEHICLE = default_vehicle()
 TRACK_M, CG_HEIGHT_M, G = 1.57, 0.64, 9.80665

@@ -20,8 +20,9 @@ from hypothesis import strategies as st
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 
-from pdhef_logtool.config import RunConfig
-from pdhef_logtool.drive_channels import DriveWindow, with_look_ahead
+from pdhef_logtool.car.vehicle import FilterTuning, Network, default_vehicle
+from pdhef_logtool.cli.summary import render_run
+from pdhef_logtool.drive.windows import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of, run_window
@@ -38,8 +39,7 @@ from pdhef_logtool.estimators.physics import (
 )
 from pdhef_logtool.estimators.registry import MODEL_ESTIMATORS, NOT_CAUSAL, make_estimator
 from pdhef_logtool.estimators.smoothed import SMOOTHED_Q_STD, SmoothedHybrid, smooth_steps, smoothed_hybrid
-from pdhef_logtool.pipeline import run_logs
-from pdhef_logtool.reasons import (
+from pdhef_logtool.records.reasons import (
     BURST_AY,
     BURST_YAW_RATE,
     DEAD_YAW_RATE,
@@ -48,15 +48,15 @@ from pdhef_logtool.reasons import (
     SPIKE_AY,
     STUCK_YAW_RATE,
 )
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.signals import Signals
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.pipeline import run_logs
 from pdhef_logtool.sinks.report import report_markdown
-from pdhef_logtool.summary import render_run
-from pdhef_logtool.tracks import StateTrack, concatenate
-from pdhef_logtool.vehicle import FilterTuning, Network, default_vehicle
 
 VEHICLE = default_vehicle()
 ALL = 10**6  # seconds: a block that holds every drive

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from pdhef_logtool.config import RunConfig
-from pdhef_logtool.errors import VehicleError
+from pdhef_logtool.car.vehicle import Network, VehicleParameters, default_vehicle, load_vehicle, vehicle_to_toml
 from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.estimators.trust_policy import CAP_WITHOUT_EVIDENCE, allowed_trust
-from pdhef_logtool.pipeline import run_logs
+from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.pipeline import run_logs
 from pdhef_logtool.sinks.parquet import read_track
 from pdhef_logtool.sinks.report import report_markdown
-from pdhef_logtool.vehicle import Network, VehicleParameters, default_vehicle, load_vehicle, vehicle_to_toml
 
 EVIDENCE = "a gain on one drive: 0.41° at trust 0, 0.33° at 0.5"
 
@@ -88,7 +88,7 @@ def test_the_report_says_the_cap_and_why(
 ) -> None:
     from rich.console import Console
 
-    from pdhef_logtool.summary import render_run
+    from pdhef_logtool.cli.summary import render_run
 
     model = _bundle()
     model.save(tmp_path / "model")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.consistency import disagreement_rows, innovation_rows, sensor_rows, whiteness_rows
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.tracks import make_track
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import make_track
 
 T0 = 1_700_000_000_000_000_000
 T = np.arange(0, 60, 0.01)

@@ -17,7 +17,7 @@ from pdhef_logtool.evaluation.metrics import (
     state_rows,
     summarise_errors,
 )
-from pdhef_logtool.tracks import StateTrack, make_track
+from pdhef_logtool.records.tracks import StateTrack, make_track
 
 T0 = 1_700_000_000_000_000_000
 

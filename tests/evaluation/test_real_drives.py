@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.alignment import align, plan_alignment
-from pdhef_logtool.evaluation.segments import smooth
-from pdhef_logtool.evaluation.truth import (
+from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.drive.alignment import align, plan_alignment
+from pdhef_logtool.drive.truth import (
     Attitude,
     dependent_signals,
     derive_truth,
@@ -18,9 +18,9 @@ from pdhef_logtool.evaluation.truth import (
     truth_at,
     yaw_rate_channel,
 )
+from pdhef_logtool.evaluation.segments import smooth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import fit_clocks, load_mapping, read_signals
-from pdhef_logtool.vehicle import load_vehicle
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 DRIVES = {

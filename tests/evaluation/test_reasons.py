@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.reasons import MERGE_S, NAMED_INTERVALS, Interval, ReasonIntervals, summarise_reasons
-from pdhef_logtool.reasons import MISSING_AY, REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
-from pdhef_logtool.tracks import make_track
+from pdhef_logtool.records.reasons import MISSING_AY, REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
+from pdhef_logtool.records.tracks import make_track
 
 STEP_NS = 10_000_000
 START_NS = 1_700_000_000_000_000_123

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.segments import find_intervals, segment_masks, smooth
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.tracks import make_track
-from pdhef_logtool.vehicle import default_vehicle
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import make_track
 
 T0 = 1_700_000_000_000_000_000
 VEHICLE = default_vehicle()  # friction 0.85, blend 3 m/s

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.segments import SEGMENTS, segment_masks
 from pdhef_logtool.evaluation.thresholds import Verdict, check_thresholds, load_thresholds, thresholds_from_dict
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.vehicle import default_vehicle
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import Signals
 
 
 def _row(estimator: str, signal: str, metric: str, value: float, unit: str = "rad", **more: Any) -> MetricRow:

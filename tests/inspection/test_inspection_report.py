@@ -11,11 +11,11 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 from rich.console import Console
 
-from pdhef_logtool.errors import MappingError, OutputError
 from pdhef_logtool.inspection import inspect_drive_log, inspect_log, render_inspection, write_mapping
 from pdhef_logtool.inspection.report import WINDOW_NS
 from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
-from pdhef_logtool.signals import Loss
+from pdhef_logtool.records.errors import MappingError, OutputError
+from pdhef_logtool.records.signals import Loss
 
 T0 = 1_700_000_000_000_000_000
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"

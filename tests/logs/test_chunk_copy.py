@@ -13,13 +13,13 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
-from pdhef_logtool.errors import OutputError
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import RawChunk
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, source_profile
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.records.errors import OutputError
 
 T0 = 1_700_000_000_000_000_000
 TEXT = b"float64 x\n"

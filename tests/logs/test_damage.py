@@ -11,9 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from recorded import numeric_paths
 
-from pdhef_logtool.errors import PdhefError
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.records.errors import PdhefError
 
 T0 = 1_700_000_000_000_000_000
 N = 400

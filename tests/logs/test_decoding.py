@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.message_schema import parse_path
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
+from pdhef_logtool.records.errors import MappingError
 
 T0 = 1_700_000_000_000_000_000
 

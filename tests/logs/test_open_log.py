@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import zstandard
 
-from pdhef_logtool.errors import EXIT_FAILURE, LogError
 from pdhef_logtool.logs.open_log import is_log_folder, looks_like_log, open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.records.errors import EXIT_FAILURE, LogError
 
 T0 = 1_700_000_000_000_000_000
 VALUES = np.arange(40) * 0.25

@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.logs.decoding import NO_TIME_NS
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.records.errors import MappingError
 
 _NUMBERS = {
     "a_double": Field.TYPE_DOUBLE, "a_float": Field.TYPE_FLOAT, "a_int32": Field.TYPE_INT32,

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from recorded import numeric_paths
 
-from pdhef_logtool.errors import LogError, MappingError
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.records.errors import LogError, MappingError
 
 # Their test fixtures carry a definition that is not the one the payloads were written with, or align a double to 4.
 _WRONG_DEFINITIONS = {

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from recorded import decoded_by_rosbags
 
-from pdhef_logtool.errors import MappingError, OutputError
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import LIBRARY, McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.records.errors import MappingError, OutputError
 
 ESTIMATE = "pdhef_msgs/msg/VehicleStateEstimate"
 T0 = 1_700_000_000_000_000_000

@@ -21,7 +21,7 @@ from pdhef_logtool.mapping import (
     join_channels,
     read_signals,
 )
-from pdhef_logtool.signals import Channel, Loss
+from pdhef_logtool.records.signals import Channel, Loss
 
 T0 = 1_700_000_000_000_000_000
 MS = 1_000_000

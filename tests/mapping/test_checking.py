@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.mapping import Mapping, QualityGate, SignalSource, check_mapping, resolve_mapping
+from pdhef_logtool.records.errors import MappingError
 
 T = np.arange(5, dtype=np.int64) + 1_000_000_000
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
-from pdhef_logtool.errors import MappingError
 from pdhef_logtool.mapping import load_mapping, mapping_to_toml
 from pdhef_logtool.mapping.estimates import choose_estimates, sources_of
-from pdhef_logtool.signals import ESTIMATE_UNITS
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import ESTIMATE_UNITS
 
 TABLES = """
 [signals.yaw_rate_rad_s]

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.geometry import rotation_from_quat
 from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import (
@@ -24,6 +23,7 @@ from pdhef_logtool.mapping import (
     read_signals,
 )
 from pdhef_logtool.mapping.choosing import choose_mapping
+from pdhef_logtool.records.geometry import rotation_from_quat
 
 MAPPINGS = Path(__file__).parents[1] / "reference" / "mappings"
 

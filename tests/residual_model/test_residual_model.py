@@ -12,7 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.errors import ModelError
+from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, WEIGHTS_FILE, ModelBundle, Normalisation, load_bundle
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES, make_features
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork

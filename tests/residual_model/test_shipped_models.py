@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.errors import ModelError
-from pdhef_logtool.estimators.calibration import find_calibration
+from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, model_folder, open_model
 from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES
-from pdhef_logtool.vehicle import load_vehicle
+from pdhef_logtool.watches.intervals import find_calibration
 
 
 def test_models_are_found_by_name() -> None:

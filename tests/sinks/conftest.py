@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pdhef_logtool.reasons import SPIKE_AY, STUCK_YAW_RATE
-from pdhef_logtool.signals import Signals
-from pdhef_logtool.tracks import StateTrack, make_track
+from pdhef_logtool.records.reasons import SPIKE_AY, STUCK_YAW_RATE
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack, make_track
 
 START_NS = 1_700_000_000_000_000_123
 STEP_NS = 10_000_000

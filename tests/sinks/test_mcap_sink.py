@@ -11,11 +11,11 @@ from rerun.chunk import McapReader
 from rosbags.highlevel import AnyReader
 from source_log import write_source
 
-from pdhef_logtool.errors import OutputError
 from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.reasons import REASONS
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.reasons import REASONS
+from pdhef_logtool.records.tracks import concatenate, make_track
 from pdhef_logtool.sinks.mcap import AnnotatedMcapSink, topic_of
-from pdhef_logtool.tracks import concatenate, make_track
 
 STATE = "pdhef_msgs/msg/VehicleStateEstimate"
 ODOMETRY = "nav_msgs/msg/Odometry"

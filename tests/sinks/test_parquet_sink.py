@@ -10,10 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_array_equal
 
-from pdhef_logtool.errors import OutputError
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.tracks import concatenate, make_track
 from pdhef_logtool.sinks.parquet import EstimatesSink, list_estimators, read_metrics, read_track, write_metrics
-from pdhef_logtool.tracks import concatenate, make_track
 
 ESTIMATE_COLUMNS = {
     "stamp_ns": pl.Int64,

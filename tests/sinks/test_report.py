@@ -7,10 +7,10 @@ import jsonschema
 import numpy as np
 import pytest
 
-from pdhef_logtool.errors import OutputError
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import Interval, ReasonFacts
-from pdhef_logtool.signals import Loss
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.report import (
     EstimatorFacts,

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
-from pdhef_logtool.errors import OutputError
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.rerun import LONGEST_BRIDGE_NS, RerunSink, _Line, _Trajectory
@@ -322,7 +322,7 @@ def test_unwritable_place_is_one_line(tmp_path):
 SCRIPT = """
 import sys
 from pathlib import Path
-from pdhef_logtool.errors import OutputError
+from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.sinks.rerun import RerunSink
 try:
     RerunSink(Path(sys.argv[1]), log_name="d", input_hash="ab" * 32, start_ns=0).abort()

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.errors import SimulationError, UsageError
+from pdhef_logtool.records.errors import SimulationError, UsageError
 from truthsim.batch import BINS, DriveSpec, Job, make_drive, run_jobs, sensor_noise, time_in_bins_s
 from truthsim.conditions import ROW_NAMES, plan_conditions, write_conditions
 from truthsim.suite import SHARES, is_held_out, plan_suite, write_suite

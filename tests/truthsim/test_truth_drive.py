@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from pdhef_logtool.errors import SimulationError, UsageError
+from pdhef_logtool.records.errors import SimulationError, UsageError
 from truthsim.drive import Drive, judge, reference_steer_rad, simulate_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import (

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy import stats
 
-from pdhef_logtool.errors import UsageError
+from pdhef_logtool.records.errors import UsageError
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.faults import FIELDS, KINDS, TARGETS, apply_faults, parse_fault
 from truthsim.manoeuvres import Plan

@@ -16,8 +16,8 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pdhef_logtool.errors import OutputError
-from pdhef_logtool.vehicle import load_vehicle
+from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.records.errors import OutputError
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.samples import SAMPLES, write_sample, write_samples
 

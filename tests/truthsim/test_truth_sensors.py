@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pdhef_logtool.geometry import ecef_from_geodetic, enu_from_ecef_rotation
+from pdhef_logtool.records.geometry import ecef_from_geodetic, enu_from_ecef_rotation
 from truthsim.manoeuvres import MANOEUVRES, Plan, Request
 from truthsim.motion import Motion, simulate_motion
 from truthsim.sensors import (

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.errors import SimulationError
+from pdhef_logtool.records.errors import SimulationError
 from truthsim.linear_theory import steady_roll, understeer_gradient_rad_per_m_s2
 from truthsim.manoeuvres import Plan
 from truthsim.motion import simulate_motion

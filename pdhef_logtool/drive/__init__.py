@@ -1,0 +1,1 @@
+"""From a log to aligned signals and truth."""

@@ -1,0 +1,476 @@
+"""From channels on their own clocks to :class:`~pdhef_logtool.records.signals.Signals` on the IMU's stamps.
+
+A plan is made once a log from a survey stretch; :func:`align` then works window by window, and the windows joined are
+bit-identical to one call over the whole, because every rule here reaches no further than ``AlignmentPlan.margin_ns``.
+
+Rules
+-----
+* The grid is the union of the stamps of the IMU channels that share one clock (``AlignmentPlan.grid_channels``).
+  Irregular steps are kept, and no stamp is invented.
+* *Inputs* (steering, a_x, friction) are what the estimator's model is driven with: interpolated when their rate is
+  comparable to the grid's, else the newest sample at or before the grid stamp is held.
+* *Measurements* (a_y, yaw rate, speed, wheel speeds) carry information once: a value stands at a grid stamp only when
+  there is a new sample for it, otherwise a filter would count the same reading several times.
+* Nothing is interpolated or held across a gap of more than ``max_gap_s``; nothing is extrapolated.
+* A sample that came much later than its neighbours is not waited for: it counts as missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray, IntArray, Signals
+
+Method: TypeAlias = Literal["exact", "interpolate", "hold", "next"]
+
+#: Only this much of the log's beginning decides the plan, so that a plan does not depend on how much was read.
+SURVEY_S = 600.0
+#: A gap is more than this many median periods, and more than ``MIN_GAP_S``.
+GAP_PERIODS = 5.0
+MIN_GAP_S = 0.1
+#: Never bridged, however slow the channel: it bounds how far windows reach.
+LONGEST_GAP_S = 10.0
+#: Assumed for a channel that shows fewer than two samples in the survey.
+UNKNOWN_PERIOD_S = 0.1
+#: Lateness is judged against the fastest sample this close in time, so that a slow drift of clocks is not lateness.
+LATE_NEIGHBOURHOOD_S = 1.0
+#: Jitter below this is never lateness.
+MIN_LATE_S = 0.05
+#: How far delays may drift away from the survey's before samples count as missing; it bounds how far windows reach.
+DELAY_DRIFT_S = 2.0
+#: Share of stamps that must coincide for two channels to be on one clock.
+SAME_CLOCK_SHARE = 0.9
+
+_IMU = ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2")
+_INPUTS = frozenset({"steer_rad", "steering_wheel_rad", "ax_m_s2", "friction"})
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelPlan:
+    """How one channel comes to the grid.
+
+    Attributes
+    ----------
+    name : signal name as mapped. target : aligned column it fills. scale : factor from one to the other.
+    method : ``exact`` (value where the stamps coincide, else missing), ``interpolate`` (linear between neighbours),
+        ``hold`` (newest sample at or before the stamp) or ``next`` (a measurement slower than the grid: at the first
+        grid stamp at or after its own stamp, once).
+    period_s : median period; None when the survey holds fewer than two samples.
+    delay_s : median of arrival − stamp. late_limit_s : a sample this much slower than the fastest one within
+        ``LATE_NEIGHBOURHOOD_S`` is not waited for.
+    max_gap_s : longest step between samples that is bridged, and longest age of a held sample.
+    """
+
+    name: str
+    target: str
+    scale: float
+    method: Method
+    period_s: float | None
+    delay_s: float
+    late_limit_s: float
+    max_gap_s: float
+
+    @property
+    def max_delay_s(self) -> float:
+        """Delay beyond which a sample counts as missing whatever its neighbours did."""
+        return self.delay_s + self.late_limit_s + DELAY_DRIFT_S
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentPlan:
+    """How the channels of one log are brought to one grid; made once, valid for all windows.
+
+    Attributes
+    ----------
+    grid_channel : the IMU channel that sets the clock. grid_channels : those that share its stamps, itself included.
+    grid_period_s : its median period.
+    channels : one entry a channel that is used. unused : mapped channels that are not used, with the reason.
+    speed_from : ``"speed_m_s"``, ``"wheel speeds"`` or ``"none"``.
+    """
+
+    grid_channel: str
+    grid_channels: tuple[str, ...]
+    grid_period_s: float
+    channels: tuple[ChannelPlan, ...]
+    unused: tuple[tuple[str, str], ...]
+    speed_from: str
+
+    @property
+    def available(self) -> frozenset[str]:
+        """Aligned columns that the mapping provides, whatever their source (``speed_m_s`` also from wheels)."""
+        names = {c.target for c in self.channels}
+        return frozenset(names | ({"speed_m_s"} if self.speed_from != "none" else set()))
+
+    @property
+    def lookback_ns(self) -> int:
+        """Longest time between a grid stamp and the arrival of a sample used there."""
+        return _ns(self._longest_gap_s + self._longest_delay_s)
+
+    @property
+    def margin_ns(self) -> int:
+        """How much :func:`align` needs before ``start_ns`` and after ``end_ns``, in stamps or in log time."""
+        return self.lookback_ns + _ns(self._longest_gap_s + LATE_NEIGHBOURHOOD_S + self._longest_delay_s)
+
+    @property
+    def _longest_gap_s(self) -> float:
+        return max((c.max_gap_s for c in self.channels), default=0.0)
+
+    @property
+    def _longest_delay_s(self) -> float:
+        return max((c.max_delay_s for c in self.channels), default=0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the plan as JSON-able dictionaries and lists."""
+        document = asdict(self)
+        document["channels"] = [asdict(c) for c in self.channels]
+        document["grid_channels"] = list(self.grid_channels)
+        document["unused"] = dict(self.unused)
+        return document
+
+
+def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float) -> AlignmentPlan:
+    """Decide clock, method, gaps and lateness of every channel from the first ``SURVEY_S`` seconds.
+
+    The grid channel is the first of yaw rate, a_y, a_x whose rate is within a factor 2 of the fastest of them.
+
+    Parameters
+    ----------
+    channels : every mapped signal by name, even if it has no sample in the survey.
+    steering_ratio : steering-wheel angle over road-wheel angle. wheel_radius_m : m.
+
+    Raises
+    ------
+    MappingError
+        No IMU channel has two samples in the survey, so that there is no grid.
+    """
+    survey = _cut_to_survey(channels)
+    periods = {name: _median_period_s(c) for name, c in survey.items()}
+    grid = _grid_channel(periods)
+    grid_period = periods[grid]
+    assert grid_period is not None
+    chosen, unused = _choose_sources(survey, steering_ratio, wheel_radius_m)
+    plans = tuple(
+        _plan_channel(survey[name], target, scale, survey[grid], grid_period)
+        for name, (target, scale) in sorted(chosen.items())
+    )
+    if "speed_m_s" in chosen:
+        speed_from = "speed_m_s"
+    else:
+        wheels = {target for target, _ in chosen.values() if target.startswith("wheel_speed_")}
+        speed_from = "wheel speeds" if _has_whole_axle(wheels) else "none"
+    return AlignmentPlan(
+        grid_channel=grid,
+        grid_channels=tuple(p.name for p in plans if p.name in _IMU and p.method == "exact"),
+        grid_period_s=grid_period,
+        channels=plans,
+        unused=tuple(sorted(unused.items())),
+        speed_from=speed_from,
+    )
+
+
+def has_imu(channels: Mapping[str, Channel]) -> bool:
+    """Return whether a channel of the IMU has the two samples that :func:`plan_alignment` needs."""
+    return any(len(channels[name]) >= 2 for name in _IMU if name in channels)
+
+
+def no_alignment(channels: Mapping[str, Channel]) -> AlignmentPlan:
+    """Return the plan of a log without IMU: no grid, and none of the channels is used."""
+    unused = tuple((name, "without an IMU there are no stamps to bring it to") for name in sorted(channels))
+    return AlignmentPlan("", (), float("nan"), (), unused, "none")
+
+
+def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> Signals:
+    """Bring the channels to the grid stamps in [start_ns, end_ns).
+
+    Measurements are used once. On the grid's own clock (``exact``) that is so by itself. ``interpolate``: the value at
+    a grid stamp lies between the sample before and the sample after; it is given only when the sample after has not
+    served the previous grid stamp already. ``next``: the value stands, unchanged, at the first grid stamp at or after
+    its own stamp (time error below one grid step); of several samples within one step the newest counts.
+
+    ``speed_m_s`` without a speed channel comes from the wheel speeds, see :func:`combine_wheel_speeds`.
+
+    ``ready_ns`` is at each stamp the latest arrival of all samples used there (both neighbours of an interpolation),
+    never before the stamp itself, cumulated by maximum: an estimator that steps through the stamps in order cannot have
+    finished step k before ``ready_ns[k]``.
+
+    Parameters
+    ----------
+    channels : with ``plan.margin_ns`` of samples before ``start_ns`` and after ``end_ns``, as far as the log has them.
+        A channel that is absent has no sample here.
+    """
+    margin = plan.margin_ns
+    usable = {
+        p.name: _without_late(_cut(channels[p.name], start_ns - margin, end_ns + margin), p)
+        for p in plan.channels
+        if p.name in channels
+    }
+    stamps = _grid_stamps(channels, plan, start_ns - margin, end_ns)
+    columns = {p.target: np.full(stamps.shape[0], np.nan) for p in plan.channels}
+    ready = stamps.copy()
+    for p in plan.channels:
+        if p.name in usable and stamps.size:
+            values, arrival = _to_grid(usable[p.name], p, stamps, _ns(_max_gap_s(plan.grid_period_s)))
+            columns[p.target] = p.scale * values if p.scale != 1.0 else values
+            np.maximum(ready, arrival, out=ready)
+    ready = np.maximum.accumulate(ready)
+
+    inside = slice(int(np.searchsorted(stamps, start_ns)), None)
+    missing = np.full(stamps.shape[0], np.nan)
+    wheels = np.stack([columns.get(f"wheel_speed_{w}_m_s", missing) for w in WHEELS], axis=1)
+    speed = combine_wheel_speeds(wheels) if plan.speed_from == "wheel speeds" else columns.get("speed_m_s", missing)
+
+    def column(name: str) -> FloatArray:
+        return columns.get(name, missing)[inside].copy()
+
+    return Signals(
+        stamps_ns=stamps[inside].copy(),
+        ready_ns=ready[inside].copy(),
+        steer_rad=column("steer_rad"),
+        ax_m_s2=column("ax_m_s2"),
+        ay_m_s2=column("ay_m_s2"),
+        yaw_rate_rad_s=column("yaw_rate_rad_s"),
+        speed_m_s=speed[inside].copy(),
+        friction=column("friction"),
+        wheel_speed_m_s=wheels[inside].copy(),
+        available=plan.available,
+    )
+
+
+def count_late(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> dict[str, int]:
+    """Count the samples with stamps in [start_ns, end_ns) that came too late to be waited for, by channel name.
+
+    Channels without late samples are left out. ``channels`` as for :func:`align`.
+    """
+    counts = {}
+    for p in plan.channels:
+        if p.name in channels:
+            channel = _cut(channels[p.name], start_ns - plan.margin_ns, end_ns + plan.margin_ns)
+            inside = (channel.stamps_ns >= start_ns) & (channel.stamps_ns < end_ns)
+            late = int(np.count_nonzero(_is_late(channel, p) & inside))
+            if late:
+                counts[p.name] = late
+    return counts
+
+
+def combine_wheel_speeds(wheel_speed_m_s: FloatArray) -> FloatArray:
+    """Combine wheel speeds [N, 4] (fl, fr, rl, rr; NaN = missing) into one speed [N] in m/s.
+
+    All four: their median, the mean of the middle two, which one spinning or locked wheel cannot move far. Otherwise
+    the mean of the rear axle, else of the front axle: over a whole axle yaw rate × half track cancels. A single wheel
+    gives NaN, because that term would be read as speed.
+    """
+    front = 0.5 * (wheel_speed_m_s[:, 0] + wheel_speed_m_s[:, 1])
+    rear = 0.5 * (wheel_speed_m_s[:, 2] + wheel_speed_m_s[:, 3])
+    ordered = np.sort(wheel_speed_m_s, axis=1)
+    middle = 0.5 * (ordered[:, 1] + ordered[:, 2])
+    whole = np.isfinite(wheel_speed_m_s).all(axis=1)
+    return np.where(whole, middle, np.where(np.isfinite(rear), rear, front))
+
+
+# ---- planning ----
+
+
+def _ns(seconds: float) -> int:
+    return round(seconds * 1e9)
+
+
+def _max_gap_s(period_s: float | None) -> float:
+    periods = GAP_PERIODS * (UNKNOWN_PERIOD_S if period_s is None else period_s)
+    return min(max(periods, MIN_GAP_S), LONGEST_GAP_S)
+
+
+def _cut(channel: Channel, start_ns: int, end_ns: int) -> Channel:
+    lo, hi = np.searchsorted(channel.stamps_ns, [start_ns, end_ns])
+    return _select(channel, slice(int(lo), int(hi)))
+
+
+def _select(channel: Channel, which: slice | BoolArray) -> Channel:
+    return Channel(
+        name=channel.name,
+        unit=channel.unit,
+        source=channel.source,
+        stamps_ns=channel.stamps_ns[which],
+        arrival_ns=channel.arrival_ns[which],
+        values=channel.values[which],
+    )
+
+
+def _cut_to_survey(channels: Mapping[str, Channel]) -> dict[str, Channel]:
+    starts = [int(c.stamps_ns[0]) for c in channels.values() if len(c)]
+    if not starts:
+        return dict(channels)
+    return {name: _cut(c, min(starts), min(starts) + _ns(SURVEY_S)) for name, c in channels.items()}
+
+
+def _median_period_s(channel: Channel) -> float | None:
+    return float(np.median(np.diff(channel.stamps_ns))) * 1e-9 if len(channel) >= 2 else None
+
+
+def _grid_channel(periods: Mapping[str, float | None]) -> str:
+    known = {name: p for name in _IMU if (p := periods.get(name)) is not None}
+    if not known:
+        mapped = ", ".join(sorted(name for name in _IMU if name in periods))
+        raise MappingError(
+            expected="samples of yaw_rate_rad_s, ay_m_s2 or ax_m_s2, whose stamps are the grid",
+            got=f"no samples of {mapped}" if mapped else "none of them mapped",
+            where="alignment",
+            remedy="map an IMU topic (pdhef inspect LOG shows what the log holds)",
+        )
+    fastest = min(known.values())
+    return next(name for name, period in known.items() if period <= 2.0 * fastest)
+
+
+def _choose_sources(
+    survey: Mapping[str, Channel], steering_ratio: float, wheel_radius_m: float
+) -> tuple[dict[str, tuple[str, float]], dict[str, str]]:
+    """Return the aligned column and the scale of every channel used, and the reason for those unused."""
+    alternatives = {"steering_wheel_rad": ("steer_rad", 1.0 / steering_ratio)}
+    for w in WHEELS:
+        alternatives[f"wheel_speed_{w}_rad_s"] = (f"wheel_speed_{w}_m_s", wheel_radius_m)
+    chosen: dict[str, tuple[str, float]] = {}
+    unused: dict[str, str] = {}
+    for name in survey:
+        if name not in alternatives:
+            chosen[name] = (name, 1.0)
+        elif alternatives[name][0] in survey:
+            unused[name] = f"{alternatives[name][0]} is mapped too"
+        else:
+            chosen[name] = alternatives[name]
+    return chosen, unused
+
+
+def _has_whole_axle(columns: set[str]) -> bool:
+    return any({f"wheel_speed_{side}_m_s" for side in axle} <= columns for axle in (("fl", "fr"), ("rl", "rr")))
+
+
+def _plan_channel(channel: Channel, target: str, scale: float, grid: Channel, grid_period_s: float) -> ChannelPlan:
+    period = _median_period_s(channel)
+    is_input = channel.name in _INPUTS
+    method: Method
+    comparable = period is not None and period <= 2.0 * grid_period_s
+    if (channel.name in _IMU or not is_input) and (comparable or period is None) and _on_one_clock(channel, grid):
+        method = "exact"
+    elif comparable:
+        method = "interpolate"
+    else:
+        method = "hold" if is_input else "next"
+    delay_s, late_limit_s = _survey_delay(channel)
+    return ChannelPlan(
+        name=channel.name,
+        target=target,
+        scale=scale,
+        method=method,
+        period_s=period,
+        delay_s=delay_s,
+        late_limit_s=late_limit_s,
+        max_gap_s=_max_gap_s(period),
+    )
+
+
+def _on_one_clock(channel: Channel, grid: Channel) -> bool:
+    """Stamps decide where there are any; without samples in the survey the topic does."""
+    if len(channel) == 0:
+        return channel.source.split(".")[0] == grid.source.split(".")[0]
+    shared = int(np.isin(channel.stamps_ns, grid.stamps_ns, assume_unique=True).sum())
+    return shared >= SAME_CLOCK_SHARE * min(len(channel), len(grid))
+
+
+def _survey_delay(channel: Channel) -> tuple[float, float]:
+    if len(channel) == 0:
+        return 0.0, MIN_LATE_S
+    delay = channel.arrival_ns - channel.stamps_ns
+    excess = delay - _fastest_nearby(channel.stamps_ns, delay)
+    typical = float(np.median(excess))
+    spread = float(np.median(np.abs(excess - typical)))
+    return float(np.median(delay)) * 1e-9, (typical + max(_ns(MIN_LATE_S), 5.0 * spread)) * 1e-9
+
+
+# ---- lateness ----
+
+
+def _fastest_nearby(stamps_ns: IntArray, delay_ns: IntArray) -> IntArray:
+    """Return the smallest delay within ±``LATE_NEIGHBOURHOOD_S`` of each sample, [N] (a sparse table of minima)."""
+    half = _ns(LATE_NEIGHBOURHOOD_S)
+    lo = np.searchsorted(stamps_ns, stamps_ns - half, side="left")
+    hi = np.searchsorted(stamps_ns, stamps_ns + half, side="right")
+    level = np.frexp((hi - lo).astype(np.float64))[1] - 1  # floor(log2), exact for integers
+    smallest = np.empty_like(delay_ns)
+    table = delay_ns
+    for k in range(int(level.max(initial=0)) + 1):
+        if k:
+            step = 1 << (k - 1)
+            table = np.minimum(table[:-step], table[step:])
+        here = level == k
+        smallest[here] = np.minimum(table[lo[here]], table[hi[here] - (1 << k)])
+    return smallest
+
+
+def _is_late(channel: Channel, p: ChannelPlan) -> BoolArray:
+    delay = channel.arrival_ns - channel.stamps_ns
+    limit = _ns(p.late_limit_s)
+    late = delay > _ns(p.max_delay_s)
+    if len(channel) and int(delay.max() - delay.min()) > limit:
+        late |= delay - _fastest_nearby(channel.stamps_ns, delay) > limit
+    return late
+
+
+def _without_late(channel: Channel, p: ChannelPlan) -> Channel:
+    late = _is_late(channel, p)
+    return _select(channel, ~late) if late.any() else channel
+
+
+# ---- to the grid ----
+
+
+def _grid_stamps(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> IntArray:
+    """Return the union of the IMU channels' stamps in [start_ns, end_ns), late samples included: time still passes."""
+    present = [_cut(channels[name], start_ns, end_ns).stamps_ns for name in plan.grid_channels if name in channels]
+    if not present:
+        return np.empty(0, dtype=np.int64)
+    if all(np.array_equal(s, present[0]) for s in present[1:]):
+        return present[0]
+    return np.unique(np.concatenate(present))
+
+
+def _to_grid(channel: Channel, p: ChannelPlan, grid_ns: IntArray, grid_gap_ns: int) -> tuple[FloatArray, IntArray]:
+    """Return values [N] at the grid stamps (NaN = missing) and the latest arrival used [N] (0 = none)."""
+    values = np.full(grid_ns.shape[0], np.nan)
+    arrival = np.zeros(grid_ns.shape[0], dtype=np.int64)
+    n = len(channel)
+    if n == 0:
+        return values, arrival
+    stamps = channel.stamps_ns
+    right = np.searchsorted(stamps, grid_ns, side="left")  # first sample at or after
+    hit = stamps[np.minimum(right, n - 1)] == grid_ns
+    left = np.where(hit, right, right - 1)  # last sample at or before
+    if p.method == "exact":
+        use = hit
+    elif p.method == "interpolate":
+        bracketed = (left >= 0) & (right < n)
+        a, b = np.maximum(left, 0), np.minimum(right, n - 1)
+        use = bracketed & (stamps[b] - stamps[a] <= _ns(p.max_gap_s))
+        if p.name not in _INPUTS:
+            served = np.zeros_like(use)
+            served[1:] = use[:-1] & (right[1:] == right[:-1])
+            use &= ~served
+    elif p.method == "hold":
+        use = (left >= 0) & (grid_ns - stamps[np.maximum(left, 0)] <= _ns(p.max_gap_s))
+    else:
+        sampled = stamps[np.maximum(left, 0)]
+        use = (left >= 0) & (grid_ns - sampled <= grid_gap_ns)
+        use[1:] &= sampled[1:] > grid_ns[:-1]
+    i = left[use]
+    values[use] = channel.values[i]
+    arrival[use] = channel.arrival_ns[i]
+    if p.method == "interpolate":
+        j = right[use]
+        step = np.maximum(stamps[j] - stamps[i], 1)
+        share = (grid_ns[use] - stamps[i]) / step
+        values[use] += share * (channel.values[j] - channel.values[i])
+        arrival[use] = np.maximum(channel.arrival_ns[i], channel.arrival_ns[j])
+    return values, arrival

@@ -1,0 +1,103 @@
+"""The shift between two signals, by the peak of their cross-correlation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.records.signals import FloatArray, IntArray
+
+#: A step of more than this many median periods is a gap.
+GAP_PERIODS = 3.0
+#: The common grid's step is kept within these bounds: finer gains nothing, coarser loses the peak.
+MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CommonGrid:
+    """Two signals on one even grid; NaN where one has a gap. ``step_s``; ``a``, ``b`` [N]."""
+
+    step_s: float
+    a: FloatArray
+    b: FloatArray
+
+    @property
+    def both(self) -> int:
+        """Number of grid points where both are known."""
+        return int(np.count_nonzero(np.isfinite(self.a) & np.isfinite(self.b)))
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """By how much ``b`` follows ``a``, and the correlation there. ``inside``: the peak is no end of the range."""
+
+    shift_s: float
+    correlation: float
+    inside: bool
+
+
+def on_common_grid(
+    stamps_a_ns: IntArray, values_a: FloatArray, stamps_b_ns: IntArray, values_b: FloatArray
+) -> CommonGrid:
+    """Sample two signals of at least two samples each on one even grid where they overlap, linear trends removed."""
+    periods = [float(np.median(np.diff(stamps))) for stamps in (stamps_a_ns, stamps_b_ns)]
+    step_ns = round(float(np.clip(min(periods), MIN_STEP_S * 1e9, MAX_STEP_S * 1e9)))
+    start = max(int(stamps_a_ns[0]), int(stamps_b_ns[0]))
+    end = min(int(stamps_a_ns[-1]), int(stamps_b_ns[-1]))
+    grid = np.arange(start, end + 1, step_ns, dtype=np.int64)
+    a = Bracket(stamps_a_ns, grid, round(GAP_PERIODS * periods[0])).linear(values_a)
+    b = Bracket(stamps_b_ns, grid, round(GAP_PERIODS * periods[1])).linear(values_b)
+    return CommonGrid(step_s=step_ns * 1e-9, a=_detrend(a), b=_detrend(b))
+
+
+def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
+    """Find the shift within ± ``max_shift_s`` at which b(t + shift) correlates best with a(t).
+
+    At each shift Pearson's coefficient is computed over the points that both have; a parabola through the peak and its
+    neighbours refines it below the grid's step. NaN when a signal does not vary.
+    """
+    reach = round(max_shift_s / grid.step_s)
+    if grid.both < 2:
+        return Shift(float("nan"), float("nan"), False)
+    correlation = np.array([_correlation(grid.a, grid.b, k) for k in range(-reach, reach + 1)])
+    if not np.isfinite(correlation).any():
+        return Shift(float("nan"), float("nan"), False)
+    best = int(np.nanargmax(correlation))
+    peak = float(correlation[best])
+    if best in (0, 2 * reach):
+        return Shift((best - reach) * grid.step_s, peak, False)
+    refined = parabolic_peak(*correlation[best - 1 : best + 2])
+    return Shift((best - reach + refined) * grid.step_s, peak, True)
+
+
+def parabolic_peak(before: float, at: float, after: float) -> float:
+    """Return the place of the vertex of the parabola through values at −1, 0, 1; 0 when it has no maximum."""
+    curvature = before - 2.0 * at + after
+    return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
+
+
+def _detrend(values: FloatArray) -> FloatArray:
+    known = np.flatnonzero(np.isfinite(values))
+    if known.size < 2:
+        return values
+    slope, offset = np.polyfit(known / values.shape[0], values[known], 1)
+    return np.asarray(values - offset - slope * (np.arange(values.shape[0]) / values.shape[0]), dtype=np.float64)
+
+
+def _correlation(a: FloatArray, b: FloatArray, shift: int) -> float:
+    n = a.shape[0]
+    if abs(shift) >= n:
+        return float("nan")
+    x = a[max(0, -shift) : n - max(0, shift)]
+    y = b[max(0, shift) : n - max(0, -shift)]
+    both = np.isfinite(x) & np.isfinite(y)
+    if np.count_nonzero(both) < 2:
+        return float("nan")
+    x, y = x[both], y[both]
+    x, y = x - x.mean(), y - y.mean()
+    power = float((x * x).sum()) * float((y * y).sum())
+    # A constant leaves rounding noise after detrending, which must not correlate.
+    floor = (1e-20 * x.size) ** 2
+    return float((x * y).sum()) / power**0.5 if power > floor else float("nan")

@@ -1,0 +1,197 @@
+"""Where the friction of a run comes from; every estimator, network and segment is given the same one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.readings import POSSIBLE_FRICTION
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+
+if TYPE_CHECKING:
+    from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionCarry
+
+#: What may be asked for beside a number.
+CHOICES = ("auto", "file", "estimate")
+
+
+class _Window(Protocol):
+    @property
+    def signals(self) -> Signals: ...
+
+
+WindowT = TypeVar("WindowT", bound=_Window)
+
+
+def parse_friction(text: str | float) -> str | float:
+    """Return one of :data:`CHOICES` or a number.
+
+    Raises
+    ------
+    UsageError
+        The text is neither, or the number is no friction.
+    """
+    if text in CHOICES:
+        return text
+    low, high = POSSIBLE_FRICTION
+    try:
+        value = float(text)
+    except (TypeError, ValueError):
+        value = math.nan
+    if isinstance(text, bool) or not low <= value <= high:
+        raise UsageError(
+            expected=f"{', '.join(CHOICES)} or a number from {low:g} to {high:g}", got=repr(text), where="--friction"
+        )
+    return value
+
+
+class _Sources(Protocol):
+    @property
+    def label(self) -> str: ...
+
+
+class _Mapping(Protocol):
+    @property
+    def signals(self) -> Mapping[str, _Sources]: ...
+
+
+def friction_topic(mapping: _Mapping) -> str:
+    """Return where a mapping finds a friction in the log, ``/topic.field``; empty if nowhere."""
+    source = mapping.signals.get("friction")
+    return "" if source is None else source.label
+
+
+@dataclass(slots=True)
+class FrictionSource:
+    """Puts the friction of a run into its windows, and keeps count of what an estimate was worth.
+
+    Attributes
+    ----------
+    label : where it comes from, in the words of the report.
+    note : what a user must be told before the run; empty: nothing.
+    constant : told to all estimators; None leaves the signals' own (and the vehicle file's where they have none).
+    bank : estimates it; None where nothing is estimated.
+    factor : by which what topic or option tell is made wrong on purpose, for training (METHOD §3).
+    stamps, observable_stamps : of the windows so far.
+    """
+
+    label: str
+    note: str = ""
+    constant: float | None = None
+    bank: FrictionBank | None = None
+    factor: float = 1.0
+    stamps: int = 0
+    observable_stamps: int = 0
+    _carry: FrictionCarry | None = None
+    _std: list[FloatArray] = field(default_factory=list)
+    _observable: list[BoolArray] = field(default_factory=list)
+
+    def fill(self, signals: Signals) -> Signals:
+        """Return the next window's signals with their friction."""
+        if self.constant is not None:
+            return replace(signals, friction=np.full(len(signals), self.constant))
+        if self.bank is None:
+            return signals if self.factor == 1.0 else replace(signals, friction=signals.friction * self.factor)
+        estimate, self._carry = self.bank.run(signals, self._carry)
+        self.stamps += len(signals)
+        self.observable_stamps += int(np.count_nonzero(estimate.observable))
+        self._std.append(estimate.std)
+        self._observable.append(estimate.observable)
+        return replace(signals, friction=estimate.friction)
+
+    def fill_windows(self, windows: Iterator[WindowT]) -> Iterator[WindowT]:
+        """Yield the windows of a drive with their friction."""
+        for window in windows:
+            yield replace(window, signals=self.fill(window.signals))  # type: ignore[type-var]
+
+    @property
+    def from_log(self) -> bool:
+        """Whether the log's own friction is used."""
+        return self.label.startswith("topic")
+
+    @property
+    def observable(self) -> BoolArray:
+        """Whether the drive shows its friction, at each stamp so far; of length 0 where nothing is estimated."""
+        return np.concatenate(self._observable) if self._observable else np.zeros(0, dtype=np.bool_)
+
+    @property
+    def observable_share(self) -> float:
+        """Share of the stamps so far at which the drive shows its friction; NaN where nothing is estimated."""
+        return self.observable_stamps / self.stamps if self.stamps else math.nan
+
+    @property
+    def observable_std(self) -> float:
+        """Median 1-sigma of the estimate where it is observable; NaN where it never is."""
+        return float(np.median(np.concatenate(self._std)[self.observable])) if self.observable_stamps else math.nan
+
+    @property
+    def summary(self) -> str:
+        """What came of an estimate, for the report; empty where nothing is estimated."""
+        if not self.stamps:
+            return ""
+        text = f"observable {100 * self.observable_share:.0f} % of the time"
+        if self.observable_stamps:
+            text += f", median 1-sigma {self.observable_std:.2f} there"
+        return text + "; elsewhere it goes back to that of a dry road"
+
+
+def friction_source(
+    choice: str | float,
+    vehicle: VehicleParameters,
+    available: frozenset[str],
+    topic: str = "",
+    *,
+    use_speed: bool = True,
+    factor: float = 1.0,
+) -> FrictionSource:
+    """Decide where a drive's friction comes from.
+
+    ``auto`` is the log's own where it has one, else the vehicle file's, else an estimate; where the log lacks what an
+    estimate needs, 1 is assumed.
+
+    Parameters
+    ----------
+    choice : of :func:`parse_friction`. available : signals that the log provides. topic : of its friction, ``/a.b``.
+    factor : on what topic or option tell; a vehicle file must come with its own friction made wrong already.
+
+    Raises
+    ------
+    UsageError
+        What was asked for is not there.
+    """
+    if not isinstance(choice, str):
+        return FrictionSource(f"option, {choice:g}", constant=choice * factor)
+    if choice == "auto" and "friction" in available:
+        return FrictionSource(f"topic {topic}" if topic else "topic", factor=factor)
+    if choice == "file" and vehicle.friction is None:
+        raise UsageError(
+            expected="a vehicle file with friction",
+            got="none in it",
+            where="--friction file",
+            remedy="write friction = ... into the file, or give --friction estimate or a number",
+        )
+    if choice == "file" or (choice == "auto" and vehicle.friction is not None):
+        constant = vehicle.friction if "friction" in available else None
+        return FrictionSource(f"vehicle file, {vehicle.friction:g}", constant=constant)
+    from pdhef_logtool.estimators.friction_bank import FrictionBank
+
+    bank = FrictionBank(vehicle, use_speed=use_speed)
+    missing = sorted(bank.needs - available)
+    if not missing:
+        nothing = "neither log nor vehicle file gives a friction: it is estimated on line" if choice == "auto" else ""
+        return FrictionSource("estimate", nothing, bank=bank)
+    if choice == "estimate":
+        raise UsageError(
+            expected="a log with what an estimate of friction needs",
+            got=f"no {', '.join(missing)}",
+            where="--friction estimate",
+            remedy="map the missing signals, or give --friction VALUE",
+        )
+    assumed = f"assumed, {vehicle.assumed_friction:g}"
+    return FrictionSource(assumed, f"friction is {assumed}: no {', '.join(missing)} to estimate it from")

@@ -1,0 +1,722 @@
+"""Truth on its own clock: every quantity that the mapped channels allow, how it was derived, and its latency.
+
+Derivations (``TruthTrack.derivation`` says which applied):
+
+* body velocity from v_x and v_y; v_x and sideslip; ENU or ECEF velocity and heading (quaternion or yaw); position and
+  heading; v_x, course and yaw; ground speed and sideslip; ground speed alone (then v_x only);
+* moved to the CG by v_cg = v − ω × p, and position, a_y likewise;
+* yaw rate from heading, a_y = v̇_y + v_x r, when they are not mapped;
+* derivatives by Savitzky–Golay over the true stamps: a cubic by least squares over ± ``DIFFERENTIATION_HALF_S``, its
+  slope at the centre; none where the window would cross a gap or the end of the data.
+
+All of it is local: windows derived with ``TruthPlan.margin_ns`` on both sides join bit-identically.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from pdhef_logtool.drive.correlation import find_shift, on_common_grid
+from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.records.geometry import (
+    ecef_from_geodetic,
+    enu_from_ecef_rotation,
+    geodetic_from_ecef,
+    rotation_from_quat,
+    shift_velocity_to_cg,
+    wrap_angle,
+)
+from pdhef_logtool.records.signals import Channel, FloatArray, IntArray
+from pdhef_logtool.records.tracks import StateTrack, make_track
+
+#: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
+DIFFERENTIATION_HALF_S = 0.2
+#: A truth gap is a step of more than this many median periods.
+GAP_PERIODS = 3.0
+#: Latency is searched for within this range.
+MAX_LATENCY_S = 0.5
+#: Two channels are the same if this share of their samples agrees to ``SAME_RELATIVE``.
+SAME_SHARE = 0.99
+SAME_RELATIVE = 1e-6
+
+_SURVEY_NS = 600_000_000_000
+_CHUNK = 16384
+_ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
+_NED_TO_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_FRD_TO_FLU = np.diag([1.0, -1.0, -1.0])
+
+VelocitySource: TypeAlias = Literal[
+    "body velocity",
+    "v_x and sideslip",
+    "velocity and heading",
+    "position and heading",
+    "v_x, course and yaw",
+    "v_x alone",
+    "ground speed and sideslip",
+    "ground speed alone",
+    "none",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """What a quaternion means: it turns ``body`` axes (FLU or FRD) into ``frame`` (ENU, NED or ECEF)."""
+
+    frame: Literal["ENU", "NED", "ECEF"]
+    body: Literal["FLU", "FRD"]
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where the local ENU frame stands: ECEF position in m, latitude and longitude in rad."""
+
+    ecef_m: tuple[float, float, float]
+    lat_rad: float
+    lon_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class TruthPlan:
+    """How one log's truth is derived; made once from a survey stretch, valid for all windows.
+
+    Attributes
+    ----------
+    base : channel whose stamps are the truth's clock. period_s : its median period.
+    max_gap_s : longest step that is bridged, by channel. half_window : samples on each side of a derivative.
+    position_m : where the truth is measured, from the CG, ISO 8855.
+    delay_s : largest median arrival − stamp of the channels.
+    """
+
+    base: str
+    velocity: VelocitySource
+    used: frozenset[str]
+    period_s: float
+    max_gap_s: Mapping[str, float]
+    half_window: int
+    origin: Origin | None
+    attitude: Attitude | None
+    position_m: tuple[float, float, float]
+    delay_s: float
+
+    @property
+    def margin_ns(self) -> int:
+        """Truth needed before and after a window, so that windows join bit-identically."""
+        derivative = self.half_window * self.max_gap_s[self.base]  # per pass; velocity, then acceleration
+        reach = 2 * derivative + max(self.max_gap_s.values()) + self.max_gap_s[self.base]
+        return round((reach + MAX_LATENCY_S + self.delay_s + 1.0) * 1e9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthTrack:
+    """Truth at the CG on its own clock. ``derivation`` says by quantity where it comes from.
+
+    ``max_gap_s``: no value may be interpolated across a longer step.
+    """
+
+    track: StateTrack
+    max_gap_s: float
+    derivation: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyEstimate:
+    """How much later than the sensors the truth shows the same motion.
+
+    ``latency_s`` is 0 unless ``reliable``. ``identical``: the truth's yaw rate is the gyro's own channel, so that the
+    latency is 0 by construction and says nothing about the other truth channels. ``reason`` is for the report.
+    """
+
+    latency_s: float
+    correlation: float
+    std_error_s: float
+    reliable: bool
+    identical: bool
+    reason: str
+
+
+def plan_truth(
+    channels: Mapping[str, Channel],
+    *,
+    truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    max_gap_s: float | None = None,
+) -> TruthPlan | None:
+    """Decide clock, derivation, local frame and the meaning of the quaternion from the first 600 s.
+
+    Parameters
+    ----------
+    channels : truth channels by name, quality gate applied (samples that failed are absent).
+    truth_position_m : where the truth is measured, from the CG. max_gap_s : default three median periods.
+
+    Returns
+    -------
+    TruthPlan, or None when no channel has two samples.
+    """
+    survey = _survey(channels)
+    if not survey:
+        return None
+    has = frozenset(survey)
+    origin = _find_origin(survey)
+    source, base = _velocity_source(has, survey, origin)
+    periods = {name: float(np.median(np.diff(c.stamps_ns))) * 1e-9 for name, c in survey.items()}
+    gaps = {name: GAP_PERIODS * p if max_gap_s is None else max_gap_s for name, p in periods.items()}
+    plan = TruthPlan(
+        base=base,
+        velocity=source,
+        used=has,
+        period_s=periods[base],
+        max_gap_s=gaps,
+        half_window=max(2, round(DIFFERENTIATION_HALF_S / periods[base])),
+        origin=origin,
+        attitude=None,
+        position_m=truth_position_m,
+        delay_s=max(float(np.median(c.arrival_ns - c.stamps_ns)) * 1e-9 for c in survey.values()),
+    )
+    if "quat_wxyz" not in has:
+        return plan
+    return replace(plan, attitude=_find_attitude(_Source(survey, plan)))
+
+
+def derive_truth(
+    truth_channels: Mapping[str, Channel],
+    *,
+    truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    max_gap_s: float | None = None,
+    plan: TruthPlan | None = None,
+) -> TruthTrack:
+    """Derive body velocity, yaw rate, sideslip, a_y and pose at the CG from whatever truth is mapped.
+
+    Parameters
+    ----------
+    truth_channels : quality gate applied. For a window: with ``plan.margin_ns`` on both sides.
+    truth_position_m, max_gap_s : as for :func:`plan_truth`; not used when a ``plan`` is given.
+    plan : from :func:`plan_truth` over the log's beginning; made from these channels when absent.
+
+    Returns
+    -------
+    TruthTrack
+        Empty without truth. Stamps are those of the plan's base channel. Sideslip is the atan2 of the velocities at
+        the CG, or the mapped sideslip where no velocity is known. ``yaw_rad`` is wrapped.
+    """
+    if plan is None:
+        plan = plan_truth(truth_channels, truth_position_m=truth_position_m, max_gap_s=max_gap_s)
+    if plan is None:
+        return TruthTrack(track=make_track("truth", np.empty(0, dtype=np.int64)), max_gap_s=0.0)
+    source = _Source(truth_channels, plan)
+    says: dict[str, str] = {}
+    x_m, y_m, yaw = _pose(source, says)
+    rate = _yaw_rate(source, yaw, says)
+    vx, vy = _body_velocity(source, says)
+    vx, vy, moved = _velocity_to_cg(plan, vx, vy, rate, says)
+    beta = _sideslip(source, vx, vy, moved, says)
+    ay = _lateral_acceleration(source, vx, vy, rate, says)
+    px, py, _ = plan.position_m
+    if (px, py) != (0.0, 0.0) and np.isfinite(yaw).any():
+        x_m = x_m - (np.cos(yaw) * px - np.sin(yaw) * py)
+        y_m = y_m - (np.sin(yaw) * px + np.cos(yaw) * py)
+    track = make_track(
+        "truth",
+        source.stamps_ns,
+        vx_m_s=vx,
+        vy_m_s=vy,
+        yaw_rate_rad_s=rate,
+        sideslip_rad=beta,
+        ay_m_s2=ay,
+        x_m=x_m,
+        y_m=y_m,
+        yaw_rad=yaw,
+    )
+    return TruthTrack(track=track, max_gap_s=plan.max_gap_s[plan.base], derivation=says)
+
+
+def truth_at(truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0) -> StateTrack:
+    """Bring the truth to other stamps by linear interpolation, angles along the shorter way.
+
+    Parameters
+    ----------
+    stamps_ns : int64 [N], the stamps to score at, on the sensors' clock.
+    latency_s : the truth shows at t + latency what the sensors show at t.
+
+    Returns
+    -------
+    StateTrack "truth" with ``stamps_ns``; NaN and ``valid`` False outside the data and across steps of more than
+    ``truth.max_gap_s``. Sideslip is recomputed from the interpolated velocities where both are known.
+    """
+    track = truth.track
+    bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
+    vx, vy = bracket.linear(track.vx_m_s), bracket.linear(track.vy_m_s)
+    beta = bracket.angle(track.sideslip_rad)
+    known = np.isfinite(vx) & np.isfinite(vy)
+    beta[known] = np.arctan2(vy[known], vx[known])
+    rate, ay = bracket.linear(track.yaw_rate_rad_s), bracket.linear(track.ay_m_s2)
+    return make_track(
+        "truth",
+        stamps_ns,
+        vx_m_s=vx,
+        vy_m_s=vy,
+        yaw_rate_rad_s=rate,
+        sideslip_rad=beta,
+        ay_m_s2=ay,
+        x_m=bracket.linear(track.x_m),
+        y_m=bracket.linear(track.y_m),
+        yaw_rad=bracket.angle(track.yaw_rad),
+        valid=bracket.inside & np.isfinite(np.stack([vx, vy, rate, beta, ay])).any(axis=0),
+    )
+
+
+def yaw_rate_channel(truth: TruthTrack) -> Channel:
+    """Return the truth's yaw rate, mapped or derived, as a channel without NaN, for :func:`estimate_truth_latency`."""
+    known = np.isfinite(truth.track.yaw_rate_rad_s)
+    stamps = truth.track.stamps_ns[known]
+    return Channel(
+        name="yaw_rate_rad_s",
+        unit="rad/s",
+        source=truth.derivation.get("yaw_rate_rad_s", "none"),
+        stamps_ns=stamps,
+        arrival_ns=stamps,
+        values=truth.track.yaw_rate_rad_s[known],
+    )
+
+
+def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) -> LatencyEstimate:
+    """Estimate the truth's latency against the gyro by cross-correlation of detrended yaw rates.
+
+    Both are sampled on a common grid, linear trends removed; the correlation coefficient is computed at each shift
+    within ± ``MAX_LATENCY_S`` over the samples that both have, and its peak refined by a parabola. The standard error
+    is that of a shift, σ_residual / (rms(ṙ) √N), with N counted at 10 Hz as if the residual were coloured up to there.
+    Reliable: correlation of at least 0.8, standard error of at most 5 ms, peak inside the range.
+
+    Parameters
+    ----------
+    sensor_yaw_rate, truth_yaw_rate : on their own clocks. Never give an estimator's output here: its lag, which is what
+        the metrics shall show, would be taken for the truth's.
+    """
+    if _same_share(sensor_yaw_rate, truth_yaw_rate) >= SAME_SHARE:
+        return LatencyEstimate(0.0, 1.0, 0.0, True, True, "the truth's yaw rate is the gyro's channel")
+
+    def refuse(reason: str, correlation: float = 0.0, error: float = float("inf")) -> LatencyEstimate:
+        return LatencyEstimate(0.0, correlation, error, False, False, reason)
+
+    if min(len(sensor_yaw_rate), len(truth_yaw_rate)) < 2:
+        return refuse("too few samples")
+    grid = on_common_grid(
+        sensor_yaw_rate.stamps_ns, sensor_yaw_rate.values, truth_yaw_rate.stamps_ns, truth_yaw_rate.values
+    )
+    if grid.both * grid.step_s < 4.0 * MAX_LATENCY_S:
+        return refuse("less than two seconds in common")
+    shift = find_shift(grid, MAX_LATENCY_S)
+    if not np.isfinite(shift.correlation):
+        return refuse("no yaw motion")
+    motion = float(np.sqrt(np.nanmean(np.gradient(grid.b, grid.step_s) ** 2)))
+    residual = float(np.nanstd(grid.b)) * float(np.sqrt(max(1.0 - shift.correlation**2, 0.0)))
+    count = max(1.0, grid.both * min(grid.step_s * 10.0, 1.0))
+    error = residual / (motion * float(np.sqrt(count))) if motion > 0 else float("inf")
+    if not shift.inside:
+        return refuse("no peak within the range searched", shift.correlation, error)
+    if shift.correlation < 0.8:
+        return refuse("gyro and truth yaw rate correlate too little", shift.correlation, error)
+    if error > 0.005:
+        return refuse("too little yaw motion", shift.correlation, error)
+    return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against truth yaw rate")
+
+
+def dependent_signals(
+    signals_channels: Mapping[str, Channel], truth_channels: Mapping[str, Channel], *, role: str = "input"
+) -> dict[str, str]:
+    """Find truth channels that are an input channel in disguise.
+
+    Equal means: at the same stamps (or, for channels of the same length, sample by sample) values agree to 1e-6
+    relative, more than the rounding of float32, on at least 99 % of the samples, and the channel is not constant.
+
+    Parameters
+    ----------
+    role : what the sentences call the channels of ``signals_channels``.
+
+    Returns
+    -------
+    By truth name, a sentence for the report. Metrics of that name are to be marked ``not independent``.
+    """
+    found: dict[str, str] = {}
+    for name, truth in sorted(truth_channels.items()):
+        for signal in sorted(signals_channels):
+            channel = signals_channels[signal]
+            if truth.values.ndim != 1 or channel.values.ndim != 1 or channel.unit != truth.unit:
+                continue
+            share = _same_share(channel, truth)
+            if share >= SAME_SHARE:
+                found[name] = (
+                    f"{truth.source} equals the {role} {signal} ({channel.source}) on {share:.1%} of its samples"
+                )
+                break
+    return found
+
+
+# ---- planning ----
+
+
+def _survey(channels: Mapping[str, Channel]) -> dict[str, Channel]:
+    starts = [int(c.stamps_ns[0]) for c in channels.values() if len(c)]
+    survey = {}
+    for name, c in channels.items():
+        n = int(np.searchsorted(c.stamps_ns, min(starts) + _SURVEY_NS)) if starts else 0
+        if n >= 2:
+            survey[name] = Channel(name, c.unit, c.source, c.stamps_ns[:n], c.arrival_ns[:n], c.values[:n])
+    return survey
+
+
+def _first(has: frozenset[str], *names: str) -> str | None:
+    return next((n for n in names if n in has), None)
+
+
+def _velocity_source(
+    has: frozenset[str], survey: Mapping[str, Channel], origin: Origin | None
+) -> tuple[VelocitySource, str]:
+    velocity = _first(has, "enu_velocity_m_s", "ecef_velocity_m_s")
+    # Without a place on Earth an ECEF velocity has no east and north that a yaw could be applied to.
+    placeless = velocity == "ecef_velocity_m_s" and origin is None
+    heading = _first(has - {"yaw_rad"} if placeless else has, "yaw_rad", "quat_wxyz")
+    position = _first(has & (frozenset({"ecef_position_m"}) | _pairs(has)), "x_m", "ecef_position_m", "lat_deg")
+    if {"vx_m_s", "vy_m_s"} <= has:
+        return "body velocity", "vx_m_s"
+    if {"vx_m_s", "sideslip_rad"} <= has:
+        return "v_x and sideslip", "vx_m_s"
+    if velocity and heading:
+        return "velocity and heading", velocity
+    if position and heading:
+        return "position and heading", position
+    if {"vx_m_s", "course_rad", "yaw_rad"} <= has:
+        return "v_x, course and yaw", "vx_m_s"
+    if "vx_m_s" in has:
+        return "v_x alone", "vx_m_s"
+    ground = velocity or position
+    if ground and "sideslip_rad" in has:
+        return "ground speed and sideslip", ground
+    if ground:
+        return "ground speed alone", ground
+    return "none", max(sorted(survey), key=lambda n: len(survey[n]))
+
+
+def _pairs(has: frozenset[str]) -> frozenset[str]:
+    pairs = [frozenset({"x_m", "y_m"}), frozenset({"lat_deg", "lon_deg"})]
+    return frozenset().union(*(p for p in pairs if p <= has))
+
+
+def _find_origin(survey: Mapping[str, Channel]) -> Origin | None:
+    if "ecef_position_m" in survey:
+        ecef = survey["ecef_position_m"].values[:1]
+    elif {"lat_deg", "lon_deg"} <= set(survey):
+        alt = survey["alt_m"].values[:1] if "alt_m" in survey else np.zeros(1)
+        ecef = ecef_from_geodetic(survey["lat_deg"].values[:1], survey["lon_deg"].values[:1], alt)
+    else:
+        return None
+    lat, lon, _ = geodetic_from_ecef(ecef)[0]
+    x, y, z = ecef[0]
+    return Origin(ecef_m=(float(x), float(y), float(z)), lat_rad=float(lat), lon_rad=float(lon))
+
+
+def _find_attitude(source: _Source) -> Attitude:
+    """Choose frame and body axes such that z points up and the car moves along x; ENU and FLU when in doubt."""
+    velocity = source.reference_velocity()
+    frames: tuple[Literal["ENU", "ECEF", "NED"], ...]
+    if source.reference == "ECEF":
+        frames = ("ECEF",)
+    else:
+        frames = ("ENU", "NED") if source.plan.origin is None else ("ENU", "ECEF", "NED")
+    bodies: tuple[Literal["FLU", "FRD"], ...] = ("FLU", "FRD")
+    best, best_score = Attitude(frames[0], "FLU"), -np.inf
+    for frame, body in [(f, b) for f in frames for b in bodies]:
+        rotation = source.rotation(Attitude(frame, body))
+        up = _median(rotation[:, 2, 2]) if source.reference == "ENU" else 1.0
+        score = (1.0 if up > 0.5 else -1.0) + _forward_share(rotation, velocity)
+        if score > best_score + 0.05:
+            best, best_score = Attitude(frame, body), score
+    return best
+
+
+def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
+    """Median of v_x / |v| in body axes while the car moves; 0 if it is not known to."""
+    speed = np.linalg.norm(velocity, axis=1)
+    moving = speed > 1.0  # NaN compares False
+    return _median((rotation[moving, :, 0] * velocity[moving]).sum(axis=1) / speed[moving])
+
+
+def _median(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else 0.0
+
+
+# ---- columns on the truth's clock ----
+
+
+class _Source:
+    """The truth channels of a window, as columns on the base channel's stamps."""
+
+    def __init__(self, channels: Mapping[str, Channel], plan: TruthPlan) -> None:
+        self.plan = plan
+        self._channels = channels
+        base = channels.get(plan.base)
+        self.stamps_ns: IntArray = np.empty(0, dtype=np.int64) if base is None else base.stamps_ns
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.plan.used
+
+    def name(self, channel: str) -> str:
+        """Topic and field of a channel, for the report."""
+        return self._channels[channel].source if channel in self._channels else channel
+
+    def column(self, name: str) -> FloatArray:
+        """Return a channel at the base stamps, [N] or [N, k]; NaN where it has a gap."""
+        channel = self._channels.get(name)
+        if channel is None:
+            width = {"quat_wxyz": (4,), "ecef_position_m": (3,), "ecef_velocity_m_s": (3,), "enu_velocity_m_s": (3,)}
+            return np.full((self.stamps_ns.shape[0], *width.get(name, ())), np.nan)
+        bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * 1e9))
+        if name in _ANGLES:
+            return bracket.angle(channel.values)
+        if name == "quat_wxyz":
+            return bracket.quaternion(channel.values)
+        return bracket.linear(channel.values)
+
+    @property
+    def reference(self) -> Literal["ENU", "ECEF"]:
+        """Frame of three-dimensional vectors: ECEF only when nothing says where on Earth the car is."""
+        only_ecef = "ecef_velocity_m_s" in self and "enu_velocity_m_s" not in self and self.plan.origin is None
+        return "ECEF" if only_ecef else "ENU"
+
+    def _from_ecef(self) -> FloatArray:
+        origin = self.plan.origin
+        return np.eye(3) if origin is None else enu_from_ecef_rotation(origin.lat_rad, origin.lon_rad)
+
+    def position(self) -> FloatArray:
+        """Return [N, 3] in the local ENU frame; height 0 when it is not known."""
+        if {"x_m", "y_m"} <= self.plan.used:
+            x, y = self.column("x_m"), self.column("y_m")
+            return np.stack([x, y, np.zeros_like(x)], axis=1)
+        if self.plan.origin is None:
+            return np.full((self.stamps_ns.shape[0], 3), np.nan)
+        if "ecef_position_m" in self:
+            ecef = self.column("ecef_position_m")
+        else:
+            lat, lon = self.column("lat_deg"), self.column("lon_deg")
+            ecef = ecef_from_geodetic(lat, lon, self.column("alt_m") if "alt_m" in self else np.zeros_like(lat))
+        return _turn(self._from_ecef(), ecef - np.array(self.plan.origin.ecef_m))
+
+    def reference_velocity(self) -> FloatArray:
+        """Return [N, 3] in the reference frame, differentiated from the position if need be."""
+        if "enu_velocity_m_s" in self:
+            return self.column("enu_velocity_m_s")
+        if "ecef_velocity_m_s" in self:
+            return _turn(self._from_ecef(), self.column("ecef_velocity_m_s"))
+        position = self.position()
+        return np.stack([self.derivative(position[:, i]) for i in range(3)], axis=1)
+
+    def rotation(self, attitude: Attitude) -> FloatArray:
+        """Return matrices [N, 3, 3] that turn forward-left-up body vectors into the reference frame."""
+        quat = self.column("quat_wxyz")
+        quat = np.where(np.linalg.norm(quat, axis=1, keepdims=True) > 1e-6, quat, np.nan)
+        matrix = rotation_from_quat(quat)
+        if attitude.body == "FRD":
+            matrix = matrix @ _FRD_TO_FLU
+        if attitude.frame == "NED":
+            matrix = _NED_TO_ENU @ matrix
+        elif attitude.frame == "ECEF":
+            matrix = self._from_ecef() @ matrix
+        return np.asarray(matrix, dtype=np.float64)
+
+    def derivative(self, values: FloatArray, *, angle: bool = False) -> FloatArray:
+        """Differentiate a column [N] by time."""
+        gap_ns = round(self.plan.max_gap_s[self.plan.base] * 1e9)
+        return differentiate(self.stamps_ns, values, self.plan.half_window, gap_ns, angle=angle)
+
+
+def _turn(matrix: FloatArray, vectors: FloatArray) -> FloatArray:
+    # Sums written out: a matrix product may round differently with the number of rows, and windows must join.
+    return np.stack([(matrix[i] * vectors).sum(axis=1) for i in range(3)], axis=1)
+
+
+def differentiate(
+    stamps_ns: IntArray, values: FloatArray, half_window: int, max_gap_ns: int, *, angle: bool = False
+) -> FloatArray:
+    """Differentiate [N] by time: slope at the centre of a cubic fitted to 2 · half_window + 1 samples (Savitzky–Golay).
+
+    The true stamps are used, so that jitter does not turn into noise. NaN where the window holds NaN, a step longer
+    than ``max_gap_ns``, or the end of the data. ``angle``: differences to the centre are wrapped.
+    """
+    n, h = int(stamps_ns.shape[0]), half_window
+    slope = np.full(n, np.nan)
+    if n < 2 * h + 1:
+        return slope
+    gaps = np.concatenate([[0], np.cumsum(np.diff(stamps_ns) > max_gap_ns)])
+    known = np.concatenate([[0], np.cumsum(~np.isfinite(values))])
+    whole = (gaps[2 * h :] == gaps[: n - 2 * h]) & (known[2 * h + 1 :] == known[: n - 2 * h])
+    centres = np.flatnonzero(whole) + h
+    offsets = np.arange(-h, h + 1)
+    for start in range(0, centres.shape[0], _CHUNK):
+        centre = centres[start : start + _CHUNK]
+        window = centre[:, None] + offsets
+        t = (stamps_ns[window] - stamps_ns[centre][:, None]) * 1e-9
+        span = np.abs(t).max(axis=1)
+        u = t / span[:, None]
+        y = values[window] - values[centre][:, None]
+        if angle:
+            y = wrap_angle(y)
+        powers = [np.ones_like(u)]
+        for _ in range(6):
+            powers.append(powers[-1] * u)
+        moments = [p.sum(axis=1) for p in powers]
+        normal = np.stack([np.stack([moments[i + j] for j in range(4)], axis=1) for i in range(4)], axis=1)
+        right = np.stack([(powers[i] * y).sum(axis=1) for i in range(4)], axis=1)
+        slope[centre] = np.linalg.solve(normal, right[:, :, None])[:, 1, 0] / span
+    return slope
+
+
+# ---- derivation ----
+
+
+def _pose(source: _Source, says: dict[str, str]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    position = source.position()
+    origin = source.plan.origin
+    if {"x_m", "y_m"} <= source.plan.used:
+        says["position_m"] = f"{source.name('x_m')} and {source.name('y_m')}"
+    elif origin is not None:
+        name = "ecef_position_m" if "ecef_position_m" in source else "lat_deg"
+        says["position_m"] = f"{source.name(name)} in a local ENU frame at its first sample"
+    attitude = source.plan.attitude
+    if "yaw_rad" in source:
+        yaw = source.column("yaw_rad")
+        says["yaw_rad"] = source.name("yaw_rad")
+    elif attitude is not None and source.reference == "ENU":
+        rotation = source.rotation(attitude)
+        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        says["yaw_rad"] = f"{source.name('quat_wxyz')}, read as {attitude.body} to {attitude.frame}"
+    else:
+        yaw = np.full(source.stamps_ns.shape[0], np.nan)
+    return position[:, 0], position[:, 1], yaw
+
+
+def _yaw_rate(source: _Source, yaw: FloatArray, says: dict[str, str]) -> FloatArray:
+    if "yaw_rate_rad_s" in source:
+        says["yaw_rate_rad_s"] = source.name("yaw_rate_rad_s")
+        return source.column("yaw_rate_rad_s")
+    if "yaw_rad" in says:
+        says["yaw_rate_rad_s"] = "smoothing derivative of yaw"
+        return source.derivative(yaw, angle=True)
+    return np.full(source.stamps_ns.shape[0], np.nan)
+
+
+def _body_velocity(source: _Source, says: dict[str, str]) -> tuple[FloatArray, FloatArray]:
+    """Return v_x, v_y at the truth's own place."""
+    kind = source.plan.velocity
+    nothing = np.full(source.stamps_ns.shape[0], np.nan)
+    if kind == "none":
+        return nothing, nothing.copy()
+    if kind in ("velocity and heading", "position and heading"):
+        vx, vy, how = _velocity_by_heading(source)
+        says["vx_m_s"] = says["vy_m_s"] = how
+        return vx, vy
+    if kind in ("ground speed and sideslip", "ground speed alone"):
+        velocity = source.reference_velocity()
+        speed = np.hypot(velocity[:, 0], velocity[:, 1])
+        if source.reference == "ECEF":
+            speed = np.sqrt((velocity * velocity).sum(axis=1))
+        says["vx_m_s"] = f"ground speed of {source.name(source.plan.base)} taken as v_x, no heading known"
+        if kind == "ground speed alone":
+            return speed, nothing
+        beta = source.column("sideslip_rad")
+        says["vx_m_s"] = f"ground speed of {source.name(source.plan.base)} times cos sideslip"
+        says["vy_m_s"] = f"ground speed of {source.name(source.plan.base)} times sin sideslip"
+        return speed * np.cos(beta), speed * np.sin(beta)
+    vx = source.column("vx_m_s")
+    says["vx_m_s"] = source.name("vx_m_s")
+    if kind == "body velocity":
+        says["vy_m_s"] = source.name("vy_m_s")
+        return vx, source.column("vy_m_s")
+    if kind == "v_x and sideslip":
+        says["vy_m_s"] = f"v_x times tan of {source.name('sideslip_rad')}"
+        return vx, vx * np.tan(source.column("sideslip_rad"))
+    if kind == "v_x, course and yaw":
+        says["vy_m_s"] = f"v_x times tan of {source.name('course_rad')} minus {source.name('yaw_rad')}"
+        return vx, vx * np.tan(wrap_angle(source.column("course_rad") - source.column("yaw_rad")))
+    return vx, nothing
+
+
+def _velocity_by_heading(source: _Source) -> tuple[FloatArray, FloatArray, str]:
+    velocity = source.reference_velocity()
+    how = f"{source.name(source.plan.base)} turned into the body by "
+    if source.plan.velocity == "position and heading":
+        how = f"smoothing derivative of {source.name(source.plan.base)} turned into the body by "
+    attitude = source.plan.attitude
+    if source.reference == "ENU" and ("yaw_rad" in source or attitude is None):
+        yaw = source.column("yaw_rad")
+        vx = np.cos(yaw) * velocity[:, 0] + np.sin(yaw) * velocity[:, 1]
+        vy = -np.sin(yaw) * velocity[:, 0] + np.cos(yaw) * velocity[:, 1]
+        return vx, vy, how + source.name("yaw_rad")
+    assert attitude is not None
+    rotation = source.rotation(attitude)
+    vx = (rotation[:, :, 0] * velocity).sum(axis=1)
+    vy = (rotation[:, :, 1] * velocity).sum(axis=1)
+    return vx, vy, how + f"{source.name('quat_wxyz')}, read as {attitude.body} to {attitude.frame}"
+
+
+def _velocity_to_cg(
+    plan: TruthPlan, vx: FloatArray, vy: FloatArray, rate: FloatArray, says: dict[str, str]
+) -> tuple[FloatArray, FloatArray, bool]:
+    x, y, _ = plan.position_m
+    if (x, y) == (0.0, 0.0):
+        return vx, vy, False
+    if "yaw_rate_rad_s" not in says:
+        says["cg"] = f"velocities left at ({x:g}, {y:g}) m from the CG: no yaw rate to move them by"
+        return vx, vy, False
+    says["cg"] = f"velocities moved to the CG from ({x:g}, {y:g}) m"
+    return *shift_velocity_to_cg(vx, vy, rate, (x, y)), True
+
+
+def _sideslip(source: _Source, vx: FloatArray, vy: FloatArray, moved: bool, says: dict[str, str]) -> FloatArray:
+    if "vy_m_s" in says:
+        says["sideslip_rad"] = "atan2(v_y, v_x)" + (" at the CG" if moved else "")
+        return np.arctan2(vy, vx)
+    if "sideslip_rad" in source:
+        says["sideslip_rad"] = source.name("sideslip_rad")
+        return source.column("sideslip_rad")
+    return np.full(source.stamps_ns.shape[0], np.nan)
+
+
+def _lateral_acceleration(
+    source: _Source, vx: FloatArray, vy: FloatArray, rate: FloatArray, says: dict[str, str]
+) -> FloatArray:
+    if "ay_m_s2" in source:
+        ay = source.column("ay_m_s2")
+        says["ay_m_s2"] = source.name("ay_m_s2")
+        x, y, _ = source.plan.position_m
+        if (x, y) != (0.0, 0.0) and "yaw_rate_rad_s" in says:
+            says["ay_m_s2"] += ", moved to the CG"
+            ay = ay - source.derivative(rate) * x + rate * rate * y
+        return ay
+    if "vy_m_s" in says and "yaw_rate_rad_s" in says:
+        says["ay_m_s2"] = "smoothing derivative of v_y plus v_x times yaw rate"
+        return source.derivative(vy) + vx * rate
+    return np.full(source.stamps_ns.shape[0], np.nan)
+
+
+# ---- latency and dependence ----
+
+
+def _same_share(a: Channel, b: Channel) -> float:
+    """Share of samples at common stamps (or by index when the lengths agree) whose values agree; 0 if too few."""
+    _, i, j = np.intersect1d(a.stamps_ns, b.stamps_ns, assume_unique=True, return_indices=True)
+    shares = [0.0]
+    if i.size >= max(10, 0.5 * min(len(a), len(b))):
+        shares.append(share_equal(a.values[i], b.values[j]))
+    if len(a) == len(b) >= 10:
+        shares.append(share_equal(a.values, b.values))
+    return max(shares)
+
+
+def share_equal(x: FloatArray, y: FloatArray) -> float:
+    """Return the share of samples [N], N ≥ 1, that agree to ``SAME_RELATIVE``; 0 for a constant."""
+    if np.ptp(x) == 0.0:
+        return 0.0
+    return float(np.mean(np.abs(x - y) <= SAME_RELATIVE * np.maximum(np.abs(x), np.abs(y))))

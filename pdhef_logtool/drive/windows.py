@@ -1,0 +1,282 @@
+"""From a log to aligned signals and truth, window by window, with everything decided once a log beforehand."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
+from pdhef_logtool.drive.alignment import (
+    SURVEY_S,
+    AlignmentPlan,
+    align,
+    count_late,
+    has_imu,
+    no_alignment,
+    plan_alignment,
+)
+from pdhef_logtool.drive.truth import (
+    LatencyEstimate,
+    TruthPlan,
+    dependent_signals,
+    derive_truth,
+    estimate_truth_latency,
+    plan_truth,
+    truth_at,
+    yaw_rate_channel,
+)
+from pdhef_logtool.logs.drive_log import DriveLog, windows
+from pdhef_logtool.mapping import ClockModel, Mapping, fit_clocks, join_channels, merge_losses, read_signals
+from pdhef_logtool.records.readings import impossible_readings
+from pdhef_logtool.records.signals import Channel, Loss, Signals, cut_signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack
+
+#: A silence of a channel is told from here on, and from this many of its periods.
+TOLD_GAP_S = 1.0
+TOLD_GAP_PERIODS = 10.0
+_JUMP = "samples whose stamps jump back behind what had been processed were dropped"
+_IMPOSSIBLE = "readings that no vehicle can have were taken as missing by the estimators"
+_LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivePlan:
+    """What is decided from the first ten minutes of a log and holds for all of its windows.
+
+    Attributes
+    ----------
+    survey_signals, survey_truth : the channels that it was decided on.
+    latency : of the truth against the sensors; None without truth yaw rate or gyro.
+    dependent : truth quantities that are an input of the estimators, with the reason.
+    derivation : by truth quantity, how it is derived.
+    """
+
+    mapping: Mapping
+    vehicle: VehicleParameters
+    clocks: dict[str, ClockModel]
+    alignment: AlignmentPlan
+    truth: TruthPlan | None
+    latency: LatencyEstimate | None
+    dependent: dict[str, str]
+    derivation: dict[str, str]
+    survey_signals: dict[str, Channel]
+    survey_truth: dict[str, Channel]
+    start_ns: int
+    end_ns: int
+
+    @property
+    def truth_latency_s(self) -> float:
+        """Latency that all estimators' comparison with truth uses; 0 unless it stands out of its own uncertainty."""
+        known = self.latency is not None and abs(self.latency.latency_s) > 2.0 * self.latency.std_error_s
+        return self.latency.latency_s if known and self.latency is not None else 0.0
+
+    @property
+    def has_truth_pose(self) -> bool:
+        """Whether the truth has position and heading."""
+        return {"position_m", "yaw_rad"} <= self.derivation.keys()
+
+    @property
+    def margin_ns(self) -> int:
+        """How much of the channels a window needs on both sides."""
+        truth_margin = 0 if self.truth is None else self.truth.margin_ns
+        return max(self.alignment.margin_ns, truth_margin)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveWindow:
+    """One window: what the estimators see, and the truth at the same stamps (None if the log has none)."""
+
+    signals: Signals
+    truth: StateTrack | None
+    share_done: float
+
+
+def plan_drive(
+    log: DriveLog,
+    mapping: Mapping,
+    vehicle: VehicleParameters,
+    start_ns: int,
+    end_ns: int,
+    *,
+    require_imu: bool = True,
+) -> DrivePlan:
+    """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and truth.
+
+    Parameters
+    ----------
+    require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
+
+    Raises
+    ------
+    MappingError
+        The log lacks what is mapped, or there is no IMU to set the stamps.
+    """
+    clocks = fit_clocks(log, mapping, start_ns, end_ns)
+    survey = read_signals(log, mapping, clocks, start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    if require_imu or has_imu(survey.signals):
+        alignment = plan_alignment(
+            survey.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
+        )
+    else:
+        alignment = no_alignment(survey.signals)
+    truth = plan_truth(survey.truth, truth_position_m=vehicle.truth_position_m) if survey.truth else None
+    latency = None
+    derivation: dict[str, str] = {}
+    if truth is not None:
+        derived = derive_truth(survey.truth, plan=truth)
+        derivation = dict(derived.derivation)
+        gyro = survey.signals.get("yaw_rate_rad_s")
+        rate = survey.truth.get("yaw_rate_rad_s") or yaw_rate_channel(derived)
+        if gyro is not None and len(gyro) and len(rate):
+            latency = estimate_truth_latency(gyro, rate)
+    return DrivePlan(
+        mapping=mapping,
+        vehicle=vehicle,
+        clocks=clocks,
+        alignment=alignment,
+        truth=truth,
+        latency=latency,
+        dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
+        derivation=derivation,
+        survey_signals=survey.signals,
+        survey_truth=survey.truth,
+        start_ns=start_ns,
+        end_ns=end_ns,
+    )
+
+
+@dataclass(slots=True)
+class DriveReader:
+    """Reads a planned drive once from start to end; ``losses`` and ``samples`` grow while it does."""
+
+    log: DriveLog
+    plan: DrivePlan
+    window_s: float
+    losses: tuple[Loss, ...] = ()
+    samples: dict[str, int] | None = None
+
+    def windows(self) -> Iterator[DriveWindow]:
+        """Yield the drive's windows in order; joined, they are bit-identical to one window over all."""
+        plan = self.plan
+        margin = plan.margin_ns
+        signals: dict[str, Channel] = {}
+        truth: dict[str, Channel] = {}
+        counts: dict[str, int] = {}
+        done_ns: int | None = None
+        for a, b in windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9)):
+            part = read_signals(self.log, plan.mapping, plan.clocks, a, b)
+            self.losses = merge_losses([self.losses, part.losses])
+            for store, new in ((signals, part.signals), (truth, part.truth)):
+                for name, channel in new.items():
+                    self.losses = merge_losses([self.losses, _gaps(store.get(name), channel)])
+                    back = 0 if done_ns is None else int(np.searchsorted(channel.stamps_ns, done_ns - margin))
+                    if back:
+                        first, last_back = int(channel.stamps_ns[0]), int(channel.stamps_ns[back - 1]) + 1
+                        jump = Loss("time-jump", _JUMP, channel.source, first, last_back, back)
+                        self.losses = merge_losses([self.losses, [jump]])
+                    counts[channel.source] = counts.get(channel.source, 0) + len(channel)
+                    store[name] = join_channels([store[name], channel]) if name in store else channel
+            self.samples = counts
+            last = b >= plan.end_ns
+            stamps = [c.stamps_ns for c in signals.values() if len(c)]
+            if not stamps:
+                continue
+            if done_ns is None:
+                done_ns = min(int(s[0]) for s in stamps)
+            newest = max(int(s[-1]) for s in stamps) + 1
+            until = newest if last else min(newest, b) - margin
+            if until <= done_ns:
+                continue
+            yield self._window(signals, truth, done_ns, until, (b - plan.start_ns) / (plan.end_ns - plan.start_ns))
+            done_ns = until
+            signals = {n: _since(c, until - margin) for n, c in signals.items()}
+            truth = {n: _since(c, until - margin) for n, c in truth.items()}
+
+    def _window(
+        self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int, share: float
+    ) -> DriveWindow:
+        plan = self.plan
+        aligned = correct_signals(align(signals, plan.alignment, start_ns, end_ns), plan.vehicle)
+        late = [
+            Loss("late", _LATE, signals[name].source, start_ns, end_ns, count, "note")
+            for name, count in count_late(signals, plan.alignment, start_ns, end_ns).items()
+            if count
+        ]
+        self.losses = merge_losses([self.losses, late, _impossible(aligned)])
+        at_stamps = None
+        if plan.truth is not None:
+            at_stamps = truth_at(derive_truth(truth, plan=plan.truth), aligned.stamps_ns, plan.truth_latency_s)
+        return DriveWindow(aligned, at_stamps, share)
+
+
+def with_look_ahead(
+    windows: Iterable[DriveWindow], look_ahead_s: float
+) -> Iterator[tuple[DriveWindow, Signals | None]]:
+    """Yield the windows that hold a stamp, each with the signals of the ``look_ahead_s`` behind its last stamp.
+
+    They are fewer only where the drive ends, and None where there are none or none are asked for. No more windows
+    are held at once than that takes.
+    """
+    held: deque[DriveWindow] = deque()
+    look_ahead_ns = round(look_ahead_s * 1e9)
+    for window in windows:
+        if len(window.signals):
+            held.append(window)
+        while held and held[-1].signals.stamps_ns[-1] - held[0].signals.stamps_ns[-1] >= look_ahead_ns:
+            yield _with_following(held, look_ahead_ns)
+    while held:
+        yield _with_following(held, look_ahead_ns)
+
+
+def _with_following(held: deque[DriveWindow], look_ahead_ns: int) -> tuple[DriveWindow, Signals | None]:
+    """Take the first window from ``held``; return it with what follows within the time."""
+    first = held.popleft()
+    if not held or look_ahead_ns == 0:
+        return first, None
+    following = join_signals([w.signals for w in held])
+    until = int(np.searchsorted(following.stamps_ns, first.signals.stamps_ns[-1] + look_ahead_ns, side="right"))
+    return first, cut_signals(following, 0, until)
+
+
+def _since(channel: Channel, stamp_ns: int) -> Channel:
+    first = int(np.searchsorted(channel.stamps_ns, stamp_ns))
+    return replace(
+        channel,
+        stamps_ns=channel.stamps_ns[first:],
+        arrival_ns=channel.arrival_ns[first:],
+        values=channel.values[first:],
+    )
+
+
+def _impossible(signals: Signals) -> list[Loss]:
+    losses = []
+    for name, mask in impossible_readings(signals).items():
+        stamps = signals.stamps_ns[mask]
+        losses.append(Loss("impossible", _IMPOSSIBLE, name, int(stamps[0]), int(stamps[-1]) + 1, len(stamps), "note"))
+    return losses
+
+
+def _gaps(before: Channel | None, channel: Channel) -> list[Loss]:
+    """Return the silences within a window's channel and between it and the window before."""
+    stamps = channel.stamps_ns
+    if before is not None and len(before):
+        stamps = np.concatenate([before.stamps_ns[-1:], stamps])
+    if stamps.shape[0] < 3:
+        return []
+    steps = np.diff(stamps)
+    least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
+    return [
+        Loss(
+            "gap",
+            f"no samples for {steps[i] * 1e-9:.2f} s",
+            channel.source,
+            int(stamps[i]),
+            int(stamps[i + 1]),
+            1,
+            "note",
+        )
+        for i in np.flatnonzero(steps > least)
+    ]

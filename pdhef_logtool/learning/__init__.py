@@ -1,0 +1,1 @@
+"""What drives with truth can teach."""

@@ -1,0 +1,123 @@
+"""Axle slip angles and lateral forces from truth, and a magic formula through them: where identification starts.
+
+F_yf cos δ + F_yr = m a_y and l_f F_yf cos δ − l_r F_yr = I_z ṙ give both axle forces; the slip angles follow from the
+true velocity (METHOD Eq 2, 3). The fit is least squares with the priors of METHOD §14.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.evaluation.segments import smooth
+from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.records.signals import BoolArray, FloatArray
+
+#: Forces are smoothed without phase; accelerometers on real cars show the road above this.
+SMOOTHING_HZ = 2.0
+#: Used where the true speed is above this multiple of the low-speed limit.
+SPEED_FACTOR = 2.0
+#: Sideslip beyond this is a spin or a drift, where a static single-track tyre explains nothing (METHOD §14).
+MAX_SIDESLIP_RAD = float(np.deg2rad(8.0))
+#: 1-sigma of the priors on log stiffness, log peak force, shape (METHOD §14).
+STIFFNESS_LOG_STD = 0.25
+PEAK_LOG_STD = 0.10
+SHAPE_STD = 0.10
+SHAPE = 1.35
+#: A peak below this multiple of the largest force that was seen is no peak.
+PEAK_OVER_SEEN = 1.1
+#: Friction demand scatters about the curve by this share of its own size and floor.
+FORCE_STD_N_PER_KG = 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxleSamples:
+    """Slip angle [N] in rad and lateral force [N] in N of both axles, from truth."""
+
+    front_slip_rad: FloatArray
+    front_force_n: FloatArray
+    rear_slip_rad: FloatArray
+    rear_force_n: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class AxleCurve:
+    """Magic formula of one axle with E = 0: stiffness N/rad, peak N, shape C."""
+
+    stiffness_n_per_rad: float
+    peak_n: float
+    shape: float
+
+    def force_n(self, slip_rad: FloatArray) -> FloatArray:
+        """Return D sin(C atan(B α)) with B = stiffness/(C D)."""
+        b = self.stiffness_n_per_rad / (self.shape * self.peak_n)
+        return self.peak_n * np.sin(self.shape * np.arctan(b * slip_rad))
+
+
+def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
+    """Return where truth and signals can be used for identification, [N]."""
+    truth = drive.truth
+    known = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s + truth.ay_m_s2)
+    moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
+    tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
+    use: BoolArray = known & moving & tame & np.isfinite(drive.signals.steer_rad)
+    return use
+
+
+def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> AxleSamples:
+    """Return slip angles and forces of all usable stamps of all drives, smoothed to ``SMOOTHING_HZ``."""
+    columns: list[tuple[FloatArray, ...]] = []
+    lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
+    for drive in drives:
+        use = usable_stamps(drive, vehicle)
+        stamps = drive.signals.stamps_ns
+
+        def smoothed(values: FloatArray, use: BoolArray = use, stamps: FloatArray = stamps) -> FloatArray:  # type: ignore[assignment]
+            return smooth(stamps, np.where(use, values, np.nan), SMOOTHING_HZ)  # type: ignore[arg-type]
+
+        truth = drive.truth
+        vx, vy, r = smoothed(truth.vx_m_s), smoothed(truth.vy_m_s), smoothed(truth.yaw_rate_rad_s)
+        ay, steer = smoothed(truth.ay_m_s2), smoothed(drive.signals.steer_rad)
+        r_dot = np.full(len(stamps), np.nan)
+        if len(stamps) > 2:
+            r_dot = np.gradient(r, stamps * 1e-9 - stamps[0] * 1e-9)
+        total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
+        front = (lr * total + moment) / (lf + lr) / np.cos(steer)
+        rear = (lf * total - moment) / (lf + lr)
+        columns.append((steer - np.arctan((vy + lf * r) / vx), front, -np.arctan((vy - lr * r) / vx), rear))
+    joined = [np.concatenate(c) for c in zip(*columns, strict=True)]
+    good = np.isfinite(np.sum(joined, axis=0))
+    return AxleSamples(*(c[good] for c in joined))
+
+
+def fit_axle(
+    slip_rad: FloatArray, force_n: FloatArray, *, prior: AxleCurve, mass_kg: float, independent: float
+) -> AxleCurve:
+    """Fit a curve to slip and force, both [N], with priors about ``prior``.
+
+    Parameters
+    ----------
+    independent : how many independent samples the N neighbouring ones are worth.
+    """
+    from scipy.optimize import least_squares
+
+    if slip_rad.size < 10:
+        return prior
+    step = max(1, slip_rad.size // 4000)
+    slip, force = slip_rad[::step], force_n[::step]
+    weight = np.sqrt(independent / slip.size) / (FORCE_STD_N_PER_KG * mass_kg)
+    seen = float(np.percentile(np.abs(force), 99.5))
+    peak0 = max(prior.peak_n, PEAK_OVER_SEEN * seen)
+    origin = np.array([np.log(prior.stiffness_n_per_rad), np.log(peak0), prior.shape])
+    std = np.array([STIFFNESS_LOG_STD, PEAK_LOG_STD, SHAPE_STD])
+
+    def residuals(theta: FloatArray) -> FloatArray:
+        curve = AxleCurve(float(np.exp(theta[0])), float(np.exp(theta[1])), float(theta[2]))
+        return np.concatenate([weight * (curve.force_n(slip) - force), (theta - origin) / std])
+
+    low = np.array([-np.inf, np.log(PEAK_OVER_SEEN * seen) - 1e-9, 1.0])
+    fit = least_squares(residuals, origin, bounds=(low, [np.inf, np.inf, 1.9]), loss="linear")
+    return AxleCurve(float(np.exp(fit.x[0])), float(np.exp(fit.x[1])), float(fit.x[2]))

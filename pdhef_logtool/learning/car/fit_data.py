@@ -1,0 +1,100 @@
+"""What identification sees of a drive: signals with truth at the same stamps, cut into fit and held-out parts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+
+#: Between the fit part and the held-out part: filter states and slow disturbances must have forgotten the former.
+GUARD_S = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FitDrive:
+    """One drive, or a part of it: signals [N] and truth [N] at the same stamps.
+
+    ``signals`` are as measured: no bias and no offset of a vehicle file is taken off.
+    ``independent_yaw_rate`` tells that the truth's yaw rate is not the gyro itself.
+    """
+
+    name: str
+    signals: Signals
+    truth: StateTrack
+    independent_yaw_rate: bool
+    log_start_ns: int
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last stamp in seconds from the log's start."""
+        stamps = self.signals.stamps_ns
+        return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
+
+    @property
+    def duration_s(self) -> float:
+        """Time from first to last stamp."""
+        stamps = self.signals.stamps_ns
+        return float(stamps[-1] - stamps[0]) * 1e-9 if stamps.size else 0.0
+
+
+def load_fit_drive(
+    name: str,
+    log: DriveLog,
+    mapping: Mapping,
+    vehicle: VehicleParameters,
+    start_ns: int,
+    end_ns: int,
+    progress: Callable[[float], None] = lambda _share: None,
+) -> FitDrive | None:
+    """Read a slice of a log; None when it has no truth from which a sideslip follows.
+
+    The vehicle gives geometry only (lever arms, steering ratio, wheel radius).
+    """
+    sensors = vehicle.sensors.model_copy(update={"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0})
+    as_measured = vehicle.model_copy(update={"steer_offset_rad": 0.0, "sensors": sensors})
+    plan = plan_drive(log, mapping, as_measured, start_ns, end_ns)
+    if plan.truth is None:
+        return None
+    signals, truth = [], []
+    for window in DriveReader(log, plan, 600.0).windows():
+        if len(window.signals) and window.truth is not None:
+            signals.append(window.signals)
+            truth.append(window.truth)
+        progress(window.share_done)
+    if not signals:
+        return None
+    joined = concatenate(truth)
+    if not np.isfinite(joined.sideslip_rad).any():
+        return None
+    return FitDrive(name, join_signals(signals), joined, "yaw_rate_rad_s" not in plan.dependent, log.start_ns)
+
+
+def split_drive(drive: FitDrive, holdout: float) -> tuple[FitDrive, FitDrive | None]:
+    """Split off the last ``holdout`` share of a drive, with ``GUARD_S`` between; None when nothing is held out."""
+    if holdout <= 0.0:
+        return drive, None
+    stamps = drive.signals.stamps_ns
+    cut = int(stamps[0]) + round((1.0 - holdout) * (int(stamps[-1]) - int(stamps[0])))
+    first = int(np.searchsorted(stamps, cut))
+    second = int(np.searchsorted(stamps, cut + round(GUARD_S * 1e9)))
+    return _part(drive, 0, first), _part(drive, second, len(stamps)) if second < len(stamps) else None
+
+
+def _part(drive: FitDrive, a: int, b: int) -> FitDrive:
+    signals = Signals(
+        **{f.name: getattr(drive.signals, f.name)[a:b] for f in fields(Signals) if f.name != "available"},
+        available=drive.signals.available,
+    )
+    columns = {}
+    for f in fields(StateTrack):
+        value = getattr(drive.truth, f.name)
+        columns[f.name] = value if f.name == "name" or value.shape[0] != len(drive.truth) else value[a:b]
+    return FitDrive(drive.name, signals, StateTrack(**columns), drive.independent_yaw_rate, drive.log_start_ns)

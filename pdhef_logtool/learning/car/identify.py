@@ -1,0 +1,464 @@
+"""Vehicle identification: axle tyres, steering, roll gradient, biases, and the filter noise that belongs to them.
+
+Direct minimisation of the sideslip error of the physics filter itself, with priors (METHOD §14), started from a fit to
+axle forces. In normalised parameters θ (distance from the prior in its standard deviations) the cost is
+
+    Σ_k w (β̂_k(θ) − β_k)² / σ² + |θ|²,
+
+where w makes one second of neighbouring, dependent samples count as one sample and σ is the error that remains, drive
+by drive. The intervals hold under the model: they do not contain what a single-track model cannot express. What
+the drives do not excite (posterior hardly narrower than the prior) is put back to its prior and said.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, FilterTuning, Tyres, VehicleParameters, correct_signals
+from pdhef_logtool.estimators.pass_through import PassThrough
+from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
+from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
+from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.learning.car.axle_forces import (
+    PEAK_LOG_STD,
+    PEAK_OVER_SEEN,
+    SHAPE,
+    SHAPE_STD,
+    STIFFNESS_LOG_STD,
+    AxleCurve,
+    AxleSamples,
+    axle_samples,
+    fit_axle,
+    usable_stamps,
+)
+from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.records.errors import EstimatorError
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+
+#: Neighbouring samples are dependent: this much time is worth one independent sample.
+CORRELATION_S = 1.0
+#: Error samples that the fit uses; more only cost time.
+FIT_RATE_HZ = 20.0
+#: The filter needs this long from its start before its error counts.
+SETTLE_S = 3.0
+#: The error that remains is not believed to be smaller than this.
+MIN_SIGMA_RAD = math.radians(0.05)
+#: A parameter whose posterior is wider than this share of its prior was not excited.
+NOT_EXCITED = 0.8
+#: Step of the numerical derivative, in prior standard deviations.
+DERIVATIVE_STEP = 0.03
+#: Width of the tyres' priors about the axle-force fit, as a share of METHOD §14's widths about a vehicle file.
+AXLE_FIT_SHARE = 0.5
+#: Errors beyond this many σ count linearly: a moment in which the filter is lost must not decide the tyres.
+ROBUST_SIGMA = 3.0
+OUTER_PASSES = 2
+MAX_ITERATIONS = 15
+#: Longest step of one iteration, in prior standard deviations, and the relative gain below which it stops.
+MAX_STEP = 2.0
+MIN_GAIN = 1e-3
+MIN_DRIVE_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Prior of one parameter, normal in its own or, if ``log``, in logarithmic scale; ``low`` bounds the value."""
+
+    name: str
+    unit: str
+    mean: float
+    std: float
+    log: bool = False
+    low: float | None = None
+    tuning: bool = False  # belongs to the filter, not to the car: never put back to its prior
+
+    def value(self, theta: float) -> float:
+        """Return the parameter at a normalised distance from the prior."""
+        return self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
+
+    def theta(self, value: float) -> float:
+        """Return the normalised distance of a value."""
+        return math.log(value / self.mean) / self.std if self.log else (value - self.mean) / self.std
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """One parameter: value with its 95 % interval, prior mean, and whether the drives excited it."""
+
+    name: str
+    unit: str
+    value: float
+    low: float
+    high: float
+    prior: float
+    excited: bool
+    tuning: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PartScore:
+    """Sideslip RMSE in degrees on one part of the drives, by estimator and vehicle file."""
+
+    part: str
+    seconds: float
+    zero_deg: float
+    start_file_deg: float
+    identified_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Identification:
+    """Everything that identification found."""
+
+    vehicle: VehicleParameters
+    parameters: tuple[Identified, ...]
+    scores: tuple[PartScore, ...]
+    samples: AxleSamples
+    notes: tuple[str, ...]
+
+
+Progress = Callable[[str, float], None]
+
+
+def identify(
+    fit: Sequence[FitDrive],
+    held_out: Sequence[FitDrive],
+    start: VehicleParameters,
+    *,
+    steering_wheel: bool = False,
+    progress: Progress = lambda _text, _share: None,
+) -> Identification:
+    """Identify a vehicle on ``fit`` and score it, once, on ``held_out``.
+
+    Parameters
+    ----------
+    fit, held_out : parts of drives that share no stamp.
+    start : gives geometry, mass, priors (its tyres, inertia, roll gradient) and sensor noise.
+    steering_wheel : the steering signal is a steering-wheel angle, so that the ratio is identified too.
+
+    Raises
+    ------
+    EstimatorError
+        There is too little usable driving with truth.
+    """
+    usable_s = sum(float(np.count_nonzero(usable_stamps(d, start))) * _period_s(d) for d in fit)
+    if usable_s < MIN_DRIVE_S:
+        raise EstimatorError(
+            expected=f"at least {MIN_DRIVE_S:g} s of driving with truth, above twice the low-speed limit",
+            got=f"{usable_s:.1f} s",
+            where="identify",
+            remedy="give more drives, a longer slice or a smaller --holdout",
+        )
+    samples = axle_samples(fit, start)
+    priors = make_priors(samples, start, usable_s, steering_wheel=steering_wheel)
+    theta = np.maximum(0.0, _low_theta(priors))
+    active = np.ones(len(priors), dtype=np.bool_)
+    sigma = np.full(len(fit), math.radians(0.4))
+    total = OUTER_PASSES + 1
+    std = np.ones(len(priors))
+    for outer in range(total):
+        progress("fitting the filter's sideslip to the truth", 0.9 * outer / total)
+        theta, std, rmse = _minimise(fit, start, priors, theta, active, sigma)
+        sigma = np.maximum(MIN_SIGMA_RAD, rmse)
+        if outer == OUTER_PASSES - 1:
+            excited = np.array([p.tuning or s < NOT_EXCITED for p, s in zip(priors, std, strict=True)])
+            if excited.all():
+                break
+            active, theta = excited, np.where(excited, theta, np.clip(0.0, _low_theta(priors), None))
+    vehicle = build_vehicle(start, priors, theta, digits=6)
+    progress("scoring", 0.95)
+    scores = [_score("fit", fit, start, vehicle)]
+    if held_out:
+        scores.append(_score("held out", held_out, start, vehicle))
+    parameters = tuple(
+        Identified(
+            name=p.name,
+            unit=p.unit,
+            value=p.value(float(t)),
+            low=p.value(float(t - 1.96 * s)),
+            high=p.value(float(t + 1.96 * s)),
+            prior=p.mean,
+            excited=bool(a),
+            tuning=p.tuning,
+        )
+        for p, t, s, a in zip(priors, theta, std, active, strict=True)
+    )
+    return Identification(vehicle, parameters, tuple(scores), samples, _notes(parameters, fit, usable_s))
+
+
+def make_priors(
+    samples: AxleSamples, start: VehicleParameters, usable_s: float, *, steering_wheel: bool
+) -> tuple[Prior, ...]:
+    """Return the priors of METHOD §14; those of the tyres stand about the fit to the axle forces.
+
+    That fit has the starting file as its own prior, and its peaks stay above every force that was seen. As it has seen
+    the drives already, the filter's error may move the tyres by ``AXLE_FIT_SHARE`` of METHOD's widths only: the error
+    of the sideslip alone would also accept tyres that contradict the forces.
+    """
+    friction = start.assumed_friction
+    priors = []
+    for axle, is_front, slip, force in (
+        ("front", True, samples.front_slip_rad, samples.front_force_n),
+        ("rear", False, samples.rear_slip_rad, samples.rear_force_n),
+    ):
+        _, _, peak, _ = start.magic_formula(is_front, friction)
+        least = PEAK_OVER_SEEN * float(np.percentile(np.abs(force), 99.5)) if force.size else 0.0
+        file_curve = AxleCurve(start.cornering_stiffness_n_per_rad(is_front, friction), max(peak, least), SHAPE)
+        curve = fit_axle(slip, force, prior=file_curve, mass_kg=start.mass_kg, independent=usable_s / CORRELATION_S)
+        priors += [
+            Prior(
+                f"{axle} cornering stiffness",
+                "N/rad",
+                curve.stiffness_n_per_rad,
+                AXLE_FIT_SHARE * STIFFNESS_LOG_STD,
+                log=True,
+            ),
+            Prior(f"{axle} peak force", "N", curve.peak_n, AXLE_FIT_SHARE * PEAK_LOG_STD, log=True, low=least or None),
+            Prior(f"{axle} shape", "1", curve.shape, AXLE_FIT_SHARE * SHAPE_STD, low=1.0),
+        ]
+    sensors = start.sensors
+    priors += [
+        Prior("yaw inertia", "kg m^2", start.yaw_inertia_kg_m2, 0.20, log=True),
+        Prior("steering offset", "rad", start.steer_offset_rad, math.radians(0.2)),
+        Prior("roll gradient", "rad/(m/s^2)", start.roll_gradient_rad_per_m_s2, 0.004),
+        Prior("a_y bias", "m/s^2", sensors.ay_bias_m_s2, 0.10),
+        Prior("yaw rate bias", "rad/s", sensors.yaw_rate_bias_rad_s, 0.002),
+    ]
+    if steering_wheel:
+        priors.append(Prior("steering ratio", "1", start.steering_ratio, 0.05, log=True))
+    priors += [
+        Prior("q v_y", "m/s/sqrt(s)", PHY_UKF_Q_STD[1], 0.5, log=True, tuning=True),
+        Prior("q yaw rate", "rad/s/sqrt(s)", PHY_UKF_Q_STD[2], 0.5, log=True, tuning=True),
+        Prior("r a_y", "m/s^2", max(1.0, sensors.ay_std_m_s2), 0.5, log=True, tuning=True),
+        Prior("r yaw rate", "rad/s", sensors.yaw_rate_std_rad_s, 0.5, log=True, tuning=True),
+    ]
+    return tuple(priors)
+
+
+def build_vehicle(
+    start: VehicleParameters, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
+) -> VehicleParameters:
+    """Return the starting file with the parameters at ``theta`` and the filter tuning that belongs to them.
+
+    ``digits`` : significant digits of every number that is written.
+    """
+
+    def rounded(value: float) -> float:
+        return float(f"{value:.{digits}g}")
+
+    v = {p.name: rounded(p.value(float(t))) for p, t in zip(priors, theta, strict=True)}
+    friction = start.assumed_friction
+
+    def tyre(axle: str) -> AxleTyre:
+        peak, shape = v[f"{axle} peak force"], v[f"{axle} shape"]
+        return AxleTyre(
+            B=rounded(v[f"{axle} cornering stiffness"] / (shape * peak)), C=shape, D_n=rounded(peak / friction), E=0.0
+        )
+
+    sensors = start.sensors.model_copy(
+        update={"ay_bias_m_s2": v["a_y bias"], "yaw_rate_bias_rad_s": v["yaw rate bias"]}
+    )
+    tuning = FilterTuning(
+        q_std=(PHY_UKF_Q_STD[0], v["q v_y"], v["q yaw rate"], PHY_UKF_Q_STD[3]),
+        r_std={
+            "ay_m_s2": v["r a_y"],
+            "yaw_rate_rad_s": v["r yaw rate"],
+            "speed_m_s": start.sensors.speed_std_m_s,
+        },
+    )
+    return start.model_copy(
+        update={
+            "yaw_inertia_kg_m2": v["yaw inertia"],
+            "steer_offset_rad": v["steering offset"],
+            "steering_ratio": v.get("steering ratio", start.steering_ratio),
+            "roll_gradient_rad_per_m_s2": v["roll gradient"],
+            "friction": friction,
+            "sensors": sensors,
+            "tyres": Tyres(front=tyre("front"), rear=tyre("rear")),
+            "filter": {**start.filter, TUNED: tuning},
+        }
+    )
+
+
+# ---- the fit ----
+
+
+def _low_theta(priors: Sequence[Prior]) -> FloatArray:
+    return np.array([-6.0 if p.low is None else max(-6.0, p.theta(p.low)) for p in priors])
+
+
+def _minimise(
+    drives: Sequence[FitDrive],
+    start: VehicleParameters,
+    priors: Sequence[Prior],
+    theta0: FloatArray,
+    active: BoolArray,
+    sigma: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Minimise over the active parameters.
+
+    ``sigma`` [drives] is the error in rad that each drive is believed to leave: a violent drive, whose error the
+    single-track model cannot remove, must not drown the others.
+
+    Returns
+    -------
+    θ, posterior standard deviations in prior units, and the RMSE of each drive in rad.
+    """
+    index = np.flatnonzero(active)
+
+    def full(part: FloatArray) -> FloatArray:
+        theta = theta0.copy()
+        theta[index] = part
+        return theta
+
+    def residuals(part: FloatArray) -> FloatArray:
+        parts = _sideslip_errors(drives, start, priors, full(part))
+        scaled = [weight * _pseudo_huber(error / s) for (error, weight), s in zip(parts, sigma, strict=True)]
+        return np.concatenate([*scaled, part])
+
+    def jacobian(part: FloatArray) -> FloatArray:
+        at = residuals(part)
+        columns = np.empty((at.size, part.size))
+        for i in range(part.size):
+            moved = part.copy()
+            moved[i] += DERIVATIVE_STEP
+            columns[:, i] = (residuals(moved) - at) / DERIVATIVE_STEP
+        return columns
+
+    part, jac = _projected_levenberg_marquardt(residuals, jacobian, theta0[index], _low_theta(priors)[index])
+    theta = full(part)
+    covariance = np.linalg.inv(jac.T @ jac)
+    std = np.ones(len(priors))
+    std[index] = np.sqrt(np.diag(covariance))
+    rmse = [
+        float(np.sqrt(np.sum(error**2) / max(1, int(np.count_nonzero(weight)))))
+        for error, weight in _sideslip_errors(drives, start, priors, theta)
+    ]
+    return theta, std, np.array(rmse)
+
+
+def _projected_levenberg_marquardt(
+    residuals: Callable[[FloatArray], FloatArray],
+    jacobian: Callable[[FloatArray], FloatArray],
+    first: FloatArray,
+    low: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Minimise |residuals|² above ``low``; returns the parameters and the Jacobian there.
+
+    Steps are projected to the bounds. (An interior-point method, such as scipy's, hardly moves at all from a start at a
+    bound, and there is where the axle-force fit often ends.)
+    """
+    at = np.maximum(first, low)
+    value = residuals(at)
+    jac = jacobian(at)
+    damping = 1e-3
+    for _ in range(MAX_ITERATIONS):
+        gradient = jac.T @ value
+        free = (at > low) | (gradient < 0.0)
+        normal = jac[:, free].T @ jac[:, free]
+        improved = False
+        for _ in range(6):
+            step = np.zeros(at.size)
+            step[free] = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient[free])
+            candidate = np.maximum(at + np.clip(step, -MAX_STEP, MAX_STEP), low)
+            there = residuals(candidate)
+            if there @ there < value @ value:
+                improved = True
+                break
+            damping *= 8.0
+        if not improved:
+            break
+        gain = 1.0 - (there @ there) / (value @ value)
+        moved = float(np.max(np.abs(candidate - at)))
+        at, value = candidate, there
+        jac = jacobian(at)
+        damping = max(damping / 4.0, 1e-6)
+        if gain < MIN_GAIN and moved < 10.0 * DERIVATIVE_STEP:
+            break
+    return at, jac
+
+
+def _pseudo_huber(scaled: FloatArray) -> FloatArray:
+    """Return residuals whose square grows like the error's own up to ``ROBUST_SIGMA`` and linearly beyond."""
+    c = ROBUST_SIGMA
+    out: FloatArray = np.sign(scaled) * c * np.sqrt(2.0 * (np.sqrt(1.0 + (scaled / c) ** 2) - 1.0))
+    return out
+
+
+def _sideslip_errors(
+    drives: Sequence[FitDrive], start: VehicleParameters, priors: Sequence[Prior], theta: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return by drive the filter's sideslip errors in rad at ``FIT_RATE_HZ`` and their weights, 0 = does not count."""
+    vehicle = build_vehicle(start, priors, theta)
+    estimator = physics_ukf_tuned(vehicle)
+    parts = []
+    for drive in drives:
+        steps, _ = estimator.filter_steps(_signals_of(drive, start, vehicle), None)
+        every = max(1, round(1.0 / (FIT_RATE_HZ * _period_s(drive))))
+        pick = slice(None, None, every)
+        beta = np.arctan2(steps.x[pick, 1], steps.x[pick, 0])
+        error = wrap_angle(beta - drive.truth.sideslip_rad[pick])
+        stamps = drive.signals.stamps_ns
+        use = usable_stamps(drive, start)[pick] & steps.valid[pick] & np.isfinite(error)
+        use &= (stamps[pick] - stamps[0]) * 1e-9 > SETTLE_S
+        weight = math.sqrt(every * _period_s(drive) / CORRELATION_S)
+        parts.append((np.where(use, error, 0.0), np.where(use, weight, 0.0)))
+    return parts
+
+
+def _signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParameters) -> Signals:
+    """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
+    ratio = start.steering_ratio / vehicle.steering_ratio
+    return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
+
+
+# ---- the verdict ----
+
+
+def _score(part: str, drives: Sequence[FitDrive], start: VehicleParameters, identified: VehicleParameters) -> PartScore:
+    """Score β = 0, the frozen filter with the starting file, and the tuned filter with the identified one."""
+    squares = np.zeros(3)
+    counts = np.zeros(3)
+    slow = start.low_speed_blend_m_s
+    for drive in drives:
+        before = _signals_of(drive, start, start)
+        tracks = (
+            PassThrough("zero", claims_zero_sideslip=True).run(before, None)[0],
+            PhysicsUkf(start).run(before, None)[0],
+            physics_ukf_tuned(identified).run(_signals_of(drive, start, identified), None)[0],
+        )
+        for i, track in enumerate(tracks):
+            error = signal_error(track, drive.truth, "sideslip_rad", slow)
+            error = error[np.isfinite(error)]
+            squares[i] += float(np.sum(error**2))
+            counts[i] += error.size
+    rmse = np.degrees(np.sqrt(squares / np.maximum(counts, 1)))
+    return PartScore(part, sum(d.duration_s for d in drives), *(float(x) for x in rmse))
+
+
+def _notes(parameters: Sequence[Identified], drives: Sequence[FitDrive], usable_s: float) -> tuple[str, ...]:
+    notes = [f"{usable_s:.0f} s of usable driving in {len(drives)} drive{'s' if len(drives) != 1 else ''}"]
+    kept = [p.name for p in parameters if not p.excited]
+    if kept:
+        notes.append(f"not excited by these drives beyond what is in the prior, and kept there: {', '.join(kept)}")
+    if not any(d.independent_yaw_rate for d in drives):
+        notes.append("the truth's yaw rate is the gyro itself: its bias is known through the sideslip alone")
+    edge = [p.name for p in parameters if p.excited and not p.low <= p.prior <= p.high and not p.tuning]
+    if edge:
+        notes.append(f"the sideslip asks for another value than the prior in: {', '.join(edge)}")
+    return tuple(notes)
+
+
+def _period_s(drive: FitDrive) -> float:
+    stamps = drive.signals.stamps_ns
+    return float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
+
+
+def understeer_deg_per_g(vehicle: VehicleParameters) -> float:
+    """Return the linear understeer gradient in degrees of road-wheel angle per g."""
+    return math.degrees(vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)) * GRAVITY_M_S2

@@ -1,0 +1,1 @@
+"""Trust in a network, and calibrated intervals."""

@@ -1,0 +1,287 @@
+"""Fit of calibrated intervals: coefficients of the terms, so that 95 % of the errors lie inside, in every regime.
+
+Error e, terms t_i ≥ 0, s² = s_0² + Σ (k_i t_i)². With r = log |e| − log(1.96 s) the pinball loss of the quantile q,
+
+    ρ(r) = q r for r > 0, −(1 − q) r else,
+
+is minimal where a share q of the errors lies inside; taken on the logarithm it weighs a straight road like a limit
+manoeuvre. Bins of grip use weigh alike.
+
+1. Drives with the vehicle file as given: s_0 = 0, q = 0.95.
+2. The same drives with the vehicle file made wrong: s_0 is the 1-sigma of 1, q = 0.85. What is added is what a vehicle
+   that differs from its file asks for; the sensors often cannot tell, so that it is added whether it differs or not.
+
+Errors of one drive are alike, so that the drives are the unit: what a fit is worth is found on drives that it has not
+seen (five folds of drives), and a last factor on a part's coefficients makes a share of *those* errors lie inside. That
+share is q (n + 1) / n of n drives, as in conformal prediction: the next drive is one more that may be the worst.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.watches.intervals import Inflation, combined
+
+#: Share inside with the vehicle file as given, and at least with one that is wrong.
+COVERED = 0.95
+COVERED_WRONG = 0.85
+#: 95 % of a normal distribution lie within this many 1-sigma.
+NORMAL_95 = 1.959963984540054
+#: Bins of true abs a_y over μ g (METHOD §10), by name: lower and upper limit.
+BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
+FOLDS = 5
+#: A fit on fewer drives says nothing of a further one.
+MIN_DRIVES = 5
+#: Errors are not told apart below this: 6e-5 degrees.
+LEAST_ERROR = 1e-6
+#: Coefficients below count for nothing.
+LEAST_COEFFICIENT = 1e-3
+#: Natural logarithm of the coefficients: range of the search, and its starts.
+LOG_RANGE = (-9.0, 5.0)
+LOG_STARTS = (-0.5, -2.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """Errors of one estimator and what was known when it was made; all [n] but the terms [n, m].
+
+    ``vy_per_sideslip`` is the estimator's 1-sigma of v_y over its 1-sigma of the sideslip: what a calibrated one
+    is multiplied by. ``bin``: number of the bin of grip use, −1 for none. ``drive``: number of the drive, the same for
+    both runs of a drive. ``wrong``: the vehicle file was made wrong.
+    """
+
+    terms: FloatArray
+    yaw_rate_terms: FloatArray
+    vy_per_sideslip: FloatArray
+    sideslip_error: FloatArray
+    vy_error: FloatArray
+    yaw_rate_error: FloatArray
+    own_std: FloatArray
+    bin: IntArray
+    drive: IntArray
+    wrong: BoolArray
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return int(self.bin.shape[0])
+
+    def where(self, mask: BoolArray) -> Samples:
+        """Return the samples of a mask [n]."""
+        return Samples(*(getattr(self, f.name)[mask] for f in fields(self)))
+
+
+def join_samples(parts: Sequence[Samples]) -> Samples:
+    """Join the samples of several drives."""
+    return Samples(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Samples)))
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """How the 95 % intervals of sideslip stand in one bin, before and after; after is of drives not fitted to.
+
+    ``width_*``: mean width over 3.92 times the RMSE; 1 for normal errors whose size is known.
+    """
+
+    bin: str
+    wrong_vehicle: bool
+    drives: int
+    samples: int
+    rmse_rad: float
+    covered_before: float
+    covered_after: float
+    width_before: float
+    width_after: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """The coefficients of one estimator, the factors that unseen drives asked for, and how its intervals stand.
+
+    ``wrong_factor``: that on the part that is added for a wrong vehicle file; 0 if there is none.
+    """
+
+    inflation: Inflation
+    unseen_factor: float
+    wrong_factor: float
+    coverage: tuple[Coverage, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """One part of the variance: its coefficients with the factor in them, and its 1-sigma on drives not seen [n]."""
+
+    coefficients: tuple[float, ...]
+    factor: float
+    unseen: FloatArray
+
+
+def fit_inflation(samples: Samples) -> Fitted:
+    """Fit one estimator's coefficients.
+
+    Raises
+    ------
+    ValueError
+        There are fewer than :data:`MIN_DRIVES` drives with the vehicle file as given.
+    """
+    if np.unique(samples.drive[~samples.wrong]).size < MIN_DRIVES:
+        raise ValueError(f"at least {MIN_DRIVES} drives are needed")
+    samples = samples.where(samples.bin >= 0)
+    right, added = _fit_parts(samples, samples.terms, samples.sideslip_error)
+    right_rate, added_rate = _fit_parts(samples, samples.yaw_rate_terms, samples.yaw_rate_error)
+    given = ~samples.wrong
+    share = share_for(COVERED, int(np.unique(samples.drive[given]).size))
+    vy_factor = covering_factor(
+        samples.vy_error[given], (right.unseen * samples.vy_per_sideslip)[given], bin_weights(samples.bin[given]), share
+    )
+    inflation = Inflation(
+        sideslip=_joined(right.coefficients, added.coefficients),
+        yaw_rate=_joined(right_rate.coefficients, added_rate.coefficients),
+        vy_factor=vy_factor,
+    )
+    rows = coverage_rows(samples, np.hypot(right.unseen, added.unseen))
+    return Fitted(inflation, right.factor, added.factor, tuple(rows))
+
+
+def _fit_parts(samples: Samples, terms: FloatArray, error: FloatArray) -> tuple[_Part, _Part]:
+    """Return the part for the vehicle file as given, and what is added for a wrong one."""
+    nothing = np.zeros(len(samples))
+    right = _fit_part(samples, terms, error, ~samples.wrong, COVERED, nothing, nothing)
+    if np.unique(samples.drive[samples.wrong]).size < MIN_DRIVES:
+        return right, _Part((0.0,) * terms.shape[1], 0.0, nothing)
+    known = combined(terms, right.coefficients)
+    return right, _fit_part(samples, terms, error, samples.wrong, COVERED_WRONG, known, right.unseen)
+
+
+def _fit_part(
+    samples: Samples,
+    terms: FloatArray,
+    error: FloatArray,
+    use: BoolArray,
+    covered: float,
+    known: FloatArray,
+    known_unseen: FloatArray,
+) -> _Part:
+    """Fit one part on the samples of a mask [n]; ``known*`` [n]: 1-sigma that is there already, fitted and unseen."""
+    weight = np.zeros(len(samples))
+    weight[use] = bin_weights(samples.bin[use])
+    unseen = np.empty(len(samples))
+    for seen, held in folds(samples.drive):
+        fit = seen & use
+        unseen[held] = combined(terms[held], fit_coefficients(terms[fit], error[fit], weight[fit], covered, known[fit]))
+    share = share_for(covered, int(np.unique(samples.drive[use]).size))
+    factor = covering_factor(error[use], unseen[use], weight[use], share, known_unseen[use])
+    coefficients = fit_coefficients(terms[use], error[use], weight[use], covered, known[use])
+    return _Part(tuple(factor * k for k in coefficients), factor, factor * unseen)
+
+
+def share_for(covered: float, drives: int) -> float:
+    """Return the share of known drives that must lie inside for ``covered`` of the next one, q (n + 1) / n.
+
+    No more than half of what q leaves out is added: few drives say little of such far quantiles.
+    """
+    return min(covered * (drives + 1) / drives, 0.5 * (1.0 + covered))
+
+
+def fit_coefficients(
+    terms: FloatArray,
+    error: FloatArray,
+    weight: FloatArray,
+    covered: float = COVERED,
+    known: FloatArray | float = 0.0,
+) -> tuple[float, ...]:
+    """Return the coefficients k [m] ≥ 0 that minimise the loss of this file's head.
+
+    Parameters
+    ----------
+    terms : [n, m], not all 0 in any row. error, weight : [n]. covered : q. known : s_0, [n].
+    """
+    from scipy.optimize import minimize
+
+    squares, there = terms**2, np.square(known)
+    size = np.log(np.maximum(np.abs(error), LEAST_ERROR)) - np.log(NORMAL_95)
+
+    def loss(log_k: FloatArray) -> tuple[float, FloatArray]:
+        k2 = np.exp(2.0 * log_k)
+        variance = there + squares @ k2
+        r = size - 0.5 * np.log(variance)
+        slope = np.where(r > 0.0, covered, covered - 1.0)
+        share = (weight * slope / variance) @ squares * k2  # d loss = −slope d log s, d log s = k² t² / s² d log k
+        return float(np.sum(weight * slope * r)), -share
+
+    count = terms.shape[1]
+    found = [
+        minimize(loss, np.full(count, start), jac=True, method="L-BFGS-B", bounds=[LOG_RANGE] * count)
+        for start in LOG_STARTS
+    ]
+    best = np.exp(min(found, key=lambda f: float(f.fun)).x)
+    return tuple(float(k) if k >= LEAST_COEFFICIENT or i == 0 else 0.0 for i, k in enumerate(best))
+
+
+def covering_factor(
+    error: FloatArray,
+    std: FloatArray,
+    weight: FloatArray,
+    covered: float = COVERED,
+    known: FloatArray | float = 0.0,
+) -> float:
+    """Return the factor g on ``std`` [n] at which a weighted share ``covered`` has e² ≤ 1.96² (s_0² + g² std²)."""
+    ratio = np.sqrt(np.maximum((error / NORMAL_95) ** 2 - np.square(known), 0.0)) / std
+    order = np.argsort(ratio, kind="stable")
+    below = np.cumsum(weight[order]) / np.sum(weight)
+    return float(ratio[order][min(int(np.searchsorted(below, covered)), len(order) - 1)])
+
+
+def bin_weights(bins: IntArray) -> FloatArray:
+    """Return weights [n], sum 1, at which every bin that occurs counts alike."""
+    _, place, count = np.unique(bins, return_inverse=True, return_counts=True)
+    weight: FloatArray = 1.0 / (count[place] * count.size)
+    return weight
+
+
+def folds(drive: IntArray) -> Iterator[tuple[BoolArray, BoolArray]]:
+    """Yield the samples to fit on and those held out, [n] each; a drive is never on both sides."""
+    numbers = np.unique(drive)
+    place = np.searchsorted(numbers, drive) % FOLDS
+    for fold in range(min(FOLDS, numbers.size)):
+        held = place == fold
+        yield ~held, held
+
+
+def coverage_rows(samples: Samples, std: FloatArray) -> Iterator[Coverage]:
+    """Yield coverage and width of the intervals ``own_std`` (before) and ``std`` (after), [n] each, by bin."""
+    error = np.abs(samples.sideslip_error)
+    for wrong in (False, True):
+        for number, name in enumerate(BINS):
+            use = (samples.bin == number) & (samples.wrong == wrong)
+            if not use.any():
+                continue
+            rmse = float(np.sqrt(np.mean(error[use] ** 2)))
+            before, after = samples.own_std[use], std[use]
+            yield Coverage(
+                bin=name,
+                wrong_vehicle=wrong,
+                drives=int(np.unique(samples.drive[use]).size),
+                samples=int(np.count_nonzero(use)),
+                rmse_rad=rmse,
+                covered_before=float(np.mean(error[use] <= NORMAL_95 * before)),
+                covered_after=float(np.mean(error[use] <= NORMAL_95 * after)),
+                width_before=float(np.mean(before)) / max(rmse, LEAST_ERROR),
+                width_after=float(np.mean(after)) / max(rmse, LEAST_ERROR),
+            )
+
+
+def bin_numbers(grip_share: FloatArray) -> IntArray:
+    """Return the number of the bin [n] of a grip use [n]; −1 where it is not known."""
+    number = np.full(grip_share.shape[0], -1, dtype=np.int64)
+    for i, (low, high) in enumerate(BINS.values()):
+        number[(grip_share >= low) & (grip_share < high)] = i
+    return number
+
+
+def _joined(right: tuple[float, ...], added: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the coefficients of the sum of two variances over the same terms."""
+    return tuple(float(np.hypot(a, b)) for a, b in zip(right, added, strict=True))

@@ -1,0 +1,380 @@
+"""``pdhef calibrate`` from drives with truth to ``calibration.json`` beside a model."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle, vehicle_sha256
+from pdhef_logtool.drive.friction import friction_source, friction_topic
+from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.estimators.registry import default_names, runnable
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
+from pdhef_logtool.learning.choosing_drives import Refusal, choose_drives
+from pdhef_logtool.learning.evidence.calibrate import (
+    COVERED,
+    COVERED_WRONG,
+    FOLDS,
+    MIN_DRIVES,
+    Fitted,
+    Samples,
+    bin_numbers,
+    fit_inflation,
+    join_samples,
+)
+from pdhef_logtool.learning.network.extract_command import MAX_VARIATION
+from pdhef_logtool.learning.noise.tune_command import HELD_OUT
+from pdhef_logtool.learning.variation import Variation, vary
+from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import choose_mapping, load_mapping
+from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
+from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.sinks.report import tool_versions, write_json
+from pdhef_logtool.watches.error_features import error_terms
+from pdhef_logtool.watches.intervals import (
+    FILE,
+    FORMAT,
+    FORMAT_VERSION,
+    inflations_document,
+    yaw_rate_terms,
+)
+
+DEFAULT_SPREAD = 0.1
+#: Neighbouring errors are alike: one sample in this time is kept.
+SAMPLE_EVERY_S = 0.05
+#: Runs of each drive with friction and vehicle made wrong.
+WRONG_RUNS = 2
+#: A drive with fewer kept samples does not count.
+MIN_SAMPLES = 20
+#: Share of the progress that running the estimators takes.
+RUNNING = 0.9
+
+Warn = Callable[[str], None]
+#: Drives that this command refuses.
+REFUSED = Refusal(
+    HELD_OUT,
+    "drives that no figure is reported on",
+    "calibrate",
+    "coverage on drives that the intervals were fitted to is no test: take --split validation, or say --any-split",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateSettings:
+    """What decides the result, beside the logs.
+
+    Attributes
+    ----------
+    config : vehicle, mapping, model, estimators, slice, sensors, which truth; the other entries are not used.
+    spread : by which friction and vehicle are made wrong in further runs of every drive; 0 = none.
+    seed : of that. split : only drives that their set's manifest puts into this split.
+    any_split : do not refuse held-out drives.
+    """
+
+    config: RunConfig
+    spread: float = DEFAULT_SPREAD
+    seed: int = 0
+    split: str | None = None
+    any_split: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class DriveEntry:
+    """What is recorded of a drive; ``left_out`` says why it is not used, empty if it is."""
+
+    name: str
+    file: str
+    sha256: str
+    split: str
+    runs: int
+    left_out: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrateResult:
+    """What the command found and wrote."""
+
+    file: Path
+    fitted: Mapping[str, Fitted]
+    drives: tuple[DriveEntry, ...]
+    left_out: tuple[DriveEntry, ...]
+    document: Mapping[str, Any]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all drives took part, 3 if some did not."""
+        return EXIT_PARTIAL if self.left_out else EXIT_OK
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {"calibration": str(self.file), "exit_code": self.exit_code, **self.document}
+
+
+def run_calibration(
+    arguments: Sequence[str],
+    output: Path,
+    settings: CalibrateSettings,
+    *,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    warn: Warn = lambda _text: None,
+) -> CalibrateResult:
+    """Fit the calibration of every estimator that gives an interval; write it to ``output``.
+
+    Parameters
+    ----------
+    arguments : logs, folders, glob patterns. output : a .json file, or the folder of a model.
+
+    Raises
+    ------
+    UsageError
+        An option is wrong, or drives are held out by their set.
+    PdhefError
+        A file or log cannot be read: an absent drive would change the result unnoticed.
+    EstimatorError
+        There are too few drives with truth.
+    """
+    config = settings.config
+    file = _output_file(output)
+    _check(settings)
+    assert config.vehicle is not None
+    vehicle = load_vehicle(config.vehicle)
+    model = open_model(config.model)
+    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    if model is not None and "train" in splits.values():
+        warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")
+    samples: dict[str, list[Samples]] = {}
+    drives: list[DriveEntry] = []
+    for number, log_input in enumerate(inputs):
+        progress(log_input.stem, RUNNING * number / len(inputs))
+        entry, found = _run_drive(log_input, number, settings, vehicle, mapping, model)
+        entry = replace(entry, split=splits.get(log_input.stem, ""))
+        if entry.left_out:
+            warn(f"{entry.name} is left out: {entry.left_out}")
+        drives.append(entry)
+        for name, part in found:
+            samples.setdefault(name, []).append(part)
+    used = tuple(d for d in drives if not d.left_out)
+    fitted: dict[str, Fitted] = {}
+    for number, (name, parts) in enumerate(samples.items()):
+        progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
+        joined = join_samples(parts)
+        count = int(np.unique(joined.drive[~joined.wrong]).size)
+        if count < MIN_DRIVES:
+            warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
+            continue
+        fitted[name] = fit_inflation(joined)
+    if not fitted:
+        raise EstimatorError(
+            expected=f"at least {MIN_DRIVES} drives with a true sideslip",
+            got=f"{len(used)}",
+            where="calibrate",
+            remedy="give more drives; the same number of short drives of many kinds is worth more than a long one",
+        )
+    left_out = tuple(d for d in drives if d.left_out)
+    document = _document(settings, vehicle, model, fitted, used, left_out)
+    write_json(file, document)
+    return CalibrateResult(file, fitted, used, left_out, document)
+
+
+def _output_file(output: Path) -> Path:
+    if output.suffix == ".json":
+        return output
+    if not output.is_dir():
+        raise UsageError(
+            expected="the folder of a model, or a file name that ends in .json",
+            got=f"no folder {output.name}",
+            where="--output",
+        )
+    return output / FILE
+
+
+def _check(settings: CalibrateSettings) -> None:
+    if settings.config.vehicle is None:
+        raise UsageError(
+            expected="a vehicle file", got="none", where="--vehicle", remedy="pdhef identify writes one of your car"
+        )
+    if not 0.0 <= settings.spread <= MAX_VARIATION:
+        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.spread), where="--vary")
+    if settings.seed < 0:
+        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
+
+
+def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
+    """Yield the draws of a key that do not leave everything as it is; ``spread`` > 0."""
+    draws = (vary(vehicle, spread, f"{key}:{number}") for number in itertools.count())
+    return (told for told in draws if told.vehicle is not vehicle)
+
+
+def _run_drive(
+    log_input: LogInput,
+    number: int,
+    settings: CalibrateSettings,
+    vehicle: VehicleParameters,
+    mapping: SignalMapping | None,
+    model: ModelBundle | None,
+) -> tuple[DriveEntry, list[tuple[str, Samples]]]:
+    """Run the estimators on a drive, once as told and some times with a wrong vehicle; return errors and terms."""
+    config = settings.config
+    sha256 = hash_log(log_input.path) if log_input.path.exists() else ""
+    entry = DriveEntry(log_input.stem, log_input.path.name, sha256, "", 0)
+    with closing(open_log(log_input.path)) as log:
+        chosen, _ = choose_mapping(log, mapping, lambda _text: None, prefer_truth=config.prefer_truth, tell_notes=False)
+        plan = plan_drive(log, chosen, vehicle, *time_slice(config, log.start_ns, log.end_ns))
+        if plan.truth is None or "sideslip_rad" not in plan.derivation:
+            return replace(entry, left_out="no true sideslip"), []
+        if "sideslip_rad" in plan.dependent:
+            return replace(entry, left_out=f"its truth is no truth: {plan.dependent['sideslip_rad']}"), []
+        windows = [
+            w for w in DriveReader(log, plan, config.window_s).windows() if len(w.signals) and w.truth is not None
+        ]
+    if not windows:
+        return replace(entry, left_out="no stamps with truth"), []
+    signals = join_signals([w.signals for w in windows])
+    truth = concatenate([replace(w.truth, covariance=np.empty((0, 3, 3))) for w in windows if w.truth is not None])
+    runs = [(vehicle, 1.0, False)]
+    if settings.spread > 0.0:
+        told = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{sha256}"), WRONG_RUNS)
+        runs += [(one.vehicle, one.friction_factor, True) for one in told]
+    found: list[tuple[str, Samples]] = []
+    for assumed, factor, wrong in runs:
+        friction = friction_source(
+            config.friction,
+            assumed,
+            plan.alignment.available,
+            friction_topic(chosen),
+            use_speed=config.sensors == "full",
+            factor=factor,
+        )
+        seen = friction.fill(signals)
+        if not found and "friction" not in plan.alignment.available:
+            signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
+        estimators, _ = runnable(
+            config.estimators or default_names(assumed, model),
+            assumed,
+            plan.alignment.available,
+            use_speed=config.sensors == "full",
+            model=model,
+        )
+        for estimator in estimators:
+            track, _ = run_window(estimator, seen, None, None)
+            part = drive_samples(track, seen, signals, truth, vehicle, number, wrong=wrong)
+            if len(part) >= MIN_SAMPLES:
+                found.append((estimator.name, part))
+    if not found:
+        return replace(entry, left_out="no estimate with an interval where the truth is known"), []
+    return replace(entry, runs=len(runs)), found
+
+
+def drive_samples(
+    track: StateTrack,
+    told: Signals,
+    signals: Signals,
+    truth: StateTrack,
+    vehicle: VehicleParameters,
+    drive: int,
+    *,
+    wrong: bool,
+) -> Samples:
+    """Return the samples of one run of a drive, a stamp every :data:`SAMPLE_EVERY_S`; none without an interval.
+
+    Parameters
+    ----------
+    told : what the estimator was told; the terms come from it. signals : with the friction of the drive, for the bins.
+    vehicle : the right one; its roll gradient and lowest speed count.
+    """
+    slow = vehicle.low_speed_blend_m_s
+    terms, _ = error_terms(track, told, vehicle.roll_gradient_rad_per_m_s2, None)
+    error = {s: signal_error(track, truth, s, slow) for s in ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s")}
+    own, rate_std = track.sideslip_std_rad, track.yaw_rate_std_rad_s
+    use = np.isfinite(own) & (own > 0.0) & np.isfinite(track.vy_std_m_s) & np.isfinite(rate_std)
+    for values in error.values():
+        use &= np.isfinite(values)
+    ay = truth.ay_m_s2 if np.isfinite(truth.ay_m_s2).any() else signals.ay_m_s2
+    friction = np.where(np.isfinite(signals.friction), signals.friction, vehicle.assumed_friction)
+    bins = bin_numbers(np.abs(smooth(truth.stamps_ns, ay, GRIP_SMOOTHING_HZ)) / (friction * GRAVITY_M_S2))
+    use &= bins >= 0
+    slot = (truth.stamps_ns - truth.stamps_ns[0]) // round(SAMPLE_EVERY_S * 1e9) if len(truth) else truth.stamps_ns
+    kept = np.flatnonzero(use)
+    kept = kept[np.unique(slot[kept], return_index=True)[1]]
+    count = kept.size
+    return Samples(
+        terms=terms[kept],
+        yaw_rate_terms=yaw_rate_terms(terms, rate_std)[kept],
+        vy_per_sideslip=track.vy_std_m_s[kept] / own[kept],
+        sideslip_error=error["sideslip_rad"][kept],
+        vy_error=error["vy_m_s"][kept],
+        yaw_rate_error=error["yaw_rate_rad_s"][kept],
+        own_std=own[kept],
+        bin=bins[kept],
+        drive=np.full(count, drive, dtype=np.int64),
+        wrong=np.full(count, wrong, dtype=np.bool_),
+    )
+
+
+def _document(
+    settings: CalibrateSettings,
+    vehicle: VehicleParameters,
+    model: ModelBundle | None,
+    fitted: Mapping[str, Fitted],
+    drives: Sequence[DriveEntry],
+    left_out: Sequence[DriveEntry],
+) -> dict[str, Any]:
+    """Return what is written; no date, so that the same command gives the same bytes."""
+    config = settings.config.to_dict()
+    coefficients = inflations_document({n: f.inflation for n, f in fitted.items()})
+    return {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "versions": tool_versions(),
+        "settings": {
+            **{
+                k: config[k]
+                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
+            },
+            "split": settings.split,
+            "any_split": settings.any_split,
+            "vary": settings.spread,
+            "vary_seed": settings.seed,
+        },
+        "vehicle": {
+            "name": vehicle.name,
+            "file": config["vehicle"],
+            "sha256": vehicle_sha256(vehicle),
+            "roll_gradient_rad_per_m_s2": vehicle.roll_gradient_rad_per_m_s2,
+        },
+        "model_sha256": None if model is None else model.sha256,
+        "fit": {
+            "covered": COVERED,
+            "folds": FOLDS,
+            "covered_with_wrong_vehicle": COVERED_WRONG,
+            "wrong_runs": WRONG_RUNS,
+            "sample_every_s": SAMPLE_EVERY_S,
+        },
+        "drives_sha256": hashlib.sha256("".join(sorted(d.sha256 for d in drives)).encode()).hexdigest(),
+        "drives": [{k: v for k, v in asdict(d).items() if k != "left_out"} for d in drives],
+        "left_out": [{"name": d.name, "file": d.file, "reason": d.left_out} for d in left_out],
+        "estimators": {
+            name: {
+                **coefficients[name],
+                "unseen_factor": f.unseen_factor,
+                "wrong_vehicle_factor": f.wrong_factor,
+                "coverage": [asdict(c) for c in f.coverage],
+            }
+            for name, f in fitted.items()
+        },
+    }

@@ -1,0 +1,187 @@
+"""The rule that turns errors at several trusts into the cap of a vehicle file (METHOD §14). Pure functions.
+
+On a car that a network has never seen it may help or hurt. So trust above 0 needs driving with truth that neither the
+network nor the vehicle file was fitted to, trust above one half needs more than a mean: a paired bootstrap of blocks.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+
+#: Trusts that are tried, the first is physics alone.
+TRUSTS = (0.0, 0.25, 0.5, 0.75, 1.0)
+#: Largest cap on a mean gain alone (METHOD §14: 0.3 to 0.5).
+UNCONFIRMED_CAP = 0.5
+#: Errors are correlated over seconds: a block is at least this long, a shorter drive is one block (METHOD §10).
+BLOCK_S = 10.0
+#: Below so many blocks a percentile interval is too narrow to confirm anything.
+MIN_BLOCKS = 8
+#: Seconds of scored driving with a lateral acceleration above this, without which nothing is decided.
+EXCITED_M_S2, MIN_EXCITED_S = 2.0, 20.0
+#: Trust 1 is "not worse" than a lower one if its RMSE is by no more than this share above it, with the same confidence.
+TOLERANCE = 0.05
+RESAMPLES = 4000
+LEVEL = 0.95
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BlockErrors:
+    """Squared sideslip errors in blocks, paired: every stamp counts at all trusts.
+
+    Attributes
+    ----------
+    squares : [T, B], sums in rad², rows as in :data:`TRUSTS`. counts : [B], stamps.
+    scored_s, excited_s : seconds that were scored, and those of them above :data:`EXCITED_M_S2`.
+    lost : stamps at which a trust above 0 gave no estimate and trust 0 did.
+    """
+
+    squares: FloatArray
+    counts: FloatArray
+    scored_s: float
+    excited_s: float
+    lost: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A difference of mean squares in deg² with its 95 % bounds; NaN where there are too few blocks."""
+
+    value_deg2: float
+    low_deg2: float
+    high_deg2: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrustDecision:
+    """The cap, why, and what it rests on.
+
+    Attributes
+    ----------
+    rmse_deg : by trust as in :data:`TRUSTS`. against_zero : squared error of each less that of trust 0.
+    best_lower : trust below 1 with the smallest RMSE. against_best : squared error of trust 1 less that of best_lower.
+    """
+
+    cap: float
+    reason: str
+    rmse_deg: tuple[float, ...]
+    against_zero: tuple[Bound, ...]
+    best_lower: float
+    against_best: Bound
+    blocks: int
+    scored_s: float
+    excited_s: float
+
+
+def block_errors(
+    errors: FloatArray, truth_sideslip: FloatArray, stamps_ns: IntArray, excited: BoolArray, *, block_s: float = BLOCK_S
+) -> BlockErrors:
+    """Return the errors of one drive in blocks of equal length, none shorter than ``block_s``.
+
+    Parameters
+    ----------
+    errors : [T, N] in rad, NaN where not scored; where trust 0 has none the stamp does not count. A trust that gives no
+        estimate where trust 0 does is charged with the larger of trust 0's error and the sideslip itself: leaving hard
+        stamps out gains nothing.
+    truth_sideslip : [N] in rad. stamps_ns : int64 [N]. excited : [N].
+    """
+    scored = np.isfinite(errors[0])
+    if not scored.any():
+        return BlockErrors(np.zeros((errors.shape[0], 0)), np.zeros(0), 0.0, 0.0)
+    kept, t = errors[:, scored], (stamps_ns[scored] - stamps_ns[scored][0]) * 1e-9
+    charge = np.fmax(np.abs(kept[0]), np.abs(truth_sideslip[scored]))
+    lost = ~np.isfinite(kept)
+    squares = np.where(lost, charge, kept) ** 2
+    count = max(1, int(t[-1] // block_s))
+    block = np.minimum((t / max(t[-1], 1e-9) * count).astype(np.int64), count - 1)
+    sums = np.stack([np.bincount(block, weights=row, minlength=count).astype(np.float64) for row in squares])
+    counts = np.bincount(block, minlength=count).astype(np.float64)
+    held = counts > 0
+    step_s = float(np.median(np.diff(stamps_ns))) * 1e-9 if stamps_ns.shape[0] > 1 else 0.0
+    return BlockErrors(
+        squares=sums[:, held],
+        counts=counts[held],
+        scored_s=float(np.count_nonzero(scored)) * step_s,
+        excited_s=float(np.count_nonzero(scored & excited)) * step_s,
+        lost=int(np.count_nonzero(lost.any(axis=0))),
+    )
+
+
+def join_blocks(drives: list[BlockErrors]) -> BlockErrors:
+    """Return the blocks of several drives together."""
+    return BlockErrors(
+        squares=np.concatenate([d.squares for d in drives], axis=1),
+        counts=np.concatenate([d.counts for d in drives]),
+        scored_s=math.fsum(d.scored_s for d in drives),
+        excited_s=math.fsum(d.excited_s for d in drives),
+        lost=sum(d.lost for d in drives),
+    )
+
+
+def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
+    """Return the cap that the errors allow.
+
+    - Too little excited driving: 0.
+    - 1, if the 95 % bounds of a paired block bootstrap confirm that the squared error at trust 1 is below that at
+      trust 0, and that it is no more than :data:`TOLERANCE` of the RMSE above that of the best lower trust.
+    - Else the largest trust up to :data:`UNCONFIRMED_CAP` whose squared error is below that at trust 0.
+    - Else 0.
+    """
+    squares, counts = errors.squares * math.degrees(1.0) ** 2, errors.counts
+    blocks, total = int(counts.shape[0]), float(counts.sum())
+    mean = squares.sum(axis=1) / total if total else np.full(len(TRUSTS), np.nan)
+    draws = (
+        np.random.default_rng(seed).multinomial(blocks, np.full(blocks, 1.0 / blocks), RESAMPLES) if blocks else None
+    )
+
+    def bound(row: FloatArray) -> Bound:
+        value = float(row.sum() / total) if total else math.nan
+        if draws is None or blocks < MIN_BLOCKS:
+            return Bound(value, math.nan, math.nan)
+        low, high = np.percentile((draws @ row) / (draws @ counts), [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
+        return Bound(value, float(low), float(high))
+
+    best = int(np.argmin(mean[:-1])) if total else 0
+    against_zero = tuple(bound(row - squares[0]) for row in squares)
+    tolerated = bound(squares[-1] - (1.0 + TOLERANCE) ** 2 * squares[best])
+    cap, reason = _rule(errors, mean, against_zero[-1], tolerated, TRUSTS[best], blocks)
+    return TrustDecision(
+        cap=cap,
+        reason=reason,
+        rmse_deg=tuple(float(v) for v in np.sqrt(mean)),
+        against_zero=against_zero,
+        best_lower=TRUSTS[best],
+        against_best=bound(squares[-1] - squares[best]),
+        blocks=blocks,
+        scored_s=errors.scored_s,
+        excited_s=errors.excited_s,
+    )
+
+
+def _rule(
+    errors: BlockErrors, mean: FloatArray, gain: Bound, tolerated: Bound, best: float, blocks: int
+) -> tuple[float, str]:
+    """Return cap and reason; bounds that are NaN confirm nothing."""
+    if not errors.excited_s >= MIN_EXCITED_S:
+        return 0.0, (
+            f"too little to decide on: {errors.excited_s:.1f} s above {EXCITED_M_S2:g} m/s², at least "
+            f"{MIN_EXCITED_S:g} s are needed"
+        )
+    if gain.high_deg2 < 0.0 and tolerated.high_deg2 <= 0.0:
+        return 1.0, "the gain at trust 1 is confirmed"
+    gained = [t for t, m in zip(TRUSTS, mean, strict=True) if 0.0 < t <= UNCONFIRMED_CAP and m < mean[0]]
+    if not gained:
+        return 0.0, "no gain over physics alone"
+    if blocks < MIN_BLOCKS:
+        why = f"{blocks} blocks are too few to confirm trust 1 ({MIN_BLOCKS} are needed)"
+    elif gain.low_deg2 > 0.0:
+        why = "trust 1 is confirmed to be worse"
+    elif not gain.high_deg2 < 0.0:
+        why = "the gain at trust 1 is not confirmed"
+    else:
+        why = f"trust 1 may be more than {TOLERANCE:.0%} worse than trust {best:g}"
+    return max(gained), f"a gain on the mean; {why}"

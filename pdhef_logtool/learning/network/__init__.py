@@ -1,0 +1,1 @@
+"""Residual datasets and training."""

@@ -1,0 +1,177 @@
+"""``pdhef train --baselines``: pure LSTM and linear regression, on the dataset that the residual network is trained on.
+
+Same drives, same split, same rows, same recipe: what differs is what is learnt. The regression is ordinary least
+squares of the true sideslip on low-passed features (see :mod:`pdhef_logtool.residual_model.linear_model`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
+from pdhef_logtool.learning.network.train_command import TrainResult, gap_free_runs, make_recipe, train_on
+from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.linear_model import LinearModel
+from pdhef_logtool.residual_model.low_pass import low_pass
+from pdhef_logtool.sinks.base import write_bytes
+
+LOW_PASS_HZ = 2.0
+#: A feature that varies by less than this share of its size is a constant, which the intercept already is.
+CONSTANT_SHARE = 1e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SideslipSequence:
+    """One gap-free run: features [N, f], the step that ends at each row [N] (NaN at the first), true sideslip [N].
+
+    The sideslip is NaN on rows that are no part of the fit.
+    """
+
+    features: FloatArray
+    dt_s: FloatArray
+    sideslip_rad: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BaselinesResult:
+    """What the command trained and wrote; the regression's errors stand in its provenance."""
+
+    pure_lstm: TrainResult
+    regression_file: Path
+    regression: LinearModel
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {
+            "pure_lstm": self.pure_lstm.to_dict(),
+            "linear_regression": {
+                "file": str(self.regression_file),
+                "sha256": self.regression.sha256,
+                "provenance": self.regression.provenance,
+            },
+        }
+
+
+def run_baselines(
+    dataset: Path,
+    output: Path,
+    *,
+    paper: bool = False,
+    seed: int = 0,
+    epochs: int | None = None,
+    device: str = "cpu",
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> BaselinesResult:
+    """Train both baselines on a residual dataset, into ``output/baselines``; options as for the residual network.
+
+    Raises
+    ------
+    UsageError
+        The device is not there, or the number of epochs is none.
+    ModelError
+        The dataset has no usable drives, or another training's checkpoint is in the way.
+    """
+    recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
+    data = read_dataset(dataset)
+    regression = fit_dataset(data, recipe.feature_names)
+    file = output / LINEAR_REGRESSION_FILE
+    write_bytes(file, regression.to_json().encode())
+    lstm = train_on(
+        data, output / PURE_LSTM_FOLDER, replace(recipe, target=LATERAL_VELOCITY), device=device, progress=progress
+    )
+    return BaselinesResult(lstm, file, regression)
+
+
+def fit_dataset(data: Dataset, names: tuple[str, ...]) -> LinearModel:
+    """Return the regression of the training drives, with its errors on all splits; raises ModelError."""
+    splits = {s: list(_sequences(data, s)) for s in ("train", "validation", "test")}
+    model = fit_linear(splits["train"], names)
+    provenance = {
+        "dataset_sha256": data.sha256,
+        "vehicle": data.vehicle_name,
+        "training_sequences": len(splits["train"]),
+        "sideslip_rmse_deg": {s: _rmse_deg(model, rows) for s, rows in splits.items()},
+    }
+    return replace(model, provenance=provenance)
+
+
+def fit_linear(
+    sequences: Sequence[SideslipSequence], names: tuple[str, ...], low_pass_hz: float = LOW_PASS_HZ
+) -> LinearModel:
+    """Return the least-squares coefficients of the sideslip on the low-passed features and a constant.
+
+    Features that do not vary, such as the friction of drives on one road, get a coefficient of 0.
+
+    Raises
+    ------
+    ModelError
+        There is no row to fit.
+    """
+    columns = [FEATURES.index(n) for n in names]
+    inputs, targets = [], []
+    for s in sequences:
+        used = np.isfinite(s.sideslip_rad)
+        inputs.append(_smooth(s.features[:, columns], s.dt_s, low_pass_hz)[used])
+        targets.append(s.sideslip_rad[used])
+    rows = np.concatenate(inputs) if inputs else np.empty((0, len(names)))
+    if rows.shape[0] <= len(names):
+        raise ModelError(
+            expected="training drives with a true sideslip",
+            got=f"{rows.shape[0]} usable rows",
+            where="train --baselines",
+            remedy="extract more drives with truth",
+        )
+    mean, std = rows.mean(axis=0), rows.std(axis=0)
+    varies = std > CONSTANT_SHARE * np.maximum(np.abs(mean), 1e-3)
+    scaled = (rows[:, varies] - mean[varies]) / std[varies]
+    target = np.concatenate(targets)
+    weights = np.linalg.lstsq(np.column_stack([scaled, np.ones(len(scaled))]), target, rcond=None)[0]
+    coefficients = np.zeros(len(names))
+    coefficients[varies] = weights[:-1] / std[varies]
+    return LinearModel(
+        feature_names=names,
+        coefficients=tuple(float(c) for c in coefficients),
+        intercept_rad=float(weights[-1] - coefficients @ mean),
+        low_pass_hz=low_pass_hz,
+    )
+
+
+def _smooth(values: FloatArray, dt_s: FloatArray, corner_hz: float) -> FloatArray:
+    out = np.empty_like(values)
+    low_pass(np.ascontiguousarray(values), dt_s, corner_hz, np.zeros(values.shape[1]), out)
+    return out
+
+
+def _rmse_deg(model: LinearModel, sequences: Sequence[SideslipSequence]) -> float | None:
+    square, count = 0.0, 0
+    for s in sequences:
+        error = _smooth(model.sideslip_rad(s.features)[:, None], s.dt_s, model.low_pass_hz)[:, 0] - s.sideslip_rad
+        used = np.isfinite(error)
+        square += float(np.sum(error[used] ** 2))
+        count += int(used.sum())
+    return math.degrees(math.sqrt(square / count)) if count else None
+
+
+def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
+    """Yield the runs of a split; rows count where the network's do and the truth is above the low-speed blend."""
+    for drive in data.drives:
+        if drive.split != split:
+            continue
+        slowest = data.vehicle(drive).low_speed_blend_m_s
+        for part in gap_free_runs(drive):
+            vx, vy = np.asarray(drive.truth_velocity[part], dtype=np.float64).T
+            used = (drive.weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
+            yield SideslipSequence(
+                features=np.asarray(drive.features[part], dtype=np.float64),
+                dt_s=np.concatenate([[np.nan], np.diff(drive.stamps_ns[part]) * 1e-9]),
+                sideslip_rad=np.where(used, np.arctan2(vy, vx), np.nan),
+            )

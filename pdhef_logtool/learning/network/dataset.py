@@ -1,0 +1,385 @@
+"""A residual dataset on disk: one Parquet file a drive, and manifest.json that makes them one dataset (DESIGN §8).
+
+Features, targets and weights are stored as float32: a relative error of 6e-8, which no network sees. Each file carries
+its own entry of the manifest in its footer, so that what an interrupted command had finished can be kept. Files in the
+folder that the manifest does not name are no part of the dataset.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.learning.network.residuals import ResidualRows
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.sinks.base import PendingFile
+from pdhef_logtool.sinks.report import tool_versions, write_json
+from pdhef_logtool.sinks.schema import arrow_schema
+
+FORMAT = "pdhef.residual-dataset"
+FORMAT_VERSION = 2
+MANIFEST = "manifest.json"
+DRIVES = "drives"
+TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
+TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
+SPLITS = ("train", "validation", "test")
+#: Rows of a row group: what waits stays below 2 MB.
+ROWS_A_GROUP = 32768
+
+_ENTRY = b"pdhef.drive"
+_SCHEMA = "residuals.parquet.json"
+
+FloatArray32: TypeAlias = NDArray[np.float32]
+
+
+class DriveWriter:
+    """Writes the Parquet file of one drive; the same rows give the same bytes, however they are handed over.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
+    """
+
+    def __init__(self, path: Path, split: str, rows_a_group: int = ROWS_A_GROUP) -> None:
+        self._schema = arrow_schema(_SCHEMA)
+        self._split = split
+        self._rows_a_group = rows_a_group
+        self._waiting: list[pa.Table] = []
+        self._pending = PendingFile(path)
+        try:
+            self._writer = pq.ParquetWriter(
+                self._pending.path, self._schema, compression="zstd", use_dictionary=["split", "segment"]
+            )
+        except OSError as error:
+            raise self._cannot_write(error) from error
+
+    def append(self, rows: ResidualRows) -> None:
+        """Take the next rows of the drive."""
+        self._waiting.append(_table(rows, self._split, self._schema))
+        if sum(t.num_rows for t in self._waiting) < self._rows_a_group:
+            return
+        joined = pa.concat_tables(self._waiting)
+        whole = joined.num_rows - joined.num_rows % self._rows_a_group
+        self._write(joined.slice(0, whole))
+        self._waiting = [joined.slice(whole)]
+
+    def finish(self, entry: Mapping[str, Any]) -> None:
+        """Write what waits and the drive's entry, and give the file its name."""
+        try:
+            if self._waiting:
+                self._write(pa.concat_tables(self._waiting))
+            self._writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(entry, sort_keys=True)})
+            self._writer.close()
+        except BaseException:
+            self.abort()
+            raise
+        self._pending.commit()
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        self._waiting.clear()
+        self._writer.close()
+        self._pending.discard()
+
+    def _write(self, table: pa.Table) -> None:
+        try:
+            self._writer.write_table(table.combine_chunks(), row_group_size=self._rows_a_group)
+        except OSError as error:
+            raise self._cannot_write(error) from error
+
+    def _cannot_write(self, error: OSError) -> OutputError:
+        return OutputError(
+            expected="a place to write to", got=error.strerror or str(error), where=str(self._pending.target)
+        )
+
+
+def _table(rows: ResidualRows, split: str, schema: pa.Schema) -> pa.Table:
+    columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
+    columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
+    columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
+    columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
+    arrays = []
+    for f in schema:
+        if f.name == "split":
+            arrays.append(pa.DictionaryArray.from_arrays(np.zeros(len(rows), dtype=np.int32), [split]))
+        else:
+            values = np.asarray(columns[f.name])
+            values = values.astype(np.float32) if f.type == pa.float32() else values
+            arrays.append(pa.array(values, type=f.type, from_pandas=True))
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def read_entry(path: Path) -> dict[str, Any] | None:
+    """Return the manifest's entry that a drive's file carries; None if there is no such file or it is not whole."""
+    try:
+        metadata = pq.read_metadata(path).metadata or {}
+        entry = json.loads(metadata[_ENTRY])
+    except (OSError, KeyError, ValueError, pa.ArrowException):
+        return None
+    return entry if isinstance(entry, dict) else None
+
+
+def drive_file(folder: Path, log: str) -> Path:
+    """Return where the drive of a log stands in a dataset."""
+    return folder / DRIVES / f"{log}.parquet"
+
+
+def write_manifest(
+    folder: Path,
+    entries: Sequence[Mapping[str, Any]],
+    failed: Sequence[Mapping[str, str]],
+    *,
+    settings: Mapping[str, Any],
+    seed: int,
+    vehicles: Sequence[tuple[str, VehicleParameters]],
+) -> dict[str, Any]:
+    """Write manifest.json over the drives' files that are there, and return it; raises OutputError.
+
+    Parameters
+    ----------
+    entries : one a drive, as in its file. failed : log, file and reason of the logs that gave none.
+    vehicles : by sha256, those that the drives name.
+    """
+    drives = []
+    for entry in sorted(entries, key=lambda e: str(e["log"])):
+        path = drive_file(folder, entry["log"])
+        drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": _sha256(path)})
+    splits: dict[str, dict[str, int]] = {name: {"drives": 0, "rows": 0, "usable_rows": 0} for name in SPLITS}
+    for d in drives:
+        total = splits.setdefault(d["split"], {"drives": 0, "rows": 0, "usable_rows": 0})
+        total["drives"] += 1
+        total["rows"] += d["rows"]
+        total["usable_rows"] += d["usable_rows"]
+    content = json.dumps([[d["log"], d["file_sha256"]] for d in drives]).encode()
+    document = {
+        "format": FORMAT,
+        "version": FORMAT_VERSION,
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "features": list(FEATURES),
+        "targets": [{"name": name, "unit": unit} for name, unit in TARGETS],
+        "period_s": float(np.median([d["period_s"] for d in drives])) if drives else None,
+        "settings": dict(settings),
+        "seed": seed,
+        "vehicles": [
+            {"name": v.name, "sha256": sha256, "parameters": v.model_dump(mode="json")} for sha256, v in vehicles
+        ],
+        "splits": splits,
+        "drives": drives,
+        "failed": list(failed),
+        "versions": tool_versions(),
+    }
+    write_json(folder / MANIFEST, document)
+    return document
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise OutputError(
+            expected="a drive's file of the dataset",
+            got=error.strerror or str(error),
+            where=str(path),
+            remedy="extract it again",
+        ) from None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveArrays:
+    """One drive for training, in time order; rows on which the parallel filter has no state are left out.
+
+    Attributes
+    ----------
+    stamps_ns : int64 [N]. features : float32 [N, 17], finite.
+    targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
+    step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
+    weight : float32 [N]. segment : int64 [N]; recurrent state starts anew where it changes.
+    truth_velocity : float32 [N, 2], true v_x and v_y; NaN where unknown.
+    """
+
+    stamps_ns: IntArray
+    features: FloatArray32
+    targets: FloatArray32
+    step_s: FloatArray
+    weight: FloatArray32
+    segment: IntArray
+    truth_velocity: FloatArray32
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetDrive:
+    """One drive of a dataset; its arrays are read when one of them is first asked for, and kept.
+
+    ``entry`` is what the manifest says of it.
+    """
+
+    name: str
+    split: str
+    path: Path
+    rows: int
+    usable_rows: int
+    period_s: float
+    entry: Mapping[str, Any]
+
+    @cached_property
+    def arrays(self) -> DriveArrays:
+        """All arrays; see :meth:`load`."""
+        return self.load()
+
+    @property
+    def stamps_ns(self) -> IntArray:
+        """See :class:`DriveArrays`, as for all that follow."""
+        return self.arrays.stamps_ns
+
+    @property
+    def features(self) -> FloatArray32:
+        """float32 [N, 17]."""
+        return self.arrays.features
+
+    @property
+    def targets(self) -> FloatArray32:
+        """float32 [N, 2]."""
+        return self.arrays.targets
+
+    @property
+    def step_s(self) -> FloatArray:
+        """float64 [N]."""
+        return self.arrays.step_s
+
+    @property
+    def weight(self) -> FloatArray32:
+        """float32 [N]."""
+        return self.arrays.weight
+
+    @property
+    def segment(self) -> IntArray:
+        """int64 [N]."""
+        return self.arrays.segment
+
+    @property
+    def truth_velocity(self) -> FloatArray32:
+        """float32 [N, 2]."""
+        return self.arrays.truth_velocity
+
+    def load(self) -> DriveArrays:
+        """Read the drive's file, without keeping anything.
+
+        Raises
+        ------
+        OutputError
+            The file is missing, or not the one that the manifest names.
+        """
+        if _sha256(self.path) != self.entry["file_sha256"]:
+            raise OutputError(
+                expected="the file that the manifest names",
+                got="another content",
+                where=str(self.path),
+                remedy="extract it again",
+            )
+        table = pq.read_table(self.path)
+        column = {name: table[name].to_numpy() for name in table.column_names if name != "split"}
+        stamps = column["stamp_ns"].astype(np.int64)
+        step_s = np.full(stamps.shape[0], self.period_s)
+        step_s[:-1] = np.diff(stamps) * 1e-9
+        features = np.stack([column[name] for name in FEATURES], axis=1).astype(np.float32)
+        targets = np.stack([column[name] for name, _ in TARGETS], axis=1).astype(np.float32)
+        weight = column["weight"].astype(np.float32)
+        targets[weight == 0.0] = 0.0
+        known = np.isfinite(features).all(axis=1)
+        return DriveArrays(
+            stamps_ns=stamps[known],
+            features=features[known],
+            targets=targets[known],
+            step_s=step_s[known],
+            weight=weight[known],
+            segment=column["segment"].astype(np.int64)[known],
+            truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32)[known],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Dataset:
+    """A residual dataset: what its manifest says, and its drives, none of which is read before it is asked for.
+
+    ``features`` names the columns of :attr:`DriveArrays.features` in order; ``sha256`` identifies the content.
+    """
+
+    folder: Path
+    features: tuple[str, ...]
+    period_s: float
+    sha256: str
+    drives: tuple[DatasetDrive, ...]
+    manifest: Mapping[str, Any]
+
+    @property
+    def vehicle_name(self) -> str:
+        """Names of the vehicles whose nominal models the residuals were taken against."""
+        return ", ".join(sorted({str(v["name"]) for v in self.manifest["vehicles"]}))
+
+    def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
+        """Return the vehicle whose nominal model a drive's residuals were taken against."""
+        wanted = drive.entry["vehicle_sha256"]
+        parameters = next(v["parameters"] for v in self.manifest["vehicles"] if v["sha256"] == wanted)
+        return VehicleParameters.model_validate(parameters)
+
+
+def read_dataset(folder: Path) -> Dataset:
+    """Open a dataset by its manifest.
+
+    Raises
+    ------
+    OutputError
+        The folder holds no dataset, or one of another format or with other features.
+    """
+    path = folder / MANIFEST
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        kind = (document["format"], document["version"])
+        if kind != (FORMAT, FORMAT_VERSION) or document["features"] != list(FEATURES):
+            raise OutputError(
+                expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
+                got=f"{kind[0]} {kind[1]} with {', '.join(document['features'])}",
+                where=str(path),
+                remedy="extract it again with this version",
+            )
+        return Dataset(
+            folder=folder,
+            features=tuple(document["features"]),
+            period_s=float(document["period_s"]),
+            sha256=str(document["sha256"]),
+            drives=tuple(
+                DatasetDrive(
+                    name=d["log"],
+                    split=d["split"],
+                    path=folder / d["file"],
+                    rows=int(d["rows"]),
+                    usable_rows=int(d["usable_rows"]),
+                    period_s=float(d["period_s"]),
+                    entry=d,
+                )
+                for d in document["drives"]
+            ),
+            manifest=document,
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise OutputError(
+            expected=f"a residual dataset with its {MANIFEST}",
+            got=str(error) or type(error).__name__,
+            where=str(folder),
+            remedy="write one with pdhef extract LOG... -o DATASET (--resume finishes an interrupted one)",
+        ) from None

@@ -1,0 +1,586 @@
+"""``pdhef extract`` from logs to a residual dataset: read, take residuals, split by drive, write."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_sha256
+from pdhef_logtool.drive.friction import friction_source, friction_topic
+from pdhef_logtool.drive.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
+from pdhef_logtool.drive.truth import derive_truth
+from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
+from pdhef_logtool.estimators.parallel_physics import parallel_filter
+from pdhef_logtool.learning.network.dataset import (
+    FORMAT,
+    FORMAT_VERSION,
+    MANIFEST,
+    SPLITS,
+    DriveWriter,
+    drive_file,
+    read_entry,
+    write_manifest,
+)
+from pdhef_logtool.learning.network.residuals import (
+    GAP_PERIODS,
+    NEGLIGIBLE_NOISE,
+    SMOOTHING_HALF_S,
+    ResidualRows,
+    difference_noise,
+    residual_windows,
+)
+from pdhef_logtool.learning.variation import vary
+from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import choose_mapping, load_mapping, merge_losses
+from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
+from pdhef_logtool.records.errors import (
+    EXIT_FAILURE,
+    EXIT_OK,
+    EXIT_PARTIAL,
+    EstimatorError,
+    OutputError,
+    PdhefError,
+    UsageError,
+)
+from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.sinks.report import tool_versions
+
+#: Upper ends of the shares of train and validation in [0, 1); the rest is test.
+SPLIT_ENDS = (0.70, 0.85)
+MAX_SMOOTHING_HALF_S = 1.0
+MAX_VARIATION = 0.3
+
+Progress = Callable[[str, float], None]
+Warn = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ExtractSettings:
+    """What decides the content of a dataset, beside the logs.
+
+    Attributes
+    ----------
+    config : vehicle, mapping, slice, sensors, friction, which truth; the other entries are not used.
+    truth_smoothing : ``auto`` (decided per drive from the truth's noise), ``none``, or a half window in seconds.
+    split : for all drives; None = what a set's manifest says of a drive, else 70/15/15 by a hash of its content.
+    seed : of that hash, and of the variation.
+    vary : spread by which friction and vehicle are made wrong for a part of the drives (``variation.vary``).
+    """
+
+    config: RunConfig
+    truth_smoothing: str = "auto"
+    split: str | None = None
+    seed: int = 0
+    vary: float = 0.0
+
+    def smoothing_half_s(self) -> float | None:
+        """Return the half window that was asked for, 0 for none, None for ``auto``; raises UsageError."""
+        if self.truth_smoothing == "auto":
+            return None
+        if self.truth_smoothing == "none":
+            return 0.0
+        try:
+            half_s = float(self.truth_smoothing)
+        except ValueError:
+            half_s = math.nan
+        if not 0.0 < half_s <= MAX_SMOOTHING_HALF_S:
+            raise UsageError(
+                expected=f"auto, none, or a half window of up to {MAX_SMOOTHING_HALF_S:g} s",
+                got=repr(self.truth_smoothing),
+                where="--truth-smoothing",
+            )
+        return half_s
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as JSON-able values; files by name only."""
+        config = self.config.to_dict()
+        used = ("vehicle", "mapping", "start", "end", "sensors", "prefer_truth")
+        return {
+            **{k: config[k] for k in used},
+            **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
+            "truth_smoothing": self.truth_smoothing,
+            "split": self.split,
+            **({"vary": self.vary, "vary_seed": self.seed} if self.vary else {}),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class DriveResult:
+    """What came of one log: its entry in the manifest, or why it has none. ``kept``: from an earlier command."""
+
+    log: str
+    file: str
+    entry: dict[str, Any] | None
+    reason: str = ""
+    kept: bool = False
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def lost(self) -> bool:
+        """Whether some of the input was lost."""
+        return self.entry is not None and any(x["severity"] == "lost" for x in self.entry["losses"])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExtractResult:
+    """What the command wrote: the manifest's document, and one result a log."""
+
+    output: Path
+    manifest: dict[str, Any]
+    results: tuple[DriveResult, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all is well, 3 if input was lost or some logs gave nothing, 1 if all gave nothing."""
+        if all(r.entry is None for r in self.results):
+            return EXIT_FAILURE
+        return EXIT_PARTIAL if any(r.entry is None or r.lost for r in self.results) else EXIT_OK
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {
+            "output": str(self.output),
+            "exit_code": self.exit_code,
+            "kept": [r.log for r in self.results if r.kept],
+            "manifest": self.manifest,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class _Job:
+    """Everything that a process needs to extract one drive."""
+
+    log_input: LogInput
+    output: Path
+    settings: ExtractSettings
+    vehicle: VehicleParameters
+    mapping: SignalMapping | None
+    listed_split: str | None
+    resume: bool
+
+
+def run_extraction(
+    arguments: Sequence[str],
+    output: Path,
+    settings: ExtractSettings,
+    *,
+    jobs: int = 1,
+    resume: bool = False,
+    progress: Progress = lambda _text, _share: None,
+    warn: Warn = lambda _text: None,
+) -> ExtractResult:
+    """Write the residual dataset of logs with truth to a folder.
+
+    A log that cannot be read or has no truth is reported and never stops the others.
+
+    Parameters
+    ----------
+    arguments : logs, folders, glob patterns. jobs : processes at work; changes nothing that is written.
+    resume : keep drives whose log and settings are as they were.
+
+    Raises
+    ------
+    UsageError, VehicleError, MappingError
+        What holds for all logs is wrong.
+    PdhefError
+        The only log cannot be used.
+    """
+    settings.smoothing_half_s()
+    _check_counts(jobs, settings)
+    inputs = find_logs(arguments)
+    mapping = None if settings.config.mapping is None else load_mapping(settings.config.mapping)
+    work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
+    _check_output(output)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        # Until the new manifest stands, what the old one says of the files here is no longer true.
+        (output / MANIFEST).unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(
+            expected="a folder to write to", got=error.strerror or str(error), where=str(output)
+        ) from None
+    by_log: dict[str, DriveResult] = {}
+    for done, result in enumerate(_run_jobs(work, jobs, progress), start=1):
+        by_log[result.log] = result
+        for text in result.warnings:
+            warn(f"{result.log}: {text}")
+        if result.entry is None:
+            warn(f"{result.log}: {result.reason}")
+        progress(result.log, done / len(work))
+    results = tuple(by_log[job.log_input.stem] for job in work)
+    used = {r.entry["vehicle_sha256"] for r in results if r.entry is not None}
+    vehicles = {vehicle_sha256(job.vehicle): job.vehicle for job in work}
+    manifest = write_manifest(
+        output,
+        [r.entry for r in results if r.entry is not None],
+        [{"log": r.log, "file": r.file, "reason": r.reason} for r in results if r.entry is None],
+        settings=settings.to_dict(),
+        seed=settings.seed,
+        vehicles=sorted((sha, v) for sha, v in vehicles.items() if sha in used),
+    )
+    if settings.split is None and len(used) and not all(manifest["splits"][s]["drives"] for s in SPLITS):
+        empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
+        warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
+    return ExtractResult(output, manifest, results)
+
+
+def _check_output(output: Path) -> None:
+    path = output / MANIFEST
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        ours = isinstance(document, dict) and document.get("format") == FORMAT
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError):
+        ours = False
+    if not ours:
+        raise UsageError(
+            expected="a new folder, or that of a residual dataset",
+            got=f"a folder with another {MANIFEST}",
+            where=str(output),
+            remedy="choose another folder with -o",
+        )
+
+
+def _check_counts(jobs: int, settings: ExtractSettings) -> None:
+    if jobs < 1:
+        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
+    if settings.seed < 0:
+        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
+    if not 0.0 <= settings.vary <= MAX_VARIATION:
+        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.vary), where="--vary")
+    if settings.split is not None and settings.split not in SPLITS:
+        raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
+
+
+def _plan_jobs(
+    inputs: Sequence[LogInput],
+    output: Path,
+    settings: ExtractSettings,
+    mapping: SignalMapping | None,
+    resume: bool,
+    warn: Warn,
+) -> Iterator[_Job]:
+    chosen = None if settings.config.vehicle is None else load_vehicle(settings.config.vehicle)
+    files, manifests = cache(load_vehicle), cache(set_manifest)
+    told = False
+    for log_input in inputs:
+        listed = _listed(log_input.path, manifests(log_input.path.parent))
+        vehicle = chosen
+        if vehicle is None and listed.vehicle is not None:
+            vehicle = files(listed.vehicle)
+        if vehicle is None:
+            vehicle = default_vehicle()
+            if not told:
+                warn(f"no --vehicle: residuals are those of the default {vehicle.name}")
+                told = True
+        yield _Job(log_input, output, settings, vehicle, mapping, listed.split, resume)
+
+
+def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[DriveResult]:
+    """Yield one result a job, in any order; a process that dies costs its own drive only."""
+    if jobs == 1 or len(work) == 1:
+        for number, job in enumerate(work):
+
+            def of_all(share: float, number: int = number, job: _Job = job) -> None:
+                progress(job.log_input.stem, (number + share) / len(work))
+
+            yield _extract_guarded(job, of_all) if len(work) > 1 else _extract(job, of_all)
+        return
+    broken: list[_Job] = []
+    with ProcessPoolExecutor(min(jobs, len(work)), mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(_extract_guarded, job): job for job in work}
+        try:
+            for future in as_completed(futures):
+                try:
+                    yield future.result()
+                except BrokenProcessPool:
+                    broken.append(futures[future])
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    # A dead process takes the whole pool with it: who it was is found out one by one.
+    for job in broken:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            try:
+                yield pool.submit(_extract_guarded, job).result()
+            except BrokenProcessPool:
+                yield _failure(job, "the process that read it died (out of memory?)")
+
+
+def _extract_guarded(job: _Job, progress: Callable[[float], None] = lambda _share: None) -> DriveResult:
+    try:
+        return _extract(job, progress)
+    except PdhefError as error:
+        return _failure(job, str(error))
+    except Exception as error:  # noqa: BLE001 (one bad log never stops the others, whatever is wrong with it)
+        return _failure(job, f"internal error, {type(error).__name__}: {error}")
+
+
+def _failure(job: _Job, reason: str) -> DriveResult:
+    return DriveResult(job.log_input.stem, job.log_input.path.name, None, reason)
+
+
+def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
+    stem, name = job.log_input.stem, job.log_input.path.name
+    if not job.log_input.path.exists():
+        open_log(job.log_input.path)  # says what is wrong
+    source = hash_log(job.log_input.path)
+    split, split_from = choose_split(source, job.settings.seed, chosen=job.settings.split, listed=job.listed_split)
+    fingerprint = _fingerprint(job, split)
+    target = drive_file(job.output, stem)
+    if job.resume:
+        entry = read_entry(target)
+        if (
+            entry is not None
+            and entry.get("settings_sha256") == fingerprint
+            and entry.get("source") == {"file": name, "sha256": source}
+        ):
+            return DriveResult(stem, name, entry, kept=True)
+    warnings: list[str] = []
+    log = open_log(job.log_input.path)
+    try:
+        mapping, _ = choose_mapping(
+            log, job.mapping, warnings.append, prefer_truth=job.settings.config.prefer_truth, tell_notes=False
+        )
+        start_ns, end_ns = time_slice(job.settings.config, log.start_ns, log.end_ns)
+        plan = _strict_truth(plan_drive(log, mapping, job.vehicle, start_ns, end_ns))
+        _check_plan(plan, job)
+        smoothing = _choose_smoothing(plan, job.settings)
+        reader = DriveReader(log, plan, job.settings.config.window_s)
+        told = vary(job.vehicle, job.settings.vary, f"{job.settings.seed}:{source}")
+        friction = friction_source(
+            job.settings.config.friction,
+            told.vehicle,
+            plan.alignment.available,
+            friction_topic(plan.mapping),
+            use_speed=job.settings.config.sensors == "full",
+            factor=told.friction_factor,
+        )
+
+        def windows() -> Iterator[Any]:
+            for window in friction.fill_windows(reader.windows()):
+                yield window
+                progress(window.share_done)
+
+        writer = DriveWriter(target, split)
+        try:
+            counts = _Counts()
+            for rows in residual_windows(
+                windows(),
+                told.vehicle,
+                period_s=plan.alignment.grid_period_s,
+                half_window=round(smoothing.half_s / plan.alignment.grid_period_s),
+                use_speed=job.settings.config.sensors == "full",
+            ):
+                counts.add(rows)
+                writer.append(rows)
+            if not counts.rows:
+                raise EstimatorError(expected="IMU samples in the slice", got="none", where=str(job.log_input.path))
+            losses = merge_losses([log.lost, reader.losses])
+            entry = {
+                "log": stem,
+                "source": {"file": name, "sha256": source},
+                "split": split,
+                "split_from": split_from,
+                "vehicle_sha256": vehicle_sha256(job.vehicle),
+                "settings_sha256": fingerprint,
+                "period_s": plan.alignment.grid_period_s,
+                **counts.to_dict(),
+                "truth": _truth_facts(plan, smoothing),
+                "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
+                **({"friction_factor": told.friction_factor} if job.settings.vary else {}),
+                "losses": [
+                    {"kind": x.kind, "what": x.what, "where": x.where, "count": x.count, "severity": x.severity}
+                    for x in losses
+                ],
+            }
+        except BaseException:
+            writer.abort()
+            raise
+        writer.finish(entry)
+    finally:
+        log.close()
+    if not entry["usable_rows"]:
+        warnings.append("not one usable target: no truth above the low-speed limit")
+    return DriveResult(stem, name, entry, warnings=tuple(warnings))
+
+
+def choose_split(
+    source_sha256: str, seed: int, *, chosen: str | None = None, listed: str | None = None
+) -> tuple[str, str]:
+    """Return a drive's split and where it is from: option, a set's manifest, or a hash of content and seed.
+
+    The hash does not depend on other drives, on names or on order: copies of a drive never stand on both sides.
+    """
+    if chosen is not None:
+        return chosen, "option"
+    if listed is not None:
+        return listed, "manifest"
+    digest = hashlib.sha256(f"{seed}:{source_sha256}".encode()).digest()
+    place = int.from_bytes(digest[:8], "big") / 2.0**64
+    return SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
+
+
+@dataclass(frozen=True, slots=True)
+class _Listed:
+    split: str | None = None
+    vehicle: Path | None = None
+
+
+def _listed(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
+    """Return what the manifest of a simulated set beside a log says of it: its split and its vehicle file."""
+    entry = manifest.get(path.name, {})
+    split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
+    file = path.parent / vehicle if isinstance(vehicle, str) and vehicle.endswith(".toml") else None
+    return _Listed(
+        split=split if isinstance(split, str) and split else None,
+        vehicle=file if file is not None and file.is_file() else None,
+    )
+
+
+def set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
+    """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
+    documents: list[Any] = []
+    for name, parse in ((MANIFEST, json.loads), ("manifest.toml", tomllib.loads)):
+        try:
+            documents.append(parse((folder / name).read_text(encoding="utf-8")))
+        except (OSError, ValueError):
+            continue  # there is none, or it is somebody else's
+    entries = [e for d in documents if isinstance(d, dict) for key in ("drives", "log") for e in _entries(d.get(key))]
+    return {e["file"]: e for e in entries if isinstance(e.get("file"), str)}
+
+
+def _entries(value: Any) -> list[dict[str, Any]]:
+    return [e for e in value if isinstance(e, dict)] if isinstance(value, list) else []
+
+
+def _strict_truth(plan: DrivePlan) -> DrivePlan:
+    """Bridge no truth gap: a line across a few lost samples is good enough to score on, not to differentiate."""
+    if plan.truth is None:
+        return plan
+    gaps = {name: gap * GAP_PERIODS / TRUTH_GAP_PERIODS for name, gap in plan.truth.max_gap_s.items()}
+    return replace(plan, truth=replace(plan.truth, max_gap_s=gaps))
+
+
+def _check_plan(plan: DrivePlan, job: _Job) -> None:
+    where = str(job.log_input.path)
+    needed = {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
+    if plan.truth is None or not needed <= plan.derivation.keys():
+        raise EstimatorError(
+            expected="truth from which v_x, v_y and yaw rate follow",
+            got=", ".join(sorted(needed & plan.derivation.keys())) or "none",
+            where=where,
+            remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
+        )
+    missing = sorted(parallel_filter(job.vehicle).needs - plan.alignment.available)
+    if missing:
+        raise EstimatorError(
+            expected="the signals of the physics filter",
+            got=f"no {', '.join(missing)}",
+            where=where,
+            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Smoothing:
+    half_s: float
+    reason: str
+    noise: tuple[float, float]
+
+
+def _choose_smoothing(plan: DrivePlan, settings: ExtractSettings) -> _Smoothing:
+    """Decide from the survey whether one-step differences of the truth are usable as they are."""
+    truth = derive_truth(plan.survey_truth, plan=plan.truth).track
+    noise = (
+        difference_noise(truth.stamps_ns, truth.vy_m_s),
+        difference_noise(truth.stamps_ns, truth.yaw_rate_rad_s),
+    )
+    asked = settings.smoothing_half_s()
+    if asked is not None:
+        return _Smoothing(asked, "as asked for", noise)
+    said = f"one-step noise of the truth {noise[0]:.3g} m/s² and {noise[1]:.3g} rad/s²"
+    limits = f"{NEGLIGIBLE_NOISE[0]:g} m/s² and {NEGLIGIBLE_NOISE[1]:g} rad/s²"
+    if all(n <= limit for n, limit in zip(noise, NEGLIGIBLE_NOISE, strict=True)):  # NaN is not
+        return _Smoothing(0.0, f"{said}: within {limits}", noise)
+    return _Smoothing(SMOOTHING_HALF_S, f"{said}: not within {limits}", noise)
+
+
+def _truth_facts(plan: DrivePlan, smoothing: _Smoothing) -> dict[str, Any]:
+    topics = {s.topic for s in plan.mapping.truth.values()}
+    perfect = bool(topics) and all(t.startswith(PERFECT_PREFIX) for t in topics)
+    return {
+        "kind": "perfect" if perfect else "recorded",
+        "quantities": dict(plan.derivation),
+        "latency_s": plan.truth_latency_s,
+        "smoothing_half_s": smoothing.half_s,
+        "smoothing_reason": smoothing.reason,
+        "difference_noise": _pair(smoothing.noise),
+        "not_independent": dict(plan.dependent),
+    }
+
+
+def _pair(values: Sequence[float]) -> dict[str, float | None]:
+    names = ("vy_dot_m_s2", "yaw_acceleration_rad_s2")
+    return {n: float(v) if math.isfinite(v) else None for n, v in zip(names, values, strict=True)}
+
+
+class _Counts:
+    """Sums over the rows of a drive."""
+
+    def __init__(self) -> None:
+        self.rows = self.usable = 0
+        self._squares = np.zeros(2)
+        self._segments: set[int] = set()
+        self._span: tuple[int, int] | None = None
+
+    def add(self, rows: ResidualRows) -> None:
+        use = rows.weight > 0.0
+        self.rows += len(rows)
+        self.usable += int(np.count_nonzero(use))
+        squares = np.square(rows.targets[use] / rows.step_s[use, None])
+        # Added one by one, so that the sum does not depend on how the rows come in parts.
+        self._squares = np.cumsum(np.concatenate([self._squares[None], squares]), axis=0)[-1]
+        self._segments.update(int(s) for s in np.unique(rows.segment[use]))
+        first = int(rows.stamps_ns[0]) if self._span is None else self._span[0]
+        self._span = (first, int(rows.stamps_ns[-1]))
+
+    def to_dict(self) -> dict[str, Any]:
+        first, last = self._span or (0, 0)
+        rms = np.sqrt(self._squares / self.usable) if self.usable else np.full(2, math.nan)
+        return {
+            "duration_s": (last - first) * 1e-9,
+            "rows": self.rows,
+            "usable_rows": self.usable,
+            "segments": len(self._segments),
+            "residual_rms": _pair(rms.tolist()),
+        }
+
+
+def _fingerprint(job: _Job, split: str) -> str:
+    """Return the hash of everything beside the log that decides a drive's file."""
+    mapping = job.settings.config.mapping
+    document = {
+        "format": FORMAT_VERSION,
+        "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "vehicle", "mapping")},
+        "split": split,
+        "vehicle": vehicle_sha256(job.vehicle),
+        "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
+        "versions": tool_versions(),
+    }
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()

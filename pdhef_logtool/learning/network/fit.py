@@ -1,0 +1,387 @@
+"""Training of the residual network: stateful truncated back-propagation through time, resumable at every epoch.
+
+Sequences run in order through chunks of ``chunk_steps``; the LSTM state is carried from chunk to chunk and detached
+(METHOD §5). The loss is the weighted mean square of the normalised residual rates. Every epoch is a pure function of
+the state before it, the seed and its number, so that an interrupted training goes on as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
+from pdhef_logtool.sinks.base import write_bytes
+
+CHECKPOINT = "checkpoint.safetensors"
+
+
+#: Longer sequences are cut into pieces for training; validation runs over them whole.
+PIECE_STEPS = 1500
+GRADIENT_CLIP = 1.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FeatureSequence:
+    """One gap-free run of one drive: features [N, 17], target [N, m], weight [N].
+
+    The target is residual rates in m/s² and rad/s² (m = 2), or v_y in m/s (m = 1).
+    """
+
+    drive: str
+    features: FloatArray
+    target: FloatArray
+    weight: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How to train. The defaults are METHOD §5's recipe; :data:`PAPER_RECIPE` is the paper's Table 1.
+
+    64 units a layer were as good as 96 after the same number of epochs (``docs/model_card.md``) in two thirds of the
+    time, in training and in service.
+    """
+
+    feature_names: tuple[str, ...] = ONE_CAR_FEATURES
+    hidden: int = 64
+    layers: int = 2
+    head: tuple[int, ...] = (64, 32)
+    dropout: float = 0.0
+    epochs: int = 30
+    batch: int = 16
+    chunk_steps: int = 50
+    learning_rate: float = 3e-3
+    schedule: str = "one-cycle"  # or "exponential"
+    patience: int = 10
+    seed: int = 0
+    period_s: float = 0.01
+    target: str = RESIDUAL
+
+
+PAPER_RECIPE = Recipe(
+    feature_names=PAPER_FEATURES,
+    hidden=128,
+    dropout=0.2,
+    epochs=200,
+    batch=64,
+    learning_rate=1e-3,
+    schedule="exponential",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Epoch:
+    """One line of the loss history; losses are mean squares of normalised targets."""
+
+    epoch: int
+    train_loss: float
+    validation_loss: float
+    learning_rate: float
+    seconds: float
+
+
+Progress = Callable[[Epoch, int], None]
+
+
+def normalisation_of(sequences: Sequence[FeatureSequence], names: tuple[str, ...]) -> Normalisation:
+    """Return mean and standard deviation of features and targets over the training sequences, by weight."""
+    columns = [FEATURES.index(n) for n in names]
+    features = np.concatenate([s.features[s.weight > 0][:, columns] for s in sequences])
+    target = np.concatenate([s.target[s.weight > 0] for s in sequences])
+    if features.shape[0] == 0:
+        raise ModelError(expected="training sequences with usable samples", got="none", where="train")
+    std = np.maximum(features.std(axis=0), 1e-6)
+    spread = np.maximum(np.sqrt(np.mean(target**2, axis=0)), 1e-6)
+    return Normalisation(
+        tuple(float(x) for x in features.mean(axis=0)),
+        tuple(float(x) for x in std),
+        tuple(float(x) for x in spread),
+    )
+
+
+def train(
+    training: Sequence[FeatureSequence],
+    validation: Sequence[FeatureSequence],
+    recipe: Recipe,
+    work: Path,
+    *,
+    init: ModelBundle | None = None,
+    device: str = "cpu",
+    progress: Progress = lambda _epoch, _of: None,
+) -> tuple[ModelBundle, list[Epoch]]:
+    """Train a network and return the bundle of the best validation epoch with the loss history.
+
+    Parameters
+    ----------
+    work : folder of the checkpoint; one of an earlier, interrupted call with the same recipe and data is resumed.
+    init : bundle to start from (fine-tuning); it decides features, architecture and normalisation.
+
+    Raises
+    ------
+    ModelError
+        There is nothing to train or to validate on, or a checkpoint of another recipe is in the way.
+    """
+    if not training or not validation:
+        raise ModelError(
+            expected="training and validation drives",
+            got=f"{len(training)} and {len(validation)} sequences",
+            where="train",
+            remedy="extract more drives, so that every split has some",
+        )
+    if init is not None:
+        recipe = replace(
+            recipe,
+            feature_names=init.feature_names,
+            hidden=init.hidden,
+            layers=init.layers,
+            head=init.head,
+            target=init.target,
+        )
+    normalisation = init.normalisation if init is not None else normalisation_of(training, recipe.feature_names)
+    network = _new_network(recipe, init).to(device)
+    optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
+    train_pieces = _pieces(training, recipe, normalisation)
+    validation_pieces = [_scaled(s, recipe, normalisation) for s in validation]
+    identity = _identity(recipe, normalisation, training, validation, init)
+    history, best, best_loss = _resume(work, identity, network, optimiser, device)
+    batches = max(1, math.ceil(len(train_pieces) / recipe.batch))
+    for epoch in range(len(history), recipe.epochs):
+        if len(history) - 1 - _best_epoch(history) >= recipe.patience:
+            break
+        began = time.perf_counter()
+        # Everything random in an epoch follows from seed and number, or a resumed training would differ.
+        torch.manual_seed(recipe.seed * 1_000_003 + epoch)
+        order = torch.randperm(len(train_pieces)).tolist()
+        network.train()
+        losses = []
+        for b in range(batches):
+            rate = _learning_rate(recipe, (epoch + b / batches) / recipe.epochs)
+            for group in optimiser.param_groups:
+                group["lr"] = rate
+            chosen = [train_pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
+            losses.append(_train_batch(network, optimiser, chosen, recipe.chunk_steps, device))
+        loss = _validate(network, validation_pieces, device)
+        history.append(Epoch(epoch + 1, float(np.mean(losses)), loss, rate, time.perf_counter() - began))
+        if loss < best_loss:
+            best, best_loss = _weights(network), loss
+        _write_checkpoint(work, identity, history, network, optimiser, best)
+        progress(history[-1], recipe.epochs)
+    bundle = ModelBundle(
+        feature_names=recipe.feature_names,
+        hidden=recipe.hidden,
+        layers=recipe.layers,
+        head=recipe.head,
+        period_s=recipe.period_s,
+        normalisation=normalisation,
+        weights=best,
+        provenance={
+            "recipe": asdict(recipe),
+            "epochs": len(history),
+            "best_epoch": _best_epoch(history) + 1,
+            "validation_loss": best_loss,
+            "training_sequences": len(training),
+            "validation_sequences": len(validation),
+        },
+        target=recipe.target,
+    )
+    return bundle, history
+
+
+# ---- data ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Piece:
+    features: torch.Tensor
+    target: torch.Tensor
+    weight: torch.Tensor
+
+
+def _scaled(s: FeatureSequence, recipe: Recipe, n: Normalisation) -> _Piece:
+    scratch = ModelBundle(recipe.feature_names, recipe.hidden, recipe.layers, recipe.head, recipe.period_s, n, {})
+    return _Piece(
+        torch.from_numpy(scratch.normalise(s.features).astype(np.float32)),
+        torch.from_numpy((s.target / np.array(n.target_std)).astype(np.float32)),
+        torch.from_numpy(s.weight.astype(np.float32)),
+    )
+
+
+def _pieces(sequences: Sequence[FeatureSequence], recipe: Recipe, n: Normalisation) -> list[_Piece]:
+    out = []
+    for s in sequences:
+        whole = _scaled(s, recipe, n)
+        for at in range(0, whole.features.shape[0], PIECE_STEPS):
+            part = slice(at, at + PIECE_STEPS)
+            if float(whole.weight[part].sum()) > 0.0:
+                out.append(_Piece(whole.features[part], whole.target[part], whole.weight[part]))
+    return out
+
+
+def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
+    def pad(columns: list[torch.Tensor]) -> torch.Tensor:
+        return torch.nn.utils.rnn.pad_sequence(columns, batch_first=True).to(device)
+
+    return _Piece(pad([p.features for p in pieces]), pad([p.target for p in pieces]), pad([p.weight for p in pieces]))
+
+
+# ---- one epoch ----
+
+
+def _train_batch(
+    network: ResidualNetwork,
+    optimiser: torch.optim.Optimizer,
+    pieces: Sequence[_Piece],
+    chunk_steps: int,
+    device: str,
+) -> float:
+    batch = _padded(pieces, device)
+    state: State | None = None
+    losses = []
+    for at in range(0, batch.features.shape[1], chunk_steps):
+        part = slice(at, at + chunk_steps)
+        output, after = network(batch.features[:, part], state)
+        state = (after[0].detach(), after[1].detach())
+        weight = batch.weight[:, part]
+        total = weight.sum()
+        if float(total) == 0.0:
+            continue
+        loss = ((output - batch.target[:, part]) ** 2).mean(dim=2).mul(weight).sum() / total
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_CLIP)
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    return float(np.mean(losses)) if losses else 0.0
+
+
+def _validate(network: ResidualNetwork, pieces: Sequence[_Piece], device: str) -> float:
+    network.eval()
+    total, weight = 0.0, 0.0
+    with torch.inference_mode():
+        for p in pieces:
+            output, _ = network(p.features[None].to(device), None)
+            square = ((output[0].cpu() - p.target) ** 2).mean(dim=1)
+            total += float((square * p.weight).sum())
+            weight += float(p.weight.sum())
+    return total / weight if weight else math.inf
+
+
+def _learning_rate(recipe: Recipe, share: float) -> float:
+    """Return the rate at a share of the training: one cycle up in the first 30 % and down, or exponential decay."""
+    if recipe.schedule == "exponential":
+        return recipe.learning_rate * math.exp(-3.0 * share)
+    if share < 0.3:
+        return recipe.learning_rate * (0.04 + 0.96 * (0.5 - 0.5 * math.cos(math.pi * share / 0.3)))
+    return recipe.learning_rate * (1e-4 + (1.0 - 1e-4) * (0.5 + 0.5 * math.cos(math.pi * (share - 0.3) / 0.7)))
+
+
+# ---- state ----
+
+
+def _new_network(recipe: Recipe, init: ModelBundle | None) -> ResidualNetwork:
+    torch.manual_seed(recipe.seed)
+    shape = Architecture(
+        len(recipe.feature_names), recipe.hidden, recipe.layers, recipe.head, recipe.dropout,
+        OUTPUT_COUNT[recipe.target],
+    )  # fmt: skip
+    network = ResidualNetwork(shape)
+    if init is not None:
+        network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in init.weights.items()})
+    return network
+
+
+def _weights(network: ResidualNetwork) -> dict[str, Any]:
+    return {k: v.detach().cpu().numpy().copy() for k, v in network.state_dict().items()}
+
+
+def _best_epoch(history: Sequence[Epoch]) -> int:
+    return int(np.argmin([e.validation_loss for e in history])) if history else -1
+
+
+def _identity(
+    recipe: Recipe,
+    n: Normalisation,
+    training: Sequence[FeatureSequence],
+    validation: Sequence[FeatureSequence],
+    init: ModelBundle | None,
+) -> dict[str, Any]:
+    document = {
+        "recipe": asdict(recipe),
+        "normalisation": asdict(n),
+        "training": [(s.drive, int(s.weight.shape[0])) for s in training],
+        "validation": [(s.drive, int(s.weight.shape[0])) for s in validation],
+        "init": None if init is None else init.sha256,
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(document))
+    return plain
+
+
+def _write_checkpoint(
+    work: Path,
+    identity: dict[str, Any],
+    history: Sequence[Epoch],
+    network: ResidualNetwork,
+    optimiser: torch.optim.Optimizer,
+    best: dict[str, Any],
+) -> None:
+    from safetensors.numpy import save
+
+    tensors = {f"network.{k}": v for k, v in _weights(network).items()}
+    tensors |= {f"best.{k}": v for k, v in best.items()}
+    for i, state in optimiser.state_dict()["state"].items():
+        for key, value in state.items():
+            tensors[f"optimiser.{i}.{key}"] = np.asarray(value.cpu().numpy()).copy()
+    document = {"identity": identity, "history": [asdict(e) for e in history]}
+    # One file holds tensors and document, so that a kill between two writes cannot leave a pair that disagrees.
+    data = save(tensors, metadata={"document": json.dumps(document)})
+    write_bytes(work / CHECKPOINT, data)
+
+
+def _resume(
+    work: Path,
+    identity: dict[str, Any],
+    network: ResidualNetwork,
+    optimiser: torch.optim.Optimizer,
+    device: str,
+) -> tuple[list[Epoch], dict[str, Any], float]:
+    from safetensors import safe_open
+
+    file = work / CHECKPOINT
+    if not file.is_file():
+        return [], _weights(network), math.inf
+    with safe_open(file, framework="numpy") as stored:
+        document = json.loads(stored.metadata()["document"])
+        tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118 (not a mapping)
+    if document["identity"] != identity:
+        raise ModelError(
+            expected="a checkpoint of this recipe and data",
+            got="one of another",
+            where=str(file),
+            remedy="train into another folder, or remove the checkpoint",
+        )
+    network.load_state_dict(
+        {k.removeprefix("network."): torch.from_numpy(v) for k, v in tensors.items() if k.startswith("network.")}
+    )
+    states: dict[int, dict[str, torch.Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith("optimiser."):
+            _, index, key = name.split(".", 2)
+            states.setdefault(int(index), {})[key] = torch.from_numpy(np.array(value)).to(
+                "cpu" if key == "step" else device
+            )
+    optimiser.load_state_dict({"state": states, "param_groups": optimiser.state_dict()["param_groups"]})
+    history = [Epoch(**e) for e in document["history"]]
+    best = {k.removeprefix("best."): v for k, v in tensors.items() if k.startswith("best.")}
+    return history, best, min(e.validation_loss for e in history)

@@ -1,0 +1,291 @@
+"""What the nominal model misses, step by step, from a drive with truth (METHOD §4, Eq 8-10, 18).
+
+From one stamp of the IMU to the next the residual is the increment
+
+    Δx_net[k] = (x_true(t_k+1) − x_true(t_k)) − ∫ f_nom(x_true, u) dτ
+
+with f_nom at the *true* state (at an estimated one the filter's own error would be learnt), the trapezoidal rule
+between the two true states, and the inputs of the same measurement times: steering and friction as the filters use
+them. The row of v_x is 0 by definition and not stored.
+
+A recorded truth is noisy, and differences over one step are mostly that noise. Then the *residual* is smoothed, not the
+truth: increments are added up to a curve, a cubic is fitted by least squares to the ± half window about each step over
+the true stamps (Savitzky-Golay), and its increment over the step is the target. All of it is linear in the
+increments, so that what the nominal model explains, fast as it may be, is not damped; only the residual is, 1 % at 1 Hz
+and ± 0.2 s. No target where the window holds a gap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.physics import U_FRICTION, FilterCarry
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+
+#: A step of more than this many periods is a gap: no increment is taken across it.
+GAP_PERIODS = 1.5
+#: Beyond this the car slides backwards rather than drives, and a single-track residual means nothing.
+MAX_SIDESLIP_RAD = math.radians(45.0)
+#: Half window of the smoothing when the truth is found to be noisy: on simulated RTK drives the targets were nearest to
+#: those of the perfect truth at 0.13 to 0.16 s (lane change, sweep).
+SMOOTHING_HALF_S = 0.15
+#: Truth noise in a one-step difference, of v̇_y in m/s² and ṙ in rad/s², up to which nothing is smoothed: well below
+#: what a training target varies by (0.2 and more).
+NEGLIGIBLE_NOISE = (0.05, 0.05)
+
+_CHUNK = 16384
+#: Third differences of white noise have 20 times its variance.
+_THIRD_DIFFERENCE_GAIN = 20.0
+#: The 80 % point of |N(0, 1)|: robust against manoeuvres, and not blind to values that repeat from sample to sample.
+_NOISE_QUANTILE, _NOISE_POINT = 0.8, 1.2815515655446004
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResidualRows:
+    """Rows of a residual dataset on the IMU's stamps, in time order.
+
+    Attributes
+    ----------
+    stamps_ns : int64 [N]. features : [N, 17] at the stamp, NaN where the parallel filter has no state.
+    targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
+    step_s : [N], time to the next stamp; NaN at the last row.
+    weight : [N], 1 where target and features can be used and the next row carries on from this one, else 0.
+    segment : int64 [N], a new number wherever the parallel filter starts anew: sequences must not cross it.
+    truth_velocity : [N, 2], true v_x and v_y at the stamp, for networks that learn them; NaN where unknown.
+    """
+
+    stamps_ns: IntArray
+    features: FloatArray
+    targets: FloatArray
+    step_s: FloatArray
+    weight: FloatArray
+    segment: IntArray
+    truth_velocity: FloatArray
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return int(self.stamps_ns.shape[0])
+
+
+def join_rows(parts: Iterable[ResidualRows]) -> ResidualRows:
+    """Join consecutive rows of one drive."""
+    parts = list(parts)
+    return ResidualRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ResidualRows)))
+
+
+@njit(cache=True)
+def _nominal_rates(state, steer, friction, p, out):  # type: ignore[no-untyped-def]
+    for k in range(state.shape[0]):
+        # v̇_y and ṙ do not depend on a_x.
+        _, vy_dot, r_dot = state_derivative(state[k, 0], state[k, 1], state[k, 2], steer[k], 0.0, friction[k], p)
+        out[k, 0] = vy_dot
+        out[k, 1] = r_dot
+
+
+def residual_increments(
+    stamps_ns: IntArray,
+    state: FloatArray,
+    steer_rad: FloatArray,
+    friction: FloatArray,
+    parameters: ModelParameters,
+    *,
+    max_step_s: float,
+) -> FloatArray:
+    """Return what truth moves by and the nominal model does not, from each stamp to the next, [N − 1, 2].
+
+    Parameters
+    ----------
+    stamps_ns : int64 [N]. state : true [v_x, v_y, r], [N, 3]; NaN where it must not be used.
+    steer_rad, friction : [N], NaN where missing. max_step_s : longer steps are gaps.
+
+    Returns
+    -------
+    Increments of v_y in m/s and r in rad/s; NaN across gaps, where anything is missing, where the speed is below the
+    low-speed limit (the nominal model is then not the dynamic one), and where |β| > 45°.
+    """
+    n = int(stamps_ns.shape[0])
+    if n < 2:
+        return np.empty((0, 2))
+    sliding = np.abs(np.arctan2(state[:, 1], state[:, 0])) > MAX_SIDESLIP_RAD
+    good = np.isfinite(state).all(axis=1) & np.isfinite(steer_rad) & np.isfinite(friction)
+    good &= (state[:, 0] >= parameters.blend_high_m_s) & ~sliding
+    rates = np.empty((n, 2))
+    usable = (np.where(good[:, None], state, 1.0), np.where(good, steer_rad, 0.0), np.where(good, friction, 1.0))
+    _nominal_rates(*usable, parameters, rates)
+    step_s = np.diff(stamps_ns) * 1e-9
+    increments: FloatArray = np.diff(state[:, 1:3], axis=0) - 0.5 * step_s[:, None] * (rates[:-1] + rates[1:])
+    increments[~(good[:-1] & good[1:] & (step_s <= max_step_s))] = np.nan
+    return increments
+
+
+def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: int) -> FloatArray:
+    """Smooth increments [N − 1, c] between stamps [N] by local cubics; the same array for a half window of 0.
+
+    The curve of the added-up increments over 2 · half_window + 1 steps is fitted; the result is the fit's increment
+    over the middle step. NaN where the window holds NaN or the end of the data.
+    """
+    if half_window == 0:
+        return increments
+    h, n = half_window, int(increments.shape[0])
+    out = np.full_like(increments, np.nan)
+    if n < 2 * h + 1:
+        return out
+    missing = np.concatenate([[0], np.cumsum(~np.isfinite(increments).all(axis=1))])
+    centres = np.flatnonzero(missing[2 * h + 1 :] == missing[: n - 2 * h]) + h
+    steps, points = np.arange(-h, h + 1), np.arange(-h, h + 2)
+    for start in range(0, centres.shape[0], _CHUNK):
+        centre = centres[start : start + _CHUNK]
+        curve = np.cumsum(increments[centre[:, None] + steps], axis=1)
+        curve = np.concatenate([np.zeros_like(curve[:, :1]), curve], axis=1)
+        at = (stamps_ns[centre[:, None] + points] - stamps_ns[centre][:, None]) * 1e-9
+        span = np.abs(at).max(axis=1)
+        u = at / span[:, None]
+        powers = [np.ones_like(u)]
+        for _ in range(6):
+            powers.append(powers[-1] * u)
+        moments = [p.sum(axis=1) for p in powers]
+        normal = np.stack([np.stack([moments[i + j] for j in range(4)], axis=1) for i in range(4)], axis=1)
+        right = np.stack([(powers[i][:, :, None] * curve).sum(axis=1) for i in range(4)], axis=1)
+        fit = np.linalg.solve(normal, right)
+        end, begin = u[:, h + 1], u[:, h]
+        out[centre] = sum(((end**i - begin**i)[:, None] * fit[:, i] for i in range(1, 4)), np.zeros_like(fit[:, 0]))
+    return out
+
+
+def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
+    """Return the 1-sigma of white noise in the derivative of ``values`` [N] by one-step differences; NaN if unknown.
+
+    From third differences, to which motion adds next to nothing at usual truth rates. Noise that an INS has filtered
+    over several samples is not seen.
+    """
+    if stamps_ns.shape[0] < 8:
+        return math.nan
+    steps = np.diff(stamps_ns)
+    period_ns = float(np.median(steps))
+    even = steps <= GAP_PERIODS * period_ns
+    third = values[3:] - 3.0 * values[2:-1] + 3.0 * values[1:-2] - values[:-3]
+    third = third[even[:-2] & even[1:-1] & even[2:] & np.isfinite(third)]
+    if third.size < 5:
+        return math.nan
+    sigma = float(np.quantile(np.abs(third), _NOISE_QUANTILE)) / (_NOISE_POINT * math.sqrt(_THIRD_DIFFERENCE_GAIN))
+    return math.sqrt(2.0) * sigma / (period_ns * 1e-9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Steps:
+    """What the targets are computed from, with the features, on the IMU's stamps."""
+
+    stamps_ns: IntArray
+    state: FloatArray
+    steer_rad: FloatArray
+    friction: FloatArray
+    features: FloatArray
+    segment: IntArray
+
+    def since(self, index: int) -> _Steps:
+        return _Steps(*(getattr(self, f.name)[index:] for f in fields(_Steps)))
+
+    def joined(self, other: _Steps) -> _Steps:
+        return _Steps(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(_Steps)))
+
+
+def residual_windows(
+    windows: Iterable[DriveWindow],
+    vehicle: VehicleParameters,
+    *,
+    period_s: float,
+    half_window: int = 0,
+    use_speed: bool = True,
+) -> Iterator[ResidualRows]:
+    """Turn the windows of a drive into residual rows; how the drive is cut into windows changes no bit of them.
+
+    Parameters
+    ----------
+    windows : signals and truth at the same stamps, biases of the vehicle file taken off; without truth no targets.
+    period_s : of the IMU. half_window : steps on each side that a target is smoothed over.
+    use_speed : as the parallel filter shall run in service.
+
+    Yields
+    ------
+    The rows of all stamps; a window's last rows come with the next one, since their targets look ahead. Memory is
+    bounded by one window.
+    """
+    physics = parallel_filter(vehicle, use_speed=use_speed)
+    parameters = model_parameters(vehicle)
+    carry: FilterCarry | None = None
+    waiting: _Steps | None = None
+    emitted = 0  # rows at the head of ``waiting`` that are there for smoothing only
+    running, segment = False, -1
+    max_step_s = GAP_PERIODS * period_s
+
+    def emit(steps: _Steps, first: int, end: int) -> ResidualRows:
+        n = len(steps.stamps_ns)
+        increments = residual_increments(
+            steps.stamps_ns, steps.state, steps.steer_rad, steps.friction, parameters, max_step_s=max_step_s
+        )
+        targets, step_s = np.full((n, 2), np.nan), np.full(n, np.nan)
+        targets[: n - 1] = smooth_increments(steps.stamps_ns, increments, half_window)
+        step_s[: n - 1] = np.diff(steps.stamps_ns) * 1e-9
+        part = slice(first, end)
+        known = _complete(steps.features)
+        usable = _complete(targets) & known
+        # Where the next row starts anew, in service nothing is carried over to it either.
+        usable[: n - 1] &= known[1:] & (steps.segment[1:] == steps.segment[:-1])
+        return ResidualRows(
+            stamps_ns=steps.stamps_ns[part],
+            features=steps.features[part],
+            targets=targets[part],
+            step_s=step_s[part],
+            weight=usable[part].astype(np.float64),
+            segment=steps.segment[part],
+            truth_velocity=steps.state[part, :2],
+        )
+
+    for window in windows:
+        if len(window.signals) == 0:
+            continue
+        features, filtered, carry = run_features(physics, window.signals, carry)
+        known = _complete(features)
+        fresh: BoolArray = known & ~(np.concatenate([[running], known[:-1]]) & np.isfinite(filtered.prior[:, 0]))
+        numbers = segment + np.cumsum(fresh)
+        running, segment = bool(known[-1]), int(numbers[-1])
+        new = _Steps(
+            stamps_ns=window.signals.stamps_ns,
+            state=_true_state(window),
+            # As measured: where it is missing, the filter's guess of it must not become a residual.
+            steer_rad=without_impossible(window.signals).steer_rad,
+            friction=filtered.inputs[:, U_FRICTION],
+            features=features,
+            segment=np.maximum(numbers, 0),
+        )
+        waiting = new if waiting is None else waiting.joined(new)
+        decided = len(waiting.stamps_ns) - 1 - half_window
+        if decided > emitted:
+            yield emit(waiting, emitted, decided)
+            keep = max(0, decided - half_window)
+            waiting, emitted = waiting.since(keep), decided - keep
+    if waiting is not None and emitted < len(waiting.stamps_ns):
+        yield emit(waiting, emitted, len(waiting.stamps_ns))
+
+
+def _complete(values: FloatArray) -> BoolArray:
+    return np.asarray(np.isfinite(values).all(axis=1), dtype=np.bool_)
+
+
+def _true_state(window: DriveWindow) -> FloatArray:
+    truth = window.truth
+    if truth is None:
+        return np.full((len(window.signals), 3), np.nan)
+    state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
+    valid: BoolArray = truth.valid
+    return np.where(valid[:, None], state, np.nan)

@@ -1,0 +1,202 @@
+"""``pdhef train`` from dataset to model bundle, with loss history, plot and resumption."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, read_dataset
+from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
+from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
+from pdhef_logtool.residual_model.bundle import RESIDUAL, ModelBundle, open_model
+from pdhef_logtool.sinks.base import PendingFile
+
+HISTORY_FILE = "history.parquet"
+PLOT_FILE = "history.png"
+#: Shorter runs between two restarts teach nothing.
+MIN_SEQUENCE_STEPS = 50
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainResult:
+    """What the command trained and wrote; ``test_loss`` is on drives that took no part, None without any."""
+
+    model: Path
+    bundle: ModelBundle
+    history: tuple[Epoch, ...]
+    test_loss: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {
+            "model": str(self.model),
+            "sha256": self.bundle.sha256,
+            "provenance": self.bundle.provenance,
+            "test_loss": self.test_loss,
+            "history": [asdict(e) for e in self.history],
+        }
+
+
+def run_training(
+    dataset: Path,
+    output: Path,
+    *,
+    init: Path | None = None,
+    paper: bool = False,
+    seed: int = 0,
+    epochs: int | None = None,
+    device: str = "cpu",
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> TrainResult:
+    """Train on a residual dataset and write the bundle, ``history.parquet`` and its plot to ``output``.
+
+    A call that was interrupted, even by kill -9, goes on from its last whole epoch when it is repeated.
+
+    Parameters
+    ----------
+    init : bundle to fine-tune. paper : Table 1's hyper-parameters instead of METHOD's recipe.
+    epochs : None = the recipe's. device : a PyTorch device such as ``cpu`` or ``cuda``.
+
+    Raises
+    ------
+    UsageError
+        The device is not there, or the number of epochs is none.
+    ModelError
+        The dataset has no usable drives, or another training's checkpoint is in the way.
+    """
+    recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
+    return train_on(
+        read_dataset(dataset),
+        output,
+        recipe,
+        init=None if init is None else open_model(init),
+        device=device,
+        progress=progress,
+    )
+
+
+def make_recipe(*, paper: bool, seed: int, epochs: int | None, device: str) -> Recipe:
+    """Return the recipe of a call; raises UsageError where it cannot be followed."""
+    import torch
+
+    if device != "cpu" and not torch.cuda.is_available():
+        raise UsageError(expected="cpu, or a machine with CUDA", got=device, where="--device")
+    if epochs is not None and epochs < 1:
+        raise UsageError(expected="at least one epoch", got=str(epochs), where="--epochs")
+    recipe = replace(PAPER_RECIPE if paper else Recipe(), seed=seed)
+    return recipe if epochs is None else replace(recipe, epochs=epochs)
+
+
+def train_on(
+    data: Dataset,
+    output: Path,
+    recipe: Recipe,
+    *,
+    init: ModelBundle | None = None,
+    device: str = "cpu",
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> TrainResult:
+    """Train one network by a recipe, whose target says what it learns; the rest as :func:`run_training`."""
+    splits = {
+        name: list(_sequences((d for d in data.drives if d.split == name), recipe.target))
+        for name in ("train", "validation", "test")
+    }
+
+    def tell(epoch: Epoch, of: int) -> None:
+        progress(
+            f"epoch {epoch.epoch}: train {epoch.train_loss:.4f}, validation {epoch.validation_loss:.4f}",
+            epoch.epoch / of,
+        )
+
+    bundle, history = train(
+        splits["train"], splits["validation"], recipe, output, init=init, device=device, progress=tell
+    )
+    test_loss = mean_square(bundle, splits["test"]) if splits["test"] else None
+    provenance = {
+        **bundle.provenance,
+        "dataset_sha256": data.sha256,
+        "vehicle": data.vehicle_name,
+        "fine_tuned_from": None if init is None else init.sha256,
+        "fine_tuned_on": None if init is None else data.vehicle_name,
+        "test_loss": test_loss,
+        "training_hours": round(sum(len(s.weight) for s in splits["train"]) * recipe.period_s / 3600.0, 3),
+    }
+    bundle = replace(bundle, provenance=provenance)
+    _write_history(output / HISTORY_FILE, history)
+    _plot_history(output / PLOT_FILE, history)
+    bundle.save(output)
+    (output / CHECKPOINT).unlink(missing_ok=True)
+    return TrainResult(output, bundle, tuple(history), test_loss)
+
+
+def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> float:
+    """Return the weighted mean square of the normalised targets, as service computes them."""
+    from pdhef_logtool.residual_model.service import NetworkService
+
+    service = NetworkService(bundle)
+    total, weight = 0.0, 0.0
+    for s in sequences:
+        rates, _ = service.run(s.features, np.zeros(len(s.weight), dtype=np.bool_), None)
+        error = (rates - s.target) / np.array(bundle.normalisation.target_std)
+        total += float((np.mean(error**2, axis=1) * s.weight).sum())
+        weight += float(s.weight.sum())
+    if weight == 0.0:
+        raise ModelError(expected="usable samples to test on", got="none", where="train")
+    return total / weight
+
+
+def gap_free_runs(drive: DatasetDrive) -> Iterable[slice]:
+    """Yield the runs of a drive that no restart of the parallel filter cuts and that are long enough to learn from."""
+    edges = [0, *(np.flatnonzero(np.diff(drive.segment)) + 1).tolist(), drive.stamps_ns.shape[0]]
+    for a, b in pairwise(edges):
+        known = np.isfinite(drive.features[a:b]).all()
+        if b - a >= MIN_SEQUENCE_STEPS and known and drive.weight[a:b].sum() > 0.0:
+            yield slice(a, b)
+
+
+def _sequences(drives: Iterable[DatasetDrive], target: str = RESIDUAL) -> Iterable[FeatureSequence]:
+    """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
+    for drive in drives:
+        for part in gap_free_runs(drive):
+            weight = np.asarray(drive.weight[part], dtype=np.float64)
+            features = np.asarray(drive.features[part], dtype=np.float64)
+            if target == RESIDUAL:
+                values = np.asarray(drive.targets[part], dtype=np.float64) / drive.step_s[part, None]
+            else:
+                values = np.asarray(drive.truth_velocity[part, 1:2], dtype=np.float64)
+                weight = weight * np.isfinite(values[:, 0])
+            values[weight == 0.0] = 0.0
+            if weight.sum() > 0.0:
+                yield FeatureSequence(drive.name, features, values, weight)
+
+
+def _write_history(path: Path, history: Iterable[Epoch]) -> None:
+    import polars as pl
+
+    with PendingFile(path) as pending:
+        pl.DataFrame([asdict(e) for e in history]).write_parquet(pending.path)
+
+
+def _plot_history(path: Path, history: list[Epoch]) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.0), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    at = [e.epoch for e in history]
+    axes.semilogy(at, [e.train_loss for e in history], label="training", color="#0072B2")
+    axes.semilogy(at, [e.validation_loss for e in history], label="validation", color="#D55E00")
+    axes.set(xlabel="epoch", ylabel="mean square of normalised targets")
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False)
+    try:
+        with PendingFile(path) as pending:
+            figure.savefig(pending.path, format="png", metadata={"Software": None})
+    except OSError as error:
+        raise OutputError(expected="a place to write to", got=error.strerror or str(error), where=str(path)) from None

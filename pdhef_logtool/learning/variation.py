@@ -1,0 +1,89 @@
+"""Wrong friction and wrong vehicle files on purpose: what a network must get along with (METHOD §3, §14).
+
+In service the nominal model is told a friction and a vehicle that are not quite those of the drive. A network that was
+trained on right ones takes a model error for something else. So a share of the drives of a training set is extracted
+with a nominal model that is wrong by a random amount, the same for the whole drive; features and targets follow from it
+as they would in service.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import AxleTyre, VehicleParameters
+
+#: Share of the drives that are left as they are: most logs come with a good vehicle file.
+UNVARIED_SHARE = 0.4
+#: 1-sigma of the natural logarithm, as multiples of the spread that is asked for.
+SPREADS = {
+    "friction": 1.5,
+    "mass": 0.7,  # with all inertia
+    "inertia": 0.7,
+    "stiffness": 1.0,  # both axles
+    "stiffness_of_axle": 0.5,  # each on its own
+    "peak": 0.5,  # both axles
+    "roll": 1.5,
+}
+#: 1-sigma of the shift of the CG as a share of the wheelbase, times the spread.
+CG_SHIFT = 0.2
+#: No draw goes further than this many 1-sigma.
+LIMIT = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """What the nominal model of a drive is told: a vehicle, and a factor on every friction."""
+
+    vehicle: VehicleParameters
+    friction_factor: float
+
+
+def vary(vehicle: VehicleParameters, spread: float, key: str) -> Variation:
+    """Draw what the nominal model of a drive is told.
+
+    Parameters
+    ----------
+    spread : about the relative 1-sigma of the stiffness; 0 leaves everything as it is.
+    key : the same key gives the same draw, for instance the hash of the log and a seed.
+    """
+    rng = np.random.default_rng(int.from_bytes(hashlib.sha256(key.encode()).digest()[:8]))
+    if spread == 0.0 or rng.uniform() < UNVARIED_SHARE:
+        return Variation(vehicle, 1.0)
+
+    def normal() -> float:
+        return float(np.clip(rng.standard_normal(), -LIMIT, LIMIT))
+
+    factor = {name: float(np.exp(spread * sigma * normal())) for name, sigma in SPREADS.items()}
+    shift = CG_SHIFT * spread * vehicle.wheelbase_m * normal()
+    axle = float(np.exp(spread * SPREADS["stiffness_of_axle"] * normal()))
+
+    def tyre(old: AxleTyre, of_axle: float) -> AxleTyre:
+        stiffness = factor["stiffness"] * of_axle
+        if old.cornering_stiffness_n_per_rad is not None:
+            changed = {"cornering_stiffness_n_per_rad": old.cornering_stiffness_n_per_rad * stiffness}
+        else:
+            assert old.B is not None and old.D_n is not None
+            changed = {"B": old.B * stiffness / factor["peak"], "D_n": old.D_n * factor["peak"]}
+        return old.model_copy(update=changed)
+
+    tyres = vehicle.tyres.model_copy(
+        update={
+            "front": tyre(vehicle.tyres.front, factor["stiffness_of_axle"]),
+            "rear": tyre(vehicle.tyres.rear, axle),
+        }
+    )
+    told = vehicle.model_copy(
+        update={
+            "mass_kg": vehicle.mass_kg * factor["mass"],
+            "yaw_inertia_kg_m2": vehicle.yaw_inertia_kg_m2 * factor["mass"] * factor["inertia"],
+            "cg_to_front_axle_m": vehicle.cg_to_front_axle_m + shift,
+            "cg_to_rear_axle_m": vehicle.cg_to_rear_axle_m - shift,
+            "roll_gradient_rad_per_m_s2": vehicle.roll_gradient_rad_per_m_s2 * factor["roll"],
+            "friction": None if vehicle.friction is None else vehicle.friction * factor["friction"],
+            "tyres": tyres,
+        }
+    )
+    return Variation(told, factor["friction"])

@@ -1,0 +1,1 @@
+"""Records that every layer shares: signals, tracks, errors, geometry, reasons."""

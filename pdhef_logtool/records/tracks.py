@@ -1,0 +1,147 @@
+"""The one record that estimates and truth share: a state track."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+
+#: Columns of estimates.parquet in order, ``estimator`` left out (it is the track's name).
+TRACK_COLUMNS = (
+    "stamp_ns",
+    "vx_m_s",
+    "vy_m_s",
+    "yaw_rate_rad_s",
+    "sideslip_rad",
+    "ay_m_s2",
+    "x_m",
+    "y_m",
+    "yaw_rad",
+    "vx_std_m_s",
+    "vy_std_m_s",
+    "yaw_rate_std_rad_s",
+    "sideslip_std_rad",
+    "network_trust",
+    "r_scale",
+    "nis",
+    "friction",
+    "valid",
+    "diverged",
+    "mixture_weight",
+    "reason",
+)
+#: Those that a source may not have at all.
+OPTIONAL_COLUMNS = ("mixture_weight", "reason")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StateTrack:
+    """Planar vehicle state over time, at the CG, ISO 8855, SI; an estimate or the truth.
+
+    Every float column has shape [N]; NaN means "not known". ``covariance`` is [N, 3, 3] over [v_x, v_y, r] or of
+    length 0 when the source gives none. ``x_m``, ``y_m``, ``yaw_rad`` are in a local ENU frame.
+    ``valid`` is False where the source says that its state must not be used. ``diverged`` flags the stamps at
+    which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
+    ``mixture_weight`` (of an adaptive estimator's second filter) and ``reason`` (bits of
+    :mod:`pdhef_logtool.records.reasons`, why samples were not used as usual) are [N], or of length 0 where the source
+    has none.
+    """
+
+    name: str
+    stamps_ns: IntArray
+    vx_m_s: FloatArray
+    vy_m_s: FloatArray
+    yaw_rate_rad_s: FloatArray
+    sideslip_rad: FloatArray
+    ay_m_s2: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    yaw_rad: FloatArray
+    covariance: FloatArray
+    sideslip_std_rad: FloatArray
+    network_trust: FloatArray
+    r_scale: FloatArray
+    nis: FloatArray
+    nis_dof: FloatArray
+    friction: FloatArray
+    valid: BoolArray
+    diverged: BoolArray
+    mixture_weight: FloatArray = field(default_factory=lambda: np.empty(0))
+    reason: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def __len__(self) -> int:
+        """Return the number of stamps."""
+        return int(self.stamps_ns.shape[0])
+
+    @property
+    def vx_std_m_s(self) -> FloatArray:
+        """Standard deviation of v_x, [N]; NaN without covariance."""
+        return self._std(0)
+
+    @property
+    def vy_std_m_s(self) -> FloatArray:
+        """Standard deviation of v_y, [N]; NaN without covariance."""
+        return self._std(1)
+
+    @property
+    def yaw_rate_std_rad_s(self) -> FloatArray:
+        """Standard deviation of r, [N]; NaN without covariance."""
+        return self._std(2)
+
+    def _std(self, i: int) -> FloatArray:
+        if self.covariance.shape[0] == 0:
+            return np.full(len(self), np.nan)
+        return np.sqrt(self.covariance[:, i, i])
+
+    def columns(self) -> dict[str, FloatArray | IntArray | BoolArray]:
+        """Return the columns of estimates.parquet by name, in order; without those that the source has not."""
+        return {
+            c: getattr(self, "stamps_ns" if c == "stamp_ns" else c)
+            for c in TRACK_COLUMNS
+            if c not in OPTIONAL_COLUMNS or len(getattr(self, c)) == len(self)
+        }
+
+    def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
+        """Return a copy with another pose."""
+        return replace(self, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad)
+
+
+def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray | BoolArray) -> StateTrack:
+    """Build a track from the columns at hand; the rest is NaN (``valid`` True, ``diverged`` False).
+
+    ``sideslip_rad`` is derived as atan2(v_y, v_x) when it is not given.
+    """
+    n = int(stamps_ns.shape[0])
+    values: dict[str, object] = {"name": name, "stamps_ns": stamps_ns}
+    for f in fields(StateTrack):
+        if f.name in values:
+            continue
+        if f.name in columns:
+            values[f.name] = columns[f.name]
+        elif f.name in OPTIONAL_COLUMNS:
+            continue
+        elif f.name == "covariance":
+            values[f.name] = np.empty((0, 3, 3))
+        elif f.name == "valid":
+            values[f.name] = np.ones(n, dtype=np.bool_)
+        elif f.name == "diverged":
+            values[f.name] = np.zeros(n, dtype=np.bool_)
+        else:
+            values[f.name] = np.full(n, np.nan)
+    if "sideslip_rad" not in columns and "vx_m_s" in columns and "vy_m_s" in columns:
+        values["sideslip_rad"] = np.arctan2(columns["vy_m_s"], columns["vx_m_s"])
+    unknown = set(columns) - {f.name for f in fields(StateTrack)}
+    if unknown:
+        raise TypeError(f"unknown track columns: {sorted(unknown)}")
+    return StateTrack(**values)  # type: ignore[arg-type]
+
+
+def concatenate(tracks: list[StateTrack]) -> StateTrack:
+    """Join the windows of one track in time order."""
+    first = tracks[0]
+    joined = {
+        f.name: np.concatenate([getattr(t, f.name) for t in tracks]) for f in fields(StateTrack) if f.name != "name"
+    }
+    return StateTrack(name=first.name, **joined)

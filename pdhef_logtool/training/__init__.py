@@ -1,1 +1,0 @@
-"""Learning from drives with truth: vehicle identification."""

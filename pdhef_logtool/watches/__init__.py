@@ -1,0 +1,1 @@
+"""What looks at signals and estimates beside the estimators: faults, slip, divergence, intervals."""

@@ -1,0 +1,180 @@
+"""Divergence that no innovation shows: the estimate's own changes of v_y against accelerometer and gyro.
+
+Behind the peak of a tyre's force two sideslips give the same a_y and nearly the same yaw rate. A filter can be carried
+to the wrong one of them and then agrees with all its sensors: its normalised innovation stays small (METHOD §12). The
+way there betrays it. At the IMU, whatever the tyres do,
+
+    v̇_y,i = a_y / (1 + g K_φ) − v_x,i r,    v_x,i = v_x − y_i r,  v_y,i = v_y + x_i r,
+
+so that D, the leaky sum of what v̂_y,i changes beyond that, is the error that the estimate has taken up of late. The
+leak is quick (``LINEAR_S``) where the tyres are in their linear range, which has one branch only, since there D would
+gather bank, bias and noise; and slow (``LIMIT_S``) near the limit of grip, and as long as the flag stands, so that a
+return to the right branch takes the flag back. The flag is set while abs D exceeds v̂_x times ``ON_RAD``, until it is
+below v̂_x times ``OFF_RAD``, both plus ``NOISE_SIGMAS`` of what the sensors' white noise (vehicle file) adds to D:
+sensors that are too noisy to judge do not judge.
+
+What it cannot see: an estimate that is off from its start on, or drifts away more slowly than the leak forgets. What
+accelerometer or gyro read wrongly it lays at the estimate's door, save missing and stuck samples, which are not judged.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+
+ON_RAD, OFF_RAD = math.radians(5.0), math.radians(3.0)
+LINEAR_S, LIMIT_S = 0.5, 3.0
+#: Shares of the grip, abs a_y / (μ g), between which the leak goes from quick to slow.
+GRIP_LOW, GRIP_HIGH = 0.5, 0.7
+GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.1, 1.0
+#: 1-sigmas of the noise in D that are allowed on top.
+NOISE_SIGMAS = 3.0
+#: Speed that D is divided by at least, in low-speed blends.
+LEAST_SPEED_BLENDS = 3.0
+#: A sample is held for this long; without a newer one the time is not judged.
+SAMPLE_HOLD_S = 0.1
+#: So many identical samples in a row are a stuck sensor, or a coarse one that says nothing yet.
+STUCK_SAMPLES = 5
+#: Beyond this step between stamps the memory starts anew.
+RESTART_GAP_S = 0.5
+
+# Entries of the memory.
+D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR = range(15)
+MEMORY_SIZE = 15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DivergenceCarry:
+    """Memory between windows: the sum's state, and the flags of steps [K] that coming stamps still need."""
+
+    memory: FloatArray
+    last_stamp_ns: int
+    ready_ns: IntArray
+    flags: BoolArray
+
+
+@dataclass(slots=True)
+class DivergenceWatch:
+    """Watches the tracks of a drive window by window, each by its name.
+
+    Only estimates with a covariance are watched: an estimator that claims no accuracy cannot be wrong about it.
+    """
+
+    vehicle: VehicleParameters
+    _carries: dict[str, DivergenceCarry] = field(default_factory=dict)
+
+    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return the next window of a track with its ``diverged`` completed."""
+        if track.covariance.shape[0] == 0:
+            return track
+        flags, self._carries[track.name] = wrong_branch(track, signals, self.vehicle, self._carries.get(track.name))
+        return replace(track, diverged=track.diverged | (flags & track.valid))
+
+
+def wrong_branch(
+    track: StateTrack, signals: Signals, vehicle: VehicleParameters, carry: DivergenceCarry | None = None
+) -> tuple[BoolArray, DivergenceCarry]:
+    """Return where a track is seen to have left the sensors' motion, [N]; joined windows equal the whole bit for bit.
+
+    Computed on measurement time; a scored stamp takes the flag of the newest step that had arrived.
+
+    Parameters
+    ----------
+    track, signals : [N] at the same stamps. carry : of the previous window, None at the start of a log.
+    """
+    signals = without_impossible(signals)
+    count = len(signals)
+    if count == 0:
+        empty = np.zeros(0, dtype=np.bool_)
+        return empty, carry or DivergenceCarry(np.zeros(MEMORY_SIZE), 0, signals.ready_ns, empty)
+    dt = np.diff(signals.stamps_ns, prepend=signals.stamps_ns[0]) * 1e-9
+    dt[0] = math.inf if carry is None else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
+    memory = np.zeros(MEMORY_SIZE) if carry is None else carry.memory.copy()
+    friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
+    flags = np.empty(count, dtype=np.bool_)
+    _watch(
+        dt, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
+        track.valid, vehicle.assumed_friction, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2,
+        vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s,
+        vehicle.imu_position_m[0], vehicle.imu_position_m[1], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
+        memory, flags,
+    )  # fmt: skip
+    ready = signals.ready_ns
+    if carry is not None:
+        ready, flags = np.concatenate([carry.ready_ns, ready]), np.concatenate([carry.flags, flags])
+    index = released_steps(ready, signals.stamps_ns)
+    newest = np.maximum(index, 0)
+    released: BoolArray = flags[newest] & (index >= 0)
+    keep = int(newest[-1])
+    return released, DivergenceCarry(memory, int(signals.stamps_ns[-1]), ready[keep:], flags[keep:])
+
+
+@njit(cache=True)
+def _hold(sample, dt, value, age, run, memory):  # type: ignore[no-untyped-def]
+    """Keep a sensor's newest sample in the memory, its age and how often it has come unchanged."""
+    if math.isfinite(sample):
+        memory[run] = memory[run] + 1.0 if sample == memory[value] else 1.0
+        memory[value] = sample
+        memory[age] = 0.0
+    else:
+        memory[age] += dt
+
+
+@njit(cache=True)
+def _watch(  # type: ignore[no-untyped-def]
+    dt, ay, gyro, friction, vx, vy, rate, valid, default_friction, tilt, ay_std, gyro_std, imu_x, imu_y, least_speed,
+    memory, flags,
+):  # fmt: skip
+    """Advance the memory over the steps [N] and write the flags [N] in place; ``dt[k]`` ends at step k."""
+    for k in range(dt.shape[0]):
+        step = dt[k]
+        if not step <= RESTART_GAP_S:
+            memory[:] = 0.0
+            memory[AY_AGE] = memory[GYRO_AGE] = math.inf
+            step = 0.0
+        before_ay, before_gyro = memory[AY], memory[GYRO]
+        could = memory[AY_AGE] <= SAMPLE_HOLD_S and memory[GYRO_AGE] <= SAMPLE_HOLD_S
+        _hold(ay[k], step, AY, AY_AGE, AY_RUN, memory)
+        _hold(gyro[k], step, GYRO, GYRO_AGE, GYRO_RUN, memory)
+        can = memory[AY_AGE] <= SAMPLE_HOLD_S and memory[GYRO_AGE] <= SAMPLE_HOLD_S
+        stuck = memory[AY_RUN] >= STUCK_SAMPLES or memory[GYRO_RUN] >= STUCK_SAMPLES
+        if math.isfinite(friction[k]):
+            memory[FRICTION] = friction[k]
+        mu = memory[FRICTION] if memory[FRICTION] > 0.0 else default_friction
+        if memory[AY_AGE] <= SAMPLE_HOLD_S:
+            memory[AY_SLOW] += (1.0 - math.exp(-step / GRIP_SMOOTHING_S)) * (memory[AY] - memory[AY_SLOW])
+        share = abs(memory[AY_SLOW]) / (mu * GRAVITY_M_S2)
+        memory[GRIP] = max(share, memory[GRIP] * math.exp(-step / GRIP_HOLD_S))
+
+        r = rate[k] if math.isfinite(rate[k]) else memory[GYRO]
+        if not valid[k] or not math.isfinite(vx[k]) or not math.isfinite(vy[k]):
+            memory[D] = memory[VAR] = memory[FLAG] = memory[HAS_LAST] = 0.0
+            flags[k] = False
+            continue
+        vx_imu, vy_imu = vx[k] - imu_y * r, vy[k] + imu_x * r
+        if memory[HAS_LAST] > 0.0:
+            if could and can and not stuck:
+                turned = 0.5 * (memory[VX] * before_gyro + vx_imu * memory[GYRO])
+                sensed = 0.5 * (before_ay + memory[AY]) / tilt - turned
+                memory[D] += (vy_imu - memory[VY]) - sensed * step
+                memory[VAR] += ((ay_std / tilt) ** 2 + (vx_imu * gyro_std) ** 2) * step * step
+            near = min(max((memory[GRIP] - GRIP_LOW) / (GRIP_HIGH - GRIP_LOW), 0.0), 1.0)
+            if memory[FLAG] > 0.0:
+                near = 1.0
+            keep = math.exp(-step * ((1.0 - near) / LINEAR_S + near / LIMIT_S))
+            memory[D] *= keep
+            memory[VAR] *= keep * keep
+        memory[VX], memory[VY], memory[HAS_LAST] = vx_imu, vy_imu, 1.0
+        angle = OFF_RAD if memory[FLAG] > 0.0 else ON_RAD
+        limit = angle * max(vx[k], least_speed) + NOISE_SIGMAS * math.sqrt(memory[VAR])
+        memory[FLAG] = 1.0 if abs(memory[D]) > limit else 0.0
+        flags[k] = memory[FLAG] > 0.0

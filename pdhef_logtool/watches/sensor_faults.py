@@ -1,0 +1,427 @@
+"""Faults of accelerometer and gyro found without the filter (METHOD §15, bottom layer): noise, spikes, stuck, dead.
+
+Nothing here looks at an innovation of a filter with the network in it, so that a model error cannot be read as noise.
+For each of a_y and yaw rate:
+
+* noise: what a parabola through the three samples before misses the sample by, squared, over its gain for white noise;
+  on an even clock that is e = (z_k − 3 z_k−1 + 3 z_k−2 − z_k−3)²/20, and it is exact for parabolas on an uneven one.
+  ŝ² = max(mean of the last 4 e, s₀² + keep · (ŝ² − s₀²)): fast attack, slow decay. Beyond ``BURST_RATIO`` s₀² the
+  excess ŝ² − s₀² is added to R in every filter, and the network does not see the sample.
+* spikes: a sample beyond 6 sigma of a constant-velocity tracker, and the next sample back again.
+* stuck: five and more identical samples that are no accident. Quantised signals repeat by themselves, so that the share
+  of repeats is learnt while the car moves, and a coarse signal is stuck only if the car has turned meanwhile; at a
+  standstill nothing is stuck.
+* dead, noisy or not: three witnesses of the turning, r, (a_y − v̇_y)/v_x and the yaw rate of the nominal model in open
+  loop from steering and speed, which gives v̇_y as well. Where two agree and the third stays
+  next to nothing, the third is dead.
+
+Stuck, dead and spiked samples are missing samples. s₀ is the vehicle file's, or what the log has as its usual noise
+where that is more: a rough car is no burst.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.reasons import BURST_AY, BURST_YAW_RATE, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+
+# The two channels; the bits of the second are those of the first, shifted left by one.
+AY, YAW_RATE = 0, 1
+CHANNELS = 2
+
+#: Noise variance over the usual one from which on it is a burst.
+BURST_RATIO = 16.0
+#: Time constant of the decay: e^(−1/8) a step of 10 ms.
+DECAY_S = 0.08
+#: Samples further apart than this in all say nothing of white noise: the motion is in them too.
+DIFFERENCE_SPAN_S = 0.16
+#: An uneven clock can make the parabola's gain large; such a difference is not used.
+MAX_DIFFERENCE_GAIN = 200.0
+#: The usual noise is learnt with the median of e, which doubles or halves in this time at most.
+LEARNING_S = 10.0
+#: Median of the square of a standard normal variable.
+MEDIAN_SQUARE = 0.4549
+#: Constant-velocity tracker: gains, spike limit, and the second derivatives (m/s⁴, rad/s³) that a car can have.
+TRACK_GAIN, TRACK_RATE_GAIN = 0.7, 0.4
+SPIKE_SIGMA = 6.0
+#: 1-sigma of the tracker's innovation over that of a sample, for the gains above.
+TRACK_INNOVATION_RATIO = 1.5
+CURVATURE = (2000.0, 100.0)
+#: This many samples in a row beyond the limit are no spikes but a jump or a burst.
+MAX_SPIKES = 2
+#: Identical samples from which on a channel may be stuck, and the chance of them that is taken for none.
+STUCK_SAMPLES = 5
+STUCK_CHANCE = 1e-6
+#: Times over which the share of repeats is learnt and forgotten, and the share that is assumed before.
+REPEATS_S = 20.0
+REPEATS_FORGOTTEN_S = 60.0
+REPEATS_BEFORE = 0.5
+#: A channel that repeats itself more often than this is quantised coarsely; it then counts as stuck only when the
+#: open-loop model has meanwhile turned by this much.
+COARSE_REPEATS = 0.1
+MOVED_RAD_S = 0.05
+#: Below this speed repeated samples are rest.
+STUCK_SPEED_M_S = 1.0
+#: A speed sample is held for this long.
+SPEED_HOLD_S = 0.5
+#: Dead: the witnesses are smoothed over this time; both must read this much, in rad/s and in sigmas of the noise, for a
+#: time in which the dead channel stays within a band and below a share of them.
+WITNESS_S = 0.04
+WITNESS_RAD_S = 0.06
+WITNESS_NOISE_SIGMAS = 5.0
+DEAD_SHARE = 0.3
+DEAD_BAND_RAD_S = 0.008
+DEAD_BAND_SIGMAS = 2.0
+DEAD_AFTER_S = 0.15
+#: It lives again when it reads this share of both others for a time, or when nothing turns for longer.
+ALIVE_SHARE = 0.6
+ALIVE_AFTER_S = 0.2
+QUIET_RAD_S = 0.03
+QUIET_AFTER_S = 1.0
+#: The open-loop model is a witness above this speed and this long after its start.
+WITNESS_SPEED_M_S = 6.0
+WITNESS_SETTLED_S = 1.0
+
+# Memory of a channel.
+C_Z, C_AGE, C_E = 0, 3, 6  # three last samples, their ages, four last e
+C_COUNT, C_NOISE, C_USUAL, C_LEARNT_S = 10, 11, 12, 13
+C_TRACK, C_TRACK_RATE, C_TRACK_AGE, C_SPIKES, C_NOISE_BEFORE = 14, 15, 16, 17, 18
+C_LAST, C_RUN, C_REPEATS, C_MOVED_S = 19, 20, 21, 22
+C_DEAD, C_DEAD_S, C_ALIVE_S, C_QUIET_S, C_SMOOTH, C_TURN_AT_START, C_TURN_MOST = 23, 24, 25, 26, 27, 28, 29
+C_ANCHOR, C_STUCK = 30, 31
+CHANNEL_MEMORY = 32
+# Memory of the witnesses: speed and its age, the open-loop model's v_y and r, the smoothed r, and what held before.
+W_SPEED, W_SPEED_AGE, W_VY, W_R, W_SMOOTH_R, W_SMOOTH_AY, W_SETTLED_S, W_STEER, W_FRICTION = range(9)
+WITNESS_MEMORY = 9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaultCarry:
+    """What the detector takes from window to window: memory of the channels [2, m] and of the witnesses [w].
+
+    ``last_stamp_ns`` is −1 before the first step.
+    """
+
+    channels: FloatArray
+    witness: FloatArray
+    last_stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorFaults:
+    """What is wrong with a_y and yaw rate at each step.
+
+    Attributes
+    ----------
+    extra_r : [N, 2], variance beyond the usual one, m²/s⁴ and rad²/s²; 0 where the channel is as usual.
+    noise_std, usual_std : [N, 2], 1-sigma ŝ of now, and what is usual.
+    reason : int64 [N], bits of :mod:`pdhef_logtool.records.reasons`.
+    filtered : the signals for filters; samples that are stuck, dead or a spike are missing.
+    network : the signals for the network's inputs; samples of a burst are missing as well.
+    """
+
+    extra_r: FloatArray
+    noise_std: FloatArray
+    usual_std: FloatArray
+    reason: IntArray
+    filtered: Signals
+    network: Signals
+
+
+@njit(cache=True)
+def _difference(c, z):  # type: ignore[no-untyped-def]
+    """Return what the parabola through the last three samples misses ``z`` by, and its gain for white noise.
+
+    Ages a₁ < a₂ < a₃ of the samples are in ``c``. The gain is NaN where the ages do not allow it.
+    """
+    a1, a2, a3 = c[C_AGE], c[C_AGE + 1], c[C_AGE + 2]
+    if c[C_COUNT] < 3.0 or a3 > DIFFERENCE_SPAN_S or not (0.0 < a1 < a2 < a3):
+        return 0.0, math.nan
+    w1 = a2 * a3 / ((a2 - a1) * (a3 - a1))
+    w2 = -a1 * a3 / ((a2 - a1) * (a3 - a2))
+    w3 = a1 * a2 / ((a3 - a1) * (a3 - a2))
+    gain = 1.0 + w1 * w1 + w2 * w2 + w3 * w3
+    if gain > MAX_DIFFERENCE_GAIN:
+        return 0.0, math.nan
+    return z - w1 * c[C_Z] - w2 * c[C_Z + 1] - w3 * c[C_Z + 2], gain
+
+
+@njit(cache=True)
+def _forget(c):  # type: ignore[no-untyped-def]
+    """Drop the samples, not what was learnt: the next sample starts anew."""
+    c[C_COUNT] = 0.0
+    c[C_SPIKES] = 0.0
+    c[C_E : C_E + 4] = 0.0
+
+
+@njit(cache=True)
+def _decayed(c, usual, dt):  # type: ignore[no-untyped-def]
+    """Return the noise variance after ``dt`` s without a sample."""
+    return usual + math.exp(-dt / DECAY_S) * max(c[C_NOISE] - usual, 0.0)
+
+
+@njit(cache=True)
+def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped-def]
+    """Take a sample into the memory of its channel; return whether it is a spike. Updates ŝ² and the usual noise."""
+    usual = max(s0 * s0, c[C_USUAL])
+    if c[C_AGE] > DIFFERENCE_SPAN_S:
+        _forget(c)
+    if c[C_COUNT] == 0.0:
+        c[C_TRACK], c[C_TRACK_RATE] = z, 0.0
+        c[C_TRACK_AGE] = 0.0
+        c[C_SPIKES] = 0.0
+        spike = False
+    else:
+        age = c[C_TRACK_AGE]
+        ahead = c[C_TRACK] + age * c[C_TRACK_RATE]
+        miss = z - ahead
+        sigma = TRACK_INNOVATION_RATIO * math.sqrt(max(usual, c[C_NOISE]))
+        # The rate is not known before the third sample.
+        spike = (
+            c[C_COUNT] >= 3.0
+            and age <= DIFFERENCE_SPAN_S
+            and abs(miss) > SPIKE_SIGMA * sigma + curvature * age * age / TRACK_RATE_GAIN
+        )
+        if spike and c[C_SPIKES] >= MAX_SPIKES:
+            # A jump or a burst: the samples are what they are.
+            spike = False
+            c[C_SPIKES] = 0.0
+            c[C_TRACK], c[C_TRACK_RATE], c[C_TRACK_AGE] = z, 0.0, 0.0
+        elif spike:
+            if c[C_SPIKES] == 0.0:
+                c[C_NOISE_BEFORE] = c[C_NOISE]
+            c[C_SPIKES] += 1.0
+        else:
+            if c[C_SPIKES] > 0.0:
+                # It was a spike and no burst: take it out of the differences and out of the noise.
+                for i in range(int(c[C_SPIKES])):
+                    c[C_Z + i] = ahead - c[C_TRACK_RATE] * c[C_AGE + i]
+                    c[C_E + i] = 0.0
+                c[C_NOISE] = c[C_NOISE_BEFORE]
+                c[C_SPIKES] = 0.0
+            c[C_TRACK] = ahead + TRACK_GAIN * miss
+            c[C_TRACK_RATE] = 0.0 if c[C_COUNT] < 2.0 and age <= 0.0 else c[C_TRACK_RATE] + TRACK_RATE_GAIN * miss / age
+            c[C_TRACK_AGE] = 0.0
+    difference, gain = _difference(c, z)
+    if math.isfinite(gain):
+        e = difference * difference / gain
+        c[C_E + 3], c[C_E + 2], c[C_E + 1] = c[C_E + 2], c[C_E + 1], c[C_E]
+        c[C_E] = e
+        if learn and not spike:
+            c[C_LEARNT_S] += dt
+            step = math.log(2.0) * dt * max(1.0 / LEARNING_S, 1.0 / c[C_LEARNT_S])
+            floor = MEDIAN_SQUARE * s0 * s0
+            learnt = max(MEDIAN_SQUARE * c[C_USUAL], 0.25 * floor)
+            c[C_USUAL] = learnt * math.exp(step if e > learnt else -step) / MEDIAN_SQUARE
+    usual = max(s0 * s0, c[C_USUAL])
+    recent = 0.25 * (c[C_E] + c[C_E + 1] + c[C_E + 2] + c[C_E + 3])
+    c[C_NOISE] = max(recent, _decayed(c, usual, dt))
+    for i in (2, 1):
+        c[C_Z + i], c[C_AGE + i] = c[C_Z + i - 1], c[C_AGE + i - 1]
+    c[C_Z], c[C_AGE] = z, 0.0
+    c[C_COUNT] = min(c[C_COUNT] + 1.0, 3.0)
+    return spike
+
+
+@njit(cache=True)
+def _stuck(c, z, dt, moving, turning):  # type: ignore[no-untyped-def]
+    """Return whether the channel repeats a value for longer than its repeats so far explain.
+
+    ``turning`` is the open-loop model's yaw rate, rad/s.
+    """
+    same = z == c[C_LAST] and c[C_RUN] > 0.0
+    c[C_RUN] = c[C_RUN] + 1.0 if same else 1.0
+    c[C_LAST] = z
+    if not same:
+        c[C_TURN_AT_START] = turning
+        c[C_TURN_MOST] = 0.0
+    c[C_TURN_MOST] = max(c[C_TURN_MOST], abs(turning - c[C_TURN_AT_START]))
+    if not moving:
+        c[C_RUN] = 1.0
+        return False
+    if same and c[C_STUCK] > 0.0:
+        return True
+    c[C_STUCK] = 0.0
+    repeats = max(c[C_REPEATS], REPEATS_BEFORE * math.exp(-c[C_MOVED_S]), 1e-3)
+    c[C_MOVED_S] += dt
+    gain = min(1.0, dt * max(1.0 / (REPEATS_S if same else REPEATS_FORGOTTEN_S), 1.0 / (c[C_MOVED_S] + 0.5)))
+    c[C_REPEATS] += gain * ((1.0 if same else 0.0) - c[C_REPEATS])
+    needed = 1.0 + math.log(STUCK_CHANCE) / math.log(min(repeats, 0.9999))
+    if c[C_REPEATS] > COARSE_REPEATS and c[C_TURN_MOST] < MOVED_RAD_S:
+        return False
+    c[C_STUCK] = 1.0 if c[C_RUN] >= max(STUCK_SAMPLES, needed) else 0.0
+    return c[C_STUCK] > 0.0
+
+
+@njit(cache=True)
+def _judge_witness(c, own, one, other, least, band, dt):  # type: ignore[no-untyped-def]
+    """Update whether a channel is dead: its yaw rate ``own`` against those of two other witnesses, rad/s.
+
+    A live channel may disagree for a while, in a spin or with a wrong model, but it moves then, or at the grip limit
+    reads much. A dead one stays within ``band`` and reads next to nothing of what both others tell.
+    """
+    if abs(own - c[C_ANCHOR]) > band:
+        c[C_ANCHOR] = own
+        c[C_DEAD_S] = 0.0
+    weakest = min(abs(one), abs(other))
+    agree = one * other > 0.0 and weakest > least
+    reading = own if one > 0.0 else -own
+    silent = agree and abs(reading) < DEAD_SHARE * weakest
+    c[C_DEAD_S] = c[C_DEAD_S] + dt if silent else 0.0
+    speaks = agree and reading > ALIVE_SHARE * weakest
+    c[C_ALIVE_S] = c[C_ALIVE_S] + dt if speaks else 0.0
+    quiet = max(abs(one), abs(other), abs(own)) < QUIET_RAD_S
+    c[C_QUIET_S] = c[C_QUIET_S] + dt if quiet else 0.0
+    if c[C_DEAD_S] >= DEAD_AFTER_S:
+        c[C_DEAD] = 1.0
+    elif c[C_ALIVE_S] >= ALIVE_AFTER_S or c[C_QUIET_S] >= QUIET_AFTER_S:
+        c[C_DEAD] = 0.0
+
+
+@njit(cache=True)
+def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
+    """Move the open-loop model by ``dt`` at the speed of ``w``; its r stays within what friction allows."""
+    v = w[W_SPEED]
+    n = substeps(v, dt, friction, p)
+    _, vy, r = rk4_step(v, w[W_VY], w[W_R], 0.5 * (w[W_STEER] + steer), -w[W_VY] * w[W_R], friction, dt, n, p)
+    limit = 1.2 * friction * GRAVITY_M_S2 / v
+    w[W_R] = min(limit, max(-limit, r))
+    w[W_VY] = min(0.3 * v, max(-0.3 * v, vy))
+
+
+@njit(cache=True)
+def _detect(  # type: ignore[no-untyped-def]
+    dt, steer, ay, yaw_rate, speed, friction, default_friction, s0, p, channels, w, extra, noise, usual_noise, reason,
+    usable,
+):  # fmt: skip
+    """Run over one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
+    for k in range(dt.shape[0]):
+        step = dt[k] if math.isfinite(dt[k]) else 0.0
+        mask = 0
+        if step > SPEED_HOLD_S:
+            for i in range(CHANNELS):
+                _forget(channels[i])
+            w[W_SETTLED_S] = 0.0
+        if math.isfinite(speed[k]):
+            w[W_SPEED], w[W_SPEED_AGE] = abs(speed[k]), 0.0
+        else:
+            w[W_SPEED_AGE] += step
+        known = w[W_SPEED_AGE] <= SPEED_HOLD_S
+        moving = not known or w[W_SPEED] > STUCK_SPEED_M_S
+        for i in range(CHANNELS):
+            z = ay[k] if i == AY else yaw_rate[k]
+            c = channels[i]
+            c[C_AGE : C_AGE + 3] += step
+            c[C_TRACK_AGE] += step
+            usable[k, i] = z
+            usual = max(s0[i] * s0[i], c[C_USUAL])
+            if not math.isfinite(z):
+                mask |= MISSING_AY << i
+                c[C_NOISE] = _decayed(c, usual, step)
+            elif _stuck(c, z, step, moving, w[W_SMOOTH_R]):
+                mask |= STUCK_AY << i
+                usable[k, i] = math.nan
+                c[C_NOISE] = _decayed(c, usual, step)
+                _forget(c)
+            elif _noise_and_spike(c, z, step, s0[i], CURVATURE[i], moving):
+                mask |= SPIKE_AY << i
+                usable[k, i] = math.nan
+            usual = max(s0[i] * s0[i], c[C_USUAL])
+            extra[k, i] = 0.0
+            if c[C_NOISE] > BURST_RATIO * usual:
+                mask |= BURST_AY << i
+                extra[k, i] = c[C_NOISE] - s0[i] * s0[i]
+            noise[k, i] = math.sqrt(max(c[C_NOISE], usual))
+            usual_noise[k, i] = math.sqrt(usual)
+
+        mu = friction[k] if math.isfinite(friction[k]) else w[W_FRICTION] if w[W_FRICTION] > 0.0 else default_friction
+        w[W_FRICTION] = mu
+        if known and w[W_SPEED] > WITNESS_SPEED_M_S and math.isfinite(steer[k]):
+            v = w[W_SPEED]
+            if w[W_SETTLED_S] == 0.0:
+                w[W_VY], w[W_R] = 0.0, 0.0
+                w[W_STEER] = steer[k]
+            else:
+                _open_loop(w, steer[k], mu, step, p)
+            w[W_STEER] = steer[k]
+            w[W_SETTLED_S] += max(step, 1e-9)
+            gain = 1.0 - math.exp(-step / WITNESS_S)
+            w[W_SMOOTH_R] += gain * (w[W_R] - w[W_SMOOTH_R])
+            modelled = measured_lateral_acceleration(v, w[W_VY], w[W_R], steer[k], mu, p)
+            w[W_SMOOTH_AY] += gain * (modelled / v - w[W_SMOOTH_AY])
+            for i in range(CHANNELS):
+                if math.isfinite(usable[k, i]):
+                    own = usable[k, i] / v if i == AY else usable[k, i]
+                    channels[i, C_SMOOTH] += gain * (own - channels[i, C_SMOOTH])
+            clear = math.isfinite(usable[k, AY]) and math.isfinite(usable[k, YAW_RATE])
+            clear = clear and mask & (BURST_AY | BURST_YAW_RATE) == 0
+            if clear and w[W_SETTLED_S] >= WITNESS_SETTLED_S:
+                of_ay, of_r = channels[AY, C_SMOOTH], channels[YAW_RATE, C_SMOOTH]
+                least = WITNESS_RAD_S + WITNESS_NOISE_SIGMAS * max(s0[AY] / v, s0[YAW_RATE])
+                drift = w[W_SMOOTH_AY] - w[W_SMOOTH_R]  # the model's v̇_y over v_x
+                band_ay = DEAD_BAND_RAD_S + DEAD_BAND_SIGMAS * s0[AY] / v
+                band_r = DEAD_BAND_RAD_S + DEAD_BAND_SIGMAS * s0[YAW_RATE]
+                was_dead = channels[AY, C_DEAD] > 0.0
+                if channels[YAW_RATE, C_DEAD] == 0.0:
+                    _judge_witness(channels[AY], of_ay, of_r + drift, w[W_SMOOTH_AY], least, band_ay, step)
+                if not was_dead:
+                    _judge_witness(channels[YAW_RATE], of_r, of_ay - drift, w[W_SMOOTH_R], least, band_r, step)
+        else:
+            w[W_SETTLED_S] = 0.0
+            for i in range(CHANNELS):
+                channels[i, C_DEAD_S] = 0.0
+                channels[i, C_ALIVE_S] = 0.0
+                channels[i, C_QUIET_S] = 0.0
+        for i in range(CHANNELS):
+            if channels[i, C_DEAD] > 0.0:
+                mask |= DEAD_AY << i
+                usable[k, i] = math.nan
+        reason[k] = mask
+
+
+def find_faults(
+    signals: Signals, vehicle: VehicleParameters, carry: FaultCarry | None
+) -> tuple[SensorFaults, FaultCarry]:
+    """Look for faults of a_y and yaw rate in one window, causally: step k depends on samples up to k.
+
+    Joined windows give the same bits as one call over the whole log.
+    """
+    signals = without_impossible(signals)
+    count = len(signals)
+    channels = np.zeros((CHANNELS, CHANNEL_MEMORY)) if carry is None else carry.channels.copy()
+    witness = np.zeros(WITNESS_MEMORY) if carry is None else carry.witness.copy()
+    if carry is None:
+        witness[W_SPEED_AGE] = np.inf
+    dt = np.empty(count)
+    if count:
+        dt[0] = (
+            np.nan
+            if carry is None or carry.last_stamp_ns < 0
+            else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
+        )
+        dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+    extra, noise, usual, usable = (np.empty((count, 2)) for _ in range(4))
+    reason = np.empty(count, dtype=np.int64)
+    s0 = np.array([vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s])
+    _detect(
+        dt, signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.friction,
+        vehicle.assumed_friction, s0, model_parameters(vehicle), channels, witness, extra, noise, usual, reason,
+        usable,
+    )  # fmt: skip
+    last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else -1)
+    filtered: dict[str, Any] = {"ay_m_s2": usable[:, AY].copy(), "yaw_rate_rad_s": usable[:, YAW_RATE].copy()}
+    seen: dict[str, Any] = {
+        "ay_m_s2": np.where(reason & BURST_AY, np.nan, usable[:, AY]),
+        "yaw_rate_rad_s": np.where(reason & BURST_YAW_RATE, np.nan, usable[:, YAW_RATE]),
+    }
+    faults = SensorFaults(extra, noise, usual, reason, replace(signals, **filtered), replace(signals, **seen))
+    return faults, FaultCarry(channels, witness, last)

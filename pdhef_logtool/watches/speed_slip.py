@@ -1,0 +1,311 @@
+"""Speed samples of wheels that spin or lock, kept from the filters: measured speed against the accelerometer.
+
+What the speed changes from sample to sample beyond ∫(a_x + b) dt is excess; b is what it exceeds a_x by slowly (grade,
+pitch, bias), learnt. Two cumulative sums (Page 1954), one for each sign, gather the excess beyond an allowance of
+``CONTRADICTION_M_S2``, and of what v̇_x = a_x + v_y r may hold in a turn. One of them beyond a bound that noise does not
+reach, at two samples in a row, is slip, and the sum's last zero says when it began. From the speed of then a_x counts
+on: v̂. While slip lasts,
+
+- the reading nearest to v̂ and within a tolerance is believed, out of the speed itself and the mean wheel speed of each
+  axle where the log has them: of two driven wheels that spin, the median of four still takes half. v̂ follows it;
+- without one the sample is missing, but for as long as wrong samples were believed before the slip was seen, v̂ stands
+  in their place: else a filter would go on with what they did to it.
+
+It ends when the speed itself has agreed with v̂ for a while; after a time-out without any reading to believe, when v̂ is
+no better than the speed and the accelerometer is not heeded for a time. Locked wheels on a car that decelerates do not
+time out. A car that stands reads zero, and below some speed there are no pulses: steps into and out of that range are
+no excess. Neither is slip what only ends: wheels that spun are right again after a fall while the car accelerates.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.signals import FloatArray, Signals
+
+#: A speed that changes by this much more or less than the accelerometer says is contradicted: no hill is so steep.
+CONTRADICTION_M_S2 = 3.0
+#: |v_y| / v_x up to which v_y r is allowed in v̇_x, while turning: a drifting car has more of it than the limit above.
+TURN_SHARE = 1.5
+#: Bound of the cumulative sums: this many 1-sigmas of the speed sensor, and at least the second.
+BOUND_SIGMAS, LEAST_BOUND_M_S = 6.0, 0.4
+#: Of the speed sensor, for an estimator that knows no vehicle.
+ASSUMED_STD_M_S = 0.08
+#: Samples in a row beyond the bound: one alone is an outlier.
+ALARM_SAMPLES = 2
+#: Time constant and limit of b.
+BIAS_S, MAX_BIAS_M_S2 = 3.0, 2.5
+#: A reading within the bound of v̂ is believed; without one the tolerance grows at this rate, and by the second share
+#: of |r| v_x.
+DRIFT_M_S2, TURN_DRIFT_SHARE = 0.3, 1.0
+#: Time constant with which v̂ follows what is believed.
+FOLLOW_S = 0.3
+#: The speed must have agreed for this long.
+RELEASE_S = 0.2
+#: Longest time without a reading to believe, and for how long nothing is gated behind it.
+TIMEOUT_S, HEED_AGAIN_S = 5.0, 30.0
+#: A sensor without pulses reads below the first; readings up to the second may come next to it.
+ZERO_M_S, PULSE_FLOOR_M_S = 0.05, 1.0
+#: Wheels lock where the car decelerates by more than this, smoothed, and spin where it does not; else they recover from
+#: slip that grew too slowly to be seen, and are right again.
+BRAKING_M_S2, BRAKING_SMOOTHING_S = 0.5, 0.1
+#: Locked wheels do not time out above this v̂.
+LOCKED_SPEED_M_S = 1.0
+#: Beyond such a step, or so long without speed or a_x, all starts anew.
+RESTART_GAP_S = 0.5
+
+# Entries of the memory. Last samples of speed, a_x, yaw rate; since the last speed sample: time, what a_x says of the
+# speed, what is allowed beyond it; time since a_x.
+(_STARTED, _SPEED, _AX, _HAS_AX, _RATE, _SPAN, _EXPECTED, _ALLOWED, _AX_AGE, _BIAS) = range(10)
+# The sums: value, dead-reckoned speed and time since the last zero, b at that time, samples beyond the bound.
+_UP, _DOWN = 10, 15
+_SUM, _FROM, _SINCE, _LEARNT, _BEYOND = range(5)
+# While slip lasts: flag, v̂, tolerance beyond the bound, time of agreement, time alone, time to put v̂ in place.
+(_SLIPS, _V, _GROWTH, _AGREED, _ALONE, _REPAIR, _NOT_HEEDED) = range(20, 27)
+# a_x, smoothed.
+_SLOW_AX = 27
+_MEMORY = 28
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlipCarry:
+    """Memory between windows; ``last_stamp_ns`` is that of the last step."""
+
+    memory: FloatArray
+    last_stamp_ns: int
+
+
+@njit(cache=True)
+def _forget(m):  # type: ignore[no-untyped-def]
+    """Begin the sums anew at the last speed sample."""
+    for s in (_UP, _DOWN):
+        m[s + _SUM] = 0.0
+        m[s + _FROM] = m[_SPEED]
+        m[s + _SINCE] = 0.0
+        m[s + _LEARNT] = m[_BIAS]
+        m[s + _BEYOND] = 0.0
+
+
+@njit(cache=True)
+def _gather(m, s, excess, z, bound):  # type: ignore[no-untyped-def]
+    """Take an excess into a sum; return whether it says slip."""
+    m[s + _SUM] += excess
+    if m[s + _SUM] <= 0.0:
+        m[s + _SUM] = 0.0
+        m[s + _FROM] = z
+        m[s + _SINCE] = 0.0
+        m[s + _LEARNT] = m[_BIAS]
+    m[s + _BEYOND] = m[s + _BEYOND] + 1.0 if m[s + _SUM] > bound else 0.0
+    return m[s + _BEYOND] >= ALARM_SAMPLES
+
+
+@njit(cache=True)
+def _onward(v, change):  # type: ignore[no-untyped-def]
+    """Return a speed after a change; slipping wheels turn no car around."""
+    return max(0.0, v + change) if v >= 0.0 else min(0.0, v + change)
+
+
+@njit(cache=True)
+def _axle(wheels, first):  # type: ignore[no-untyped-def]
+    return 0.5 * (wheels[first] + wheels[first + 1])
+
+
+@njit(cache=True)
+def _brakes(m):  # type: ignore[no-untyped-def]
+    return m[_SLOW_AX] + m[_BIAS] < -BRAKING_M_S2
+
+
+@njit(cache=True)
+def _one_axle_agrees(z, wheels, bound):  # type: ignore[no-untyped-def]
+    """Return whether the speed is that of one axle and not of the other: it has just become right again.
+
+    Wheels that slip together take it along to where no axle is, or to where both are.
+    """
+    front, rear = abs(_axle(wheels, 0) - z) <= 0.5 * bound, abs(_axle(wheels, 2) - z) <= 0.5 * bound
+    return math.isfinite(wheels.sum()) and front != rear
+
+
+@njit(cache=True)
+def _start(v, wheels, bound, spins):  # type: ignore[no-untyped-def]
+    """Return v̂ at an alarm: the dead-reckoned speed, or that of the axle that slips less and says more slip still.
+
+    Slip that grew slowly at first has taken the speed along before the sum began to count.
+    """
+    front, rear = _axle(wheels, 0), _axle(wheels, 2)
+    if spins and min(front, rear) < v - bound:
+        return min(front, rear)
+    if not spins and max(front, rear) > v + bound:
+        return max(front, rear)
+    return v
+
+
+@njit(cache=True)
+def _while_slipping(m, z, wheels, bound):  # type: ignore[no-untyped-def]
+    """Take a sample while slip lasts; return the speed to believe, NaN for none."""
+    v, span = m[_V], m[_SPAN]
+    tolerance = bound + m[_GROWTH]
+    agrees = abs(z - v) <= tolerance
+    m[_AGREED] = m[_AGREED] + span if agrees else 0.0
+    believed = z if agrees else math.nan
+    distance = abs(z - v) if agrees else tolerance
+    for first in (0, 2):
+        axle = _axle(wheels, first)
+        if abs(axle - v) < distance:
+            believed, distance = axle, abs(axle - v)
+    if math.isfinite(believed):
+        keep = math.exp(-span / FOLLOW_S)
+        m[_V] = believed + keep * (v - believed)
+        m[_GROWTH] *= keep
+        m[_ALONE] = 0.0
+    else:
+        m[_ALONE] += span
+    locked = abs(z) < ZERO_M_S and v > LOCKED_SPEED_M_S and _brakes(m)
+    if m[_ALONE] > TIMEOUT_S and not locked:
+        m[_SLIPS] = 0.0
+        m[_NOT_HEEDED] = HEED_AGAIN_S
+        return z
+    if m[_AGREED] >= RELEASE_S:
+        m[_SLIPS] = 0.0
+    return believed
+
+
+@njit(cache=True)
+def _gate(dt, ax, yaw_rate, speed, wheels, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
+    """Run over one window; ``dt[k]`` ends at step k, NaN = start. Returns whether any sample is not as it was.
+
+    ``believed`` [N] is the speed for filters, ``reckoned`` [N] that with v̂ in place of what is missing.
+    """
+    changed = False
+    for k in range(dt.shape[0]):
+        if not dt[k] <= RESTART_GAP_S:
+            m[:] = 0.0
+        step = dt[k] if m[_STARTED] > 0.0 else 0.0
+        has_ax = math.isfinite(ax[k])
+        if math.isfinite(yaw_rate[k]):
+            m[_RATE] = yaw_rate[k]
+        # As in the filters: the mean of the step's two ends, or the one that is known.
+        a = m[_AX] if not has_ax else ax[k] if m[_HAS_AX] == 0.0 else 0.5 * (m[_AX] + ax[k])
+        known = has_ax or m[_HAS_AX] > 0.0
+        m[_HAS_AX] = 1.0 if has_ax else 0.0
+        if has_ax:
+            m[_AX] = ax[k]
+            m[_SLOW_AX] += (1.0 - math.exp(-step / BRAKING_SMOOTHING_S)) * (ax[k] - m[_SLOW_AX])
+            m[_AX_AGE] = 0.0
+        else:
+            m[_AX_AGE] += step
+        if step > 0.0:
+            m[_NOT_HEEDED] = max(0.0, m[_NOT_HEEDED] - step)
+            change = (a + m[_BIAS]) * step
+            turning = abs(m[_RATE] * (m[_V] if m[_SLIPS] > 0.0 else m[_SPEED])) * step
+            m[_SPAN] += step
+            m[_EXPECTED] += change
+            m[_ALLOWED] += CONTRADICTION_M_S2 * step + TURN_SHARE * turning
+            for s in (_UP, _DOWN):
+                m[s + _FROM] = _onward(m[s + _FROM], change)
+                m[s + _SINCE] += step
+            if m[_SLIPS] > 0.0:
+                m[_V] = _onward(m[_V], change)
+                m[_GROWTH] += DRIFT_M_S2 * step + TURN_DRIFT_SHARE * turning
+                m[_REPAIR] = max(0.0, m[_REPAIR] - step)
+            if m[_AX_AGE] > RESTART_GAP_S or m[_SPAN] > RESTART_GAP_S:
+                m[_SLIPS] = 0.0
+                m[_STARTED] = 0.0
+        z = speed[k]
+        believed[k] = reckoned[k] = z
+        if not math.isfinite(z):
+            continue
+        if m[_STARTED] == 0.0:
+            if known:
+                m[_STARTED] = 1.0
+                m[_SPEED] = z
+                m[_NOT_HEEDED] = RELEASE_S  # the first sample may be a wrong one
+                _forget(m)
+        elif m[_SLIPS] > 0.0:
+            believed[k] = _while_slipping(m, z, wheels[k], bound)
+            reckoned[k] = believed[k]
+            if not math.isfinite(believed[k]):
+                reckoned[k] = m[_V]
+                if m[_REPAIR] > 0.0:
+                    believed[k] = m[_V]
+            changed = changed or believed[k] != z
+            if m[_SLIPS] == 0.0:
+                m[_SPEED] = z
+                _forget(m)
+        else:
+            excess = z - m[_SPEED] - m[_EXPECTED]
+            quiet = max(m[_UP + _SUM], m[_DOWN + _SUM]) < 0.5 * bound
+            if quiet:
+                m[_BIAS] = min(MAX_BIAS_M_S2, max(-MAX_BIAS_M_S2, m[_BIAS] + excess / BIAS_S))
+            low, high = min(abs(z), abs(m[_SPEED])), max(abs(z), abs(m[_SPEED]))
+            m[_SPEED] = z
+            if (low < ZERO_M_S and high <= PULSE_FLOOR_M_S) or m[_NOT_HEEDED] > 0.0:
+                _forget(m)
+            else:
+                alone = m[_UP + _BEYOND] + m[_DOWN + _BEYOND] == 1.0
+                up = _gather(m, _UP, excess - m[_ALLOWED], z, bound)
+                down = _gather(m, _DOWN, -excess - m[_ALLOWED], z, bound)
+                recovers = up == _brakes(m) or _one_axle_agrees(z, wheels[k], bound)
+                if (up or down) and recovers:
+                    _forget(m)
+                elif alone and not (up or down):
+                    _forget(m)  # one sample was off: its way back is no slip either
+                elif up or down:
+                    s = _UP if up else _DOWN
+                    m[_SLIPS] = 1.0
+                    m[_BIAS] = m[s + _LEARNT]
+                    m[_V] = _start(m[s + _FROM], wheels[k], bound, up)
+                    m[_REPAIR] = m[s + _SINCE]
+                    m[_GROWTH] = m[_AGREED] = m[_ALONE] = 0.0
+                    believed[k] = reckoned[k] = m[_V]
+                    changed = True
+        m[_SPAN] = m[_EXPECTED] = m[_ALLOWED] = 0.0
+    return changed
+
+
+def _run(
+    signals: Signals, speed_std_m_s: float, carry: SlipCarry | None
+) -> tuple[bool, FloatArray, FloatArray, SlipCarry]:
+    count = len(signals)
+    dt = np.empty(count)
+    if count:
+        dt[0] = math.nan if carry is None else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
+        dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+    memory = np.zeros(_MEMORY) if carry is None else carry.memory.copy()
+    believed, reckoned = np.empty(count), np.empty(count)
+    changed = _gate(
+        dt, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s,
+        max(LEAST_BOUND_M_S, BOUND_SIGMAS * speed_std_m_s), memory, believed, reckoned,
+    )  # fmt: skip
+    last = int(signals.stamps_ns[-1]) if count else (0 if carry is None else carry.last_stamp_ns)
+    return changed, believed, reckoned, SlipCarry(memory, last)
+
+
+def without_slip(
+    signals: Signals, speed_std_m_s: float, carry: SlipCarry | None, *, reckoned: bool = False
+) -> tuple[Signals, SlipCarry]:
+    """Return the signals with the speed samples of slipping wheels missing; the same object where there are none.
+
+    Causal: step k depends on samples up to k. Joined windows give the same bits as one call over the whole log.
+
+    Parameters
+    ----------
+    speed_std_m_s : 1-sigma of the speed sensor. carry : what the previous window's call returned.
+    reckoned : put the dead-reckoned speed where a sample is missing, for estimators that need one to go on.
+    """
+    changed, believed, with_reckoned, after = _run(signals, speed_std_m_s, carry)
+    if not changed:
+        return signals, after
+    return replace(signals, speed_m_s=with_reckoned if reckoned else believed), after
+
+
+def believable(
+    signals: Signals, speed_std_m_s: float, carry: SlipCarry | None, *, gate: bool, reckoned: bool = False
+) -> tuple[Signals, SlipCarry | None]:
+    """Return what an estimator starts from: no impossible readings and, with ``gate``, no speed of slipping wheels."""
+    signals = without_impossible(signals)
+    return without_slip(signals, speed_std_m_s, carry, reckoned=reckoned) if gate else (signals, None)

@@ -1,0 +1,159 @@
+"""A drive of the condition table in memory, and every estimator on it.
+
+A log is read once, as ``pdhef run`` reads it. Friction is the one thing that an estimator is told of the truth, and
+only through the factor of the row: 1.2 times it, or nothing at all. The bins are those of the true friction always.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error
+from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import auto_map
+from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.watches.intervals import Calibration, calibrated
+from studies.table_maths import interval_score
+
+SIDESLIP = "sideslip_rad"
+#: Bins of true |a_y| over μ g (METHOD §10), by name: lower and upper limit.
+BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6), "high": (0.6, np.inf)}
+NONLINEAR = "nonlinear"
+#: A drive counts in a bin from this many seconds on.
+BIN_LEAST_S = 0.3
+_FRICTION = SignalSource("friction", "/truth/perfect/state", "friction")
+#: Recognised types tell no lateral acceleration, and the smoothed derivative in its place lacks the ends of a drive.
+_TRUE_A_Y = SignalSource("ay_m_s2", "/truth/perfect/state", "ay_m_s2")
+#: What is kept of the metrics: the sideslip in all segments, of the rest these.
+_KEPT = {
+    "vx_m_s": ("rmse",),
+    "vy_m_s": ("rmse", "lag_s"),
+    "yaw_rate_rad_s": ("rmse", "lag_s"),
+    "ay_m_s2": ("rmse", "lag_s"),
+    "position_m": ("rmse",),
+    "lateral_1s_m": ("rmse",),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConditionDrive:
+    """Signals [N] as an estimator would get them with the true friction, and the perfect truth [N] at their stamps."""
+
+    name: str
+    signals: Signals
+    truth: StateTrack
+    friction: FloatArray
+
+
+def read_drive(path: Path, vehicle: VehicleParameters, name: str, *, friction: float | None = None) -> ConditionDrive:
+    """Read a simulated log; ``friction`` where the log has none of its own.
+
+    The perfect truth stands on the sensors' clock, so that no latency is looked for: a stuck gyro would bend it.
+    """
+    with closing(open_log(path)) as log:
+        mapping = auto_map(log).mapping
+        if friction is None:
+            mapping = replace(
+                mapping,
+                signals={**mapping.signals, "friction": _FRICTION},
+                truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y},
+            )
+        plan = replace(plan_drive(log, mapping, vehicle, log.start_ns, log.end_ns), latency=None)
+        windows = [w for w in DriveReader(log, plan, 600.0).windows() if len(w.signals)]
+    signals = join_signals([w.signals for w in windows])
+    truth = concatenate([w.truth for w in windows if w.truth is not None])
+    if friction is not None:
+        constant = np.full(len(signals), friction)
+        signals = replace(signals, friction=constant, available=signals.available | {"friction"})
+    return ConditionDrive(name, signals, truth, signals.friction)
+
+
+def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:
+    """Return the signals with what the row tells of the friction.
+
+    Raises
+    ------
+    ValueError
+        The row asks for something that is not known here.
+    """
+    unknown = set(assume) - {"friction_factor", "friction", "sensors"}
+    if unknown or assume.get("friction", "unknown") != "unknown" or assume.get("sensors", "esp") != "esp":
+        raise ValueError(f"expected friction_factor, friction unknown or sensors esp, got {assume}")
+    if assume.get("friction") == "unknown":
+        nothing = np.full(len(drive.signals), np.nan)
+        return replace(drive.signals, friction=nothing, available=drive.signals.available - {"friction"})
+    return replace(drive.signals, friction=float(assume.get("friction_factor", 1.0)) * drive.signals.friction)
+
+
+def bin_masks(drive: ConditionDrive) -> dict[str, BoolArray]:
+    """Return the segments: everything, the bins, and the nonlinear range; by true friction and lateral acceleration."""
+    share = np.abs(smooth(drive.truth.stamps_ns, drive.truth.ay_m_s2, GRIP_SMOOTHING_HZ))
+    share = share / (drive.friction * GRAVITY_M_S2)
+    masks = {name: (share >= low) & (share < high) for name, (low, high) in BINS.items()}
+    return {ALL: np.ones(len(share), dtype=np.bool_), **masks, NONLINEAR: share > NONLINEAR_SHARE}
+
+
+def score(track: StateTrack, drive: ConditionDrive, low_speed_m_s: float) -> list[MetricRow]:
+    """Return the metrics that the table needs: of :mod:`pdhef_logtool.evaluation.metrics`, and of the interval."""
+    masks = bin_masks(drive)
+    rows = [
+        row
+        for row in score_track(track, drive.truth, masks, log=drive.name, low_speed_m_s=low_speed_m_s)
+        if row.signal in (SIDESLIP, "state") or (row.segment == ALL and row.metric in _KEPT.get(row.signal, ()))
+    ]
+    error = signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
+    sigma = np.hypot(track.sideslip_std_rad, np.nan_to_num(drive.truth.sideslip_std_rad, nan=0.0))
+    return rows + interval_rows(error, sigma, masks, log=drive.name, estimator=track.name)
+
+
+def interval_rows(
+    error: FloatArray, sigma: FloatArray, masks: dict[str, BoolArray], *, log: str, estimator: str
+) -> list[MetricRow]:
+    """Return ``interval_score95`` and ``width95`` (mean of the whole width) of the sideslip by segment."""
+    known = np.isfinite(error) & np.isfinite(sigma)
+    rows = []
+    for segment, mask in masks.items():
+        use = mask & known
+        n = int(np.count_nonzero(use))
+        if n:
+            mean = float(np.mean(interval_score(error[use], sigma[use])))
+            width = float(np.mean(2.0 * NORMAL_95 * sigma[use]))
+            rows.append(MetricRow(log, estimator, SIDESLIP, segment, "interval_score95", mean, "rad", n))
+            rows.append(MetricRow(log, estimator, SIDESLIP, segment, "width95", width, "rad", n))
+    return rows
+
+
+def run_and_score(
+    estimators: Sequence[Estimator],
+    signals: Signals,
+    drive: ConditionDrive,
+    low_speed_m_s: float,
+    calibration: Calibration | None = None,
+) -> list[MetricRow]:
+    """Run estimators on signals and score each against the drive's truth, with calibrated intervals if any."""
+    rows: list[MetricRow] = []
+    for estimator in estimators:
+        track, _ = estimator.run(signals, None)
+        if calibration is not None and track.name in calibration.inflations:
+            track, _ = calibrated(track, signals, calibration)
+        rows += score(track, drive, low_speed_m_s)
+    return rows
+
+
+def independent_runs(folder: Path) -> Iterable[tuple[Path, float]]:
+    """Yield the independent simulator's runs with their friction."""
+    for source in sorted(folder.glob("*.parquet")):
+        yield source, float(json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))["mu"])

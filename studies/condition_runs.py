@@ -1,0 +1,315 @@
+"""All drives of the condition table through all estimators, in processes, row by row; a finished row is kept.
+
+A row's file carries a key: the hash of the drives' contents, the vehicle file, the model, the estimators' names, the
+settings, and the sources of what computes. A row whose key is as it was is not computed again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import cache, lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pyarrow.parquet as pq
+
+from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.estimators.registry import make_estimator, runnable
+from pdhef_logtool.evaluation.metrics import MetricRow, signal_error, summarise_errors
+from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
+from pdhef_logtool.sinks.base import PendingFile
+from pdhef_logtool.watches.intervals import Calibration, find_calibration
+from studies import error_budget, fixed_grid
+from studies.condition_drives import SIDESLIP, read_drive, run_and_score, told
+
+ROOT = Path(__file__).resolve().parents[1]
+FORMAT = 1
+COLUMNS = ("row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n")
+_KEY, _NOTES = b"key", b"notes"
+#: What decides the figures, beside the drives: sources by folder or file.
+_SOURCES = (
+    "pdhef_logtool/estimators",
+    "pdhef_logtool/residual_model",
+    "pdhef_logtool/evaluation",
+    "pdhef_logtool/mapping",
+    "pdhef_logtool/drive",
+    "pdhef_logtool/car",
+    "pdhef_logtool/watches",
+    "pdhef_logtool/records",
+    "studies/condition_drives.py",
+    "studies/condition_runs.py",
+    "studies/fixed_grid.py",
+    "studies/table_maths.py",
+)
+_BUDGET_SOURCES = ("truthsim", "studies/error_budget.py", "studies/defaults/fit_nominal_tyres.py")
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What every drive is run with; ``model`` None leaves out what needs a network."""
+
+    vehicle: Path
+    model: Path | None
+    estimators: tuple[str, ...]
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What the setup is, by content."""
+        _, model = _loaded(self.vehicle, self.model)
+        calibration = _calibration(self.model)
+        return {
+            "vehicle": hashlib.sha256(self.vehicle.read_bytes()).hexdigest(),
+            "model": None if model is None else model.sha256,
+            "calibration": None if calibration is None else calibration.sha256,
+            "estimators": list(self.estimators),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One drive of one row. ``kind``: ``score``, ``grid`` (fixed settings alone) or ``budget``."""
+
+    kind: str
+    row: str
+    log: Path
+    sha256: str
+    assume: dict[str, Any]
+    friction: float | None = None
+    entry: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class RowResult:
+    """What came of a row: figures in the columns ``COLUMNS``, and sentences on what did not run."""
+
+    row: str
+    kind: str
+    table: pl.DataFrame
+    notes: tuple[str, ...]
+
+
+@cache
+def source_digest(*places: str) -> str:
+    """Return the hash of the Python sources under folders or files of the repository."""
+    digest = hashlib.sha256()
+    for place in places:
+        path = ROOT / place
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def row_key(setup: Setup, tasks: Sequence[Task]) -> str:
+    """Return the hash of all that the row's figures depend on."""
+    kind = tasks[0].kind
+    document = {
+        "format": FORMAT,
+        "kind": kind,
+        "setup": setup.identity,
+        "assume": tasks[0].assume,
+        "drives": [[t.log.name, t.sha256, t.friction] for t in tasks],
+        "grid": [asdict(s) for s in fixed_grid.GRID],
+        "sources": source_digest(*_SOURCES, *(_BUDGET_SOURCES if kind == "budget" else ())),
+    }
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def run_rows(
+    setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: int, title: str, say: Say
+) -> dict[str, RowResult]:
+    """Run the tasks of every row, keep what is there already, write each row's Parquet as soon as it is whole."""
+    folder.mkdir(parents=True, exist_ok=True)
+    done: dict[str, RowResult] = {}
+    todo: list[Task] = []
+    keys = {name: row_key(setup, tasks) for name, tasks in rows.items() if tasks}
+    for name, tasks in rows.items():
+        if not tasks:
+            continue
+        kept = _read(folder / f"{name}.parquet", name, tasks[0].kind, keys[name])
+        if kept is None:
+            todo += tasks
+        else:
+            done[name] = kept
+    if done:
+        say(f"{title}: {len(done)} rows kept")
+    open_rows: dict[str, list[tuple[Task, list[tuple[Any, ...]], list[str]]]] = {}
+    began = time.monotonic()
+    with _workers(setup, jobs) as work:
+        for count, (task, rows_of, notes) in enumerate(work(todo), start=1):
+            so_far = open_rows.setdefault(task.row, [])
+            so_far.append((task, rows_of, notes))
+            left = (time.monotonic() - began) / count * (len(todo) - count)
+            say(f"\r{title}: {count} of {len(todo)} drives, {left:.0f} s left   ")
+            if len(so_far) == len(rows[task.row]):
+                done[task.row] = _write(folder / f"{task.row}.parquet", task, so_far, keys[task.row])
+                del open_rows[task.row]
+    if todo:
+        say(f"\n{title}: {len(todo)} drives in {time.monotonic() - began:.0f} s\n")
+    return {name: done[name] for name in rows if name in done}
+
+
+def _read(path: Path, row: str, kind: str, key: str) -> RowResult | None:
+    try:
+        metadata = pq.read_metadata(path).metadata or {}
+        if metadata.get(_KEY) != key.encode():
+            return None
+        return RowResult(row, kind, pl.read_parquet(path), tuple(json.loads(metadata[_NOTES])))
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def _write(path: Path, task: Task, parts: list[tuple[Task, list[tuple[Any, ...]], list[str]]], key: str) -> RowResult:
+    # Processes finish in any order; the file does not show it.
+    parts = sorted(parts, key=lambda p: p[0].log.as_posix())
+    schema = dict.fromkeys(COLUMNS, pl.String) | {"value": pl.Float64, "n": pl.Int64}
+    table = pl.DataFrame([(task.row, *r) for _, rows, _ in parts for r in rows], schema=schema, orient="row")
+    notes = tuple(dict.fromkeys(n for _, _, notes in parts for n in notes))
+    arrow = table.to_arrow()
+    arrow = arrow.replace_schema_metadata({_KEY: key.encode(), _NOTES: json.dumps(notes).encode()})
+    with PendingFile(path) as pending:
+        pq.write_table(arrow, pending.path, compression="zstd")
+    return RowResult(task.row, task.kind, table, notes)
+
+
+_Done = tuple[Task, list[tuple[Any, ...]], list[str]]
+
+
+@contextmanager
+def _workers(setup: Setup, jobs: int) -> Iterator[Callable[[list[Task]], Iterator[_Done]]]:
+    """Yield a function that runs tasks, here or in processes, and yields what they give in any order."""
+    if jobs == 1:
+        yield lambda todo: (_run(setup, task) for task in todo)
+        return
+    # Read by the fresh interpreters when they load the libraries: one thread each, parallel over drives.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+
+        def work(todo: list[Task]) -> Iterator[_Done]:
+            futures = [pool.submit(_run, setup, task) for task in todo]
+            try:
+                for future in as_completed(futures):
+                    yield future.result()
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+        yield work
+
+
+def _run(setup: Setup, task: Task) -> _Done:
+    rows, notes = {"score": _score, "grid": _grid, "budget": _budget}[task.kind](setup, task)
+    return task, [_cells(r) for r in rows], notes
+
+
+def _cells(r: MetricRow) -> tuple[Any, ...]:
+    return (r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.unit, r.n)
+
+
+@cache
+def _loaded(vehicle: Path, model: Path | None) -> tuple[VehicleParameters, ModelBundle | None]:
+    return load_vehicle(vehicle), None if model is None else load_bundle(model)
+
+
+@cache
+def _calibration(model: Path | None) -> Calibration | None:
+    """Return the calibration in the model's folder, as ``pdhef run`` takes it."""
+    return None if model is None else find_calibration(None, model)
+
+
+@cache
+def _estimators(setup: Setup, available: frozenset[str], use_speed: bool) -> tuple[tuple[Estimator, ...], list[str]]:
+    """Build estimators once a process: they are immutable, and the network takes longer to build than to run."""
+    vehicle, model = _loaded(setup.vehicle, setup.model)
+    ready, skipped = runnable(setup.estimators, vehicle, available, use_speed=use_speed, model=model)
+    return tuple(ready), [f"{s.name} does not run: {s.reason}" for s in skipped]
+
+
+@cache
+def _grid_base(setup: Setup, use_speed: bool) -> HybridUkf | None:
+    vehicle, model = _loaded(setup.vehicle, setup.model)
+    if model is None:
+        return None
+    base = make_estimator(fixed_grid.BASE, vehicle, use_speed=use_speed, model=model)
+    return base if isinstance(base, HybridUkf) else None
+
+
+def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
+    vehicle, _ = _loaded(setup.vehicle, setup.model)
+    drive = read_drive(task.log, vehicle, task.log.stem, friction=task.friction)
+    signals = told(drive, task.assume)
+    use_speed = task.assume.get("sensors") != "esp"
+    estimators, notes = _estimators(setup, signals.available, use_speed)
+    notes = list(notes)
+    rows: list[MetricRow] = []
+    for estimator in estimators:
+        try:
+            rows += run_and_score([estimator], signals, drive, vehicle.low_speed_blend_m_s, _calibration(setup.model))
+        except Exception as error:  # noqa: BLE001 (one estimator's failure on one drive is a result, not an end)
+            notes.append(f"{estimator.name} failed on {task.row}/{drive.name}: {type(error).__name__}: {error}")
+    base = _grid_base(setup, use_speed)
+    if base is not None:
+        rows += fixed_grid.run_grid(base, signals, drive, vehicle.low_speed_blend_m_s)
+    return rows, notes
+
+
+def _grid(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
+    vehicle, _ = _loaded(setup.vehicle, setup.model)
+    base = _grid_base(setup, task.assume.get("sensors") != "esp")
+    if base is None:
+        return [], []
+    drive = read_drive(task.log, vehicle, task.log.stem)
+    return list(fixed_grid.run_grid(base, told(drive, task.assume), drive, vehicle.low_speed_blend_m_s)), []
+
+
+@lru_cache(maxsize=256)
+def _fitted(car: str, friction: float, file: Path) -> VehicleParameters:
+    return error_budget.fit_vehicle(error_budget.choose_vehicle(car), friction, load_vehicle(file))
+
+
+def _budget(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
+    """Sideslip RMSE with nothing and with each cause taken away; the cause stands in ``segment``."""
+    vehicle, model = _loaded(setup.vehicle, setup.model)
+    run = error_budget.drive_again(task.entry)
+    fitted = _fitted(run.spec.vehicle, run.spec.friction, setup.vehicle)
+    rows: list[MetricRow] = []
+    notes: list[str] = []
+    for cause in (None, *error_budget.causes_of(run.spec, task.assume)):
+        case = error_budget.without(run, cause, vehicle, task.assume, fitted)
+        ready, _ = runnable(
+            setup.estimators, case.vehicle, case.signals.available, use_speed=case.use_speed, model=model
+        )
+        for estimator in ready:
+            track, _ = estimator.run(case.signals, None)
+            error = signal_error(track, case.drive.truth, SIDESLIP, vehicle.low_speed_blend_m_s)
+            use = error[error == error]
+            if use.size:
+                rmse = summarise_errors(use)["rmse"]
+                name = "base" if cause is None else cause
+                rows.append(
+                    MetricRow(task.log.stem, estimator.name, SIDESLIP, name, "rmse", rmse, "rad", int(use.size))
+                )
+    return rows, notes
+
+
+def as_frame(results: dict[str, RowResult]) -> pl.DataFrame:
+    """Join the tables of all rows."""
+    return pl.concat([r.table for r in results.values()]) if results else pl.DataFrame()
+
+
+def progress(text: str) -> None:
+    """Write a line, or its replacement, to stderr."""
+    sys.stderr.write(text if text.startswith(("\r", "\n")) else text + "\n")
+    sys.stderr.flush()

@@ -1,0 +1,174 @@
+"""The condition table (METHOD §10): every estimator on the same drives with one thing wrong in each row.
+
+    python -m studies.conditions --vehicle car.toml --model model/ [--drives 30] [--jobs 2] [--rows NAME,...]
+
+Simulates the drives (``pdhef simulate conditions``; kept once made), runs all registered estimators that can run, and
+writes ``conditions.md`` with ``conditions/`` (tables as Parquet, plots) to ``--out``. Logs and the rows' results lie in
+``--work`` and are kept: a repeated call computes only rows whose drives, vehicle, model, settings or sources changed.
+The independent simulator's runs join as a row where ``../shared`` lies beside the repository.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.estimators.registry import DESCRIPTIONS, check_names
+from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.sinks.report import tool_versions
+from studies import fixed_grid
+from studies.condition_drives import independent_runs
+from studies.condition_runs import ROOT, Setup, Task, as_frame, progress, run_rows
+from studies.conditions_page import Facts, Tables, write_page
+from studies.independent_sim_logs import write_run
+from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
+
+INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
+INDEPENDENT_ROW = "independent-simulator"
+#: The drives on which the best fixed setting is chosen have the table's seed plus this.
+CALIBRATION_SEED_OFFSET = 1000
+#: What the table's claims are about, the first of these that ran, and what it is held against.
+SUBJECTS = ("pd-hef", fixed_grid.BASE)
+REFERENCES = ("pd-hef-fixed-r", "pd-hef-trust0", "phy-ukf-tuned", "physics-plus", "pd-hef-paper", fixed_grid.BEST)
+BUDGET = ("phy-ukf-tuned", "phy-ukf")
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the command line's options."""
+    parser = argparse.ArgumentParser(prog="python -m studies.conditions", description=__doc__.splitlines()[0])
+    parser.add_argument("--vehicle", type=Path, default=ROOT / "sample_logs" / "vehicle.toml")
+    parser.add_argument("--model", type=Path, help="model bundle; without one no hybrid filter runs")
+    parser.add_argument("--estimators", default=",".join(DESCRIPTIONS), help="names, default all")
+    parser.add_argument("--rows", default=",".join((*ROW_NAMES, INDEPENDENT_ROW)))
+    parser.add_argument("--drives", type=int, default=30, help="drives a row")
+    parser.add_argument(
+        "--calibration-drives", type=int, default=10, help="drives a row to choose the fixed setting on"
+    )
+    parser.add_argument(
+        "--budget-drives", type=int, default=10, help="drives a row in the error budget; 0 leaves it out"
+    )
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "conditions")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs")
+    given = parser.parse_args(arguments)
+    given.estimators = tuple(given.estimators.split(","))
+    given.rows = given.rows.split(",")
+    check_names(given.estimators)
+    unknown = [r for r in given.rows if r not in (*ROW_NAMES, INDEPENDENT_ROW)]
+    if unknown:
+        parser.error(f"--rows: expected names out of {', '.join((*ROW_NAMES, INDEPENDENT_ROW))}, got {unknown}")
+    return given
+
+
+def simulated(given: argparse.Namespace, kind: str, drives: int, seed: int) -> dict[str, list[Task]]:
+    """Simulate the rows asked for and return their drives as tasks."""
+    rows = [r for r in given.rows if r != INDEPENDENT_ROW]
+    if not rows:
+        return {}
+    # A manifest holds what was asked for: one of some rows must not take the place of that of all.
+    part = "" if set(rows) == set(ROW_NAMES) else "-" + hashlib.sha256(",".join(rows).encode()).hexdigest()[:8]
+    folder = given.work / f"drives-{seed}-{drives}{part}"
+
+    def say(text: str, _share: float) -> None:
+        progress(f"\rsimulating (seed {seed}): {text}   ")
+
+    manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs, progress=say)
+    progress(f"\rsimulated (seed {seed}): {len(manifest['drives'])} drives        ")
+    progress("\n")
+    entries = {e["file"]: e for e in manifest["drives"]}
+    return {
+        row["name"]: [
+            Task(kind, row["name"], folder / file, entries[file]["sha256"], row["assume"], entry=entries[file])
+            for file in row["files"]
+        ]
+        for row in manifest["rows"]
+    }
+
+
+def independent(work: Path) -> list[Task]:
+    """Return the independent simulator's runs as tasks, converted to logs; none where they are not there."""
+    folder = work / INDEPENDENT_ROW
+    folder.mkdir(parents=True, exist_ok=True)
+    tasks = []
+    for source, friction in independent_runs(INDEPENDENT):
+        log = folder / f"{source.stem}.mcap"
+        if not log.is_file():
+            write_run(source, log)
+        digest = hashlib.sha256(source.read_bytes()).hexdigest()
+        tasks.append(Task("score", INDEPENDENT_ROW, log, digest, {}, friction=friction))
+    return tasks
+
+
+def run(given: argparse.Namespace) -> Path:
+    """Do everything; returns the page."""
+    setup = Setup(given.vehicle, given.model, given.estimators)
+    tasks = simulated(given, "score", given.drives, given.seed)
+    absent = ""
+    if INDEPENDENT_ROW in given.rows:
+        tasks[INDEPENDENT_ROW] = independent(given.work)
+        if not tasks[INDEPENDENT_ROW]:
+            absent = f"{INDEPENDENT_ROW} is left out: it needs ../shared beside the repository"
+            progress(absent)
+    scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators", say=progress)
+    if not scored:
+        raise SystemExit("no drives to score")
+    calibration = {}
+    if given.model is not None and given.calibration_drives > 0:
+        grid = simulated(given, "grid", given.calibration_drives, given.seed + CALIBRATION_SEED_OFFSET)
+        folder = given.work / "calibration"
+        calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings", say=progress)
+    metrics = as_frame(scored)
+    ran = set(metrics["estimator"].unique())
+    budget = {}
+    if given.budget_drives > 0:
+        names = tuple(dict.fromkeys([*[n for n in BUDGET if n in ran][:1], *[n for n in SUBJECTS if n in ran][:1]]))
+        some = {
+            name: [Task("budget", t.row, t.log, t.sha256, t.assume, entry=t.entry) for t in row[: given.budget_drives]]
+            for name, row in tasks.items()
+            if name != INDEPENDENT_ROW
+        }
+        narrow = Setup(given.vehicle, given.model, names)
+        folder = given.work / "budget"
+        budget = run_rows(narrow, some, folder, jobs=given.jobs, title="error budget", say=progress)
+    facts = Facts(
+        command=_command(given),
+        setup={**setup.identity, "vehicle_file": given.vehicle.name},
+        rows={r.name: r.description for r in ROWS}
+        | {INDEPENDENT_ROW: "runs of another simulator, friction as it says"},
+        subject=next((n for n in SUBJECTS if n in ran), None),
+        references=REFERENCES,
+        order=given.estimators,
+        notes=tuple(dict.fromkeys([*([absent] if absent else []), *(n for r in scored.values() for n in r.notes)])),
+        versions=tool_versions(),
+        calibration_seed=given.seed + CALIBRATION_SEED_OFFSET,
+    )
+    return write_page(given.out, facts, Tables(metrics, as_frame(calibration), as_frame(budget)))
+
+
+def _command(given: argparse.Namespace) -> str:
+    """Return the command line that makes the page again; files by name only."""
+    words: list[Any] = ["python -m studies.conditions", "--vehicle", given.vehicle.name]
+    words += [] if given.model is None else ["--model", given.model.name]
+    words += ["--drives", given.drives, "--seed", given.seed, "--calibration-drives", given.calibration_drives]
+    words += ["--budget-drives", given.budget_drives]
+    return " ".join(map(str, words))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the table; 1 with one line where an input is wrong."""
+    try:
+        page = run(parse(arguments))
+    except PdhefError as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(page)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

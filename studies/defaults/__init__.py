@@ -1,0 +1,1 @@
+"""What made the frozen constants and the shipped car."""

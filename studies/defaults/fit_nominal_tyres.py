@@ -1,0 +1,179 @@
+"""Fit the nominal axle tyres to slow ramp steers of the truth vehicle on two roads; write the samples' vehicle files.
+
+    python benchmarks/fit_nominal_tyres.py [sample_logs]
+
+The nominal model (METHOD section 2) knows one slip angle an axle, from the mean steering angle and the motion of the
+CG. So load transfer, compliance and both wheels of an axle go into its magic formula. Forces follow from Newton and
+Euler as they would from measured accelerations: F_f = (l_r m a_y + I_z dr/dt) / (L cos d), F_r = m a_y - F_f cos d.
+
+One curve serves all roads: by similarity (Pacejka 2012, section 4.2) the force over friction is a function of the slip
+angle over friction, so that the peak follows friction and the stiffness stays. The fit is to both roads at once, with
+``reference_friction = 1``; fitted on one road alone the rear axle, which never reaches its peak there, was wrong on the
+other.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from pdhef_logtool.records.signals import FloatArray
+from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Request
+from truthsim.motion import Motion, simulate_motion
+from truthsim.sensors import SensorNoise
+from truthsim.vehicle import Vehicle
+
+CAR = Vehicle()
+NOISE = SensorNoise()
+#: One file a road, with the same tyres: a vehicle file says the friction where no log does.
+ROADS = {
+    "vehicle.toml": ("truthsim saloon", 0.85),
+    "vehicle_mu03.toml": ("truthsim saloon on a road of friction 0.3", 0.3),
+}
+SPEED_KM_H = 80.0
+#: Steering goes to this multiple of what the plain ramp manoeuvre guesses, well into the plateau of the front axle.
+SCALE = 2.5
+#: Below this the ramp is the linear range, in which roll is proportional to lateral acceleration.
+LINEAR_A_Y_M_S2 = 4.0
+
+
+@dataclass(frozen=True)
+class AxleFit:
+    """Magic formula of an axle at friction 1, and how well it fits."""
+
+    B: float
+    C: float
+    D_n: float
+    E: float
+    rms_n: float
+    peak_n: float
+
+
+def axle_curves(motion: Motion) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """Return slip angle (rad) and lateral force (N) of both axles over a motion."""
+    lf, lr = CAR.cg_to_front_axle_m, CAR.cg_to_rear_axle_m
+    v_x, v_y, r, steer = (motion.column(k) for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad"))
+    force = CAR.mass_kg * motion.column("ay_m_s2")
+    front = (lr * force + CAR.yaw_inertia_kg_m2 * motion.column("yaw_acceleration_rad_s2")) / (lf + lr)
+    return {
+        "front": (steer - np.arctan2(v_y + lf * r, v_x), front / np.cos(steer)),
+        "rear": (-np.arctan2(v_y - lr * r, v_x), force - front),
+    }
+
+
+def magic_formula(alpha: FloatArray, b: float, c: float, d: float, e: float) -> FloatArray:
+    """F = D sin(C atan(B a - E (B a - atan(B a)))); E = 1 - exp(e) keeps E below 1."""
+    x = b * alpha
+    curvature = 1.0 - np.exp(e)
+    return np.asarray(d * np.sin(c * np.arctan(x - curvature * (x - np.arctan(x)))))
+
+
+def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleFit:
+    """Fit B, C, D, E to slip angle and force, both over friction, by least squares.
+
+    The rear axle of an understeering car never reaches its peak in a ramp: the static load bounds it.
+    """
+    top = float(force.max())
+    start = [10.0, 1.3, 1.01 * top, 0.0]
+    bounds = ([3.0, 1.05, 1.0 * top, -2.0], [40.0, 1.7, max(load_n, 1.02 * top), 1.1])
+    found = least_squares(
+        lambda p: (magic_formula(alpha, *p) - force) / top, start, bounds=bounds, x_scale=[10.0, 1.0, top, 1.0]
+    )
+    b, c, d, e = found.x
+    error = magic_formula(alpha, b, c, d, e) - force
+    return AxleFit(b, c, d, 1.0 - float(np.exp(e)), float(np.sqrt(np.mean(error**2))), top)
+
+
+def fit_axles(motions: dict[float, Motion]) -> dict[str, AxleFit]:
+    """Fit both axles to one motion a friction."""
+    wheelbase = CAR.cg_to_front_axle_m + CAR.cg_to_rear_axle_m
+    arms = {"front": CAR.cg_to_rear_axle_m, "rear": CAR.cg_to_front_axle_m}
+    curves = {friction: axle_curves(motion) for friction, motion in motions.items()}
+    return {
+        axle: fit_axle(
+            np.concatenate([curve[axle][0] / friction for friction, curve in curves.items()]),
+            np.concatenate([curve[axle][1] / friction for friction, curve in curves.items()]),
+            CAR.mass_kg * GRAVITY_M_S2 * arm / wheelbase,
+        )
+        for axle, arm in arms.items()
+    }
+
+
+def roll_gradient_rad_per_m_s2(motion: Motion) -> float:
+    """Return the roll angle per planar lateral acceleration in the linear range."""
+    a_y, roll = motion.column("ay_m_s2"), motion.column("roll_rad")
+    small = np.abs(a_y) < LINEAR_A_Y_M_S2
+    return float(np.polyfit(a_y[small], roll[small], 1)[0])
+
+
+def ramp(friction: float) -> Motion:
+    """Return the slow ramp steer that everything is fitted to."""
+    manoeuvre = MANOEUVRES["ramp-steer"]
+    duration_s = manoeuvre.default_duration_s(SPEED_KM_H / 3.6)
+    request = Request(SPEED_KM_H / 3.6, friction, seed=0, duration_s=duration_s, scale=SCALE)
+    return simulate_motion(manoeuvre.plan(request), friction, vehicle=CAR)
+
+
+def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
+    """Return a vehicle file."""
+    tyres = "\n".join(
+        f"[tyres.{axle}]\nB = {fit.B:.3f}\nC = {fit.C:.4f}\nD_n = {fit.D_n:.1f}\nE = {fit.E:.4f}\n"
+        "reference_friction = 1.0"
+        for axle, fit in fits.items()
+    )
+    roads = " and ".join(f"{road:g}" for _, road in ROADS.values())
+    return f"""# Nominal vehicle of the simulated sample logs, made by benchmarks/fit_nominal_tyres.py:
+# mass and geometry of the paper's Table 3; axle tyres and roll gradient fitted to
+# ramp steers at {SPEED_KM_H:g} km/h into the plateau of the front axle, on roads of friction {roads}.
+# Peak forces follow the friction, stiffness does not (reference_friction).
+name = "{name}"
+mass_kg = {CAR.mass_kg}
+yaw_inertia_kg_m2 = {CAR.yaw_inertia_kg_m2}
+cg_to_front_axle_m = {CAR.cg_to_front_axle_m}
+cg_to_rear_axle_m = {CAR.cg_to_rear_axle_m}
+track_m = {CAR.track_m}
+cg_height_m = {CAR.cg_height_m}
+wheel_radius_m = {CAR.wheel_radius_m}
+steering_ratio = 16.0
+roll_gradient_rad_per_m_s2 = {roll_gradient_rad_per_m_s2(motion):.5f}
+friction = {friction}
+imu_position_m = [0.0, 0.0, 0.0]
+truth_position_m = [0.0, 0.0, 0.0]
+low_speed_blend_m_s = 3.0
+
+[network]
+trust_cap = 1.0
+evidence = "the shipped network was trained on drives of this simulated car (docs/model_card.md)"
+
+[sensors]
+ax_std_m_s2 = {NOISE.acceleration_m_s2}
+ay_std_m_s2 = {NOISE.acceleration_m_s2}
+yaw_rate_std_rad_s = {NOISE.yaw_rate_rad_s}
+speed_std_m_s = {NOISE.wheel_speed_m_s}
+steer_std_rad = {NOISE.steer_rad}
+
+{tyres}
+"""
+
+
+def main(folder: Path) -> None:
+    """Fit, print how well, and write the vehicle files."""
+    motions = {friction: ramp(friction) for _, friction in ROADS.values()}
+    fits = fit_axles(motions)
+    print("axle      B      C     D_n       E      BCD   rms N   largest N (over friction)")
+    for axle, fit in fits.items():
+        print(
+            f"{axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {fit.B * fit.C * fit.D_n:8.0f}"
+            f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
+        )
+    for file, (name, friction) in ROADS.items():
+        text = vehicle_text(motions[max(motions)], fits, name=name, friction=friction)
+        (folder / file).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1] if len(sys.argv) > 1 else "sample_logs"))

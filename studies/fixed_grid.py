@@ -1,0 +1,78 @@
+"""The hybrid filter with fixed settings: a grid of trust, σ of a_y, and a factor on the process noise.
+
+It answers what an adaptive mechanism has to beat: the one fixed setting that is best on calibration drives, and, per
+row, the one that nobody could have known beforehand. All settings share one pass of the network.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.evaluation.metrics import ALL, MetricRow, signal_error, summarise_errors
+from pdhef_logtool.records.signals import Signals
+from studies.condition_drives import SIDESLIP, ConditionDrive, bin_masks
+
+TRUSTS = (0.0, 0.5, 1.0)
+#: Factors on the 1-sigma of a_y and on all of the process noise, from those of the hybrid filter with fixed noise.
+AY_FACTORS = (0.5, 1.0, 2.0)
+Q_FACTORS = (0.5, 1.0, 2.0)
+PREFIX = "fixed"
+#: The estimator whose trust and noise the grid varies.
+BASE = "pd-hef-fixed-r"
+#: What the best setting on the calibration drives is called in the tables.
+BEST = "fixed-best"
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One point of the grid."""
+
+    trust: float
+    ay_factor: float
+    q_factor: float
+
+    @property
+    def name(self) -> str:
+        """Name in the tables."""
+        return f"{PREFIX}(trust {self.trust:g}, R {self.ay_factor:g}, Q {self.q_factor:g})"
+
+
+GRID = tuple(Setting(*point) for point in product(TRUSTS, AY_FACTORS, Q_FACTORS))
+
+
+def is_setting(name: str) -> bool:
+    """Tell whether an estimator's name is one of the grid."""
+    return re.match(rf"{PREFIX}\(", name) is not None
+
+
+def at(base: HybridUkf, setting: Setting) -> HybridUkf:
+    """Return the filter at a point of the grid."""
+    a, b, c, d = base.q_std
+    factor = setting.q_factor
+    return replace(
+        base,
+        trust=setting.trust,
+        q_std=(factor * a, factor * b, factor * c, factor * d),
+        r_std=(setting.ay_factor * base.r_std[0], base.r_std[1]),
+        name=setting.name,
+    )
+
+
+def run_grid(
+    base: HybridUkf, signals: Signals, drive: ConditionDrive, low_speed_m_s: float, grid: tuple[Setting, ...] = GRID
+) -> Iterator[MetricRow]:
+    """Yield the sideslip RMSE and availability of every setting, over everything and in the nonlinear range."""
+    rate, _, _ = base.residual_rate(signals, None)
+    masks = {name: m for name, m in bin_masks(drive).items() if name in (ALL, "nonlinear")}
+    for setting in grid:
+        track, _ = at(base, setting).filter.run(signals, None, setting.trust * rate)
+        error = signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
+        for segment, mask in masks.items():
+            use = error[mask & (error == error)]
+            if use.size:
+                rmse = summarise_errors(use)["rmse"]
+                yield MetricRow(drive.name, setting.name, SIDESLIP, segment, "rmse", rmse, "rad", int(use.size))

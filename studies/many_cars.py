@@ -1,0 +1,170 @@
+"""Short drives of many simulated cars, each with a vehicle file of its own: what one network for many cars learns from.
+
+    python -m studies.many_cars [-o out/many-cars] [--cars 300] [--jobs 2]
+
+Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
+that no network ever saw. A car's file is fitted to a ramp steer of it (``error_budget.fit_vehicle``), as somebody who
+has measured his car would have it. Drives are split by car.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_to_toml
+from pdhef_logtool.records.errors import SimulationError
+from studies.error_budget import fit_vehicle
+from truthsim.batch import DriveSpec, Job, run_jobs
+from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
+from truthsim.sensors import SensorNoise
+from truthsim.suite import draw_spec
+from truthsim.vehicle import GRAVITY_M_S2, Vehicle
+from truthsim.vehicle_choice import choose_vehicle
+
+SEED = 4000
+CARS = 300
+DRIVES_PER_CAR = 8
+DRIVE_S = 12.5
+BASE = Path("sample_logs/vehicle.toml")
+KINDS = ("sedan", "suv")
+#: Share of the cars that get the tyres of the other kind.
+OTHER_TYRES_SHARE = 0.3
+#: Ranges of the uniform draws, on top of what ``truthsim.randomisation`` draws.
+RANGES = {"mass": (0.85, 1.15), "cg": (-0.10, 0.12), "height": (0.9, 1.1), "stiffness": (0.8, 1.25)}
+#: Factors on the usual 1-sigma of sensors, uniform in the logarithm.
+SENSOR_FACTORS = {
+    "acceleration_m_s2": (0.5, 2.0),
+    "yaw_rate_rad_s": (0.4, 1.6),
+    "steer_rad": (0.5, 2.0),
+    "wheel_speed_m_s": (0.5, 2.0),
+    "acceleration_bias_m_s2": (0.3, 1.5),
+    "yaw_rate_bias_rad_s": (0.2, 1.5),
+    "steer_bias_rad": (0.5, 2.0),
+}
+DELAY_S = (0.0, 0.025)
+STEER_GAIN = 0.01
+#: Less understeer than this no maker sells: 0.5 degrees per g.
+LEAST_UNDERSTEER = np.radians(0.5) / GRAVITY_M_S2
+#: A ramp steer at this friction shows the axles' curves.
+FIT_FRICTION = 0.85
+SPLITS = (("train", 0.84), ("validation", 0.92), ("test", 1.0))
+_ATTEMPTS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Car:
+    """One car: its name as ``--vehicle`` takes it, its file, and the sensors that it has."""
+
+    text: str
+    vehicle: VehicleParameters
+    sensors: tuple[tuple[str, float], ...]
+
+
+def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str, ...] = KINDS) -> Car:
+    """Draw a car that understeers and can be driven through a ramp steer, with its vehicle file."""
+    while True:
+        kind = str(rng.choice(kinds))
+        words = [f"{kind}~{rng.integers(2**31)}"]
+        words += [f"{name}={rng.uniform(*limits):.3f}" for name, limits in RANGES.items()]
+        if rng.uniform() < OTHER_TYRES_SHARE:
+            words.append(f"tyres={KINDS[1 - KINDS.index(kind)] if kind in KINDS else KINDS[0]}")
+        text = ",".join(words)
+        car = choose_vehicle(text)
+        if understeer_gradient_rad_per_m_s2(car, FIT_FRICTION) < LEAST_UNDERSTEER:
+            continue
+        try:
+            fitted = fit_vehicle(car, FIT_FRICTION, base)
+        except (SimulationError, ValueError):
+            continue  # rolls over or spins in the ramp
+        return Car(text, _file_of(car, fitted, text), _sensors(rng))
+
+
+def _file_of(car: Vehicle, fitted: VehicleParameters, name: str) -> VehicleParameters:
+    return fitted.model_copy(
+        update={
+            "name": name,
+            "wheel_radius_m": car.wheel_radius_m,
+            "steering_ratio": car.steering_ratio,
+            "network": Network(),  # the base file's is about another car
+        }
+    )
+
+
+def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
+    usual = SensorNoise()._asdict()
+    values = {
+        name: usual[name] * float(np.exp(rng.uniform(np.log(low), np.log(high))))
+        for name, (low, high) in SENSOR_FACTORS.items()
+    }
+    values["can_delay_s"] = float(rng.uniform(*DELAY_S))
+    values["steer_gain"] = STEER_GAIN
+    return tuple((name, round(value, 6)) for name, value in sorted(values.items()))
+
+
+def plan_cars(
+    cars: int, drives: int, seed: int, folder: Path, base: VehicleParameters, kinds: tuple[str, ...] = KINDS
+) -> list[Job]:
+    """Draw the cars, write their files into ``folder``/cars and return the drives; one seed, one set."""
+    (folder / "cars").mkdir(parents=True, exist_ok=True)
+    jobs = []
+    for index in range(cars):
+        rng = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(500, index)))
+        car = draw_car(rng, base, kinds)
+        file = f"cars/car_{index:04d}.toml"
+        (folder / file).write_text(vehicle_to_toml(car.vehicle), encoding="utf-8")
+        place = (index + 0.5) / cars
+        facts: list[tuple[str, Any]] = [
+            ("vehicle_file", file),
+            ("split", next(name for name, end in SPLITS if place < end)),
+        ]
+        for number in range(drives):
+            candidates = tuple(_spec(rng, car) for _ in range(_ATTEMPTS))
+            jobs.append(Job(f"car_{index:04d}_{number}.mcap", candidates, (*facts, ("car", index))))
+    return jobs
+
+
+def _spec(rng: np.random.Generator, car: Car) -> DriveSpec:
+    return replace(draw_spec(rng, duration_s=DRIVE_S, vehicle=car.text), sensors=car.sensors)
+
+
+def write_cars(
+    folder: Path, *, cars: int, drives: int, seed: int, jobs: int = 1, kinds: tuple[str, ...] = KINDS
+) -> dict[str, Any]:
+    """Write a set of many cars and its manifest; drives that are there as they should be are kept."""
+    planned = plan_cars(cars, drives, seed, folder, load_vehicle(BASE), kinds)
+    head = {"command": "python -m studies.many_cars", "seed": seed, "cars": cars, "drives_per_car": drives}
+    return run_jobs(planned, folder, head, processes=jobs)
+
+
+def main() -> int:
+    """Write the set."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/many-cars"))
+    parser.add_argument("--cars", type=int, default=CARS)
+    parser.add_argument("--drives", type=int, default=DRIVES_PER_CAR, help="of each car")
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS), help="sedan, suv, hatchback")
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
+    given = parser.parse_args()
+    manifest = write_cars(
+        given.output,
+        cars=given.cars,
+        drives=given.drives,
+        seed=given.seed,
+        jobs=given.jobs,
+        kinds=tuple(given.kinds),
+    )
+    made = sum("sha256" in e for e in manifest["drives"])
+    print(f"{made} drives of {given.cars} cars in {given.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

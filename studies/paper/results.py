@@ -1,0 +1,219 @@
+"""Everything that the page and the pictures need, gathered once, and as one JSON document."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_sha256
+from pdhef_logtool.residual_model.bundle import load_bundle
+from pdhef_logtool.sinks.report import tool_versions
+from studies.paper.comparison import Improvement, Spread, improvement, spread
+from studies.paper.experiment import (
+    BURST,
+    BURST_S,
+    FIGURES,
+    OVERSHOOTS,
+    A,
+    B,
+    Experiment,
+    Model,
+    Scenario,
+    run_experiment,
+)
+from studies.paper.figures import hybrid_of
+from studies.paper.probes import (
+    History,
+    Inflation,
+    ResidualFit,
+    TrustCurve,
+    inflation,
+    read_history,
+    residual_fit,
+    trust_curve,
+)
+from studies.paper.schemes import SCHEMES
+from studies.paper.step_time import StepTime, step_times
+from truthsim.suite import is_held_out
+
+SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
+#: Beside a model: the vehicle file that its filter noise and the evidence about it stand in.
+VEHICLE_FILE = "vehicle.toml"
+#: Schemes whose trust or factor on R may move.
+ADAPTIVE = ("pd-hef-paper", "pd-hef")
+BASELINES = ("phy-ukf", "phy-ukf-tuned", "physics-plus", "linear-regression", "pure-lstm", "pd-hef-paper")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Results:
+    """What came out.
+
+    Attributes
+    ----------
+    ran : schemes in the order of the tables. hybrid : the name of our hybrid filter among them.
+    histories : by training seed. fits : residual fits by scenario, one a model.
+    curves : β over |a_y| by scenario and scheme. inflations : of R by scheme.
+    """
+
+    experiment: Experiment
+    vehicle: VehicleParameters
+    models: tuple[Model, ...]
+    histories: Mapping[int, History]
+    fits: Mapping[str, tuple[ResidualFit, ...]]
+    curves: Mapping[str, Mapping[str, TrustCurve]]
+    inflations: Mapping[str, Inflation]
+    times: Mapping[str, StepTime] = field(default_factory=dict)
+
+    @property
+    def ran(self) -> tuple[str, ...]:
+        """Schemes that ran."""
+        there = {r.scheme for r in self.experiment.runs}
+        return tuple(n for n in SCHEMES if n in there)
+
+    @property
+    def hybrid(self) -> str:
+        """Our hybrid filter: ``pd-hef`` if this version has it."""
+        return hybrid_of(self.ran)
+
+    def spread(self, scenario: str, scheme: str, figure: str) -> Spread | None:
+        """See :func:`~studies.paper.comparison.spread`."""
+        return spread(self.experiment, scenario, scheme, figure)
+
+    def improvement(
+        self, scenario: str, scheme: str, baseline: str, figure: str = "sideslip_deg"
+    ) -> Improvement | None:
+        """See :func:`~studies.paper.comparison.improvement`."""
+        return improvement(self.experiment, scenario, scheme, baseline, figure)
+
+
+def load_models(folders: Mapping[int, Path]) -> tuple[Model, ...]:
+    """Load model folders by training seed, in the order given."""
+
+    def trust(folder: Path) -> Network | None:
+        beside = folder / VEHICLE_FILE
+        return load_vehicle(beside).network if beside.is_file() else None
+
+    return tuple(Model(seed, load_bundle(folder), trust(folder)) for seed, folder in folders.items())
+
+
+def gather(
+    nominal: VehicleParameters,
+    folders: Mapping[int, Path],
+    *,
+    noise_seeds: Sequence[int],
+    with_times: bool = True,
+    progress: Callable[[str], None] = lambda _text: None,
+) -> Results:
+    """Run the whole experiment.
+
+    Parameters
+    ----------
+    folders : model folders by training seed; the first is the one that the pictures show.
+    """
+    models = load_models(folders)
+    experiment = run_experiment(nominal, models, scenarios=SCENARIOS, noise_seeds=noise_seeds, progress=progress)
+    histories = {seed: h for seed, folder in folders.items() if (h := read_history(folder)) is not None}
+    fits = {s.name: tuple(residual_fit(experiment.drives[s.name], m.bundle) for m in models) for s in (A, B)}
+    curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
+    inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
+    times: dict[str, StepTime] = {}
+    if with_times:
+        progress("step times")
+        names = [n for n in SCHEMES if n not in experiment.missing]
+        times = step_times(experiment.drives[B.name], models[0].bundle, names)
+    return Results(experiment, nominal, models, histories, fits, curves, inflations, times)
+
+
+def _plain(value: Any) -> Any:
+    """Return JSON-able values, floats to six digits; what is not finite is null."""
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    return value
+
+
+def document(results: Results) -> dict[str, Any]:
+    """Return all results for ``results.json``; the same but for ``step_time_us`` when made again."""
+    r = results
+    scenarios = [s.name for s in SCENARIOS]
+    names = (*FIGURES, *OVERSHOOTS)
+    summary = {
+        scenario: {
+            scheme: {f: asdict(s) for f in names if (s := r.spread(scenario, scheme, f)) is not None}
+            for scheme in r.ran
+        }
+        for scenario in scenarios
+    }
+    gains = [
+        {"scenario": scenario, "scheme": r.hybrid, "baseline": b, "figure": f, **asdict(gain), "proven": gain.proven}
+        for scenario in scenarios
+        for b in BASELINES
+        if b in r.ran and b != r.hybrid
+        for f in FIGURES
+        if not f.endswith(("_relative", "_ms")) and f != "diverged"
+        if (gain := r.improvement(scenario, r.hybrid, b, f)) is not None
+    ]
+    residuals = {
+        scenario: [
+            {
+                "training_seed": m.seed,
+                "explained": [fit.explained(0), fit.explained(1)],
+                "lag_ms": [fit.lag_ms(0), fit.lag_ms(1)],
+                "yaw_rate_increment_rad_s": list(fit.increments(1)),
+                "noise_of_target_and_output": [fit.noise(0), fit.noise(1)],
+            }
+            for m, fit in zip(r.models, fits, strict=True)
+        ]
+        for scenario, fits in r.fits.items()
+    }
+    trust = {
+        scenario: {
+            scheme: {
+                "centre_g": c.centre_g.tolist(),
+                "median": c.median.tolist(),
+                "p10": c.low.tolist(),
+                "p90": c.high.tolist(),
+                "mean": float(c.trust.mean()),
+            }
+            for scheme, c in curves.items()
+        }
+        for scenario, curves in r.curves.items()
+    }
+    plain: dict[str, Any] = _plain(
+        {
+            "made_by": "python -m studies.paper",
+            "scenarios": [
+                {
+                    **asdict(s),
+                    "speed_km_h": s.speed_km_h,
+                    "friction": s.friction,
+                    "held_out_of_training_suites": is_held_out(s.manoeuvre, s.speed_km_h, s.friction),
+                }
+                for s in SCENARIOS
+            ],
+            "friction": "known: the vehicle file is told the friction of each drive",
+            "vehicle": {"name": r.vehicle.name, "sha256": vehicle_sha256(r.vehicle)},
+            "models": [
+                {"training_seed": m.seed, "sha256": m.bundle.sha256, "provenance": m.bundle.provenance}
+                for m in r.models
+            ],
+            "versions": tool_versions(),
+            "missing": r.experiment.missing,
+            "network_schemes": sorted(r.experiment.networks),
+            "summary": summary,
+            "improvements": gains,
+            "residuals": residuals,
+            "trust": trust,
+            "r_factor": {name: asdict(i) for name, i in r.inflations.items()},
+            "drives": list(r.experiment.facts),
+            "runs": [asdict(run) for run in r.experiment.runs],
+            "step_time_us": {name: asdict(t) for name, t in r.times.items()},
+        }
+    )
+    return plain

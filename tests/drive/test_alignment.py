@@ -1,0 +1,452 @@
+"""Alignment: windows join bit-identically, nothing crosses a gap, measurements count once, the late are not awaited."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.drive.alignment import AlignmentPlan, align, combine_wheel_speeds, count_late, plan_alignment
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel, Signals
+
+T0 = 1_700_000_000_000_000_000
+MS = 1_000_000
+
+
+def channel(name, stamps_ns, values, delay_ns=2 * MS, topic="/a"):
+    stamps_ns = np.asarray(stamps_ns, dtype=np.int64)
+    return Channel(
+        name=name,
+        unit=SIGNAL_UNITS[name],
+        source=f"{topic}.{name}",
+        stamps_ns=stamps_ns,
+        arrival_ns=stamps_ns + np.asarray(delay_ns, dtype=np.int64),
+        values=np.asarray(values, dtype=np.float64),
+    )
+
+
+def regular(start_s, end_s, rate_hz):
+    return T0 + np.round(np.arange(start_s * rate_hz, end_s * rate_hz) / rate_hz * 1e9).astype(np.int64)
+
+
+def seconds(stamps_ns):
+    return (np.asarray(stamps_ns) - T0) * 1e-9
+
+
+def plan_of(channels, **kwargs) -> AlignmentPlan:
+    return plan_alignment(channels, **{"steering_ratio": 16.0, "wheel_radius_m": 0.3, **kwargs})
+
+
+def whole(channels, plan) -> Signals:
+    return align(channels, plan, T0 - 10**12, T0 + 10**13)
+
+
+def imu(end_s=10.0, rate=100, drop=()):
+    stamps = regular(0, end_s, rate)
+    keep = np.ones(stamps.size, dtype=bool)
+    keep[list(drop)] = False
+    return {
+        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps[keep], np.sin(seconds(stamps[keep]))),
+        "ay_m_s2": channel("ay_m_s2", stamps, np.cos(seconds(stamps))),
+        "ax_m_s2": channel("ax_m_s2", stamps, seconds(stamps)),
+    }
+
+
+def equal(a: Signals, b: Signals) -> None:
+    for f in fields(Signals):
+        if f.name == "available":
+            assert a.available == b.available
+        else:
+            np.testing.assert_array_equal(getattr(a, f.name), getattr(b, f.name), err_msg=f.name)
+
+
+# ---- the grid ----
+
+
+def test_grid_is_the_imu_stamps_with_irregular_steps_kept():
+    stamps = np.sort(np.unique(T0 + np.random.default_rng(1).integers(0, 5_000 * MS, 400)))
+    channels = {"yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, np.arange(stamps.size))}
+    signals = whole(channels, plan_of(channels))
+    np.testing.assert_array_equal(signals.stamps_ns, stamps)
+    np.testing.assert_array_equal(signals.yaw_rate_rad_s, np.arange(stamps.size))
+    np.testing.assert_array_equal(signals.ready_ns, stamps + 2 * MS)
+
+
+def test_a_sample_missing_in_one_imu_channel_is_missing_there_only():
+    channels = imu(drop=(10, 11, 500))
+    signals = whole(channels, plan_of(channels))
+    assert len(signals) == 1000
+    assert np.flatnonzero(np.isnan(signals.yaw_rate_rad_s)).tolist() == [10, 11, 500]
+    np.testing.assert_array_equal(signals.ay_m_s2, channels["ay_m_s2"].values)
+    np.testing.assert_array_equal(signals.ax_m_s2, channels["ax_m_s2"].values)
+
+
+def test_a_dropout_of_the_grid_channel_does_not_stop_the_clock():
+    channels = imu(drop=range(300, 700))
+    signals = whole(channels, plan_of(channels))
+    assert np.isnan(signals.yaw_rate_rad_s[300:700]).all()
+    assert np.isfinite(signals.ay_m_s2).all()
+    assert np.diff(signals.stamps_ns).max() == 10 * MS
+
+
+def test_grid_order_and_a_slow_gyro_does_not_set_the_clock():
+    channels = imu()
+    assert plan_of(channels).grid_channel == "yaw_rate_rad_s"
+    slow = regular(0, 10, 5)
+    channels["yaw_rate_rad_s"] = channel("yaw_rate_rad_s", slow, np.zeros(slow.size), topic="/gnss")
+    plan = plan_of(channels)
+    assert plan.grid_channel == "ay_m_s2"
+    assert plan.grid_channels == ("ax_m_s2", "ay_m_s2")
+    signals = whole(channels, plan)
+    assert np.isfinite(signals.yaw_rate_rad_s).sum() == slow.size  # a measurement counts once
+
+
+def test_an_imu_channel_of_another_device_is_brought_to_the_grid():
+    channels = imu()
+    other = regular(0, 10, 100) + 3 * MS
+    channels["ay_m_s2"] = channel("ay_m_s2", other, 2.0 * seconds(other), topic="/other")
+    plan = plan_of(channels)
+    assert "ay_m_s2" not in plan.grid_channels
+    signals = whole(channels, plan)
+    np.testing.assert_allclose(signals.ay_m_s2[1:], 2.0 * seconds(signals.stamps_ns[1:]), atol=1e-6)
+    assert np.isnan(signals.ay_m_s2[0])  # nothing is extrapolated
+
+
+@pytest.mark.parametrize("channels", [{}, {"speed_m_s": channel("speed_m_s", regular(0, 1, 10), np.zeros(10))}])
+def test_without_an_imu_the_error_says_what_to_map(channels):
+    with pytest.raises(MappingError, match="map an IMU topic"):
+        plan_of(channels)
+
+
+def test_an_imu_without_samples_is_named():
+    with pytest.raises(MappingError, match="no samples of ay_m_s2"):
+        plan_of({"ay_m_s2": channel("ay_m_s2", [], [])})
+
+
+# ---- inputs ----
+
+
+def test_comparable_inputs_are_interpolated_and_slow_ones_held():
+    channels = imu()
+    fast = regular(0, 10, 83)
+    slow = regular(0, 10, 2)
+    channels["steering_wheel_rad"] = channel("steering_wheel_rad", fast, 16.0 * seconds(fast), topic="/can")
+    channels["friction"] = channel("friction", slow, np.arange(slow.size), topic="/mu")
+    plan = plan_of(channels)
+    method = {c.name: c.method for c in plan.channels}
+    assert method["steering_wheel_rad"] == "interpolate"
+    assert method["friction"] == "hold"
+    signals = whole(channels, plan)
+    t = seconds(signals.stamps_ns)
+    inside = t <= seconds(fast[-1])
+    np.testing.assert_allclose(signals.steer_rad[inside], t[inside], atol=1e-6)
+    assert np.isnan(signals.steer_rad[~inside]).all()
+    np.testing.assert_array_equal(signals.friction, np.floor(t * 2 + 1e-9))
+
+
+def test_samples_on_the_grid_are_taken_as_they_are():
+    channels = imu()
+    stamps = channels["ax_m_s2"].stamps_ns
+    values = np.random.default_rng(2).normal(size=stamps.size)
+    channels["steer_rad"] = channel("steer_rad", stamps, values, topic="/steer")
+    channels["speed_m_s"] = channel("speed_m_s", stamps, values + 20.0, topic="/speed")
+    signals = whole(channels, plan_of(channels))
+    np.testing.assert_array_equal(signals.steer_rad, values)
+    np.testing.assert_array_equal(signals.speed_m_s, values + 20.0)
+
+
+@settings(derandomize=True, max_examples=60, deadline=None)
+@given(gap_s=st.floats(0.15, 3.0), rate=st.sampled_from([83.0, 30.0, 7.0]), at=st.floats(2.0, 5.0))
+def test_no_value_crosses_a_gap(gap_s, rate, at):
+    channels = imu()
+    before, after = regular(0, at, rate), regular(at + gap_s + 5.0 / rate, 10, rate)
+    stamps = np.concatenate([before, after])
+    values = np.where(stamps < T0 + at * 1e9, 1.0, 2.0)
+    channels["steer_rad"] = channel("steer_rad", stamps, values, topic="/can")
+    channels["speed_m_s"] = channel("speed_m_s", stamps, values, topic="/can")
+    plan = plan_of(channels)
+    signals = whole(channels, plan)
+    assert set(np.unique(signals.steer_rad[np.isfinite(signals.steer_rad)])) <= {1.0, 2.0}
+    assert set(np.unique(signals.speed_m_s[np.isfinite(signals.speed_m_s)])) <= {1.0, 2.0}
+    max_gap = {c.name: c.max_gap_s for c in plan.channels}["steer_rad"]
+    deep = (signals.stamps_ns > before[-1] + (max_gap + 0.01) * 1e9) & (signals.stamps_ns < after[0])
+    assert deep.any()
+    assert np.isnan(signals.steer_rad[deep]).all()
+    assert np.isnan(signals.speed_m_s[deep]).all()
+
+
+def test_a_channel_that_starts_late_and_ends_early():
+    channels = imu()
+    stamps = regular(4, 6, 50)
+    channels["steer_rad"] = channel("steer_rad", stamps, np.ones(stamps.size), topic="/can")
+    signals = whole(channels, plan_of(channels))
+    np.testing.assert_array_equal(
+        np.isfinite(signals.steer_rad), (signals.stamps_ns >= stamps[0]) & (signals.stamps_ns <= stamps[-1])
+    )
+
+
+def test_a_mapped_channel_without_a_sample_in_the_survey_still_comes_in_later():
+    channels = imu(end_s=20)
+    empty = {**channels, "speed_m_s": channel("speed_m_s", [], [], topic="/can")}
+    plan = plan_of(empty)
+    stamps = regular(15, 20, 10)
+    signals = whole({**channels, "speed_m_s": channel("speed_m_s", stamps, stamps * 0 + 5.0, topic="/can")}, plan)
+    assert np.isfinite(signals.speed_m_s).sum() == stamps.size
+    assert "speed_m_s" in signals.available
+
+
+def test_a_channel_that_goes_missing_after_the_survey_is_missing():
+    channels = imu()
+    plan = plan_of(channels)
+    del channels["ax_m_s2"]
+    signals = whole(channels, plan)
+    assert np.isnan(signals.ax_m_s2).all()
+    assert len(signals) == 1000
+
+
+# ---- measurements count once ----
+
+
+def test_a_slow_measurement_stands_once_at_the_first_stamp_at_or_after():
+    channels = imu()
+    stamps = regular(0, 10, 10) + 4 * MS
+    channels["speed_m_s"] = channel("speed_m_s", stamps, np.arange(stamps.size), topic="/can")
+    signals = whole(channels, plan_of(channels))
+    at = np.flatnonzero(np.isfinite(signals.speed_m_s))
+    np.testing.assert_array_equal(signals.stamps_ns[at], stamps + 6 * MS)
+    np.testing.assert_array_equal(signals.speed_m_s[at], np.arange(stamps.size))
+
+
+def test_a_measurement_at_half_the_rate_is_given_at_half_the_stamps():
+    channels = imu()
+    stamps = regular(0, 10, 50) + 3 * MS
+    channels["speed_m_s"] = channel("speed_m_s", stamps, seconds(stamps), topic="/can")
+    plan = plan_of(channels)
+    assert {c.name: c.method for c in plan.channels}["speed_m_s"] == "interpolate"
+    signals = whole(channels, plan)
+    good = np.isfinite(signals.speed_m_s)
+    assert good.sum() == stamps.size - 1
+    np.testing.assert_allclose(signals.speed_m_s[good], seconds(signals.stamps_ns[good]), atol=1e-6)
+
+
+@settings(derandomize=True, max_examples=50, deadline=None)
+@given(seed=st.integers(0, 10**6), count=st.integers(5, 900))
+def test_never_more_measurements_than_samples(seed, count):
+    rng = np.random.default_rng(seed)
+    channels = imu()
+    stamps = np.unique(T0 + rng.integers(0, 10_000 * MS, count))
+    channels["speed_m_s"] = channel("speed_m_s", stamps, np.ones(stamps.size), topic="/can")
+    signals = whole(channels, plan_of(channels))
+    # Between any two grid stamps there are at least as many samples as uses, shifted by one for the neighbour ahead.
+    used = np.cumsum(np.isfinite(signals.speed_m_s))
+    seen = np.searchsorted(stamps, signals.stamps_ns, side="right")
+    assert np.all(used <= seen + 1)
+    assert used[-1] <= stamps.size
+
+
+# ---- wheels ----
+
+
+def test_wheel_speeds_in_rad_s_become_columns_and_a_speed():
+    channels = imu()
+    stamps = channels["ay_m_s2"].stamps_ns
+    for i, w in enumerate(("fl", "fr", "rl", "rr")):
+        name = f"wheel_speed_{w}_rad_s"
+        channels[name] = channel(name, stamps, np.full(stamps.size, 10.0 + i), topic="/wheels")
+    plan = plan_of(channels, wheel_radius_m=0.5)
+    assert plan.speed_from == "wheel speeds"
+    signals = whole(channels, plan)
+    np.testing.assert_allclose(signals.wheel_speed_m_s, np.tile([5.0, 5.5, 6.0, 6.5], (stamps.size, 1)))
+    np.testing.assert_allclose(signals.speed_m_s, 5.75)
+    assert {"speed_m_s", "wheel_speed_fl_m_s"} <= signals.available
+
+
+def test_a_mapped_speed_beats_the_wheels_and_road_wheel_angle_beats_the_steering_wheel():
+    channels = imu()
+    stamps = channels["ay_m_s2"].stamps_ns
+    for name, value in {
+        "speed_m_s": 20.0,
+        "wheel_speed_rl_m_s": 30.0,
+        "wheel_speed_rr_m_s": 30.0,
+        "steer_rad": 0.1,
+        "steering_wheel_rad": 9.0,
+    }.items():
+        channels[name] = channel(name, stamps, np.full(stamps.size, value), topic="/can")
+    plan = plan_of(channels)
+    signals = whole(channels, plan)
+    assert np.all(signals.speed_m_s == 20.0)
+    assert np.all(signals.steer_rad == 0.1)
+    assert plan.to_dict()["unused"] == {"steering_wheel_rad": "steer_rad is mapped too"}
+
+
+def test_a_single_wheel_gives_no_speed():
+    channels = imu()
+    stamps = channels["ay_m_s2"].stamps_ns
+    channels["wheel_speed_rl_m_s"] = channel("wheel_speed_rl_m_s", stamps, np.ones(stamps.size), topic="/can")
+    plan = plan_of(channels)
+    signals = whole(channels, plan)
+    assert plan.speed_from == "none"
+    assert "speed_m_s" not in signals.available
+    assert np.isnan(signals.speed_m_s).all()
+
+
+def test_combined_wheel_speed_withstands_one_wrong_wheel():
+    nan = np.nan
+    speeds = np.array(
+        [
+            [10.0, 10.2, 10.0, 99.0],
+            [10.0, 10.2, 0.0, 10.2],
+            [9.0, 11.0, nan, 10.5],
+            [nan, 1.0, 2.0, 4.0],
+            [nan, 1, nan, 2],
+        ]
+    )
+    np.testing.assert_allclose(combine_wheel_speeds(speeds), [10.1, 10.1, 10.0, 3.0, nan])
+
+
+# ---- arrival ----
+
+
+def test_ready_is_the_latest_arrival_of_what_is_used():
+    channels = imu(end_s=1.0)
+    stamps = regular(0, 1, 100) + 5 * MS
+    channels["steer_rad"] = channel("steer_rad", stamps, np.zeros(stamps.size), delay_ns=6 * MS, topic="/can")
+    signals = whole(channels, plan_of(channels))
+    inner = slice(1, -1)  # both neighbours: the later one lies 5 ms ahead and takes 6 ms
+    np.testing.assert_array_equal(signals.ready_ns[inner], signals.stamps_ns[inner] + 11 * MS)
+    assert signals.ready_ns[0] == signals.stamps_ns[0] + 2 * MS  # no steering yet
+
+
+def test_late_samples_are_not_waited_for_and_are_counted():
+    channels = imu()
+    stamps = regular(0, 10, 100)
+    delay = np.full(stamps.size, 6 * MS)
+    delay[500] = 800 * MS
+    channels["speed_m_s"] = channel("speed_m_s", stamps, np.ones(stamps.size), delay_ns=delay, topic="/can")
+    plan = plan_of(channels)
+    signals = whole(channels, plan)
+    assert np.flatnonzero(np.isnan(signals.speed_m_s)).tolist() == [500]
+    assert (signals.ready_ns - signals.stamps_ns).max() == 6 * MS
+    assert count_late(channels, plan, T0, T0 + 10**10) == {"speed_m_s": 1}
+    assert count_late(channels, plan, T0, int(stamps[500])) == {}
+
+
+def test_slowly_drifting_clocks_are_not_lateness():
+    channels = imu(end_s=120)
+    stamps = channels["ay_m_s2"].stamps_ns
+    delay = np.linspace(0, 1_000 * MS, stamps.size).astype(np.int64)
+    channels["speed_m_s"] = channel("speed_m_s", stamps, np.ones(stamps.size), delay_ns=delay, topic="/can")
+    plan = plan_of(channels)
+    assert count_late(channels, plan, T0, T0 + 10**12) == {}
+    assert np.isfinite(whole(channels, plan).speed_m_s).all()
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_lateness_matches_a_plain_loop(seed):
+    rng = np.random.default_rng(seed)
+    channels = imu(end_s=8)
+    stamps = np.unique(T0 + rng.integers(0, 8_000 * MS, 300))
+    delay = rng.integers(0, 20 * MS, stamps.size) + rng.choice([0, 300 * MS], stamps.size, p=[0.9, 0.1])
+    channels["speed_m_s"] = channel("speed_m_s", stamps, np.ones(stamps.size), delay_ns=delay, topic="/can")
+    plan = plan_of(channels)
+    limit = {c.name: c.late_limit_s for c in plan.channels}["speed_m_s"]
+    expected = 0
+    for s, d in zip(stamps.tolist(), delay.tolist(), strict=True):
+        near = [e for r, e in zip(stamps.tolist(), delay.tolist(), strict=True) if abs(r - s) <= 10**9]
+        expected += d - min(near) > round(limit * 1e9)
+    assert count_late(channels, plan, T0, T0 + 10**10).get("speed_m_s", 0) == expected
+
+
+# ---- windows ----
+
+
+def ragged(rng, name, topic, rate, share_late):
+    n = int(40 * rate)
+    stamps = T0 + np.cumsum(rng.gamma(2.0, 0.5 / rate * 1e9, n)).astype(np.int64)
+    stamps = np.unique(stamps)
+    for _ in range(2):  # two dropouts
+        at = T0 + rng.integers(0, 40_000 * MS)
+        stamps = stamps[(stamps < at) | (stamps > at + rng.integers(50 * MS, 8_000 * MS))]
+    delay = rng.integers(0, 30 * MS, stamps.size) + rng.choice(
+        [0, 400 * MS, 5_000 * MS], stamps.size, p=[1 - share_late, share_late / 2, share_late / 2]
+    )
+    return channel(name, stamps, rng.normal(size=stamps.size), delay_ns=delay, topic=topic)
+
+
+@settings(derandomize=True, max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10**6), cuts=st.lists(st.integers(0, 40_000), min_size=1, max_size=5), late=st.floats(0, 0.2)
+)
+def test_windows_join_bit_identically(seed, cuts, late):
+    rng = np.random.default_rng(seed)
+    channels = {
+        "yaw_rate_rad_s": ragged(rng, "yaw_rate_rad_s", "/imu", 100, late),
+        "ay_m_s2": ragged(rng, "ay_m_s2", "/acc", 90, late),
+        "ax_m_s2": ragged(rng, "ax_m_s2", "/acc2", 30, late),
+        "steer_rad": ragged(rng, "steer_rad", "/can", 83, late),
+        "speed_m_s": ragged(rng, "speed_m_s", "/gnss", 9, late),
+        "wheel_speed_rl_rad_s": ragged(rng, "wheel_speed_rl_rad_s", "/w", 60, late),
+        "friction": ragged(rng, "friction", "/mu", 1, late),
+    }
+    plan = plan_of(channels)
+    full = whole(channels, plan)
+    edges = [T0 - 10**12, *(T0 + c * MS for c in sorted(cuts)), T0 + 10**13]
+    parts = []
+    for start, end in pairwise(edges):
+        lo, hi = start - plan.margin_ns, end + plan.margin_ns
+        near = {}
+        for name, c in channels.items():  # only what the contract asks the caller for
+            k = (c.stamps_ns >= lo) & (c.stamps_ns < hi)
+            near[name] = channel(
+                name, c.stamps_ns[k], c.values[k], (c.arrival_ns - c.stamps_ns)[k], c.source.split(".")[0]
+            )
+        parts.append(align(near, plan, start, end))
+    joined = Signals(
+        **{
+            f.name: np.concatenate([getattr(p, f.name) for p in parts])
+            for f in fields(Signals)
+            if f.name != "available"
+        },
+        available=parts[0].available,
+    )
+    equal(joined, full)
+    assert np.all(np.diff(full.ready_ns) >= 0)
+    assert np.all(full.ready_ns >= full.stamps_ns)
+
+
+@settings(derandomize=True, max_examples=15, deadline=None)
+@given(shift=st.integers(-(10**15), 10**15))
+def test_a_shift_of_the_clock_shifts_stamps_only(shift):
+    rng = np.random.default_rng(5)
+    channels = {
+        "yaw_rate_rad_s": ragged(rng, "yaw_rate_rad_s", "/imu", 100, 0.05),
+        "speed_m_s": ragged(rng, "speed_m_s", "/gnss", 9, 0.05),
+        "steer_rad": ragged(rng, "steer_rad", "/can", 83, 0.05),
+    }
+    moved = {
+        n: channel(n, c.stamps_ns + shift, c.values, c.arrival_ns - c.stamps_ns, c.source.split(".")[0])
+        for n, c in channels.items()
+    }
+    plan, plan_moved = plan_of(channels), plan_of(moved)
+    assert plan == plan_moved
+    a = align(channels, plan, T0, T0 + 10**11)
+    b = align(moved, plan, T0 + shift, T0 + shift + 10**11)
+    np.testing.assert_array_equal(a.stamps_ns + shift, b.stamps_ns)
+    np.testing.assert_array_equal(a.ready_ns + shift, b.ready_ns)
+    for name in ("steer_rad", "yaw_rate_rad_s", "speed_m_s"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_an_empty_window_and_a_json_plan():
+    channels = imu()
+    plan = plan_of(channels)
+    assert len(align(channels, plan, T0 - 10**12, T0 - 10**11)) == 0
+    assert len(align({}, plan, T0, T0 + 10**10)) == 0
+    assert json.loads(json.dumps(plan.to_dict())) == plan.to_dict()

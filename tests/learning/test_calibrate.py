@@ -1,0 +1,312 @@
+"""``pdhef calibrate``: known scales are recovered, unseen drives are covered, and a run uses what it wrote."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.learning.evidence.calibrate import (
+    COVERED_WRONG,
+    FOLDS,
+    Samples,
+    bin_numbers,
+    bin_weights,
+    coverage_rows,
+    covering_factor,
+    fit_coefficients,
+    fit_inflation,
+    folds,
+    share_for,
+)
+from pdhef_logtool.learning.evidence.calibrate_command import REFUSED, CalibrateSettings, run_calibration
+from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, combined, load_calibration
+
+
+def _samples(rng: np.random.Generator, std: FloatArray, terms: FloatArray, drives: int = 30) -> Samples:
+    """Samples of drives whose errors have a size of their own, [n], as those of real drives have."""
+    n = std.shape[0]
+    drive = np.arange(n) * drives // n
+    size = np.exp(rng.normal(0.0, 0.2, drives))[drive]
+    error = std * size * rng.standard_t(6.0, n)
+    return Samples(
+        terms=terms,
+        yaw_rate_terms=terms[:, [0, 1, 6]],
+        vy_per_sideslip=np.full(n, 20.0),
+        sideslip_error=error,
+        vy_error=20.0 * error,
+        yaw_rate_error=2.0 * terms[:, 1] * rng.standard_normal(n),
+        own_std=terms[:, 1],
+        bin=np.asarray(rng.integers(0, 3, n)),
+        drive=drive,
+        wrong=drive % 3 == 0,
+    )
+
+
+def _terms(rng: np.random.Generator, n: int) -> FloatArray:
+    terms = rng.lognormal(-6.0, 0.7, (n, len(SIDESLIP_TERMS)))
+    terms[:, 0] = 1e-4
+    return terms
+
+
+def test_a_known_scale_is_recovered() -> None:
+    rng = np.random.default_rng(1)
+    n = 20_000
+    terms = _terms(rng, n)
+    error = 2.5 * terms[:, 1] * rng.standard_normal(n)
+    k = fit_coefficients(terms, error, np.full(n, 1.0 / n))
+    assert k[1] == pytest.approx(2.5, rel=0.05)
+    np.testing.assert_allclose(np.median(combined(terms, k) / terms[:, 1]), 2.5, rtol=0.05)
+
+
+def test_two_causes_are_told_apart() -> None:
+    rng = np.random.default_rng(2)
+    n = 40_000
+    terms = _terms(rng, n)
+    std = np.hypot(1.5 * terms[:, 1], 0.6 * terms[:, 5])
+    k = fit_coefficients(terms, std * rng.standard_normal(n), np.full(n, 1.0 / n))
+    assert k[1] == pytest.approx(1.5, rel=0.1)
+    assert k[5] == pytest.approx(0.6, rel=0.2)
+    assert max(k[i] for i in (2, 3, 4, 6)) < 0.25
+
+
+def test_new_drives_are_covered_where_errors_are_small_and_where_they_are_large() -> None:
+    rng = np.random.default_rng(3)
+    terms = _terms(rng, 30_000)
+    std = np.hypot(1.5 * terms[:, 1], 0.6 * terms[:, 2])
+    fitted = fit_inflation(_samples(rng, std, terms, drives=300))
+    fresh_terms = _terms(rng, 60_000)
+    fresh_std = np.hypot(1.5 * fresh_terms[:, 1], 0.6 * fresh_terms[:, 2])
+    fresh = _samples(rng, fresh_std, fresh_terms, drives=200)
+    interval = 1.96 * combined(fresh_terms, fitted.inflation.sideslip)
+    order = np.argsort(fresh_std)
+    for part in np.array_split(order, 4):
+        covered = np.mean(np.abs(fresh.sideslip_error[part]) <= interval[part])
+        assert covered == pytest.approx(0.95, abs=0.015)
+    # Before, a single drive in the least favourable part was covered far less.
+    assert np.mean(np.abs(fresh.sideslip_error) <= 1.96 * fresh.own_std) < 0.8
+    rate = combined(fresh.yaw_rate_terms, fitted.inflation.yaw_rate)
+    assert np.mean(np.abs(fresh.yaw_rate_error) <= 1.96 * rate) == pytest.approx(0.95, abs=0.01)
+    assert fitted.inflation.vy_factor == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_wrong_vehicle_widens_by_what_it_asks_for() -> None:
+    """Its errors grow with the sideslip; with the file as given they do not, and the filter's 1-sigma says it all."""
+    rng = np.random.default_rng(7)
+
+    def drives(n: int, count: int) -> Samples:
+        terms = _terms(rng, n)
+        samples = _samples(rng, 1.5 * terms[:, 1], terms, count)
+        extra = 3.0 * terms[:, 2] * rng.standard_normal(n)
+        return replace(samples, sideslip_error=samples.sideslip_error + np.where(samples.wrong, extra, 0.0))
+
+    samples = drives(60_000, 400)
+    fitted = fit_inflation(samples)
+    narrow = fit_inflation(samples.where(~samples.wrong))
+    fresh = drives(60_000, 300)
+    covered = {}
+    for name, one in (("both", fitted), ("given", narrow)):
+        inside = np.abs(fresh.sideslip_error) <= 1.96 * combined(fresh.terms, one.inflation.sideslip)
+        covered[name] = [np.mean(inside[fresh.wrong == wrong]) for wrong in (False, True)]
+    assert covered["given"][0] == pytest.approx(0.95, abs=0.015)
+    assert covered["given"][1] < 0.7
+    assert covered["both"][1] == pytest.approx(COVERED_WRONG, abs=0.02)
+    assert narrow.wrong_factor == 0.0
+    assert fitted.unseen_factor == pytest.approx(narrow.unseen_factor, rel=0.1)
+    k, given = np.array(fitted.inflation.sideslip), np.array(narrow.inflation.sideslip)
+    assert int(np.argmax(k - given)) == 2
+
+
+def test_unseen_drives_decide_the_factor() -> None:
+    """Terms that know each drive's own error size by chance fit it, and mean nothing on another drive."""
+    rng = np.random.default_rng(4)
+    drives, each = 10, 200
+    drive = np.repeat(np.arange(drives), each)
+    kind = drive % FOLDS  # the drives of a fold have a size and a term that no other has
+    n = drives * each
+    terms = np.full((n, len(SIDESLIP_TERMS)), 1e-6)
+    terms[np.arange(n), 1 + kind] = 1e-3
+    samples = replace(
+        _samples(rng, np.full(n, 1e-3), terms, drives),
+        drive=drive,
+        sideslip_error=1e-3 * 2.0**kind * rng.standard_normal(n),
+        bin=np.zeros(n, dtype=np.int64),
+        wrong=np.zeros(n, dtype=np.bool_),
+    )
+    weight = np.full(n, 1.0 / n)
+    seen = combined(terms, fit_coefficients(terms, samples.sideslip_error, weight))
+    assert covering_factor(samples.sideslip_error, seen, weight) == pytest.approx(1.0, abs=0.02)
+    assert fit_inflation(samples).unseen_factor > 3.0
+
+
+def test_the_covering_factor_is_the_weighted_quantile() -> None:
+    error, std = np.arange(1.0, 100.0), np.full(99, 1.0 / 1.959963984540054)
+    alike = np.full(99, 1.0 / 99.0)
+    assert covering_factor(error, std, alike) == pytest.approx(95.0)
+    assert covering_factor(-error, 2.0 * std, alike) == pytest.approx(47.5)
+    assert covering_factor(error, std, np.where(error <= 10.0, 0.1, 0.0)) == pytest.approx(10.0)
+
+
+def test_few_drives_must_be_covered_further() -> None:
+    assert share_for(0.95, 10**6) == pytest.approx(0.95, abs=1e-5)
+    assert share_for(0.95, 60) == pytest.approx(0.95 * 61 / 60)
+    assert share_for(0.95, 5) == 0.975
+    assert share_for(0.85, 5) == 0.925
+
+
+def test_bins_count_alike() -> None:
+    weight = bin_weights(np.array([0] * 90 + [2] * 10))
+    assert weight.sum() == pytest.approx(1.0)
+    assert weight[:90].sum() == pytest.approx(0.5)
+    assert np.ptp(weight[90:]) == 0.0
+
+
+def test_a_drive_is_never_on_both_sides() -> None:
+    drive = np.random.default_rng(0).permutation(np.repeat([3, 8, 9, 20, 21, 40, 41], 5))
+    held = np.zeros(drive.size, dtype=int)
+    for seen, out in folds(drive):
+        assert not set(drive[seen]) & set(drive[out])
+        held += out
+    assert np.all(held == 1)
+
+
+def test_bins_and_coverage() -> None:
+    assert bin_numbers(np.array([0.0, 0.29, 0.3, 0.6, 2.0, np.nan])).tolist() == [0, 0, 1, 2, 2, -1]
+    rng = np.random.default_rng(5)
+    n = 50_000
+    samples = replace(_samples(rng, np.ones(n), np.ones((n, 7))), sideslip_error=rng.standard_normal(n))
+    for row in coverage_rows(samples, np.full(n, 2.0)):
+        assert row.covered_before == pytest.approx(0.95, abs=0.01)
+        assert row.covered_after > 0.999
+        assert (row.width_before, row.width_after) == pytest.approx((1.0, 2.0), rel=0.03)
+
+
+def test_few_drives_are_refused() -> None:
+    rng = np.random.default_rng(6)
+    with pytest.raises(ValueError, match="5 drives"):
+        fit_inflation(_samples(rng, np.ones(400), np.ones((400, 7)), drives=4))
+
+
+# ---- the command ----
+
+
+def _settings(sample_logs_dir: Path, estimators: tuple[str, ...] = ("phy-ukf", "zero")) -> CalibrateSettings:
+    config = RunConfig(estimators=estimators, vehicle=sample_logs_dir / "vehicle.toml", model=Path("none"), end="+6s")
+    return CalibrateSettings(config, spread=0.1)
+
+
+@pytest.fixture(scope="module")
+def calibration(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("calibration")
+    logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "fishhook", "sweep", "road", "no_truth")]
+    told: list[str] = []
+    result = run_calibration(logs, folder, _settings(sample_logs_dir), warn=told.append)
+    assert result.exit_code == 3
+    assert [d.name for d in result.left_out] == ["no_truth"]
+    assert any("no_truth" in t for t in told)
+    again = run_calibration(logs[:5], folder / "again.json", _settings(sample_logs_dir))
+    assert json.loads(again.file.read_text())["estimators"] == json.loads(result.file.read_text())["estimators"]
+    return result.file
+
+
+def test_the_file_says_where_it_is_from(calibration: Path) -> None:
+    assert calibration.name == "calibration.json"
+    document = json.loads(calibration.read_text())
+    assert list(document["estimators"]) == ["phy-ukf"]  # zero claims no interval
+    assert len(document["drives"]) == 5
+    assert document["settings"]["vary"] == 0.1
+    assert document["vehicle"]["file"] == "vehicle.toml"
+    assert str(calibration.parent) not in calibration.read_text()
+    assert {c["wrong_vehicle"] for c in document["estimators"]["phy-ukf"]["coverage"]} == {False, True}
+    assert [d["runs"] for d in document["drives"]] == [3] * 5
+
+
+def test_a_run_uses_it_says_so_and_windows_change_nothing(
+    calibration: Path, sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    tables, figures = {}, {}
+    for name, made, window_s in (
+        ("plain", Path("none"), 600.0),
+        ("whole", calibration, 600.0),
+        ("cut", calibration, 1.7),
+    ):
+        config = RunConfig(
+            estimators=("phy-ukf", "zero"),
+            vehicle=sample_logs_dir / "vehicle.toml",
+            model=Path("none"),
+            calibration=made,
+            annotate="none",
+            window_s=window_s,
+        )
+        result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config)
+        report = result.results[0].report
+        assert report is not None
+        notes = {e["name"]: "; ".join(e["notes"]) for e in report["estimators"]}
+        assert ("intervals not calibrated" if name == "plain" else "calibrated by calibration.json") in notes["phy-ukf"]
+        assert "calibrated" not in notes["zero"]
+        assert "another vehicle" not in notes["phy-ukf"]
+        tables[name] = pl.read_parquet(tmp_path / name / "logs" / "dlc" / "estimates.parquet")
+        metrics = pl.read_parquet(tmp_path / name / "metrics.parquet").filter(pl.col("estimator") == "phy-ukf")
+        figures[name] = {
+            metric: metrics.filter(pl.col("metric") == metric)["value"].to_list()
+            for metric in ("rmse", "nis", "coverage95", "nees")
+        }
+    assert tables["whole"].equals(tables["cut"])
+    # Coverage and NEES are those of the calibrated covariance; the filter's own innovations know nothing of it.
+    assert {m: figures["whole"][m] == figures["plain"][m] for m in figures["plain"]} == {
+        "rmse": True,
+        "nis": True,
+        "coverage95": False,
+        "nees": False,
+    }
+    assert all(figures["plain"].values())
+    same = [c for c in tables["whole"].columns if c not in ("vy_std_m_s", "yaw_rate_std_rad_s", "sideslip_std_rad")]
+    assert tables["whole"].select(same).equals(tables["plain"].select(same))
+    assert not tables["whole"]["sideslip_std_rad"].equals(tables["plain"]["sideslip_std_rad"])
+    assert load_calibration(calibration).inflations["phy-ukf"].sideslip[0] > 0.0
+
+
+def test_too_few_drives_with_truth(sample_logs_dir: Path, tmp_path: Path) -> None:
+    with pytest.raises(EstimatorError, match="5 drives"):
+        run_calibration([str(sample_logs_dir / "step.mcap")], tmp_path / "c.json", _settings(sample_logs_dir))
+    assert not (tmp_path / "c.json").exists()
+
+
+def test_held_out_drives_are_refused(sample_logs_dir: Path, tmp_path: Path) -> None:
+    entries = []
+    for name, split in (("dlc", "validation"), ("step", "test")):
+        shutil.copy(sample_logs_dir / f"{name}.mcap", tmp_path)
+        entries.append({"file": f"{name}.mcap", "split": split})
+    (tmp_path / "manifest.json").write_text(json.dumps({"drives": entries}))
+    settings = _settings(sample_logs_dir)
+    inputs = find_logs([str(tmp_path)])
+    with pytest.raises(UsageError, match=r"step \(test\)"):
+        choose_drives(inputs, settings, REFUSED)
+    chosen, splits = choose_drives(inputs, replace(settings, split="validation"), REFUSED)
+    assert [i.stem for i in chosen] == ["dlc"]
+    assert splits == {"dlc": "validation"}
+    assert len(choose_drives(inputs, replace(settings, any_split=True), REFUSED)[0]) == 2
+    with pytest.raises(UsageError, match="train"):
+        choose_drives(inputs, replace(settings, split="train"), REFUSED)
+
+
+def test_wrong_options(sample_logs_dir: Path, tmp_path: Path) -> None:
+    settings = _settings(sample_logs_dir)
+    log = [str(sample_logs_dir / "step.mcap")]
+    with pytest.raises(UsageError, match="--output"):
+        run_calibration(log, tmp_path / "nowhere", settings)
+    with pytest.raises(UsageError, match="--vary"):
+        run_calibration(log, tmp_path, replace(settings, spread=0.5))
+    with pytest.raises(UsageError, match="--vehicle"):
+        run_calibration(log, tmp_path, replace(settings, config=replace(settings.config, vehicle=None)))

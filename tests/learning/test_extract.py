@@ -1,0 +1,381 @@
+"""``pdhef extract``: from logs to a residual dataset on disk, and back."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import polars as pl
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+from residual_car import CAR, Motion, Wave, drive
+
+from pdhef_logtool.car.vehicle import VehicleParameters, vehicle_to_toml
+from pdhef_logtool.learning.network import extract_command
+from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
+from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, run_extraction
+from pdhef_logtool.logs.discovery import hash_log
+from pdhef_logtool.records.errors import LogError, OutputError, UsageError
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.run.config import RunConfig
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "schemas/dataset.schema.json").read_text(encoding="utf-8"))
+MAPPING = """
+[signals.steer_rad]
+topic = "/steer"
+field = "angle"
+stamp = "stamp"
+[signals.ax_m_s2]
+topic = "/imu"
+field = "ax"
+stamp = "stamp"
+[signals.ay_m_s2]
+topic = "/imu"
+field = "ay"
+stamp = "stamp"
+[signals.yaw_rate_rad_s]
+topic = "/imu"
+field = "r"
+stamp = "stamp"
+[signals.speed_m_s]
+topic = "/speed"
+field = "v"
+stamp = "stamp"
+[truth.vx_m_s]
+topic = "/ins"
+field = "vx"
+stamp = "stamp"
+[truth.vy_m_s]
+topic = "/ins"
+field = "vy"
+stamp = "stamp"
+[truth.yaw_rate_rad_s]
+topic = "/ins"
+field = "r"
+stamp = "stamp"
+[truth_quality]
+topic = "/ins"
+field = "fix"
+values = [4]
+"""
+
+
+def _topic(stamps: np.ndarray, **columns: np.ndarray) -> FakeTopic:
+    return FakeTopic("vendor/msg/Any", stamps + 5_000_000, {"stamp": stamps, **columns})
+
+
+def _log(
+    motion: Motion, *, arm: tuple[float, float] = (0.0, 0.0), latency_s: float = 0.0, sigma: float = 0.0
+) -> FakeLog:
+    """The drive as recorded, its truth measured ``arm`` from the CG, late, noisy, and bad for a second."""
+    stamps, s = motion.stamps_ns, motion.state
+    late = stamps + round(latency_s * 1e9)
+    rng = np.random.default_rng(2)
+    noise = rng.normal(0.0, [sigma, sigma, 0.2 * sigma], s.shape)
+    fix = np.full(len(stamps), 4.0)
+    fix[1000:1100] = 1.0
+    bad = np.where(fix == 4.0, 0.0, 3.0)
+    return FakeLog(
+        {
+            "/steer": _topic(stamps, angle=motion.steer),
+            "/imu": _topic(stamps, ax=motion.ax, ay=motion.ay, r=s[:, 2]),
+            "/speed": _topic(stamps[::2], v=s[::2, 0]),
+            "/ins": _topic(
+                late,
+                vx=s[:, 0] - s[:, 2] * arm[1] + noise[:, 0],
+                vy=s[:, 1] + s[:, 2] * arm[0] + noise[:, 1] + bad,
+                r=s[:, 2] + noise[:, 2] + (0.0 if sigma else 1e-5 * np.sin(np.arange(len(stamps)))),
+                fix=fix,
+            ),
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    return drive(30.0, lateral=Wave(0.5, 0.7), yaw=Wave(0.3, 1.1))
+
+
+def _extract(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: FakeLog, car: VehicleParameters = CAR, **settings: Any
+) -> ExtractResult:
+    (tmp_path / "drive.mcap").write_bytes(b"in memory")
+    (tmp_path / "m.toml").write_text(MAPPING)
+    (tmp_path / "v.toml").write_text(vehicle_to_toml(car))
+    monkeypatch.setattr(extract_command, "open_log", lambda _path: log)
+    config = RunConfig(vehicle=tmp_path / "v.toml", mapping=tmp_path / "m.toml", window_s=settings.pop("window_s", 7.0))
+    return run_extraction([str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **settings))
+
+
+def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Usable rows: errors of the residual rates, and indices."""
+    (found,) = read_dataset(result.output).drives
+    index = np.round((found.stamps_ns - motion.stamps_ns[0]) / 1e7).astype(int)
+    use = found.weight > 0
+    error = found.targets[use] / found.step_s[use, None] - motion.residual[index[use]] / 0.01
+    return error, index[use]
+
+
+def test_clean_truth_is_differenced_as_it_is(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _extract(tmp_path, monkeypatch, _log(motion))
+    error, index = _errors(result, motion)
+    assert np.abs(error).max() < 6e-3
+    (entry,) = result.manifest["drives"]
+    assert entry["truth"]["smoothing_half_s"] == 0.0
+    assert entry["truth"]["kind"] == "recorded"
+    # The second without a fix gives no target; everything else but the last row does.
+    assert set(range(2999)) - set(index.tolist()) == set(range(999, 1100))
+    rms = entry["residual_rms"]
+    assert rms["vy_dot_m_s2"] == pytest.approx(0.5 / np.sqrt(2), rel=0.05)
+    assert rms["yaw_acceleration_rad_s2"] == pytest.approx(0.3 / np.sqrt(2), rel=0.05)
+
+
+def test_truth_away_from_the_cg_is_moved(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = _log(motion, arm=(1.3, -0.4))
+    moved = CAR.model_copy(update={"truth_position_m": (1.3, -0.4, 0.5)})
+    error, _ = _errors(_extract(tmp_path, monkeypatch, log, moved), motion)
+    assert np.abs(error).max() < 1e-2
+    forgotten, _ = _errors(_extract(tmp_path, monkeypatch, log, CAR), motion)
+    assert np.abs(forgotten).max() > 0.3
+
+
+def test_late_truth_is_put_back(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = _extract(tmp_path, monkeypatch, _log(motion, latency_s=0.08))
+    (entry,) = result.manifest["drives"]
+    assert entry["truth"]["latency_s"] == pytest.approx(0.08, abs=1e-3)
+    error, _ = _errors(result, motion)
+    assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.02
+
+
+def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = _log(motion, sigma=0.01)
+    result = _extract(tmp_path, monkeypatch, log)
+    (entry,) = result.manifest["drives"]
+    assert entry["truth"]["smoothing_half_s"] == 0.15
+    assert entry["truth"]["difference_noise"]["vy_dot_m_s2"] == pytest.approx(np.sqrt(2), rel=0.1)
+    error, _ = _errors(result, motion)
+    assert np.abs(error.mean(axis=0)).max() < 0.02
+    smoothed = np.sqrt(np.mean(error**2, axis=0))
+    assert smoothed[0] < 0.12
+    raw, _ = _errors(_extract(tmp_path, monkeypatch, log, truth_smoothing="none"), motion)
+    assert np.sqrt(np.mean(raw**2, axis=0))[0] > 1.0
+    wide = _extract(tmp_path, monkeypatch, log, truth_smoothing="0.2")
+    assert wide.manifest["drives"][0]["truth"]["smoothing_half_s"] == 0.2
+
+
+def test_windows_of_reading_change_no_byte(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hashes = set()
+    for window_s in (3.0, 7.3, 600.0):
+        result = _extract(tmp_path, monkeypatch, _log(motion, sigma=0.01), window_s=window_s)
+        hashes.add(result.manifest["sha256"])
+    assert len(hashes) == 1
+
+
+# ---- files ----
+
+
+@pytest.fixture(scope="module")
+def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> ExtractResult:
+    out = tmp_path_factory.mktemp("dataset")
+    logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
+    return run_extraction(logs, out, ExtractSettings(RunConfig(), seed=4))
+
+
+def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Path) -> None:
+    document = json.loads((dataset.output / MANIFEST).read_text(encoding="utf-8"))
+    assert document == dataset.manifest
+    jsonschema.validate(document, SCHEMA)
+    assert document["features"] == list(FEATURES)
+    by_log = {d["log"]: d for d in document["drives"]}
+    assert by_log["dlc"]["source"] == {"file": "dlc.mcap", "sha256": hash_log(sample_logs_dir / "dlc.mcap")}
+    # The manifest of the sample logs names a vehicle file for each.
+    names = {v["sha256"]: v["name"] for v in document["vehicles"]}
+    assert len(names) == 2
+    assert by_log["dlc"]["vehicle_sha256"] != by_log["sweep"]["vehicle_sha256"]
+
+
+def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
+    frame = pl.read_parquet(dataset.output / "drives/dlc.parquet")
+    assert frame.columns == [
+        "stamp_ns",
+        *FEATURES,
+        "target_dvy_m_s",
+        "target_dyaw_rate_rad_s",
+        "truth_vx_m_s",
+        "truth_vy_m_s",
+        "weight",
+        "segment",
+        "split",
+    ]
+    assert frame["stamp_ns"].diff().drop_nulls().min() > 0  # type: ignore[operator]
+    entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
+    assert (len(frame), int(frame["weight"].sum())) == (entry["rows"], entry["usable_rows"])
+    usable = frame.filter(pl.col("weight") > 0)
+    assert usable.null_count().sum_horizontal().item() == 0
+    assert set(frame["split"].unique()) == {entry["split"]}
+
+
+def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
+    data = read_dataset(dataset.output)
+    assert data.features == FEATURES
+    assert data.period_s == pytest.approx(0.01)
+    for found in data.drives:
+        frame = pl.read_parquet(found.path).filter(pl.col(FEATURES[0]).is_not_null())
+        np.testing.assert_array_equal(found.features, frame.select(FEATURES).to_numpy())
+        assert found.features.dtype == found.targets.dtype == found.weight.dtype == np.float32
+        assert np.isfinite(found.features).all() and np.isfinite(found.targets).all()
+        np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
+        assert not found.targets[found.weight == 0].any()
+        assert data.vehicle(found).name == next(
+            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == found.entry["vehicle_sha256"]
+        )
+
+
+def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(dataset.output, copy)
+    (copy / "drives/dlc.parquet").write_bytes((copy / "drives/sweep.parquet").read_bytes())
+    broken = next(d for d in read_dataset(copy).drives if d.name == "dlc")
+    with pytest.raises(OutputError, match="another content"):
+        broken.load()
+    document = json.loads((copy / MANIFEST).read_text())
+    (copy / MANIFEST).write_text(json.dumps({**document, "version": 99}))
+    with pytest.raises(OutputError, match="extract it again"):
+        read_dataset(copy)
+    (copy / MANIFEST).unlink()
+    with pytest.raises(OutputError, match="--resume"):
+        read_dataset(copy)
+
+
+def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
+    logs = [str(sample_logs_dir / name) for name in ("sweep.mcap", "dlc.mcap")]
+    again = run_extraction(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=4), jobs=2)
+    assert again.manifest == dataset.manifest
+    for name in ("dlc", "sweep"):
+        assert (tmp_path / f"out/drives/{name}.parquet").read_bytes() == (
+            dataset.output / f"drives/{name}.parquet"
+        ).read_bytes()
+
+
+def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(dataset.output, out)
+    (out / MANIFEST).unlink()  # a killed command leaves none
+    (out / "drives/sweep.parquet").write_bytes(b"PAR1 torn")
+    logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
+    settings = ExtractSettings(RunConfig(), seed=4)
+    resumed = run_extraction(logs, out, settings, resume=True)
+    assert [r.kept for r in resumed.results] == [True, False]
+    assert resumed.manifest == dataset.manifest
+    other = run_extraction(logs, out, replace(settings, truth_smoothing="0.1"), resume=True)
+    assert not any(r.kept for r in other.results)
+    afresh = run_extraction(logs, out, replace(settings, truth_smoothing="0.1"))
+    assert not any(r.kept for r in afresh.results)
+
+
+def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    shutil.copy(sample_logs_dir / "dlc.mcap", logs / "good.mcap")
+    (logs / "bad.mcap").write_bytes(b"this is no log")
+    told: list[str] = []
+    result = run_extraction([str(logs)], tmp_path / "out", ExtractSettings(RunConfig()), warn=told.append)
+    assert result.exit_code == 3
+    jsonschema.validate(result.manifest, SCHEMA)
+    assert [f["log"] for f in result.manifest["failed"]] == ["bad"]
+    assert any(t.startswith("bad: ") for t in told)
+    assert [d.name for d in read_dataset(tmp_path / "out").drives] == ["good"]
+    with pytest.raises(LogError):
+        run_extraction([str(logs / "bad.mcap")], tmp_path / "alone", ExtractSettings(RunConfig()))
+
+
+# ---- split ----
+
+
+def test_hash_split_is_stable_and_about_70_15_15() -> None:
+    names = [f"{i:064x}" for i in range(4000)]
+    splits = [choose_split(n, 0)[0] for n in names]
+    shares = [splits.count(s) / len(splits) for s in SPLITS]
+    np.testing.assert_allclose(shares, [0.70, 0.15, 0.15], atol=0.02)
+    assert splits == [choose_split(n, 0)[0] for n in reversed(names)][::-1]
+    assert splits != [choose_split(n, 1)[0] for n in names]
+    # Written down: a split that changed between versions would leak test drives into training.
+    assert " ".join(choose_split(n, 0)[0] for n in names[:8]) == "train train train validation train train train train"
+
+
+def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: Path, tmp_path: Path) -> None:
+    shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
+    shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "b.mcap")
+    suite = {"format": 1, "drives": [{"file": "a.mcap", "split": "extrapolation"}, {"file": "c.mcap", "split": "test"}]}
+    (tmp_path / "manifest.json").write_text(json.dumps(suite))
+    logs = [str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")]
+    result = run_extraction(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=3))
+    found = {d["log"]: (d["split"], d["split_from"]) for d in result.manifest["drives"]}
+    assert found["a"] == ("extrapolation", "manifest")
+    assert found["b"] == choose_split(hash_log(tmp_path / "b.mcap"), 3)
+    jsonschema.validate(result.manifest, SCHEMA)
+    chosen = run_extraction(logs, tmp_path / "out", ExtractSettings(RunConfig(), split="validation"))
+    assert {(d["split"], d["split_from"]) for d in chosen.manifest["drives"]} == {("validation", "option")}
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"truth_smoothing": "5"}, {"truth_smoothing": "much"}, {"split": "other"}, {"seed": -1}]
+)
+def test_wrong_settings_are_told_before_any_log_is_read(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        run_extraction([str(tmp_path / "none.mcap")], tmp_path / "out", ExtractSettings(RunConfig(), **wrong))
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_manifest_is_not_overwritten(sample_logs_dir: Path, tmp_path: Path) -> None:
+    shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
+    (tmp_path / "manifest.json").write_text('{"format": 1, "drives": []}')
+    with pytest.raises(UsageError, match="another manifest"):
+        run_extraction([str(tmp_path / "a.mcap")], tmp_path, ExtractSettings(RunConfig()))
+    assert (tmp_path / "manifest.json").read_text() == '{"format": 1, "drives": []}'
+
+
+# ---- command line ----
+
+
+def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "COLUMNS": "120"}
+    command = [sys.executable, "-m", "pdhef_logtool", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
+    out = tmp_path / "residuals"
+    log = str(sample_logs_dir / "dlc.mcap")
+    result = _pdhef("extract", log, "-o", str(out), "-v", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
+    assert result.returncode == 0, result.stderr
+    assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
+    assert result.stderr == ""
+    (found,) = read_dataset(out).drives
+    assert found.usable_rows > 0.99 * found.rows
+    rtk = _pdhef("extract", log, "-o", str(tmp_path / "rtk"), "--prefer-truth", "rtk", "--split", "train", "--json")
+    assert rtk.returncode == 0, rtk.stderr
+    document = json.loads(rtk.stdout)
+    jsonschema.validate(document["manifest"], SCHEMA)
+    (entry,) = document["manifest"]["drives"]
+    assert entry["truth"]["kind"] == "recorded" and entry["truth"]["smoothing_half_s"] > 0
+    # The two truths of one drive tell of the same residual.
+    (other,) = read_dataset(tmp_path / "rtk").drives
+    both = (found.weight > 0) & (other.weight > 0)
+    for i in range(2):
+        assert np.corrcoef(found.targets[both, i], other.targets[both, i])[0, 1] > 0.95
+
+
+def test_errors_are_one_line(tmp_path: Path) -> None:
+    result = _pdhef("extract", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
+    assert result.returncode != 0
+    assert result.stderr.splitlines()[-1].startswith("pdhef: ")
+    assert "Traceback" not in result.stderr

@@ -1,0 +1,153 @@
+"""Training: it learns what can be learnt, resumes bit for bit, and refuses what it cannot use."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.learning.network.fit import (
+    CHECKPOINT,
+    PAPER_RECIPE,
+    FeatureSequence,
+    Recipe,
+    normalisation_of,
+    train,
+)
+from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.service import NetworkService
+
+SMALL = Recipe(FEATURES[:8], hidden=12, layers=1, head=(8,), epochs=6, batch=4, learning_rate=2e-2)
+
+
+def make_sequences(seed: int, count: int, steps: int = 400) -> list[FeatureSequence]:
+    """Targets are a lagged, nonlinear function of two features: a network without memory cannot learn them."""
+    rng = np.random.default_rng(seed)
+    out = []
+    for i in range(count):
+        drive = np.cumsum(rng.normal(size=(steps, len(FEATURES))), axis=0) * 0.1
+        lagged = np.zeros(steps)
+        for k in range(1, steps):
+            lagged[k] = 0.9 * lagged[k - 1] + 0.1 * np.tanh(drive[k, 1])
+        target = np.stack([0.8 * lagged, -0.3 * lagged], axis=1)
+        out.append(FeatureSequence(f"drive{i}", drive, target, np.ones(steps)))
+    return out
+
+
+def test_network_learns_a_residual_with_memory_and_serves_it(tmp_path: Path) -> None:
+    training, validation = make_sequences(0, 24), make_sequences(1, 4)
+    bundle, history = train(training, validation, replace(SMALL, epochs=12), tmp_path)
+    assert history[-1].validation_loss < 0.15 * history[0].validation_loss or history[-1].validation_loss < 0.05
+    test = make_sequences(2, 1)[0]
+    rates, _ = NetworkService(bundle).run(test.features, np.zeros(len(test.weight), dtype=np.bool_), None)
+    error = np.sqrt(np.mean((rates - test.target) ** 2, axis=0))
+    assert np.all(error < 0.35 * np.sqrt(np.mean(test.target**2, axis=0)))
+
+
+def test_same_seed_same_weights_other_seed_others(tmp_path: Path) -> None:
+    training, validation = make_sequences(0, 6), make_sequences(1, 2)
+    a, _ = train(training, validation, SMALL, tmp_path / "a")
+    b, _ = train(training, validation, SMALL, tmp_path / "b")
+    c, _ = train(training, validation, replace(SMALL, seed=1), tmp_path / "c")
+    assert a.sha256 == b.sha256 != c.sha256
+
+
+def test_training_that_stopped_half_way_ends_as_if_it_had_not(tmp_path: Path) -> None:
+    training, validation = make_sequences(0, 6), make_sequences(1, 2)
+    whole, history = train(training, validation, SMALL, tmp_path / "whole")
+
+    class Stop(Exception):  # noqa: N818
+        pass
+
+    def stop(epoch: object, _of: int) -> None:
+        if getattr(epoch, "epoch", 0) == 3:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(training, validation, SMALL, tmp_path / "cut", progress=stop)
+    resumed, again = train(training, validation, SMALL, tmp_path / "cut")
+    assert resumed.sha256 == whole.sha256
+    assert [e.validation_loss for e in again] == [e.validation_loss for e in history]
+
+
+def test_a_killed_training_resumes(tmp_path: Path) -> None:
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "from test_fit import *\n"
+        "long = replace(SMALL, epochs=400, patience=400)\n"
+        "train(make_sequences(0, 8), make_sequences(1, 2), long, Path(sys.argv[2]))\n"
+    )
+    arguments = [sys.executable, "-c", code, str(Path(__file__).parent), str(tmp_path)]
+    process = subprocess.Popen(arguments, env=os.environ)
+    deadline = time.monotonic() + 60.0
+    while not (tmp_path / CHECKPOINT).exists() and time.monotonic() < deadline:
+        time.sleep(0.02)
+    time.sleep(0.1)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    seen: list[int] = []
+
+    class Stop(Exception):  # noqa: N818
+        pass
+
+    def stop(epoch: object, _of: int) -> None:
+        seen.append(getattr(epoch, "epoch", 0))
+        raise Stop
+
+    with pytest.raises(Stop):
+        train(
+            make_sequences(0, 8),
+            make_sequences(1, 2),
+            replace(SMALL, epochs=400, patience=400),
+            tmp_path,
+            progress=stop,
+        )
+    assert seen[0] > 1
+
+
+def test_fine_tuning_starts_where_the_other_model_ended(tmp_path: Path) -> None:
+    training, validation = make_sequences(0, 12), make_sequences(1, 3)
+    first, history = train(training, validation, replace(SMALL, epochs=10), tmp_path / "first")
+    tuned, after = train(
+        training, validation, replace(SMALL, epochs=1, learning_rate=1e-6), tmp_path / "tuned", init=first
+    )
+    assert after[0].validation_loss == pytest.approx(min(e.validation_loss for e in history), rel=0.05)
+    assert tuned.normalisation == first.normalisation
+
+
+def test_samples_without_weight_teach_nothing(tmp_path: Path) -> None:
+    training, validation = make_sequences(0, 4), make_sequences(1, 2)
+    spoiled = []
+    for s in training:
+        target, weight = s.target.copy(), s.weight.copy()
+        target[100:150] = 1e3
+        weight[100:150] = 0.0
+        spoiled.append(replace(s, target=target, weight=weight))
+    clean = [replace(s, weight=t.weight) for s, t in zip(training, spoiled, strict=True)]
+    a, _ = train(spoiled, validation, SMALL, tmp_path / "a")
+    b, _ = train(clean, validation, SMALL, tmp_path / "b")
+    assert a.sha256 == b.sha256
+    assert normalisation_of(spoiled, FEATURES) == normalisation_of(clean, FEATURES)
+
+
+def test_checkpoint_of_other_data_and_empty_splits_are_refused(tmp_path: Path) -> None:
+    training, validation = make_sequences(0, 4), make_sequences(1, 2)
+    train(training, validation, replace(SMALL, epochs=1), tmp_path)
+    with pytest.raises(ModelError, match="checkpoint"):
+        train(training[:2], validation, replace(SMALL, epochs=1), tmp_path)
+    with pytest.raises(ModelError, match="0 sequences"):
+        train(training, [], SMALL, tmp_path / "none")
+
+
+def test_paper_recipe_is_table_1() -> None:
+    r = PAPER_RECIPE
+    assert (r.batch, r.epochs, r.learning_rate, r.dropout) == (64, 200, 1e-3, 0.2)
+    assert (r.hidden, r.layers, r.head, len(r.feature_names)) == (128, 2, (64, 32), 6)

@@ -1,0 +1,232 @@
+"""Residuals of drives whose residual is known in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from residual_car import CAR, FRICTION, START_NS, Motion, Wave, drive, pick, truth_of, window
+
+from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.learning.network.residuals import (
+    ResidualRows,
+    difference_noise,
+    join_rows,
+    residual_windows,
+    smooth_increments,
+)
+
+LATERAL, YAW = Wave(0.5, 0.7), Wave(0.3, 1.1)
+
+
+@pytest.fixture(scope="module")
+def motion() -> Motion:
+    return drive(lateral=LATERAL, yaw=YAW)
+
+
+@pytest.fixture(scope="module")
+def noisy(motion: Motion) -> DriveWindow:
+    """With noise, a lost stretch of 0.8 s, single lost stamps, and truth and steering that fail for a while."""
+    whole = window(motion, seed=3)
+    steer = whole.signals.steer_rad.copy()
+    steer[900:905] = np.nan
+    truth = motion.state.copy()
+    truth[700:720] = np.nan
+    whole = DriveWindow(replace(whole.signals, steer_rad=steer), truth_of(motion.stamps_ns, truth), 1.0)
+    kept = np.ones(len(motion.t), dtype=bool)
+    kept[300:380] = kept[500] = kept[1203] = False
+    return pick(whole, np.flatnonzero(kept))
+
+
+def rows_of(*windows: DriveWindow, half_window: int = 0, **changes: float) -> ResidualRows:
+    car = CAR.model_copy(update=changes)
+    return join_rows(residual_windows(windows, car, period_s=0.01, half_window=half_window))
+
+
+def rates(rows: ResidualRows) -> np.ndarray:
+    return rows.targets / rows.step_s[:, None]
+
+
+def test_known_residual_comes_out(motion: Motion) -> None:
+    rows = rows_of(window(motion))
+    assert rows.weight[:-1].all()
+    assert rows.weight[-1] == 0.0
+    # 0.01 s trapezoids of a motion below 1 Hz.
+    np.testing.assert_allclose(rows.targets[:-1] / 0.01, motion.residual / 0.01, atol=2e-3)
+    assert np.std(motion.residual[:, 0] / 0.01) > 100 * 2e-3
+
+
+def test_residual_is_taken_at_the_true_state_not_at_the_estimate(motion: Motion) -> None:
+    whole = window(motion)
+    signals = whole.signals
+    lost = replace(
+        whole, signals=replace(signals, ay_m_s2=signals.ay_m_s2 + 3.0, yaw_rate_rad_s=signals.yaw_rate_rad_s + 0.1)
+    )
+    good, bad = rows_of(whole), rows_of(lost)
+    assert np.abs(bad.features[:, 6] - good.features[:, 6]).max() > 0.3  # the filter is far off
+    np.testing.assert_array_equal(bad.targets, good.targets)
+
+
+def test_car_of_the_nominal_model_has_no_residual() -> None:
+    rows = rows_of(window(drive(10.0)))
+    assert np.abs(rates(rows)[:-1]).max() < 2e-3
+
+
+def test_wrong_friction_is_a_residual_of_force(motion: Motion) -> None:
+    """The truth has FRICTION; a nominal model with 10 % less lacks 10 % of the peak force, and its sign follows a_y."""
+    rows = rows_of(window(drive(10.0)), friction=0.9 * FRICTION)
+    ay = drive(10.0).ay[:-1]
+    slope = float(ay @ rates(rows)[:-1, 0] / (ay @ ay))
+    assert 0.05 < slope < 0.15
+
+
+def test_signal_friction_wins_over_the_vehicle_file() -> None:
+    whole = window(drive(10.0))
+    told = replace(whole, signals=replace(whole.signals, friction=np.full(len(whole.signals), FRICTION)))
+    assert np.abs(rates(rows_of(told, friction=0.5))[:-1]).max() < 2e-3
+    assert np.abs(rates(rows_of(whole, friction=0.5))[:-1]).max() > 0.5
+
+
+def test_smoothed_targets_of_a_noisy_truth_are_unbiased(motion: Motion) -> None:
+    exact = motion.residual / 0.01
+    errors = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        measured = motion.state + rng.normal(0.0, [0.01, 0.01, 0.002], motion.state.shape)
+        whole = replace(window(motion), truth=truth_of(motion.stamps_ns, measured))
+        rows = rows_of(whole, half_window=15)
+        use = rows.weight > 0
+        assert 0.97 < use.mean() < 1.0  # the ends have no window
+        found, true = rates(rows)[use], exact[use[:-1]]
+        errors.append(found - true)
+        gain = (found * true).sum(axis=0) / (true * true).sum(axis=0)
+        np.testing.assert_allclose(gain, 1.0, atol=0.05)
+    spread = np.sqrt(np.mean(np.square(errors), axis=(0, 1)))
+    # One-step differences have sqrt(2) sigma / dt = 1.4 m/s2 and 0.28 rad/s2.
+    assert spread[0] < 0.12 and spread[1] < 0.04
+    mean = np.abs(np.mean(errors, axis=(0, 1)))
+    assert mean[0] < 0.01 and mean[1] < 0.004
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(cuts=st.lists(st.integers(1, 1900), max_size=8), half_window=st.sampled_from([0, 1, 15]))
+def test_windows_change_no_bit(noisy: DriveWindow, cuts: list[int], half_window: int) -> None:
+    n = len(noisy.signals)
+    edges = sorted({0, n, *(c for c in cuts if c < n)})
+    parts = [pick(noisy, slice(a, b)) for a, b in pairwise(edges)]
+    whole, joined = rows_of(noisy, half_window=half_window), rows_of(*parts, half_window=half_window)
+    assert len(whole) == n
+    for f in fields(ResidualRows):
+        np.testing.assert_array_equal(getattr(joined, f.name), getattr(whole, f.name), err_msg=f.name)
+
+
+def test_one_stamp_a_window_changes_no_bit(noisy: DriveWindow) -> None:
+    part = pick(noisy, slice(0, 420))
+    single = [pick(part, slice(i, i + 1)) for i in range(420)]
+    whole, joined = rows_of(part, half_window=3), rows_of(*single, half_window=3)
+    for f in fields(ResidualRows):
+        np.testing.assert_array_equal(getattr(joined, f.name), getattr(whole, f.name), err_msg=f.name)
+
+
+def test_no_target_across_gaps_or_without_truth_or_steering(noisy: DriveWindow) -> None:
+    rows = rows_of(noisy)
+    index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
+    gone = set(index[np.isnan(rows.targets).any(axis=1)].tolist())
+    expected = {299, 499, 1202, *range(699, 720), *range(899, 905), int(index[-1])}
+    assert gone == expected
+    assert not rows.weight[np.isin(index, list(expected))].any()
+
+
+def test_smoothing_reaches_over_no_gap(noisy: DriveWindow) -> None:
+    h = 15
+    plain, smooth = rows_of(noisy), rows_of(noisy, half_window=h)
+    missing = np.flatnonzero(np.isnan(plain.targets[:-1]).any(axis=1))
+    near = np.zeros(len(plain), dtype=bool)
+    near[:h] = near[-h - 1 :] = True
+    for i in missing:
+        near[max(0, i - h) : i + h + 1] = True
+    np.testing.assert_array_equal(np.isnan(smooth.targets).any(axis=1), near)
+
+
+def test_segments_begin_where_the_filter_does(noisy: DriveWindow) -> None:
+    rows = rows_of(noisy)
+    index = np.round((rows.stamps_ns - START_NS) / 1e7).astype(int)
+    assert rows.segment[0] == 0
+    # The lost 0.8 s restart the filter (at the next speed sample); a lost stamp and held steering do not.
+    changes = np.flatnonzero(np.diff(rows.segment)) + 1
+    assert index[changes].tolist() == [380]
+    assert (np.diff(rows.segment) >= 0).all()
+    # What leads into a new start is not carried over in service either.
+    assert rows.weight[changes - 1].tolist() == [0.0]
+
+
+def test_rows_before_the_filter_starts_weigh_nothing(motion: Motion) -> None:
+    whole = window(motion)
+    speed = whole.signals.speed_m_s.copy()
+    speed[:200] = np.nan
+    rows = rows_of(replace(whole, signals=replace(whole.signals, speed_m_s=speed)))
+    assert np.isnan(rows.features[:200]).all()
+    assert not rows.weight[:200].any()
+    assert np.isfinite(rows.targets[:200]).all()
+    assert rows.weight[200:-1].all()
+    assert not rows.segment.any()
+
+
+def test_slow_and_spinning_cars_weigh_nothing() -> None:
+    motion = drive(5.0)
+    state = motion.state.copy()
+    state[100:200, 0] = 0.99 * CAR.low_speed_blend_m_s
+    state[300:350, 1] = 1.01 * state[300:350, 0]
+    rows = rows_of(replace(window(motion), truth=truth_of(motion.stamps_ns, state)))
+    expected = np.ones(len(rows), dtype=bool)
+    expected[99:200] = expected[299:350] = expected[-1] = False
+    np.testing.assert_array_equal(rows.weight > 0, expected)
+
+
+def test_features_do_not_see_the_truth(noisy: DriveWindow) -> None:
+    truth = noisy.truth
+    assert truth is not None
+    state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
+    shuffled = np.random.default_rng(1).permutation(state)
+    a = rows_of(noisy)
+    b = rows_of(replace(noisy, truth=truth_of(truth.stamps_ns, shuffled)))
+    np.testing.assert_array_equal(a.features, b.features)
+    np.testing.assert_array_equal(a.segment, b.segment)
+    assert not np.array_equal(a.targets, b.targets, equal_nan=True)
+
+
+@settings(max_examples=30, deadline=None, derandomize=True)
+@given(
+    coefficients=st.lists(st.floats(-3, 3), min_size=4, max_size=4),
+    seed=st.integers(0, 1000),
+    half_window=st.integers(2, 20),
+)
+def test_smoothing_keeps_cubics_on_uneven_stamps(coefficients: list[float], seed: int, half_window: int) -> None:
+    rng = np.random.default_rng(seed)
+    stamps = START_NS + np.cumsum(rng.integers(5_000_000, 15_000_000, 80))
+    curve = np.polynomial.Polynomial(coefficients)((stamps - START_NS) * 1e-9)
+    increments = np.diff(curve)[:, None]
+    out = smooth_increments(stamps, increments, half_window)
+    inner = slice(half_window, len(increments) - half_window)
+    np.testing.assert_allclose(out[inner], increments[inner], atol=1e-9)
+    assert np.isnan(out[:half_window]).all() and np.isnan(out[len(increments) - half_window :]).all()
+
+
+@pytest.mark.parametrize("sigma", [1e-3, 0.02])
+def test_noise_of_differences_is_measured_under_motion(motion: Motion, sigma: float) -> None:
+    rng = np.random.default_rng(5)
+    vy = motion.state[:, 1] + rng.normal(0.0, sigma, len(motion.t))
+    found = difference_noise(motion.stamps_ns, vy)
+    assert found == pytest.approx(np.sqrt(2) * sigma / 0.01, rel=0.1)
+    assert difference_noise(motion.stamps_ns, motion.state[:, 1]) < 0.01
+
+
+def test_staircase_truth_is_noise() -> None:
+    """A 20 Hz truth that is repeated at 100 Hz has no usable one-step differences, though most of them are 0."""
+    t = np.arange(2000) * 0.01
+    held = np.sin(2 * np.pi * 0.5 * t)[np.arange(2000) // 5 * 5]
+    assert difference_noise(START_NS + np.arange(2000) * 10_000_000, held) > 1.0

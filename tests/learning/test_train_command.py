@@ -1,0 +1,118 @@
+"""``pdhef train`` from a dataset on disk to a model that runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+
+from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.learning.network.train_command import run_training
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.residual_model.bundle import load_bundle
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.pipeline import run_logs
+
+
+def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "pdhef_logtool", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "COLUMNS": "120"})
+
+
+@pytest.fixture(scope="module")
+def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("dataset")
+    vehicle = str(sample_logs_dir / "vehicle.toml")
+    for split, start, end in (("train", "30", "110"), ("validation", "115", "150"), ("test", "155", "190")):
+        # One drive gives three parts only because there are no other sample drives of this length.
+        part = folder / split
+        done = _pdhef(
+            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(part), "--vehicle", vehicle, "--split", split,
+            "--start", start, "--end", end,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tmp_path: Path) -> None:
+    joined = _joined(dataset, tmp_path / "joined")
+    done = _pdhef("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    bundle = load_bundle(tmp_path / "model")
+    assert document["sha256"] == bundle.sha256
+    assert len(document["history"]) == 2
+    assert {p.name for p in (tmp_path / "model").iterdir()} == {
+        "history.parquet", "history.png", "model.json", "weights.safetensors",
+    }  # fmt: skip
+    assert pl.read_parquet(tmp_path / "model" / "history.parquet").height == 2
+    assert bundle.provenance["dataset_sha256"]
+    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=tmp_path / "model", annotate="none")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef-trust0"}
+    again = run_training(joined, tmp_path / "again", epochs=2)
+    assert again.bundle.sha256 == bundle.sha256
+    assert again.bundle.provenance["fine_tuned_on"] is None
+    tuned = run_training(joined, tmp_path / "tuned", init=tmp_path / "model", epochs=1)
+    assert tuned.bundle.provenance["fine_tuned_from"] == bundle.sha256
+    assert tuned.bundle.provenance["fine_tuned_on"] == load_vehicle(sample_logs_dir / "vehicle.toml").name
+    check_baselines(sample_logs_dir, joined, tmp_path, bundle.sha256)
+
+
+def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str) -> None:
+    """Train the baselines into the model; they run, the network stays as it was, the split is the network's."""
+    done = _pdhef("train", str(dataset), "-o", str(folder / "model"), "--epochs", "2", "--baselines", "--json")
+    assert done.returncode == 0, done.stderr
+    document = json.loads(done.stdout)
+    bundle = load_bundle(folder / "model")
+    assert bundle.sha256 == network_sha256
+    assert bundle.pure_lstm is not None
+    assert bundle.linear_regression is not None
+    assert document["pure_lstm"]["sha256"] == bundle.pure_lstm.sha256
+    assert document["linear_regression"]["sha256"] == bundle.linear_regression.sha256
+    same = ("dataset_sha256", "training_sequences", "epochs")
+    assert [bundle.pure_lstm.provenance[k] for k in same] == [bundle.provenance[k] for k in same]
+    assert bundle.pure_lstm.feature_names == bundle.linear_regression.feature_names == bundle.feature_names
+    errors = bundle.linear_regression.provenance["sideslip_rmse_deg"]
+    assert 0.0 < errors["train"] < 1.0
+    assert errors["test"] is not None
+    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=folder / "model", annotate="none")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
+    assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression", "pd-hef-paper"}
+    both = _pdhef("train", str(dataset), "-o", str(folder / "m"), "--baselines", "--init", str(folder / "model"))
+    assert both.returncode == 2
+    assert len(both.stderr.splitlines()) == 1
+
+
+def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="epoch"):
+        run_training(dataset / "train", tmp_path / "m", epochs=0)
+    with pytest.raises(OutputError, match="extract"):
+        run_training(tmp_path, tmp_path / "m")
+    done = _pdhef("train", str(dataset / "train"), "-o", str(tmp_path / "m"), "--epochs", "1")
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+    assert "validation" in done.stderr
+
+
+def _joined(dataset: Path, target: Path) -> Path:
+    """Join datasets of one vehicle by hand: their drives' files side by side, their manifests' drives in one list."""
+    target.mkdir()
+    manifest = None
+    for part in sorted(dataset.iterdir()):
+        document = json.loads((part / "manifest.json").read_text())
+        for drive in document["drives"]:
+            name = f"{part.name}.parquet"
+            (target / name).write_bytes((part / drive["file"]).read_bytes())
+            drive["file"], drive["log"] = name, part.name
+        if manifest is None:
+            manifest = document
+        else:
+            manifest["drives"] += document["drives"]
+    (target / "manifest.json").write_text(json.dumps(manifest))
+    return target

@@ -1,0 +1,179 @@
+"""The baselines' training: known coefficients come back, a trivial map is learnt, damaged files are one clear error."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_linear
+from pdhef_logtool.learning.network.fit import FeatureSequence, Recipe, train
+from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.residual_model.bundle import (
+    LATERAL_VELOCITY,
+    LINEAR_REGRESSION_FILE,
+    PURE_LSTM_FOLDER,
+    ModelBundle,
+    load_bundle,
+)
+from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES
+from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
+from pdhef_logtool.residual_model.low_pass import low_pass
+from pdhef_logtool.residual_model.service import NetworkService
+
+SMALL = Recipe(hidden=8, layers=1, head=(8,), epochs=8, batch=4, learning_rate=2e-2)
+NAMES = ("vx_m_s", "ay_m_s2", "steer_rad", "friction")
+
+
+def smoothed(values: np.ndarray, dt: float, corner_hz: float) -> np.ndarray:
+    """The textbook recursion in plain Python."""
+    share = 1.0 - math.exp(-2.0 * math.pi * corner_hz * dt)
+    out = [values[0]]
+    for v in values[1:]:
+        out.append(out[-1] + share * (v - out[-1]))
+    return np.array(out)
+
+
+def make_features(seed: int, steps: int = 600) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    features = np.cumsum(rng.normal(size=(steps, len(FEATURES))), axis=0) * 0.1
+    features[:, FEATURES.index("friction")] = 0.85  # one road: says nothing
+    return features
+
+
+def make_sequence(seed: int, noise: float = 0.0) -> SideslipSequence:
+    features = make_features(seed)
+    n = len(features)
+    raw = 0.01 + 0.002 * features[:, 0] - 0.03 * features[:, 1] + 0.5 * features[:, 2]
+    beta = smoothed(raw, 0.01, 2.0) + noise * np.random.default_rng(seed).standard_normal(n)
+    beta[100:120] = np.nan  # no truth there
+    return SideslipSequence(features, np.array([np.nan, *[0.01] * (n - 1)]), beta)
+
+
+def test_regression_recovers_known_coefficients():
+    model = fit_linear([make_sequence(s) for s in range(4)], NAMES)
+    assert model.coefficients == pytest.approx((0.002, -0.03, 0.5, 0.0), abs=1e-10)
+    assert model.intercept_rad == pytest.approx(0.01, abs=1e-10)
+    noisy = fit_linear([make_sequence(s, 0.01) for s in range(8)], NAMES)
+    assert noisy.coefficients[:3] == pytest.approx((0.002, -0.03, 0.5), abs=0.004)
+    assert noisy.coefficients[3] == 0.0  # a constant feature takes nothing
+
+
+def test_low_pass_is_the_textbooks_and_carries_its_memory():
+    values = np.random.default_rng(0).standard_normal((300, 2))
+    dt = np.full(300, 0.01)
+    dt[0] = np.nan
+    whole, memory = np.empty_like(values), np.zeros(2)
+    low_pass(values, dt, 2.0, memory, whole)
+    for i in range(2):
+        np.testing.assert_allclose(whole[:, i], smoothed(values[:, i], 0.01, 2.0), rtol=1e-12)
+    memory, parts = np.zeros(2), []
+    for part in (slice(0, 1), slice(1, 130), slice(130, 300)):
+        out = np.empty_like(values[part])
+        low_pass(np.ascontiguousarray(values[part]), dt[part], 2.0, memory, out)
+        parts.append(out)
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_regression_without_truth_is_refused():
+    nothing = replace(make_sequence(0), sideslip_rad=np.full(600, np.nan))
+    with pytest.raises(ModelError, match="0 usable rows"):
+        fit_linear([nothing], NAMES)
+
+
+def velocity_sequences(seed: int, count: int) -> list[FeatureSequence]:
+    """The target is one of the features: the trivial map."""
+    out = []
+    for i in range(count):
+        features = make_features(seed + i)
+        out.append(FeatureSequence(f"drive{i}", features, 2.0 * features[:, 6:7], np.ones(len(features))))
+    return out
+
+
+@pytest.fixture(scope="module")
+def velocity_network(tmp_path_factory: pytest.TempPathFactory) -> ModelBundle:
+    recipe = replace(SMALL, target=LATERAL_VELOCITY)
+    work = tmp_path_factory.mktemp("lstm")
+    return train(velocity_sequences(0, 20), velocity_sequences(100, 4), recipe, work)[0]
+
+
+def test_a_network_learns_a_velocity(velocity_network):
+    assert velocity_network.target == LATERAL_VELOCITY
+    assert velocity_network.feature_names == ONE_CAR_FEATURES
+    test = velocity_sequences(200, 1)[0]
+    vy, _ = NetworkService(velocity_network).run(test.features, np.zeros(len(test.weight), dtype=np.bool_), None)
+    assert vy.shape == (600, 1)
+    error = np.sqrt(np.mean((vy - test.target) ** 2))
+    assert error < 0.3 * np.sqrt(np.mean(test.target**2))
+
+
+def save_model(folder: Path, velocity_network: ModelBundle) -> None:
+    recipe = replace(SMALL, epochs=1)
+    sequences = [replace(s, target=np.repeat(s.target, 2, axis=1)) for s in velocity_sequences(0, 2)]
+    residual, _ = train(sequences, sequences, recipe, folder / "work")
+    residual.save(folder)
+    velocity_network.save(folder / PURE_LSTM_FOLDER)
+    model = LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0, {"dataset_sha256": "a"})
+    (folder / LINEAR_REGRESSION_FILE).write_text(model.to_json())
+
+
+def test_baselines_come_with_the_model(tmp_path, velocity_network):
+    save_model(tmp_path, velocity_network)
+    bundle = load_bundle(tmp_path)
+    assert bundle.pure_lstm is not None
+    assert bundle.pure_lstm.sha256 == velocity_network.sha256
+    assert bundle.linear_regression == LinearModel(NAMES, (0.1, 0.2, 0.3, 0.4), 0.01, 2.0)
+    assert bundle.linear_regression.provenance == {"dataset_sha256": "a"}
+    alone = replace(bundle, pure_lstm=None, linear_regression=None)
+    assert alone.sha256 == bundle.sha256  # the network's own
+
+
+@pytest.mark.parametrize("damage", ["no json", "list", "version", "coefficient", "feature", "count", "entry", "text"])
+def test_a_damaged_regression_is_one_clear_error(tmp_path, velocity_network, damage):
+    save_model(tmp_path, velocity_network)
+    file = tmp_path / LINEAR_REGRESSION_FILE
+    document = json.loads(file.read_text())
+    changed = {
+        "list": [],
+        "version": {**document, "version": 99},
+        "coefficient": {**document, "coefficients": [0.1, 0.2, 0.3, 0.5]},
+        "feature": {**document, "features": ["truth", *NAMES[1:]]},
+        "count": {**document, "coefficients": [0.1]},
+        "entry": {k: v for k, v in document.items() if k != "low_pass_hz"},
+        "text": {**document, "coefficients": "abc"},
+    }
+    file.write_text("{" if damage == "no json" else json.dumps(changed[damage]))
+    for load in (lambda: load_linear_model(file), lambda: load_bundle(tmp_path)):
+        with pytest.raises(ModelError, match=r"linear-regression\.json") as caught:
+            load()
+        assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("damage", ["missing", "weights", "target", "shape"])
+def test_a_damaged_pure_lstm_is_one_clear_error(tmp_path, velocity_network, damage):
+    save_model(tmp_path, velocity_network)
+    folder = tmp_path / PURE_LSTM_FOLDER
+    if damage == "missing":
+        (folder / "weights.safetensors").unlink()
+    elif damage == "weights":
+        (folder / "weights.safetensors").write_bytes((tmp_path / "weights.safetensors").read_bytes())
+    else:
+        document = json.loads((folder / "model.json").read_text())
+        if damage == "target":
+            del document["target"]
+        else:
+            document["normalisation"]["target_std"] = []
+        (folder / "model.json").write_text(json.dumps(document))
+    with pytest.raises(ModelError, match="pure-lstm") as caught:
+        load_bundle(tmp_path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_velocity_network_is_no_residual_network(tmp_path, velocity_network):
+    velocity_network.save(tmp_path)
+    with pytest.raises(ModelError, match="lateral_velocity"):
+        load_bundle(tmp_path)

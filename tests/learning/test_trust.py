@@ -1,0 +1,342 @@
+"""``pdhef trust``: the rule on errors whose answer is known, and what it writes."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
+from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
+from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.learning.evidence.trust import (
+    MIN_BLOCKS,
+    MIN_EXCITED_S,
+    TRUSTS,
+    BlockErrors,
+    block_errors,
+    decide_cap,
+    join_blocks,
+)
+from pdhef_logtool.learning.evidence.trust_command import (
+    REFUSED,
+    RepeatedNetwork,
+    TrustSettings,
+    errors_by_trust,
+    run_trust,
+    seen_by_identification,
+)
+from pdhef_logtool.learning.noise.tune_drives import MAX_BYTES, DriveBench, TuneSetup
+from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.run.config import RunConfig
+
+PERIOD_NS = 10_000_000
+
+
+def _errors(rmse_deg: list[float], *, spread: float = 0.3, blocks: int = 30, seed: int = 0) -> BlockErrors:
+    """Blocks of 1000 stamps whose mean square at each trust scatters about the given RMSE, each for itself."""
+    rng = np.random.default_rng(seed)
+    scatter = np.exp(rng.normal(0.0, spread, (len(TRUSTS), blocks)))
+    squares = 1000.0 * np.radians(rmse_deg)[:, None] ** 2 * scatter
+    return BlockErrors(squares, np.full(blocks, 1000.0), 10.0 * blocks, 4.0 * blocks)
+
+
+# ---- the rule ----
+
+
+def test_a_network_that_helps_gets_full_trust() -> None:
+    decision = decide_cap(_errors([0.5, 0.4, 0.3, 0.2, 0.1]))
+    assert decision.cap == 1.0
+    assert decision.best_lower == 0.75
+    assert decision.against_zero[-1].high_deg2 < 0.0
+    assert decision.rmse_deg[0] == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_network_that_hurts_gets_none() -> None:
+    decision = decide_cap(_errors([0.2, 0.25, 0.3, 0.4, 0.5]))
+    assert decision.cap == 0.0
+    assert "no gain" in decision.reason
+
+
+def test_too_much_of_a_good_thing_is_capped_at_the_largest_trust_that_gains() -> None:
+    # Full trust is better than none, but half of it is far better.
+    decision = decide_cap(_errors([0.5, 0.3, 0.1, 0.3, 0.4], spread=0.1))
+    assert (decision.cap, decision.best_lower) == (0.5, 0.5)
+    assert decision.against_zero[-1].high_deg2 < 0.0
+    assert "worse than trust 0.5" in decision.reason
+    decision = decide_cap(_errors([0.5, 0.4, 0.6, 0.9, 1.2], spread=0.1))
+    assert decision.cap == 0.25
+    assert "confirmed to be worse" in decision.reason
+
+
+def test_a_gain_within_the_noise_is_never_full_trust() -> None:
+    # Gain of 4 %, scatter of a factor: not confirmed in most draws, and half trust where the mean gains.
+    caps = [decide_cap(_errors([0.50, 0.495, 0.49, 0.485, 0.48], spread=1.2, seed=s)).cap for s in range(40)]
+    assert caps.count(1.0) <= 3
+    assert {0.0, 0.5} <= set(caps)
+
+
+def test_a_network_that_does_nothing_is_rarely_confirmed() -> None:
+    caps = [decide_cap(_errors([0.3] * 5, spread=0.5, seed=s)).cap for s in range(200)]
+    # One side of a 95 % interval is 2.5 %; a percentile interval of 30 blocks is a little narrow.
+    assert caps.count(1.0) <= 12
+
+
+def test_one_block_cannot_confirm_a_gain() -> None:
+    # All of the gain is in a single block of thirty, of which a third of the resamples know nothing.
+    errors = _errors([0.3] * 5, spread=0.0)
+    squares = errors.squares.copy()
+    squares[0, 7] *= 100.0
+    decision = decide_cap(replace(errors, squares=squares))
+    assert decision.against_zero[-1].value_deg2 < 0.0
+    assert decision.cap == 0.5
+    assert "not confirmed" in decision.reason
+
+
+def test_too_little_driving_decides_nothing() -> None:
+    helps = _errors([0.5, 0.4, 0.3, 0.2, 0.1])
+    decision = decide_cap(replace(helps, excited_s=MIN_EXCITED_S - 0.1))
+    assert decision.cap == 0.0
+    assert "19.9 s above 2 m/s²" in decision.reason
+    few = decide_cap(replace(_errors([0.5, 0.4, 0.3, 0.2, 0.1], blocks=MIN_BLOCKS - 1), excited_s=99.0))
+    assert few.cap == 0.5
+    assert math.isnan(few.against_zero[-1].high_deg2)
+    assert "too few to confirm" in few.reason
+    nothing = decide_cap(BlockErrors(np.zeros((5, 0)), np.zeros(0), 0.0, 0.0))
+    assert nothing.cap == 0.0
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    st.lists(st.floats(0.01, 5.0), min_size=5, max_size=5),
+    st.floats(0.0, 1.5),
+    st.integers(1, 40),
+    st.floats(0.0, 400.0),
+    st.integers(0, 1000),
+)
+def test_no_trust_without_a_gain(
+    rmse_deg: list[float], spread: float, blocks: int, excited_s: float, seed: int
+) -> None:
+    errors = replace(_errors(rmse_deg, spread=spread, blocks=blocks, seed=seed), excited_s=excited_s)
+    decision = decide_cap(errors, seed=seed)
+    assert decision.cap in (0.0, 0.25, 0.5, 1.0)
+    at = TRUSTS.index(decision.cap)
+    total = errors.squares.sum(axis=1)
+    if decision.cap > 0.0:
+        assert excited_s >= MIN_EXCITED_S
+        assert total[at] < total[0]
+    if decision.cap == 1.0:
+        assert blocks >= MIN_BLOCKS
+        assert math.sqrt(total[-1]) <= 1.05 * math.sqrt(total[:-1].min()) * (1 + 1e-9)
+    # Units and order of the blocks are of no account, up to the draws.
+    assert decide_cap(errors, seed=seed) == decision
+    worse = replace(errors, squares=np.concatenate([errors.squares[:1], errors.squares[1:] + errors.squares[:1]]))
+    assert decide_cap(worse, seed=seed).cap == 0.0
+
+
+def test_the_bounds_are_those_of_the_bootstrap_of_the_reports() -> None:
+    rng = np.random.default_rng(5)
+    count = 40_000
+    stamps = 10**18 + np.arange(count, dtype=np.int64) * PERIOD_NS
+    errors = rng.normal(0.0, np.linspace(0.01, 0.006, len(TRUSTS))[:, None], (len(TRUSTS), count))
+    blocks = block_errors(errors, np.zeros(count), stamps, np.ones(count, dtype=np.bool_))
+    assert blocks.squares.shape == (len(TRUSTS), 39)  # 399.99 s: not one block may be shorter than 10 s
+    decision = decide_cap(blocks)
+    other = block_bootstrap_difference(errors[-1], errors[0], stamps, n=4000)
+    # That of RMSE(1) − RMSE(0) times their sum is that of the difference of squares.
+    factor = math.degrees(1.0) * (decision.rmse_deg[0] + decision.rmse_deg[-1])
+    assert decision.against_zero[-1].value_deg2 == pytest.approx(other.value * factor, rel=1e-9)
+    width = decision.against_zero[-1].high_deg2 - decision.against_zero[-1].low_deg2
+    assert width == pytest.approx((other.high - other.low) * factor, rel=0.2)
+
+
+def test_blocks_hold_every_scored_stamp_once_and_none_is_short() -> None:
+    rng = np.random.default_rng(2)
+    count = 3_700
+    stamps = 10**18 + np.arange(count, dtype=np.int64) * PERIOD_NS
+    errors = rng.normal(0.0, 0.01, (len(TRUSTS), count))
+    errors[:, 500:900] = np.nan  # no truth
+    excited = np.arange(count) < 1000
+    blocks = block_errors(errors, np.zeros(count), stamps, excited)
+    assert blocks.counts.sum() == 3300
+    assert blocks.counts.shape == (3,)
+    np.testing.assert_allclose(blocks.squares.sum(axis=1), np.nansum(errors**2, axis=1))
+    assert blocks.scored_s == pytest.approx(33.0)
+    assert blocks.excited_s == pytest.approx(6.0)
+    short = block_errors(errors[:, :400], np.zeros(400), stamps[:400], excited[:400])
+    assert short.counts.tolist() == [400.0]
+    both = join_blocks([blocks, short])
+    assert both.counts.sum() == 3700
+    assert both.scored_s == pytest.approx(37.0)
+
+
+def test_leaving_hard_stamps_out_gains_nothing() -> None:
+    count = 2000
+    stamps = 10**18 + np.arange(count, dtype=np.int64) * PERIOD_NS
+    errors = np.full((len(TRUSTS), count), 0.01)
+    errors[0, :100] = 0.05
+    truth = np.full(count, 0.03)
+    errors[-1, :200] = np.nan
+    blocks = block_errors(errors, truth, stamps, np.ones(count, dtype=np.bool_))
+    assert blocks.lost == 200
+    assert blocks.squares[-1].sum() == pytest.approx(100 * 0.05**2 + 100 * 0.03**2 + 1800 * 0.01**2)
+    # Where physics alone has no estimate nothing is compared.
+    errors[0, -500:] = np.nan
+    assert block_errors(errors, truth, stamps, np.ones(count, dtype=np.bool_)).counts.sum() == 1500
+
+
+# ---- the command ----
+
+
+def _bundle(seed: int = 0) -> ModelBundle:
+    torch.manual_seed(seed)
+    n = len(FEATURES)
+    network = ResidualNetwork(Architecture(n, 8, 1, (4,)))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
+
+
+def _settings(sample_logs_dir: Path, folder: Path, **changes: object) -> TrustSettings:
+    _bundle().save(folder / "model")
+    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=folder / "model")
+    return replace(TrustSettings(config), **changes)  # type: ignore[arg-type]
+
+
+def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle, bundle = load_vehicle(sample_logs_dir / "vehicle.toml"), _bundle()
+    bench = DriveBench(TuneSetup(RunConfig(), vehicle, None, bundle, ()))
+    bench.load(0, find_logs([str(sample_logs_dir / "dlc.mcap")])[0], MAX_BYTES)
+    signals, truth = bench.take(0)
+    passes = []
+    run = NetworkService.run
+    monkeypatch.setattr(NetworkService, "run", lambda *a: passes.append(1) or run(*a))
+    blocks = errors_by_trust(vehicle, RepeatedNetwork(bundle, {}), signals, truth, use_speed=True)
+    assert len(passes) == 1
+    for row, trust in zip(blocks.squares, TRUSTS, strict=True):
+        hybrid = adaptive_hybrid_ukf(vehicle, NetworkService(bundle), trust=trust)
+        estimator = hybrid if trust > 0.0 else CautiousPhysics(strongest_physics(vehicle))
+        track = estimator.run(signals, None)[0]
+        error = signal_error(track, truth, "sideslip_rad", vehicle.low_speed_blend_m_s)
+        assert row.sum() == pytest.approx(np.nansum(error**2), rel=1e-12)
+    assert len({float(row.sum()) for row in blocks.squares}) == len(TRUSTS)
+    assert 0.0 < blocks.excited_s < blocks.scored_s
+
+
+def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir: Path, tmp_path: Path) -> None:
+    source = tmp_path / "car.toml"
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    source.write_text("# A head.\n" + text.replace("track_m = 1.57", "track_m = 1.57  # measured"))
+    assert "# measured" in source.read_text()
+    options = _settings(sample_logs_dir, tmp_path)
+    options = replace(options, config=replace(options.config, vehicle=source))
+    logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "no_truth")]
+    told: list[str] = []
+    result = run_trust(logs, tmp_path / "trusted.toml", options, warn=told.append)
+    assert result.exit_code == 3
+    assert any(line.startswith("no_truth is left out") for line in told)
+    before, after = load_vehicle(source), load_vehicle(tmp_path / "trusted.toml")
+    assert after.model_copy(update={"network": before.network}) == before
+    assert after.network == result.network
+    assert after.network.model_sha256 == _bundle().sha256
+    assert after.network.trust_cap == result.decision.cap
+    assert after.network.has_evidence
+    for figure in (f"{result.decision.rmse_deg[0]:.3f}°", f"{result.decision.rmse_deg[4]:.3f}°", "2 drives"):
+        assert figure in after.network.evidence
+    written = (tmp_path / "trusted.toml").read_text()
+    assert written.startswith("# A head.")
+    assert "# measured" in written
+    record = json.loads((tmp_path / "trusted.trust.json").read_text())
+    assert record["trust_cap"] == result.decision.cap
+    assert [d["name"] for d in record["drives"]] == ["dlc", "step"]
+    assert record["drives"][0]["sha256"]
+    assert record["model_sha256"] == _bundle().sha256
+    # Once more, onto itself: the old evidence is replaced.
+    again = replace(options, config=replace(options.config, vehicle=tmp_path / "trusted.toml"))
+    run_trust(logs[:2], tmp_path / "trusted.toml", again)
+    assert (tmp_path / "trusted.toml").read_text() == written
+
+
+def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "set").mkdir()
+    entries = []
+    for name, split in (("dlc", "train"), ("step", "test")):
+        shutil.copy(sample_logs_dir / f"{name}.mcap", tmp_path / "set")
+        entries.append({"file": f"{name}.mcap", "split": split})
+    (tmp_path / "set" / "manifest.json").write_text(json.dumps({"drives": entries}))
+    logs = find_logs([str(tmp_path / "set")])
+    options = TrustSettings(RunConfig())
+    with pytest.raises(UsageError, match=r"dlc \(train\).*--split test"):
+        choose_drives(logs, options, REFUSED)
+    with pytest.raises(UsageError, match="drives of split extrapolation, got drives of test, train"):
+        choose_drives(logs, replace(options, split="extrapolation"), REFUSED)
+    assert [i.stem for i in choose_drives(logs, replace(options, split="test"), REFUSED)[0]] == ["step"]
+    assert [i.stem for i in choose_drives(logs, replace(options, any_split=True), REFUSED)[0]] == ["dlc", "step"]
+
+
+def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:
+    vehicle = load_vehicle(sample_logs_dir / "vehicle.toml")
+    bench = DriveBench(TuneSetup(RunConfig(), vehicle, None, None, ()))
+    facts = bench.load(0, find_logs([str(sample_logs_dir / "dlc.mcap")])[0], MAX_BYTES)
+    spans: dict[str, str | float | int | list[str]] = {"drives": ["dlc: 0.00 to 7.00 s", "dlc_2: 0.00 to 7.00 s"]}
+    assert seen_by_identification(vehicle, [facts]) == []
+    identified = vehicle.model_copy(update={"identification": spans})
+    told = seen_by_identification(identified, [facts])
+    assert len(told) == 1
+    assert "dlc: 0.00 to 7.00 s" in told[0]
+    assert len(seen_by_identification(identified, [facts], 6.9)) == 1
+    assert seen_by_identification(identified, [facts], 7.0) == []
+
+
+def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -> None:
+    options = _settings(sample_logs_dir, tmp_path)
+    log = [str(sample_logs_dir / "dlc.mcap")]
+    wrong = [
+        (replace(options, config=replace(options.config, vehicle=None)), "a vehicle file"),
+        (replace(options, config=replace(options.config, model=Path("none"))), "a model bundle"),
+        (replace(options, seed=-1), "seed"),
+    ]
+    for one, message in wrong:
+        with pytest.raises(UsageError, match=message):
+            run_trust(log, tmp_path / "out.toml", one)
+    with pytest.raises(UsageError, match=r"\.toml"):
+        run_trust(log, tmp_path / "out.txt", options)
+    with pytest.raises(EstimatorError, match="at least one drive with a true sideslip"):
+        run_trust([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "out.toml", options)
+    assert not (tmp_path / "out.toml").exists()
+
+
+def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Path) -> None:
+    _bundle().save(tmp_path / "model")
+    words = [sys.executable, "-m", "pdhef_logtool", "trust", str(sample_logs_dir / "dlc.mcap"),
+             "-v", str(sample_logs_dir / "vehicle.toml"), "--model", str(tmp_path / "model"),
+             "-o", str(tmp_path / "car.toml")]  # fmt: skip
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    shown = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    assert shown.returncode == 0, shown.stderr
+    # A double lane change is over too soon to decide on.
+    assert "trust cap 0: too little to decide on" in shown.stdout
+    done = subprocess.run([*words, "--json"], capture_output=True, text=True, check=False, env=environment)
+    document = json.loads(done.stdout)
+    assert document["trust_cap"] == 0.0
+    assert document["trusts"] == list(TRUSTS)
+    assert document["against_trust_0"][4]["low_deg2"] is None
+    assert load_vehicle(tmp_path / "car.toml").network.evidence == document["evidence"]

@@ -1,0 +1,196 @@
+"""A single-track car in plain Python, written from METHOD's equations, and drives of it for the estimator tests.
+
+It shares nothing with ``pdhef_logtool.car.nominal_model``: it is what the compiled model is compared with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from pdhef_logtool.records.signals import Signals
+
+MASS_KG, YAW_INERTIA, FRONT_M, REAR_M = 1440.0, 1523.0, 1.16, 1.71
+WHEELBASE_M = FRONT_M + REAR_M
+#: B, C, D in N at friction 1, E.
+FRONT_TYRE = (12.3, 1.41, 7600.0, 0.30)
+REAR_TYRE = (15.4, 1.17, 6110.0, 0.20)
+FRICTION = 0.85
+START_NS = 1_600_000_000_000_000_000
+
+Force = Callable[[float, float, bool], float]
+
+
+def magic_tyre(alpha: float, mu: float, front: bool) -> float:
+    """Eq 3, axle force in N."""
+    b, c, d, e = FRONT_TYRE if front else REAR_TYRE
+    inner = b * alpha - e * (b * alpha - math.atan(b * alpha))
+    return mu * d * math.sin(c * math.atan(inner))
+
+
+def tanh_tyre(alpha: float, mu: float, front: bool) -> float:
+    """Another tyre than the estimators assume: stiffness independent of friction, softer approach to the peak."""
+    stiffness = 105_000.0 if front else 96_000.0
+    peak = mu * MASS_KG * 9.81 * (REAR_M if front else FRONT_M) / WHEELBASE_M
+    return peak * math.tanh(stiffness * alpha / peak)
+
+
+def forces(vx: float, vy: float, r: float, steer: float, mu: float, tyre: Force = magic_tyre) -> tuple[float, float]:
+    """Lateral acceleration and yaw acceleration of Eq 1, 2."""
+    alpha_f = steer - math.atan((vy + FRONT_M * r) / vx)
+    alpha_r = -math.atan((vy - REAR_M * r) / vx)
+    front = tyre(alpha_f, mu, True) * math.cos(steer)
+    rear = tyre(alpha_r, mu, False)
+    return (front + rear) / MASS_KG, (FRONT_M * front - REAR_M * rear) / YAW_INERTIA
+
+
+def derivative(s: np.ndarray, steer: float, ax: float, mu: float, tyre: Force = magic_tyre) -> np.ndarray:
+    """d/dt of [v_x, v_y, r] above the low-speed blend."""
+    vx, vy, r = s
+    ay, r_dot = forces(vx, vy, r, steer, mu, tyre)
+    return np.array([ax + vy * r, ay - vx * r, r_dot])
+
+
+def runge_kutta(
+    s: np.ndarray, steer: float, ax: float, mu: float, dt: float, n: int = 1, tyre: Force = magic_tyre
+) -> np.ndarray:
+    h = dt / n
+    for _ in range(n):
+        k1 = derivative(s, steer, ax, mu, tyre)
+        k2 = derivative(s + h / 2 * k1, steer, ax, mu, tyre)
+        k3 = derivative(s + h / 2 * k2, steer, ax, mu, tyre)
+        k4 = derivative(s + h * k3, steer, ax, mu, tyre)
+        s = s + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return s
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Signals and the true state at their stamps."""
+
+    signals: Signals
+    vx: np.ndarray
+    vy: np.ndarray
+    r: np.ndarray
+    ay: np.ndarray
+
+    @property
+    def time_s(self) -> np.ndarray:
+        return (self.signals.stamps_ns - self.signals.stamps_ns[0]) * 1e-9
+
+    @property
+    def sideslip(self) -> np.ndarray:
+        return np.arctan2(self.vy, self.vx)
+
+
+def make_signals(dt: np.ndarray, delay_ns: int | np.ndarray = 0, **columns: np.ndarray) -> Signals:
+    """Columns on stamps that start at START_NS and are ``dt`` apart; what is not given is missing."""
+    stamps = START_NS + np.concatenate([[0], np.cumsum(np.round(dt * 1e9).astype(np.int64))])
+    n = len(stamps)
+    names = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
+    return Signals(
+        stamps_ns=stamps,
+        ready_ns=np.maximum.accumulate(stamps + delay_ns),
+        wheel_speed_m_s=np.full((n, 4), np.nan),
+        available=frozenset(columns),
+        **{c: np.array(columns.get(c, np.full(n, np.nan)), dtype=float) for c in names},
+    )
+
+
+def drive(
+    steer: Callable[[float], float],
+    duration_s: float = 10.0,
+    speed: float = 25.0,
+    acceleration: Callable[[float], float] = lambda _t: 0.0,
+    *,
+    step_s: float | np.ndarray = 0.01,
+    mu: float = FRICTION,
+    tyre: Force = magic_tyre,
+    speed_every: int = 2,
+    delay_ns: int | np.ndarray = 0,
+) -> Drive:
+    """Drive with inputs that are held from stamp to stamp, noise-free sensors at the centre of gravity."""
+    dt = np.full(round(duration_s / step_s), step_s) if np.isscalar(step_s) else np.asarray(step_s)
+    dt = np.round(dt * 1e9) * 1e-9
+    n = len(dt) + 1
+    t = np.concatenate([[0.0], np.cumsum(dt)])
+    state = np.zeros((n, 3))
+    state[0, 0] = speed
+    delta, ax, ay = np.empty(n), np.empty(n), np.empty(n)
+    for k in range(n):
+        delta[k] = steer(t[k])
+        ax[k] = acceleration(t[k]) - state[k, 1] * state[k, 2]  # the driver holds the speed
+        ay[k] = forces(*state[k], delta[k], mu, tyre)[0]
+        if k + 1 < n:
+            state[k + 1] = runge_kutta(state[k], delta[k], ax[k], mu, dt[k], 2, tyre)
+    measured_speed = np.where(np.arange(n) % speed_every == 0, state[:, 0], np.nan)
+    signals = make_signals(
+        dt,
+        delay_ns,
+        steer_rad=delta,
+        ax_m_s2=ax,
+        ay_m_s2=ay,
+        yaw_rate_rad_s=state[:, 2],
+        speed_m_s=measured_speed,
+    )
+    return Drive(signals, state[:, 0], state[:, 1], state[:, 2], ay)
+
+
+def rolling_drive(
+    speed: Callable[[np.ndarray], np.ndarray], steer: Callable[[np.ndarray], np.ndarray], duration_s: float
+) -> Drive:
+    """Drive at parking speed, where wheels roll without slip: r = v tan δ / L, v_y = l_r r; 100 Hz."""
+    n = round(duration_s * 100) + 1
+    t = np.arange(n) * 0.01
+    v, delta = speed(t), steer(t)
+    r = v * np.tan(delta) / WHEELBASE_M
+    vy = REAR_M * r
+    ay = np.gradient(vy, t) + v * r
+    signals = make_signals(
+        np.full(n - 1, 0.01),
+        steer_rad=delta,
+        ax_m_s2=np.gradient(v, t) - vy * r,
+        ay_m_s2=ay,
+        yaw_rate_rad_s=r,
+        speed_m_s=np.where(np.arange(n) % 2 == 0, v, np.nan),
+    )
+    return Drive(signals, v, vy, r, ay)
+
+
+def slalom(amplitude: float = 0.03, frequency_hz: float = 0.4) -> Callable[[float], float]:
+    return lambda t: amplitude * math.sin(2 * math.pi * frequency_hz * t)
+
+
+def with_noise(signals: Signals, seed: int, scale: float = 1.0) -> Signals:
+    """Add the sensor noise of METHOD §9 (Gaussian)."""
+    rng = np.random.default_rng(seed)
+    n = len(signals)
+
+    def noisy(column: np.ndarray, std: float) -> np.ndarray:
+        return column + scale * std * rng.standard_normal(n)
+
+    return replace(
+        signals,
+        steer_rad=noisy(signals.steer_rad, 0.0008),
+        ax_m_s2=noisy(signals.ax_m_s2, 0.12),
+        ay_m_s2=noisy(signals.ay_m_s2, 0.12),
+        yaw_rate_rad_s=noisy(signals.yaw_rate_rad_s, 0.004),
+        speed_m_s=noisy(signals.speed_m_s, 0.08),
+    )
+
+
+def cut(signals: Signals, first: int, end: int) -> Signals:
+    """The window [first, end) of aligned signals."""
+    return replace(
+        signals, **{f.name: getattr(signals, f.name)[first:end] for f in fields(signals) if f.name != "available"}
+    )
+
+
+def keep(signals: Signals, mask: np.ndarray) -> Signals:
+    """Only the stamps of ``mask``: a recorder that lost the others."""
+    return replace(
+        signals, **{f.name: getattr(signals, f.name)[mask] for f in fields(signals) if f.name != "available"}
+    )

@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import datetime as dt
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.run.config import RunConfig, load_config, parse_time, time_slice
+
+START = 1_700_000_000_000_000_000
+END = START + 300_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("12.5", START + 12_500_000_000),
+        ("+10s", START + 10_000_000_000),
+        ("0", START),
+        ("end", END),
+        ("end-5s", END - 5_000_000_000),
+        ("end - 0.25", END - 250_000_000),
+        ("1700000000123456789", 1_700_000_000_123_456_789),
+        ("2023-11-14T22:13:20Z", START),
+        ("2023-11-14T22:13:20.5+00:00", START + 500_000_000),
+        ("2023-11-14T23:13:20+01:00", START),
+        ("2023-11-14T22:13:20", START),
+    ],
+)
+def test_times_as_users_write_them(text: str, expected: int) -> None:
+    assert parse_time(text, START, END, option="--start") == expected
+
+
+@pytest.mark.parametrize("text", ["", "abc", "-5", "10m", "end+5", "2023-13-01T00:00:00Z", "nan", "1e3"])
+def test_other_times_are_refused_with_the_option(text: str) -> None:
+    with pytest.raises(UsageError, match=r"--end.*2026-01-31T12:00:00Z"):
+        parse_time(text, START, END, option="--end")
+
+
+@settings(derandomize=True)
+@given(st.datetimes(dt.datetime(1971, 1, 1), dt.datetime(2200, 1, 1)))
+def test_rfc_3339_is_exact_to_the_microsecond(when: dt.datetime) -> None:
+    microseconds = (when - dt.datetime(1970, 1, 1)) // dt.timedelta(microseconds=1)
+    assert parse_time(when.isoformat() + "Z", 0, 0, option="--start") == microseconds * 1000
+
+
+def test_slice_is_cut_to_the_log() -> None:
+    assert time_slice(RunConfig(start="10", end="end-10s"), START, END) == (START + 10**10, END - 10**10)
+    assert time_slice(RunConfig(), START, END) == (START, END)
+    assert time_slice(RunConfig(end="1e9".replace("e9", "000")), START, END) == (START, END)
+
+
+@pytest.mark.parametrize(("start", "end"), [("400", None), ("20", "10"), ("10", "10"), (None, "1000000000000000")])
+def test_empty_slice_is_a_usage_error(start: str | None, end: str | None) -> None:
+    with pytest.raises(UsageError, match="300"):
+        time_slice(RunConfig(start=start, end=end), START, END)
+
+
+def test_flags_win_over_file_and_paths_are_relative_to_it(tmp_path: Path) -> None:
+    file = tmp_path / "pdhef.toml"
+    file.write_text('estimators = ["zero", "gyro"]\nvehicle = "car.toml"\nannotate = "sidecar"\nstart = 10\n')
+    config = load_config(file, {"annotate": "none", "mapping": None})
+    assert config.estimators == ("zero", "gyro")
+    assert config.vehicle == tmp_path / "car.toml"
+    assert config.annotate == "none"
+    assert config.start == "10"
+    assert config.mapping is None
+
+
+def test_file_of_the_working_directory_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "pdhef.toml").write_text('sensors = "esp"\n')
+    monkeypatch.chdir(tmp_path)
+    assert load_config(None, {}).sensors == "esp"
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('estimater = ["zero"]', "estimater"),
+        ('estimators = ["zero", "ukf"]', "ukf"),
+        ('estimators = ["zero", "zero"]', "zero"),
+        ("estimators = []", "none"),
+        ('annotate = "all"', "all"),
+        ("window_s = 0.1", "0.1"),
+        ("start = soon", "TOML"),
+        ('end = "later"', "later"),
+    ],
+)
+def test_wrong_files_name_what_is_wrong(tmp_path: Path, text: str, named: str) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text(text)
+    with pytest.raises(UsageError, match=named):
+        load_config(file, {})
+
+
+def test_missing_file_is_a_usage_error(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"none\.toml"):
+        load_config(tmp_path / "none.toml", {})
+
+
+def test_configuration_in_outputs_holds_no_folders(tmp_path: Path) -> None:
+    document = RunConfig(vehicle=tmp_path / "car.toml").to_dict()
+    assert document["vehicle"] == "car.toml"
+    assert str(tmp_path) not in str(document)
+
+
+def test_words_that_stand_for_files_stay_words(tmp_path: Path) -> None:
+    file = tmp_path / "pdhef.toml"
+    file.write_text('model = "none"\ncalibration = "unsure"\nvehicle = "none"\n')
+    config = load_config(file, {})
+    assert (config.model, config.calibration) == (Path("none"), Path("unsure"))
+    assert config.vehicle == tmp_path / "none"

@@ -1,0 +1,193 @@
+"""The condition table from simulation to page on a tiny row, and the error budget's drives against the logs."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+import torch
+
+from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.estimators.registry import make_estimator
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from studies import conditions, fixed_grid
+from studies.condition_drives import bin_masks, read_drive, told
+from studies.conditions_page import choose_fixed
+from studies.error_budget import causes_of, drive_again, fit_vehicle, without
+from truthsim.vehicle_choice import choose_vehicle
+
+NAMES = "zero,phy-ukf,pd-hef-fixed-r"
+ROWS = ("in-domain", "friction-plus-20", "gyro-dropped")
+
+
+@pytest.fixture(scope="module")
+def vehicle(sample_logs_dir: Path) -> VehicleParameters:
+    return load_vehicle(sample_logs_dir / "vehicle.toml")
+
+
+def _bundle() -> ModelBundle:
+    """Return a network that knows nothing but says something."""
+    torch.manual_seed(0)
+    network = ResidualNetwork(Architecture(len(FEATURES), 8, 1, (4,)))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    scale = Normalisation((0.0,) * len(FEATURES), (10.0,) * len(FEATURES), (1.0, 1.0))
+    return ModelBundle(FEATURES, 8, 1, (4,), 0.01, scale, weights)
+
+
+def _make(work: Path) -> int:
+    arguments = ["--drives", "2", "--rows", ",".join(ROWS), "--jobs", "1", "--calibration-drives", "1"]
+    arguments += ["--budget-drives", "1", "--estimators", NAMES, "--model", str(work / "model")]
+    return conditions.main([*arguments, "--work", str(work / "work"), "--out", str(work / "docs")])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    work = tmp_path_factory.mktemp("conditions")
+    _bundle().save(work / "model")
+    assert _make(work) == 0
+    return work
+
+
+def _drives(folder: Path) -> tuple[Path, dict[str, Any]]:
+    found = next((folder / "work").glob("drives-1-2*"))
+    return found, json.loads((found / "manifest.json").read_text(encoding="utf-8"))
+
+
+def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(made, vehicle):
+    page = (made / "docs" / "conditions.md").read_text(encoding="utf-8")
+    assert all(f"| {row} |" in page for row in ROWS)
+    assert "nan" not in page
+    folder, manifest = _drives(made)
+    squares, count = 0.0, 0
+    for entry in manifest["drives"]:
+        if entry["row"] == "in-domain":
+            drive = read_drive(folder / entry["file"], vehicle, "x")
+            track, _ = make_estimator("zero", vehicle).run(drive.signals, None)
+            truth = drive.truth
+            scored = track.valid & (np.hypot(truth.vx_m_s, truth.vy_m_s) > vehicle.low_speed_blend_m_s)
+            squares += float(np.sum(truth.sideslip_rad[scored] ** 2))  # the error of sideslip 0
+            count += int(scored.sum())
+    table = pl.read_parquet(made / "docs" / "conditions" / "sideslip.parquet")
+    row = table.filter((pl.col("row") == "in-domain") & (pl.col("estimator") == "zero"))
+    assert row["pooled_deg"][0] == pytest.approx(math.degrees(math.sqrt(squares / count)), rel=1e-6)
+
+
+def test_wrong_friction_reaches_the_model_and_nothing_else(made):
+    metrics = pl.read_parquet(made / "docs" / "conditions" / "metrics.parquet").filter(
+        (pl.col("metric") == "rmse") & (pl.col("signal") == "sideslip_rad") & (pl.col("segment") == "low")
+    )
+
+    def of(row: str, estimator: str) -> list[float]:
+        chosen = metrics.filter((pl.col("row") == row) & (pl.col("estimator") == estimator)).sort("drive")
+        return chosen["value"].to_list()
+
+    # The bins are those of the true friction, so that what ignores friction scores the same in each of them.
+    assert of("in-domain", "zero") == of("friction-plus-20", "zero")
+    assert of("in-domain", "phy-ukf") != of("friction-plus-20", "phy-ukf")
+
+
+def test_a_second_call_computes_nothing_and_writes_the_same(made, monkeypatch):
+    page = (made / "docs" / "conditions.md").read_bytes()
+    monkeypatch.setattr("studies.condition_runs._run", lambda *_: pytest.fail("a kept row was computed again"))
+    assert _make(made) == 0
+    assert (made / "docs" / "conditions.md").read_bytes() == page
+
+
+def test_a_drive_made_again_is_that_of_the_log(made, vehicle):
+    folder, manifest = _drives(made)
+    for entry in manifest["drives"][::2]:
+        run = drive_again(entry)
+        case = without(run, None, vehicle, {}, vehicle)
+        logged = read_drive(folder / entry["file"], vehicle, "x")
+        for f in fields(Signals):
+            ours, theirs = getattr(case.signals, f.name), getattr(logged.signals, f.name)
+            if f.name == "available":
+                assert ours == theirs
+            else:
+                # The log rounds friction to 2^-24.
+                np.testing.assert_allclose(ours.astype(float), theirs.astype(float), rtol=0, atol=1e-7)
+        np.testing.assert_allclose(case.drive.truth.vy_m_s, logged.truth.vy_m_s, rtol=0, atol=1e-6)
+
+
+def test_each_cause_takes_away_its_own_error_alone(made, vehicle):
+    _, manifest = _drives(made)
+    run = drive_again(manifest["drives"][0])
+    base = without(run, None, vehicle, {}, vehicle)
+    planar = np.interp(
+        (base.signals.stamps_ns - base.signals.stamps_ns[0]) * 1e-9, run.motion.times_s, run.motion.column("ay_m_s2")
+    )
+    error = {}
+    for cause in (None, "bias", "noise", "tilt", "all"):
+        signals = without(run, cause, vehicle, {}, vehicle).signals
+        error[cause] = signals.ay_m_s2 - planar
+    assert error["noise"].std() < error[None].std()
+    smooth = np.ones(100) / 100
+    assert (
+        np.abs(np.convolve(error["tilt"], smooth, "valid")).max()
+        < np.abs(np.convolve(error[None], smooth, "valid")).max()
+    )
+    assert np.abs(error["all"]).max() < 1e-3  # quantisation of the accelerometer
+    # The draws of one error do not move when another is taken away.
+    np.testing.assert_allclose(np.diff(error["bias"] - error[None]), 0.0, atol=2e-3)
+    delay = without(run, "delay", vehicle, {}, vehicle).signals
+    assert (delay.ready_ns - delay.stamps_ns).max() < (base.signals.ready_ns - base.signals.stamps_ns).min()
+
+
+def test_causes_follow_the_row(made):
+    _, manifest = _drives(made)
+    by_row = {e["row"]: drive_again(e).spec for e in manifest["drives"]}
+    assert "fault" in causes_of(by_row["gyro-dropped"], {})
+    assert "fault" not in causes_of(by_row["in-domain"], {})
+    assert "told" in causes_of(by_row["in-domain"], {"friction": "unknown"})
+
+
+def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(made, vehicle):
+    car = choose_vehicle("sedan,mass=1.2,stiffness=0.85")
+    fitted = fit_vehicle(car, 0.3, vehicle)
+    assert fitted.mass_kg == pytest.approx(1.2 * 1440.0)
+    soft = fitted.cornering_stiffness_n_per_rad(True, 0.3)
+    stiff = fit_vehicle(choose_vehicle("sedan,mass=1.2"), 0.3, vehicle).cornering_stiffness_n_per_rad(True, 0.3)
+    assert soft / stiff == pytest.approx(0.85, rel=0.08)
+
+
+def test_told_and_bins(made, vehicle):
+    folder, manifest = _drives(made)
+    drive = read_drive(folder / manifest["drives"][0]["file"], vehicle, "x")
+    assert np.isnan(told(drive, {"friction": "unknown"}).friction).all()
+    np.testing.assert_allclose(told(drive, {"friction_factor": 0.8}).friction, 0.8 * drive.friction)
+    with pytest.raises(ValueError, match="expected"):
+        told(drive, {"weather": "rain"})
+    masks = bin_masks(drive)
+    assert (sum(masks[b].astype(int) for b in ("low", "middle", "high")) == 1).all()
+
+
+def test_a_point_of_the_grid_is_the_estimator_with_that_setting(made, vehicle):
+    folder, manifest = _drives(made)
+    drive = read_drive(folder / manifest["drives"][0]["file"], vehicle, "x")
+    base = make_estimator(fixed_grid.BASE, vehicle, model=_bundle())
+    whole, _ = base.run(drive.signals, None)
+    rate, _, _ = base.residual_rate(drive.signals, None)
+    shared, _ = fixed_grid.at(base, fixed_grid.Setting(1.0, 1.0, 1.0)).filter.run(drive.signals, None, rate)
+    np.testing.assert_array_equal(whole.vy_m_s, shared.vy_m_s)
+
+
+def test_the_best_fixed_setting_is_that_of_the_least_geometric_mean():
+    rows = [("r1", "a", 1.0), ("r2", "a", 4.0), ("r1", "b", 3.0), ("r2", "b", 3.0)]
+    table = pl.DataFrame(
+        [(r, "d", f"fixed({s})", "sideslip_rad", "all", "rmse", v, "rad", 10) for r, s, v in rows],
+        schema=["row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n"],
+        orient="row",
+    )
+    chosen = choose_fixed(table)
+    assert chosen is not None
+    assert chosen.name == "fixed(a)"
+    assert dict(chosen.ranking)["fixed(a)"] == pytest.approx(2.0)

@@ -1,0 +1,83 @@
+"""The condition table's maths against closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from studies.table_maths import (
+    geometric_mean,
+    interval_score,
+    median_ratio,
+    percentiles,
+    pooled_mean,
+    pooled_ratio,
+    pooled_rmse,
+    verdict,
+)
+
+
+def test_pooling_equals_the_rmse_of_all_samples_together():
+    rng = np.random.default_rng(1)
+    drives = [rng.normal(0.0, s, n) for s, n in ((1.0, 50), (3.0, 7), (0.2, 400))]
+    rmse = np.array([np.sqrt(np.mean(d**2)) for d in drives] + [np.nan])
+    samples = np.array([len(d) for d in drives] + [0.0])
+    together = np.concatenate(drives)
+    assert pooled_rmse(rmse, samples) == pytest.approx(np.sqrt(np.mean(together**2)), rel=1e-12)
+    means = np.array([d.mean() for d in drives] + [np.nan])
+    assert pooled_mean(means, samples) == pytest.approx(together.mean(), rel=1e-9)
+
+
+def test_percentiles_of_eleven_equal_steps_and_of_nothing():
+    assert percentiles(np.array([*range(11), np.nan], dtype=float)) == pytest.approx((1.0, 5.0, 9.0))
+    assert np.isnan(percentiles(np.array([np.nan]))).all()
+
+
+def test_geometric_mean_of_a_geometric_series_is_its_middle():
+    assert geometric_mean(2.0 ** np.arange(9)) == pytest.approx(16.0)
+    assert np.isnan(geometric_mean(np.array([1.0, 0.0])))
+
+
+def test_a_constant_ratio_has_no_spread_however_much_the_drives_differ():
+    # A bootstrap that drew the two sides apart would show the drives' spread here.
+    other = np.random.default_rng(2).lognormal(0.0, 2.0, 30)
+    for bound in (median_ratio(0.8 * other, other), pooled_ratio(0.8 * other, other, *np.full((2, 30), 100.0))):
+        assert (bound.value, bound.low, bound.high) == pytest.approx((0.8, 0.8, 0.8))
+        assert bound.drives == 30
+        assert verdict(bound) == "better"
+
+
+def test_the_bound_of_a_pooled_ratio_has_the_width_of_its_normal_limit():
+    # Squares 1 + 0.1 z against exactly 1: the ratio of roots has the standard deviation 0.05 / sqrt(N) to first order.
+    rng = np.random.default_rng(3)
+    n = 400
+    squares = 1.0 + 0.1 * rng.standard_normal(n)
+    bound = pooled_ratio(np.sqrt(squares), np.ones(n), *np.full((2, n), 10.0))
+    expected = 2.0 * 1.96 * 0.05 * squares.std() / 0.1 / np.sqrt(n)
+    assert bound.high - bound.low == pytest.approx(expected, rel=0.1)
+
+
+def test_drives_that_one_side_lacks_count_on_neither():
+    bound = median_ratio(np.array([1.0, 100.0, 1.0]), np.array([2.0, np.nan, 2.0]))
+    assert (bound.value, bound.drives) == (0.5, 2)
+    assert np.isnan(median_ratio(np.array([1.0]), np.array([2.0])).low)
+
+
+@pytest.mark.parametrize(
+    ("ratio", "word"), [(0.9, "better"), (1.02, "not worse"), (1.2, "worse")], ids=["better", "not worse", "worse"]
+)
+def test_verdicts(ratio, word):
+    assert verdict(median_ratio(np.full(5, ratio), np.ones(5))) == word
+
+
+def test_verdict_is_open_when_the_drives_disagree():
+    assert verdict(median_ratio(np.array([0.5, 2.0, 0.4, 2.5, 1.0]), np.ones(5))) == "open"
+
+
+def test_interval_score_of_a_gaussian_is_least_for_the_true_sigma_and_as_in_theory():
+    error = np.random.default_rng(4).standard_normal(400_000)
+    at = {s: float(np.mean(interval_score(error, np.full_like(error, s)))) for s in (0.7, 1.0, 1.4)}
+    # E[S] = 2 φ(z) · 2 / α for the true quantiles.
+    assert at[1.0] == pytest.approx(2.0 * norm.pdf(1.959963984540054) * 2.0 / 0.05, rel=0.01)
+    assert at[1.0] < min(at[0.7], at[1.4])
