@@ -22,7 +22,7 @@ def blocks(page: str) -> dict[str, str]:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("truthsim_docs", ROOT / "benchmarks" / "truthsim_docs.py")
+    spec = importlib.util.spec_from_file_location("truthsim_docs", ROOT / "studies" / "truthsim_docs.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, "truthsim_docs", module)
