@@ -22,14 +22,14 @@ from typing import Any
 
 import polars as pl
 import pyarrow.parquet as pq
+from pdhef_logtool.estimators.registry import make_estimator, runnable
 
 from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.estimators.registry import make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow, signal_error, summarise_errors
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
-from pdhef_logtool.sinks.base import PendingFile
 from pdhef_logtool.watches.intervals import Calibration, find_calibration
 from studies import error_budget, fixed_grid
 from studies.condition_drives import SIDESLIP, read_drive, run_and_score, told

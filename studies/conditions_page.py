@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-
 from pdhef_logtool.estimators.registry import NOT_CAUSAL
+
+from pdhef_logtool.records.files import PendingFile, write_bytes
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.sinks.base import PendingFile, write_bytes
 from studies import fixed_grid
 from studies.condition_drives import BIN_LEAST_S, BINS, NONLINEAR, SIDESLIP
 from studies.error_budget import CAUSES

@@ -22,13 +22,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator, runnable
+from pdhef_logtool.estimators.trust_policy import allowed_trust
 
 from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle
 from pdhef_logtool.drive.windows import DriveReader, plan_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator, runnable
-from pdhef_logtool.estimators.trust_policy import allowed_trust
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference, block_bootstrap_interval
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive
@@ -37,12 +37,12 @@ from pdhef_logtool.learning.evidence.trust_command import errors_by_trust
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import FloatArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.run.config import RunConfig, time_slice
-from pdhef_logtool.sinks.base import write_bytes
 from studies.conditions_page import number, table
 from studies.identify_250lm import _features as regression_features
 

@@ -19,20 +19,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pdhef_logtool.estimators.registry import make_estimator
 
 from benchmarks.measuring import ROOT
 from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
 from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.errors import SimulationError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.release import released_steps
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import open_model
-from pdhef_logtool.sinks.base import write_bytes
 from studies.condition_drives import SIDESLIP, ConditionDrive, read_drive
 from studies.conditions_page import number, table
 from studies.table_maths import Bound, median_ratio, pooled_ratio, pooled_rmse

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.checked_inputs import InputCarry, check_inputs, r_scale
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
@@ -298,11 +299,12 @@ class AdaptiveHybridUkf:
 def adaptive_hybrid_ukf(
     vehicle: VehicleParameters,
     network: NetworkService,
+    noise: FilterNoise | None = None,
     *,
     trust: float = 1.0,
     use_speed: bool = True,
     notes: tuple[str, ...] = (),
 ) -> AdaptiveHybridUkf:
-    """Return ``pd-hef`` with the noise of ``[filter.pd-hef]`` of the vehicle file."""
-    fixed = hybrid_ukf(vehicle, network, trust=trust, use_speed=use_speed)
+    """Return ``pd-hef`` with a noise; what that leaves out is that of the hybrid filter."""
+    fixed = hybrid_ukf(vehicle, network, noise, trust=trust, use_speed=use_speed)
     return AdaptiveHybridUkf(vehicle, network, trust, fixed.q_std, fixed.r_std, use_speed=use_speed, notes=notes)

@@ -8,6 +8,7 @@ v_x and v_y go on by a_x + v_y r and a_y − v_x r, a_y corrected for body roll.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
 
@@ -97,3 +102,10 @@ class DirectNetwork:
 
         track, steps = run_stepwise(self.name, signals, carry.steps if carry else None, 0, step)
         return track, DirectCarry(after, network, steps)
+
+
+def build(name: str, car: Car, options: Options) -> DirectNetwork:
+    """Return ``pure-lstm`` of a car whose network has it."""
+    del name
+    assert car.network is not None and car.network.pure_lstm is not None
+    return DirectNetwork(car.vehicle, NetworkService(car.network.pure_lstm), use_speed=options.use_speed)

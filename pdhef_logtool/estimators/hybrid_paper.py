@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -70,6 +71,10 @@ from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 from pdhef_logtool.watches.speed_slip import SlipCarry, believable
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 STATES = 4
 #: θ of Eq 22 and γ of Eq 26: the paper names no values, METHOD §7 fixes these.
@@ -465,3 +470,11 @@ class PaperHybridUkf:
             diverged=where_usable(steps.diverged, 0.0).astype(np.bool_),
         )
         return track, int(index[-1]) if count else -1
+
+
+def build(name: str, car: Car, options: Options) -> PaperHybridUkf:
+    """Return ``pd-hef-paper`` of a car: with the paper's network where there is one beside the car's."""
+    del name
+    paper = None if car.network is None else car.network.paper_network
+    network = options.service(car) if paper is None else NetworkService(paper)
+    return PaperHybridUkf(car.vehicle, network, use_speed=options.use_speed)

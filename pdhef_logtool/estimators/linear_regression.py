@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,10 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,3 +75,10 @@ class LinearRegression:
 
         track, steps = run_stepwise(self.name, signals, carry.steps if carry else None, 1, step)
         return track, RegressionCarry(after, steps)
+
+
+def build(name: str, car: Car, options: Options) -> LinearRegression:
+    """Return ``linear-regression`` of a car whose network has it."""
+    del name
+    assert car.network is not None and car.network.linear_regression is not None
+    return LinearRegression(car.vehicle, car.network.linear_regression, use_speed=options.use_speed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from numba import njit
 
@@ -27,6 +28,10 @@ from pdhef_logtool.estimators.stepwise import (
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 #: The rate of a_y is taken along the motion over this time.
 AY_RATE_STEP_S = 0.001
@@ -100,3 +105,9 @@ class OpenLoop:
 
         std = self.vehicle.sensors.speed_std_m_s
         return run_stepwise(self.name, signals, carry, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)
+
+
+def build(name: str, car: Car, options: Options) -> OpenLoop:
+    """Return ``open-loop`` of a car."""
+    del name, options
+    return OpenLoop(car.vehicle)

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from numba import njit
 
 from pdhef_logtool.estimators.stepwise import StepCarry, advance_speed, run_stepwise
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 
 @njit(cache=True)
@@ -49,3 +54,9 @@ class PassThrough:
             _pass_through(dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, vy, state, values, valid)
 
         return run_stepwise(self.name, signals, carry, 2, step)
+
+
+def build(name: str, car: Car, options: Options) -> PassThrough:
+    """Return ``zero`` or ``gyro``."""
+    del car, options
+    return PassThrough(name, claims_zero_sideslip=name == "zero")

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -52,6 +52,10 @@ from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.speed_slip import SlipCarry, believable
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 # State entries and measurement entries, by name.
 VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3
@@ -739,3 +743,9 @@ def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[
     """
     steps, _ = estimator.filter_steps(signals, None)
     return float(steps.log_likelihood.sum()), int(np.isfinite(steps.innovation).sum())
+
+
+def build(name: str, car: Car, options: Options) -> PhysicsUkf:
+    """Return ``phy-ukf`` of a car, as it is frozen."""
+    del name
+    return PhysicsUkf(car.vehicle, use_speed=options.use_speed)

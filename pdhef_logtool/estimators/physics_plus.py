@@ -11,11 +11,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.lagged_forces import (
     ForceParameters,
@@ -88,6 +90,10 @@ from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.speed_slip import believable
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 NAME = "physics-plus"
 
@@ -555,22 +561,25 @@ class PhysicsPlusUkf:
         return track, FilterCarry(after.x, after.P, after.memory, after.last_stamp_ns, waiting, after.slip)
 
 
-def physics_plus(vehicle: VehicleParameters, *, use_speed: bool = True) -> PhysicsPlusUkf:
-    """Return the filter with the noise of ``[filter.physics-plus]`` where the vehicle file has it.
-
-    ``q_std`` may leave out its last entries, ``r_std`` any measurement: what is left out has its default, which is
-    :data:`PHYSICS_PLUS_Q_STD` and the sensors' noise.
-    """
-    tuning, sensors = vehicle.filter.get(NAME), vehicle.sensors
-    if tuning is None:
+def physics_plus(
+    vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
+) -> PhysicsPlusUkf:
+    """Return the filter with a noise; what that leaves out is :data:`PHYSICS_PLUS_Q_STD` and the sensors' noise."""
+    sensors = vehicle.sensors
+    if noise is None:
         return PhysicsPlusUkf(vehicle, use_speed=use_speed)
     return PhysicsPlusUkf(
         vehicle,
-        q_std=(*tuning.q_std, *PHYSICS_PLUS_Q_STD[len(tuning.q_std) :]),
+        q_std=(*noise.q_std, *PHYSICS_PLUS_Q_STD[len(noise.q_std) :]),
         r_std=(
-            tuning.r_std.get("ay_m_s2", sensors.ay_std_m_s2),
-            tuning.r_std.get("yaw_rate_rad_s", sensors.yaw_rate_std_rad_s),
-            tuning.r_std.get("speed_m_s", sensors.speed_std_m_s),
+            noise.r_std.get("ay_m_s2", sensors.ay_std_m_s2),
+            noise.r_std.get("yaw_rate_rad_s", sensors.yaw_rate_std_rad_s),
+            noise.r_std.get("speed_m_s", sensors.speed_std_m_s),
         ),
         use_speed=use_speed,
     )
+
+
+def build(name: str, car: Car, options: Options) -> PhysicsPlusUkf:
+    """Return ``physics-plus`` of a car, with its noise where the car has one."""
+    return physics_plus(car.vehicle, car.noise.get(name), use_speed=options.use_speed)

@@ -27,9 +27,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale
-from pdhef_logtool.estimators.hybrid import TABLE as FILTER_TABLE
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import (
     AX_BIAS,
@@ -45,9 +45,9 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, cut_sig
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.service import NetworkService
 
-#: Table of the vehicle file that holds this estimator's noise; without it that of the filter is used.
-TABLE = "pd-hef-smoothed"
-#: Used where the file has neither: v_y's noise is 3/4 of the filter's. On 30 simulated validation drives the geometric
+#: Name under which a car holds this estimator's noise; without it that of the filter is used.
+NAME = "pd-hef-smoothed"
+#: Used where the car has neither: v_y's noise is 3/4 of the filter's. On 30 simulated validation drives the geometric
 #: mean of the sideslip RMSE is 0.0260° with 97 % in the 95 % band: 0.0274° at the filter's noise, 0.0253° but narrower
 #: bands at half of it; without bias states 0.0307° at the filter's noise; the filter itself has 0.0309°.
 SMOOTHED_Q_STD = (0.089, 0.045, 0.03, 0.021)
@@ -300,18 +300,14 @@ class SmoothedHybrid:
 def smoothed_hybrid(
     vehicle: VehicleParameters,
     network: NetworkService,
+    noise: FilterNoise | None = None,
     *,
     trust: float = 1.0,
     use_speed: bool = True,
     notes: tuple[str, ...] = (),
 ) -> SmoothedHybrid:
-    """Return ``pd-hef-smoothed`` with the noise of its own table of the vehicle file, else with that of the filter."""
-    own = None if FILTER_TABLE in vehicle.filter else FilterTuning()
-    own = vehicle.filter.get(TABLE, own)
-    if own is None:
-        tuning = vehicle.filter[FILTER_TABLE]
-    else:
-        tuning = FilterTuning(q_std=(*own.q_std, *SMOOTHED_Q_STD[len(own.q_std) :]), r_std=own.r_std)
-    tuned = vehicle.model_copy(update={"filter": {FILTER_TABLE: tuning}})
-    hybrid = hybrid_ukf(tuned, network, trust=trust, use_speed=use_speed, name=TABLE)
-    return SmoothedHybrid(replace(hybrid, vehicle=vehicle), notes=(NOT_CAUSAL, *notes))
+    """Return ``pd-hef-smoothed`` with a noise; what its ``q_std`` leaves out is :data:`SMOOTHED_Q_STD`."""
+    noise = noise or FilterNoise()
+    noise = noise.model_copy(update={"q_std": (*noise.q_std, *SMOOTHED_Q_STD[len(noise.q_std) :])})
+    hybrid = hybrid_ukf(vehicle, network, noise, trust=trust, use_speed=use_speed, name=NAME)
+    return SmoothedHybrid(hybrid, notes=(NOT_CAUSAL, *notes))

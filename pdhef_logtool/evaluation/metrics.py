@@ -58,7 +58,9 @@ MAX_STEP_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class MetricRow:
-    """One figure. The first eight fields are the columns of metrics.parquet.
+    """One figure. The first eight fields and ``algorithm`` are the columns of metrics.parquet.
+
+    ``algorithm`` is the digest of what ran under the estimator's name; empty where nobody knows (recorded estimates).
 
     ``independent`` is False when the truth of this signal is one of the estimators' inputs; tables and rankings leave
     such rows out. In the file a row with metric ``not_independent`` says so for its estimator and signal.
@@ -73,6 +75,7 @@ class MetricRow:
     unit: str
     n: int
     independent: bool = True
+    algorithm: str = ""
 
 
 def score_track(

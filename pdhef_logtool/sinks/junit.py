@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pdhef_logtool.evaluation.thresholds import Verdict
-from pdhef_logtool.sinks.base import write_bytes
+from pdhef_logtool.records.files import write_bytes
 
 
 def write_junit(path: Path, verdicts: Mapping[str, Sequence[Verdict]]) -> None:

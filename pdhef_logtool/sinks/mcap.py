@@ -186,12 +186,15 @@ class AnnotatedMcapSink:
 def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
     """Return the figures as ``estimator/signal/segment/metric`` → ``value unit n=samples`` (``null``: not computable).
 
-    ``log`` and ``truth`` (``available`` or ``no truth``) stand beside them.
+    ``log``, ``truth`` (``available`` or ``no truth``) and ``estimator/algorithm`` (what ran, as JSON) stand beside them.
     """
     record = {
         "log": str(report["log"]["name"]),
         "truth": "available" if report["truth"]["available"] else "no truth",
     }
+    for e in report["estimators"]:
+        if e["algorithm"] is not None:
+            record[f"{e['name']}/algorithm"] = json.dumps(e["algorithm"], sort_keys=True)
     for m in report["metrics"]:
         value = "null" if m["value"] is None else repr(float(m["value"]))
         record[f"{m['estimator']}/{m['signal']}/{m['segment']}/{m['metric']}"] = f"{value} {m['unit']} n={m['n']}"

@@ -13,9 +13,10 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.files import PendingFile, cannot_write
 from pdhef_logtool.records.signals import FloatArray, Loss, Signals
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, make_track
-from pdhef_logtool.sinks.base import Event, PendingFile
+from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.schema import arrow_schema
 
 #: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
@@ -24,6 +25,7 @@ ROWS_A_GROUP = 32768
 
 #: Columns that files of earlier versions have not.
 _LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
+_LATER_METRIC_COLUMNS = ("algorithm",)
 _FLAGS = ("valid", "diverged")
 _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
@@ -57,7 +59,7 @@ class EstimatesSink:
                 store_schema=True,
             )
         except OSError as error:
-            raise _cannot_write(path, error) from error
+            raise cannot_write(path, error) from error
 
     @property
     def lost(self) -> tuple[Loss, ...]:
@@ -102,7 +104,7 @@ class EstimatesSink:
         try:
             self._writer.write_table(table, row_group_size=self._rows_a_group)
         except OSError as error:
-            raise _cannot_write(self._pending.target, error) from error
+            raise cannot_write(self._pending.target, error) from error
 
 
 def _table_from_track(track: StateTrack, schema: pa.Schema) -> pa.Table:
@@ -244,14 +246,15 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
         try:
             pq.write_table(pa.Table.from_arrays(arrays, schema=schema), pending.path, compression="zstd")
         except OSError as error:
-            raise _cannot_write(path, error) from error
+            raise cannot_write(path, error) from error
 
 
 def read_metrics(path: Path) -> list[MetricRow]:
     """Read a metrics.parquet; null becomes NaN, rows marked ``not_independent`` are so again; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
     with _open(path) as file:
-        absent = set(schema.names) - set(file.schema_arrow.names)
+        names = [n for n in schema.names if n in file.schema_arrow.names]
+        absent = set(schema.names) - {*names, *_LATER_METRIC_COLUMNS}
         if absent:
             raise OutputError(
                 expected="a metrics.parquet",
@@ -259,7 +262,7 @@ def read_metrics(path: Path) -> list[MetricRow]:
                 where=str(path),
                 remedy="run the logs again",
             )
-        records = file.read(columns=schema.names).to_pylist()
+        records = file.read(columns=names).to_pylist()
     dependent = {(r["log"], r["estimator"], r["signal"]) for r in records if r["metric"] == "not_independent"}
     return [
         MetricRow(
@@ -268,7 +271,3 @@ def read_metrics(path: Path) -> list[MetricRow]:
         )
         for r in records
     ]
-
-
-def _cannot_write(target: Path, error: OSError) -> OutputError:
-    return OutputError(expected="a place to write to", got=str(error), where=str(target))

@@ -16,12 +16,15 @@ import numpy as np
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import ReasonFacts
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.sinks.base import Event, write_bytes
+from pdhef_logtool.sinks.base import Event
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+#: Columns of a figure in the report.
+_METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 #: Distributions whose version decides what a run computes or writes.
 VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
 
@@ -68,7 +71,8 @@ class SourceFacts:
 class EstimatorFacts:
     """One estimator that was asked for: ``skipped`` holds the reason if it did not run.
 
-    ``reasons``: why it did not use its sensors as usual; None if it does not look.
+    ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the name,
+    with its digest; None if it did not run.
     """
 
     name: str
@@ -76,6 +80,7 @@ class EstimatorFacts:
     skipped: str | None = None
     notes: Sequence[str] = ()
     reasons: Sequence[ReasonFacts] | None = None
+    algorithm: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +191,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
                 "causal": e.causal,
                 "outcome": "ran" if e.skipped is None else "skipped",
                 "reason": e.skipped,
+                "algorithm": e.algorithm,
                 "notes": list(e.notes),
                 "reasons": None if e.reasons is None else list(e.reasons),
             }
@@ -199,19 +205,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "notes": list(facts.truth.notes),
         },
         "friction": facts.friction,
-        "metrics": [
-            {
-                "log": m.log,
-                "estimator": m.estimator,
-                "signal": m.signal,
-                "segment": m.segment,
-                "metric": m.metric,
-                "value": m.value,
-                "unit": m.unit,
-                "n": m.n,
-            }
-            for m in facts.metrics
-        ],
+        "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
         "segments": list(facts.segments),
         "losses": list(facts.losses),
         "warnings": list(facts.warnings),

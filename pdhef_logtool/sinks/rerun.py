@@ -13,11 +13,12 @@ import rerun.blueprint as rrb
 
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import TRUTH, Event, PendingFile
+from pdhef_logtool.sinks.base import TRUTH, Event
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
 
@@ -88,7 +89,7 @@ class RerunSink:
     input_hash : hexadecimal hash of all that went into the run; names the recording, so that the viewer takes two
         recordings of the same run as one and of different runs as two.
     start_ns : zero of the timeline ``elapsed``.
-    min_speed_m_s : sideslip is not drawn below, where it has no meaning.
+    min_speed_m_s : sideslip is not drawn below, where it has no meaning. colours : 0xRRGGBB by estimator.
 
     Raises
     ------
@@ -97,8 +98,16 @@ class RerunSink:
     """
 
     def __init__(
-        self, path: Path, *, log_name: str, input_hash: str, start_ns: int, min_speed_m_s: float = 1.0
+        self,
+        path: Path,
+        *,
+        log_name: str,
+        input_hash: str,
+        start_ns: int,
+        min_speed_m_s: float = 1.0,
+        colours: Mapping[str, int] | None = None,
     ) -> None:
+        self._colours = colours or {}
         self._start_ns = start_ns
         self._min_speed_m_s = min_speed_m_s
         self._lines: dict[str, _Line] = {}
@@ -141,7 +150,7 @@ class RerunSink:
             # Without this the file falls behind and the difference waits in memory: 380 MB more after one hour.
             self._recording.flush()
         self._window[track.name] = track
-        rgb = colour_rgb(track.name)
+        rgb = colour_rgb(track.name, self._colours)
         fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
         for plot in _STATES + _HEALTH:
             values = np.asarray(getattr(track, plot.column)) * plot.factor
@@ -165,7 +174,9 @@ class RerunSink:
             for name, path in self._paths.items():
                 self._log_static(
                     f"/plan/{name}",
-                    rr.LineStrips2D(path.strips(), colors=[colour_rgb(name)], radii=[rr.Radius.ui_points(1.5)]),
+                    rr.LineStrips2D(
+                        path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
+                    ),
                 )
             found = self._draw_reasons()
             if events or found:
@@ -317,7 +328,7 @@ class RerunSink:
                 self._draw(
                     f"/error/{plot.entity}/{name}",
                     name,
-                    colour_rgb(name),
+                    colour_rgb(name, self._colours),
                     track.stamps_ns[of_track],
                     np.where(known, error, np.nan),
                 )

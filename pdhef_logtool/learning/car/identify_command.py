@@ -15,8 +15,8 @@ from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import choose_mapping, load_mapping
 from pdhef_logtool.records.errors import EstimatorError, OutputError, UsageError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.run.config import RunConfig, time_slice
-from pdhef_logtool.sinks.base import write_bytes
 
 #: Other tyres, another nominal model: what was found with those of the starting file counts no more.
 NO_NETWORK_TRIED = "no network was tried on this vehicle"

@@ -39,12 +39,12 @@ from pdhef_logtool.learning.noise.tune_drives import MAX_BYTES, DriveBench, Driv
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 from pdhef_logtool.run.config import NANOSECONDS_FROM, RunConfig, parse_time
-from pdhef_logtool.sinks.base import write_bytes
 from pdhef_logtool.sinks.report import tool_versions, write_json
 
 FORMAT = "pdhef-trust"

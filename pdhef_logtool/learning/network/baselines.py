@@ -17,12 +17,12 @@ import numpy as np
 from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
 from pdhef_logtool.learning.network.train_command import TrainResult, gap_free_runs, make_recipe, train_on
 from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
-from pdhef_logtool.sinks.base import write_bytes
 
 LOW_PASS_HZ = 2.0
 #: A feature that varies by less than this share of its size is a constant, which the intercept already is.

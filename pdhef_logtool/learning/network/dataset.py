@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.sinks.base import PendingFile
 from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.sinks.schema import arrow_schema
 

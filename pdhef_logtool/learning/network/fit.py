@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
-from pdhef_logtool.sinks.base import write_bytes
 
 CHECKPOINT = "checkpoint.safetensors"
 

@@ -13,8 +13,8 @@ import numpy as np
 from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.residual_model.bundle import RESIDUAL, ModelBundle, open_model
-from pdhef_logtool.sinks.base import PendingFile
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"

@@ -35,9 +35,9 @@ from pdhef_logtool.learning.noise.tune_drives import Benches, DriveFacts, TuneSe
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.files import PendingFile, write_bytes
 from pdhef_logtool.residual_model.bundle import open_model
 from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.sinks.base import PendingFile, write_bytes
 from pdhef_logtool.sinks.report import tool_versions, write_json
 
 FORMAT = "pdhef-tuning"
