@@ -1,8 +1,9 @@
 """Everything that is known of one vehicle, as estimators and commands take it.
 
-A car is a folder: ``vehicle.toml`` is a person's and never rewritten; beside it stand the parts that commands write, each
-one its own (:mod:`~.parts`). A bare ``vehicle.toml`` is a car too, and may hold ``[filter.*]`` and ``[network]`` of an older
-file or of an export (:mod:`~.flat`). A part whose basis has changed is stale: it is not taken, and the car says so.
+A car is a folder: ``vehicle.toml`` is a person's and never rewritten; beside it stand the parts that commands write,
+each one its own (:mod:`~.parts`). A bare ``vehicle.toml`` is a car too, and may hold ``[filter.*]`` and ``[network]`` of
+an older file or of an export (:mod:`~.flat`). A part whose basis has changed is stale: it is not taken, and the car
+says so.
 """
 
 from __future__ import annotations
@@ -148,10 +149,8 @@ class Car:
         """
         found = self.trust
         if found is None or not found.has_evidence:
-            return AllowedTrust(
-                0.0,
-                f"no evidence that this network helps on {self.vehicle.name}; a drive with truth and pdhef trust give it",
-            )
+            why = f"no evidence that this network helps on {self.vehicle.name}; a drive with truth and pdhef trust give it"
+            return AllowedTrust(0.0, why)
         here = "" if self.network is None else self.network.sha256
         if found.network_sha256 is not None and found.network_sha256 != here:
             return AllowedTrust(
@@ -172,7 +171,7 @@ class Car:
         return replace(self, noise={**self.noise, name: noise})
 
     def with_vehicle(self, vehicle: VehicleParameters) -> Car:
-        """Return the car with other physics and everything else as it is, for physics that are made wrong on purpose."""
+        """Return the car with other physics, made wrong on purpose, and everything else as it is."""
         return replace(self, vehicle=vehicle)
 
 

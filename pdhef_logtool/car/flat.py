@@ -72,8 +72,10 @@ def read_flat(path: Path) -> FlatCar:
             noise[score["name"]] = noise[score["name"]].model_copy(update=told)
     drives = [d for d in tables.identification.drives if isinstance(d, LearntOn)]
     spans = [d for d in tables.identification.drives if isinstance(d, str)]
-    for span in _parsed(spans, _SPAN, f"{where}: identification.drives"):
-        drives.append(LearntOn(name=span["name"], start_s=float(span["start_s"]), end_s=float(span["end_s"])))
+    drives += [
+        LearntOn(name=span["name"], start_s=float(span["start_s"]), end_s=float(span["end_s"]))
+        for span in _parsed(spans, _SPAN, f"{where}: identification.drives")
+    ]
     network = tables.network
     trust = None
     if network is not None:

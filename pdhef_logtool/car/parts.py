@@ -78,7 +78,7 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y, yaw rate and, optionally, the a_x bias; empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
     physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, for filters that have one.
-    score_deg : what it scored in ``pdhef tune``; lower is better; None where nothing was compared. trial : which it was.
+    score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
     """
 
     q_std: Annotated[tuple[NonNegative, ...], Field(max_length=4)] = ()

@@ -154,7 +154,8 @@ SPECS: tuple[Spec, ...] = (
         "hybrid:build", _ESP, 0x882255, default=False, network="residual",
     ),
     Spec(
-        "pd-hef-smoothed", "the hybrid filter smoothed with what came later: not causal, ranked apart (needs a network)",
+        "pd-hef-smoothed",
+        "the hybrid filter smoothed with what came later: not causal, ranked apart (needs a network)",
         "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="residual", tunable="on request",
     ),
     Spec(

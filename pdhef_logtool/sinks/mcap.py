@@ -186,7 +186,7 @@ class AnnotatedMcapSink:
 def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
     """Return the figures as ``estimator/signal/segment/metric`` → ``value unit n=samples`` (``null``: not computable).
 
-    ``log``, ``truth`` (``available`` or ``no truth``) and ``estimator/algorithm`` (what ran, as JSON) stand beside them.
+    ``log``, ``truth`` (``available``, ``no truth``) and ``estimator/algorithm`` (what ran, as JSON) stand beside them.
     """
     record = {
         "log": str(report["log"]["name"]),

@@ -71,8 +71,8 @@ class SourceFacts:
 class EstimatorFacts:
     """One estimator that was asked for: ``skipped`` holds the reason if it did not run.
 
-    ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the name,
-    with its digest; None if it did not run.
+    ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the
+    name, with its digest; None if it did not run.
     """
 
     name: str

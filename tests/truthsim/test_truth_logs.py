@@ -261,7 +261,8 @@ def test_write_samples_repeats_itself_bit_for_bit(tmp_path: Path, monkeypatch: p
 
 @pytest.fixture(scope="module")
 def fitting() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fit_nominal_tyres", ROOT / "studies" / "defaults" / "fit_nominal_tyres.py")
+    file = ROOT / "studies" / "defaults" / "fit_nominal_tyres.py"
+    spec = importlib.util.spec_from_file_location("fit_nominal_tyres", file)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
