@@ -523,6 +523,7 @@ def identify(
         _print_json(result.to_dict())
     else:
         render_identification(result, _stdout())
+    raise typer.Exit(result.exit_code)
 
 
 @app.command(

@@ -218,13 +218,13 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
     table.add_column("truth")
     for drive in result.results:
         if drive.entry is None:
-            table.add_row(drive.log, "-", "-", "-", "-", "-", "failed")
+            table.add_row(drive.record.name, "-", "-", "-", "-", "-", "failed")
             continue
         e, truth = drive.entry, drive.entry["truth"]
         half_s = truth["smoothing_half_s"]
         how = truth["kind"] + (f", ±{half_s:g} s" if half_s else "") + (", kept" if drive.kept else "")
         table.add_row(
-            drive.log,
+            drive.record.name,
             f"{e['duration_s']:.1f}",
             f"{100.0 * e['usable_rows'] / max(e['rows'], 1):.1f} %",
             _cell(e["residual_rms"]["vy_dot_m_s2"], 1.0, 3),

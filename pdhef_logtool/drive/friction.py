@@ -92,6 +92,10 @@ class FrictionSource:
     _std: list[FloatArray] = field(default_factory=list)
     _observable: list[BoolArray] = field(default_factory=list)
 
+    def afresh(self) -> FrictionSource:
+        """Return the same source at the start of a drive."""
+        return FrictionSource(self.label, self.note, self.constant, self.bank, self.factor)
+
     def fill(self, signals: Signals) -> Signals:
         """Return the next window's signals with their friction."""
         if self.constant is not None:

@@ -1,23 +1,18 @@
-"""What a run does: defaults, ``pdhef.toml`` and flags, where flags win; and the times of a slice."""
+"""What a run does: defaults, ``pdhef.toml`` and flags, where flags win."""
 
 from __future__ import annotations
 
-import datetime as dt
-import re
 import tomllib
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from pdhef_logtool.drive.friction import parse_friction
+from pdhef_logtool.drive.options import SENSOR_SUITES, WINDOW_S, ReadOptions, parse_time
 from pdhef_logtool.estimators.registry import check_names
 from pdhef_logtool.records.errors import UsageError
 
 ANNOTATE = ("full", "sidecar", "none")
-SENSOR_SUITES = ("full", "esp")
-#: A bare integer from here on is nanoseconds, not seconds from the log's start.
-NANOSECONDS_FROM = 10**15
-WINDOW_S = 600.0
 _FILES = ("vehicle", "mapping", "thresholds", "model", "calibration")
 #: What may stand in place of a file.
 _KEYWORDS = {"model": ("default", "many-cars", "none"), "calibration": ("none", "unsure")}
@@ -31,7 +26,7 @@ class RunConfig:
     ----------
     estimators : names, in the order of the tables; None = every one that the vehicle file suits.
     vehicle, mapping : files; None = the default sedan, recognised types.
-    start, end : slice as given (:func:`parse_time`); None = the log's own.
+    start, end : slice as given (:func:`~pdhef_logtool.drive.options.parse_time`); None = the log's own.
     annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only.
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
     friction : ``auto`` is the log's own, else the vehicle file's, else estimated; ``file``, ``estimate``, or a number.
@@ -57,6 +52,11 @@ class RunConfig:
     thresholds: Path | None = None
     model: Path | None = None
     calibration: Path | None = None
+
+    @property
+    def read_options(self) -> ReadOptions:
+        """What of it decides how a log is read."""
+        return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
@@ -126,58 +126,3 @@ def _check(config: RunConfig) -> None:
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:
             parse_time(text, 0, 0, option=name)
-
-
-def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
-    """Turn a time as users write it into int64 nanoseconds of the log's clock.
-
-    ``12.5`` and ``+12.5s`` are seconds from the log's start, ``end-5s`` is 5 s before its end, a bare integer of at
-    least 1e15 is nanoseconds, and anything with a ``T`` or ``-`` between digits is RFC 3339 (UTC when it names no
-    zone).
-
-    Raises
-    ------
-    UsageError
-        The text is none of these.
-    """
-    text = text.strip()
-    if re.fullmatch(r"\d+", text) and int(text) >= NANOSECONDS_FROM:
-        return int(text)
-    relative = re.fullmatch(r"\+?(\d+(?:\.\d*)?|\.\d+)\s*s?", text)
-    if relative:
-        return start_ns + round(float(relative[1]) * 1e9)
-    from_end = re.fullmatch(r"end(?:\s*-\s*(\d+(?:\.\d*)?|\.\d+)\s*s?)?", text)
-    if from_end:
-        return end_ns - round(float(from_end[1] or 0.0) * 1e9)
-    try:
-        when = dt.datetime.fromisoformat(text)
-    except ValueError:
-        raise UsageError(
-            expected="a time such as 12.5, +10s, end-5s, 1700000000000000000 or 2026-01-31T12:00:00Z",
-            got=repr(text),
-            where=option,
-        ) from None
-    if when.tzinfo is None:
-        when = when.replace(tzinfo=dt.UTC)
-    delta = when - dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
-    return (delta.days * 86_400 + delta.seconds) * 10**9 + delta.microseconds * 1000
-
-
-def time_slice(config: RunConfig, start_ns: int, end_ns: int) -> tuple[int, int]:
-    """Return the slice [start, end) of a log that spans [start_ns, end_ns).
-
-    Raises
-    ------
-    UsageError
-        The slice is empty or lies outside of the log.
-    """
-    begin = start_ns if config.start is None else parse_time(config.start, start_ns, end_ns, option="--start")
-    finish = end_ns if config.end is None else parse_time(config.end, start_ns, end_ns, option="--end")
-    begin, finish = max(begin, start_ns), min(finish, end_ns)
-    if begin >= finish:
-        raise UsageError(
-            expected=f"a slice inside the log's {(end_ns - start_ns) / 1e9:.3f} s",
-            got=f"start {config.start or 'of the log'}, end {config.end or 'of the log'}",
-            where="--start/--end",
-        )
-    return begin, finish

@@ -9,17 +9,13 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_sha256
-from pdhef_logtool.drive.friction import FrictionSource, friction_source, friction_topic
-from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive, with_look_ahead
-from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
-from pdhef_logtool.estimators.registry import NOT_CAUSAL, default_names, runnable
-from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
-from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import Mapping, choose_mapping, load_mapping, merge_losses
+from pdhef_logtool.drive.friction import FrictionSource
+from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
+from pdhef_logtool.estimators.base import Estimator, notes_of
+from pdhef_logtool.estimators.registry import NOT_CAUSAL, Skipped, default_names, runnable
+from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
 from pdhef_logtool.records.errors import (
     EXIT_FAILURE,
     EXIT_GATE,
@@ -30,11 +26,10 @@ from pdhef_logtool.records.errors import (
     PdhefError,
     UsageError,
 )
-from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, IntArray, Loss, Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import SHIPPED, ModelBundle, open_model
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.estimating import estimate
 from pdhef_logtool.run.track_store import TrackStore
 from pdhef_logtool.sinks.base import TRUTH, Event, Sink
 from pdhef_logtool.sinks.report import (
@@ -57,7 +52,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.reasons import ReasonFacts
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
-    from pdhef_logtool.watches.divergence import DivergenceWatch
 
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
@@ -227,131 +221,76 @@ def run_log(
         Nothing of the log can be used; nothing is then left under a final name.
     """
     progress(log_input.stem, 0.0)
-    log = open_log(log_input.path)
-    try:
-        return _run_open_log(log, log_input, output, config, vehicle, mapping, model, calibration, progress, warn)
-    finally:
-        log.close()
+    with read_drive(log_input, vehicle, mapping, config.read_options, tell=warn) as drive:
+        ready, skipped = _choose_estimators(drive, config, vehicle, model)
+        stands_for = {e.name: getattr(e, "calibrated_as", e.name) for e in ready}
+        intervals = TrackCalibrator(
+            calibration, vehicle_sha256(vehicle), None if model is None else model.sha256, stands_for
+        )
+        folder = output / "logs" / drive.name
+        sinks = _open_sinks(folder, drive, config, vehicle)
+        try:
+            with TrackStore(folder) as store:
+                signals = _estimate(drive, ready, intervals, sinks, store, progress)
+                rows, events, reasons = _evaluate(store, ready, signals, drive, vehicle)
+            if drive.friction.bank is not None:
+                events = sorted([*events, *friction_events(drive.friction, signals.stamps_ns)], key=in_time)
+            losses = merge_losses([drive.losses, *(sink.lost for sink in sinks)])
+            ran = [
+                EstimatorFacts(
+                    e.name, causal=e.causal, notes=(*notes_of(e), *intervals.notes(e.name)), reasons=reasons[e.name]
+                )
+                for e in ready
+            ]
+            left_out = [EstimatorFacts(s.name, causal=s.name not in NOT_CAUSAL, skipped=s.reason) for s in skipped]
+            facts = report_facts(drive, vehicle, [*ran, *left_out], rows, events, losses)
+            report = build_report(replace(facts, friction=friction_facts(drive.friction)))
+            from pdhef_logtool.sinks.parquet import write_metrics
+
+            for sink in sinks:
+                sink.finish(report, events)
+            write_metrics(folder / "metrics.parquet", rows)
+            write_json(folder / "report.json", report)
+        except BaseException:
+            for sink in sinks:
+                sink.abort()
+            with suppress(OSError):
+                folder.rmdir()
+            raise
+        outcome = outcome_of(drive, losses)
+    progress(drive.name, 1.0)
+    return LogResult(outcome, folder, report, tuple(rows))
 
 
-def _run_open_log(
-    log: DriveLog,
-    log_input: LogInput,
-    output: Path,
-    config: RunConfig,
-    vehicle: VehicleParameters,
-    mapping: Mapping | None,
-    model: ModelBundle | None,
-    calibration: Calibration | None,
-    progress: Progress,
-    warn: Callable[[str], None],
-) -> LogResult:
-    from pdhef_logtool.drive.plausibility import plausibility_warnings
-    from pdhef_logtool.watches.divergence import DivergenceWatch
+def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
+    """Return how a log that was read is recorded in run.json."""
+    return LogOutcome(log=drive.name, file=drive.path.name, sha256=drive.sha256, lost=lost_texts(losses))
 
-    warnings: list[str] = []
 
-    def tell(text: str) -> None:
-        warnings.append(text)
-        warn(f"{log_input.stem}: {text}")
-
-    mapping, missing = choose_mapping(log, mapping, tell, prefer_truth=config.prefer_truth)
-    start_ns, end_ns = time_slice(config, log.start_ns, log.end_ns)
-    plan = plan_drive(log, mapping, vehicle, start_ns, end_ns)
-    for warning in plausibility_warnings(plan.survey_signals):
-        tell(warning.message)
-    for name, reason in plan.alignment.unused:
-        tell(f"{name} is not used: {reason}")
+def _choose_estimators(
+    drive: Drive, config: RunConfig, vehicle: VehicleParameters, model: ModelBundle | None
+) -> tuple[list[Estimator], list[Skipped]]:
+    """Return the estimators that can run and those that cannot; raises EstimatorError if none can."""
     estimators, skipped = runnable(
         config.estimators or default_names(vehicle, model),
         vehicle,
-        plan.alignment.available,
-        use_speed=config.sensors == "full",
+        drive.available,
+        use_speed=drive.options.use_speed,
         model=model,
     )
     for skip in skipped:
-        tell(f"{skip.name} is skipped: {skip.reason}")
+        drive.tell(f"{skip.name} is skipped: {skip.reason}")
     if not estimators:
         raise EstimatorError(
             expected="at least one estimator that can run",
             got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
-            where=str(log_input.path),
+            where=str(drive.path),
             remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
         )
-    friction = friction_source(
-        config.friction,
-        vehicle,
-        plan.alignment.available,
-        friction_topic(plan.mapping),
-        use_speed=config.sensors == "full",
-    )
-    if friction.note:
-        tell(friction.note)
-    sha256 = hash_log(log_input.path)
-    stands_for = {e.name: getattr(e, "calibrated_as", e.name) for e in estimators}
-    intervals = TrackCalibrator(
-        calibration, vehicle_sha256(vehicle), None if model is None else model.sha256, stands_for
-    )
-    folder = output / "logs" / log_input.stem
-    reader = DriveReader(log, plan, config.window_s)
-    sinks = _open_sinks(folder, log, log_input.stem, config, vehicle, plan, sha256)
-    try:
-        with TrackStore(folder) as store:
-            context = _estimate(
-                reader,
-                estimators,
-                friction,
-                DivergenceWatch(vehicle),
-                intervals,
-                sinks,
-                store,
-                lambda share: progress(log_input.stem, 0.8 * share),
-            )
-            progress(log_input.stem, 0.8)
-            rows, events, reasons = _evaluate(log_input.stem, store, estimators, context, plan, vehicle)
-        if friction.bank is not None:
-            events = sorted([*events, *friction_events(friction, context.stamps_ns)], key=in_time)
-        losses = merge_losses([log.lost, reader.losses, *(sink.lost for sink in sinks)])
-        ran = [
-            EstimatorFacts(
-                e.name, causal=e.causal, notes=(*notes_of(e), *intervals.notes(e.name)), reasons=reasons[e.name]
-            )
-            for e in estimators
-        ]
-        left_out = [EstimatorFacts(s.name, causal=s.name not in NOT_CAUSAL, skipped=s.reason) for s in skipped]
-        report = build_report(
-            report_facts(
-                log, log_input, sha256, plan, missing, vehicle, [*ran, *left_out], rows, events, losses, warnings,
-                reader.samples or {}, friction,
-            )
-        )  # fmt: skip
-        from pdhef_logtool.sinks.parquet import write_metrics
-
-        for sink in sinks:
-            sink.finish(report, events)
-        write_metrics(folder / "metrics.parquet", rows)
-        write_json(folder / "report.json", report)
-    except BaseException:
-        for sink in sinks:
-            sink.abort()
-        with suppress(OSError):
-            folder.rmdir()
-        raise
-    lost = tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
-    outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=sha256, lost=lost)
-    progress(log_input.stem, 1.0)
-    return LogResult(outcome, folder, report, tuple(rows))
+    return estimators, skipped
 
 
-def _open_sinks(
-    folder: Path,
-    log: DriveLog,
-    stem: str,
-    config: RunConfig,
-    vehicle: VehicleParameters,
-    plan: DrivePlan,
-    input_hash: str,
-) -> list[Sink]:
+def _open_sinks(folder: Path, drive: Drive, config: RunConfig, vehicle: VehicleParameters) -> list[Sink]:
     from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
     from pdhef_logtool.sinks.parquet import EstimatesSink
     from pdhef_logtool.sinks.rerun import RerunSink
@@ -360,13 +299,13 @@ def _open_sinks(
     try:
         sinks.append(EstimatesSink(folder / "estimates.parquet"))
         if config.annotate != "none":
-            sinks.append(AnnotatedMcapSink(folder / "annotated.mcap", log if config.annotate == "full" else None))
+            sinks.append(AnnotatedMcapSink(folder / "annotated.mcap", drive.log if config.annotate == "full" else None))
         sinks.append(
             RerunSink(
                 folder / "recording.rrd",
-                log_name=stem,
-                input_hash=input_hash,
-                start_ns=plan.start_ns,
+                log_name=drive.name,
+                input_hash=drive.sha256,
+                start_ns=drive.plan.start_ns,
                 min_speed_m_s=vehicle.low_speed_blend_m_s,
             )
         )
@@ -377,94 +316,39 @@ def _open_sinks(
     return sinks
 
 
-class DeadReckoning:
-    """Dead-reckons one track from window to window, from the true pose at the start where there is one."""
-
-    def __init__(self) -> None:
-        self._last: tuple[int, float, float, float] | None = None
-        self._pose: tuple[float, float, float] | None = None
-
-    def add(self, track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
-        """Return the next window of the track with its pose; ``start`` is where the first window begins."""
-        if len(track) == 0:
-            return track
-        stamps, vx, vy, rate = track.stamps_ns, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
-        if not np.isfinite(vy).any():
-            vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
-        if self._last is not None:
-            stamps = np.concatenate([[self._last[0]], stamps])
-            vx, vy, rate = (np.concatenate([[v], c]) for v, c in zip(self._last[1:], (vx, vy, rate), strict=True))
-        x, y, yaw = dead_reckon(stamps, vx, vy, rate, self._pose or start)
-        self._last = (int(stamps[-1]), float(vx[-1]), float(vy[-1]), float(rate[-1]))
-        self._pose = (float(x[-1]), float(y[-1]), float(yaw[-1]))
-        skip = len(x) - len(track)
-        return track.with_pose(x[skip:], y[skip:], yaw[skip:])
-
-
-def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
-    """Return the first known pose x, y, yaw of the truth; the origin without one."""
-    if truth is not None:
-        known = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))
-        if known.size:
-            i = int(known[0])
-            return float(truth.x_m[i]), float(truth.y_m[i]), float(truth.yaw_rad[i])
-    return 0.0, 0.0, 0.0
-
-
 def _estimate(
-    reader: DriveReader,
+    drive: Drive,
     estimators: Sequence[Estimator],
-    friction: FrictionSource,
-    watch: DivergenceWatch,
     intervals: TrackCalibrator,
     sinks: Sequence[Sink],
     store: TrackStore,
-    progress: Callable[[float], None],
+    progress: Progress,
 ) -> Signals:
     """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
-    carries: dict[str, Any] = {}
-    poses = {e.name: DeadReckoning() for e in estimators} | {TRUTH: DeadReckoning()}
     seen: list[Signals] = []
-    start: tuple[float, float, float] | None = None
-    look_ahead_s = max(map(look_ahead_of, estimators), default=0.0)
-    for window, ahead in with_look_ahead(friction.fill_windows(reader.windows()), look_ahead_s):
+    for window in estimate(drive, estimators, intervals=intervals):
         seen.append(window.signals)
-        if start is None:
-            start = first_pose(window.truth)
         for sink in sinks:
             sink.append_signals(window.signals)
         if window.truth is not None:
             store.append(window.truth)
-            drawn = window.truth
-            if not reader.plan.has_truth_pose:
-                drawn = poses[TRUTH].add(drawn, start)
+            assert window.drawn_truth is not None
             for sink in sinks:
-                sink.append(drawn)
-        for estimator in estimators:
-            carry = carries.get(estimator.name)
-            track, carries[estimator.name] = run_window(estimator, window.signals, carry, ahead)
-            track = intervals.add(watch.add(track, window.signals), window.signals)
-            track = poses[estimator.name].add(track, start)
+                sink.append(window.drawn_truth)
+        for track in window.tracks:
             store.append(track)
             for sink in sinks:
                 sink.append(track)
-        progress(window.share_done)
-    if not seen:
-        raise EstimatorError(
-            expected="IMU samples in the chosen slice",
-            got="none that can be used",
-            where=str(reader.log.path),
-            remedy="pdhef inspect LOG shows what the log holds and what was dropped",
-        )
+        progress(drive.name, 0.8 * window.share_done)
+    progress(drive.name, 0.8)
     return join_signals(seen)
 
 
 def _evaluate(
-    stem: str,
     store: TrackStore,
     estimators: Sequence[Estimator],
     signals: Signals,
-    plan: DrivePlan,
+    drive: Drive,
     vehicle: VehicleParameters,
 ) -> tuple[list[MetricRow], list[Event], dict[str, tuple[ReasonFacts, ...] | None]]:
     """Score the stored tracks, one whole track in memory at a time besides the truth.
@@ -476,7 +360,7 @@ def _evaluate(
     from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
 
-    truth = store.read(TRUTH)
+    stem, truth = drive.name, store.read(TRUTH)
     masks = segment_masks(signals, truth, vehicle)
     slow = vehicle.low_speed_blend_m_s
     rows: list[MetricRow] = []
@@ -486,7 +370,7 @@ def _evaluate(
         track = store.read(estimator.name)
         assert track is not None
         if truth is not None:
-            rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=plan.dependent)
+            rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
         else:
             rows += state_rows(track, masks, log=stem)
         rows += whiteness_rows(track, masks, log=stem)
@@ -522,21 +406,17 @@ def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
 
 
 def report_facts(
-    log: DriveLog,
-    log_input: LogInput,
-    sha256: str,
-    plan: DrivePlan,
-    missing: Sequence[str],
+    drive: Drive,
     vehicle: VehicleParameters,
     estimators: Sequence[EstimatorFacts],
     rows: Sequence[MetricRow],
     events: Sequence[Event],
     losses: Sequence[Loss],
-    warnings: Sequence[str],
-    samples: dict[str, int],
-    friction: FrictionSource | None = None,
+    samples: dict[str, int] | None = None,
 ) -> ReportFacts:
-    """Gather what report.json says of one log; ``samples`` are the messages that were used, by source."""
+    """Gather what report.json says of one log; ``samples`` by source, None: those that the drive has read."""
+    plan, log = drive.plan, drive.log
+    samples = drive.samples if samples is None else samples
     mapping = plan.mapping
     mapped = set(mapping.topics)
     notes = []
@@ -552,10 +432,10 @@ def report_facts(
         notes.append("no true position: the drawn truth trajectory is its velocity dead-reckoned")
     return ReportFacts(
         log=LogFacts(
-            name=log_input.stem,
-            file=log_input.path.name,
-            kind=log.kind,
-            sha256=sha256,
+            name=drive.name,
+            file=drive.path.name,
+            kind=drive.kind,
+            sha256=drive.sha256,
             start_ns=plan.start_ns,
             end_ns=plan.end_ns,
             topics=[
@@ -563,7 +443,7 @@ def report_facts(
             ],
         ),
         signals=[SourceFacts(n, s.label, SIGNAL_UNITS[n], samples.get(s.label, 0)) for n, s in mapping.signals.items()],
-        missing_signals=list(missing),
+        missing_signals=list(drive.missing),
         vehicle_name=vehicle.name,
         vehicle_sha256=vehicle_sha256(vehicle),
         estimators=list(estimators),
@@ -575,11 +455,10 @@ def report_facts(
             not_independent=sorted(plan.dependent),
             notes=notes,
         ),
-        friction=None if friction is None else friction_facts(friction),
         metrics=rows,
         segments=events,
         losses=losses,
-        warnings=warnings,
+        warnings=drive.notes,
         versions=tool_versions(),
     )
 

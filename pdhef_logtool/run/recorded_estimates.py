@@ -6,7 +6,7 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle, load_vehicle
 from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
 from pdhef_logtool.drive.truth import (
     SAME_SHARE,
     TruthTrack,
@@ -23,24 +24,21 @@ from pdhef_logtool.drive.truth import (
     share_equal,
     truth_at,
 )
-from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
-from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
+from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import (
     Mapping as SignalMapping,
 )
 from pdhef_logtool.mapping import (
-    SignalSource,
     check_mapping,
-    choose_mapping,
     join_channels,
     load_mapping,
     merge_losses,
     read_signals,
 )
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
-from pdhef_logtool.records.errors import MappingError, UsageError
+from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import (
     TRUTH_UNITS,
     WHEELS,
@@ -52,16 +50,16 @@ from pdhef_logtool.records.signals import (
     join_signals,
 )
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.estimate_channels import RecordedEstimate, gap_ns, read_estimate
+from pdhef_logtool.run.estimating import DeadReckoning, first_pose
 from pdhef_logtool.run.pipeline import (
-    DeadReckoning,
     LogResult,
     Progress,
     RunResult,
-    first_pose,
     judge,
     make_folder,
+    outcome_of,
     read_thresholds,
     report_facts,
     without_whole,
@@ -69,7 +67,7 @@ from pdhef_logtool.run.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.sinks.base import TRUTH, Event
-from pdhef_logtool.sinks.report import EstimatorFacts, LogOutcome, build_report, write_json
+from pdhef_logtool.sinks.report import EstimatorFacts, build_report, write_json
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
@@ -88,7 +86,7 @@ def score_log(
     output: Path | None = None,
     junit: Path | None = None,
     progress: Progress = lambda _text, _share: None,
-    warn: Callable[[str], None] = lambda _text: None,
+    warn: Tell = lambda _text: None,
 ) -> RunResult:
     """Score recorded estimates of one log against its truth; same figures, tables and report as a run.
 
@@ -105,9 +103,7 @@ def score_log(
     PdhefError
         There is no estimate, no truth, or nothing of the log can be used.
     """
-    inputs = find_logs([argument])
-    if len(inputs) != 1:
-        raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=argument)
+    log_input = one_log(argument)
     vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
     thresholds = read_thresholds(config, junit)
@@ -117,114 +113,98 @@ def score_log(
             f"no --vehicle: the truth is taken to be measured at the centre of gravity, sideslip is scored above "
             f"{slow:g} m/s, and segments are cut at friction {vehicle.assumed_friction:g}"
         )
-    log = open_log(inputs[0].path)
-    try:
-        scoring = _Scoring(log, inputs[0], config, vehicle, warn)
-        scoring.choose(mapping, estimates, truth, name)
-        result = judge(scoring.score(output, progress), thresholds)
-    finally:
-        log.close()
+    scoring = _Scoring(config, vehicle, warn, estimates, truth, name)
+    with scoring.read(log_input, mapping) as drive:
+        result = judge(scoring.score(drive, output, progress), thresholds)
     if output is not None:
-        document = _config_document(config, scoring)
+        document = _config_document(config, drive, scoring.estimates)
         write_run(output, document, [result])
     write_verdicts(junit, [result])
     return RunResult(output, (result,))
 
 
-def _config_document(config: RunConfig, scoring: _Scoring) -> dict[str, Any]:
+def _config_document(config: RunConfig, drive: Drive, estimates: Sequence[EstimateSource]) -> dict[str, Any]:
     document = config.to_dict()
     for key in ("estimators", "annotate", "sensors"):
         del document[key]
-    document["estimates"] = {
-        e.name: {name: source.label for name, source in e.signals.items()} for e in scoring.estimates
-    }
-    document["truth"] = {name: source.label for name, source in scoring.mapping.truth.items()}
+    document["estimates"] = {e.name: {name: source.label for name, source in e.signals.items()} for e in estimates}
+    document["truth"] = {name: source.label for name, source in drive.mapping.truth.items()}
     return document
 
 
 class _Scoring:
-    """One log being scored: what was chosen for it, and what the reader of the report must know."""
+    """One log being scored: what was asked for, and which fields were chosen."""
 
     def __init__(
         self,
-        log: DriveLog,
-        log_input: LogInput,
         config: RunConfig,
         vehicle: VehicleParameters,
-        warn: Callable[[str], None],
+        warn: Tell,
+        estimates: Sequence[str],
+        truth: Sequence[str],
+        name: str | None,
     ) -> None:
-        self.log, self.log_input, self.config, self.vehicle = log, log_input, config, vehicle
-        self.mapping = SignalMapping()
-        self.missing: tuple[str, ...] = ()
+        self.config, self.vehicle, self.warn = config, vehicle, warn
+        self._asked, self._truth, self._name = estimates, truth, name
         self.estimates: tuple[EstimateSource, ...] = ()
-        self.warnings: list[str] = []
-        self._warn = warn
 
-    def tell(self, text: str) -> None:
-        """Say it now, and in the report."""
-        self.warnings.append(text)
-        self._warn(f"{self.log_input.stem}: {text}")
-
-    def choose(
-        self, mapping: SignalMapping | None, estimates: Sequence[str], truth: Sequence[str], name: str | None
-    ) -> None:
-        """Decide which fields are estimate, truth and sensors."""
-        self.estimates = choose_estimates(self.log, estimates, mapping, name)
-        named = sources_of(self.log, truth, TRUTH_UNITS, "--truth")[0] if truth else None
-        can = None if mapping is None else mapping.can
+    def read(self, log_input: LogInput, mapping: SignalMapping | None) -> Drive:
+        """Open the log; decide which fields are estimate, truth and sensors."""
+        given = mapping
         if mapping is not None and not mapping.signals and not mapping.truth:
             mapping = None  # a file of estimates alone leaves the rest to recognition
-        if mapping is not None and named is not None:
-            mapping = self._with_truth(mapping, named)
-        chosen, self.missing = choose_mapping(
-            self.log, mapping, self.tell, prefer_truth=self.config.prefer_truth, require_signals=False
+        elif mapping is not None and self._truth:
+            mapping = replace(mapping, truth={}, quality=None)
+
+        def choose(log: DriveLog, chosen: SignalMapping, tell: Tell) -> SignalMapping:
+            self.estimates = choose_estimates(log, self._asked, given, self._name)
+            for estimate in self.estimates:
+                check_mapping(estimate.as_mapping(), log)
+            if self._truth:
+                quality = chosen.quality if given is None else given.quality
+                if quality is not None:
+                    tell(f"--truth replaces the mapped truth and its gate on {quality.describe()}")
+                named = sources_of(log, self._truth, TRUTH_UNITS, "--truth")[0]
+                can = None if given is None else given.can
+                chosen = replace(chosen, truth=named, quality=None, can=can)
+            if not chosen.truth:
+                raise MappingError(
+                    expected="a truth to score against",
+                    got="none mapped and none recognised",
+                    where=str(log.path),
+                    remedy="name it with --truth SIGNAL=TOPIC.FIELD or in a mapping file",
+                )
+            return chosen
+
+        options = replace(self.config.read_options, friction=None)
+        return read_drive(
+            log_input, self.vehicle, mapping, options, tell=self.warn, adjust=choose, require_sensors=False
         )
-        if mapping is None and named is not None:
-            chosen = replace(self._with_truth(chosen, named), can=can)
-            check_mapping(chosen, self.log)
-        self.mapping = chosen
-        for estimate in self.estimates:
-            check_mapping(estimate.as_mapping(), self.log)
-        if not chosen.truth:
-            raise MappingError(
-                expected="a truth to score against",
-                got="none mapped and none recognised",
-                where=str(self.log.path),
-                remedy="name it with --truth SIGNAL=TOPIC.FIELD or in a mapping file",
-            )
 
-    def _with_truth(self, mapping: SignalMapping, truth: dict[str, SignalSource]) -> SignalMapping:
-        if mapping.quality is not None:
-            self.tell(f"--truth replaces the mapped truth and its gate on {mapping.quality.describe()}")
-        return replace(mapping, truth=truth, quality=None)
-
-    def score(self, output: Path | None, progress: Progress) -> LogResult:
+    def score(self, drive: Drive, output: Path | None, progress: Progress) -> LogResult:
         """Read, compare and, with a folder, write."""
-        log, stem = self.log, self.log_input.stem
-        start_ns, end_ns = time_slice(self.config, log.start_ns, log.end_ns)
-        sha256 = hash_log(self.log_input.path)
-        progress(stem, 0.1)
-        plan = plan_drive(log, self.mapping, self.vehicle, start_ns, end_ns, require_imu=False)
-        recorded, losses = self._read_estimates(start_ns, end_ns)
-        progress(stem, 0.3)
-        truth, truth_losses, samples = read_truth(log, plan, self.config.window_s)
-        progress(stem, 0.6)
-        signals, sensor_losses, counts = self._read_sensors(plan)
-        progress(stem, 0.8)
-        samples |= counts
+        plan = drive.plan
+        progress(drive.name, 0.1)
+        recorded, losses = self._read_estimates(drive)
+        progress(drive.name, 0.3)
+        truth, truth_losses, samples = read_truth(drive.log, plan, drive.options.window_s)
+        progress(drive.name, 0.6)
+        signals = _read_sensors(drive)
+        all_losses = merge_losses([drive.log.lost, losses, truth_losses, drive.losses])
+        progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
-        rows, dependent = self._figures(plan, recorded, truth, signals)
-        plan = replace(plan, dependent={**dependent, **plan.dependent})
+        rows, dependent = self._figures(drive, plan, recorded, truth, signals)
+        drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
         truth_track = truth_at(truth, scored_ns, plan.truth_latency_s)
         events = self._events(truth_track, signals_at(signals, scored_ns), recorded)
+        samples |= drive.samples
         for r in recorded:
             samples |= r.samples
-        all_losses = merge_losses([log.lost, losses, truth_losses, sensor_losses])
         facts = report_facts(
-            log, self.log_input, sha256, plan, self.missing, self.vehicle,
+            drive, self.vehicle,
             [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded],
-            rows, events, all_losses, self.warnings, samples,
+            rows, events, all_losses, samples,
         )  # fmt: skip
         read = {s.topic for e in self.estimates for s in e.signals.values()}
         topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
@@ -238,32 +218,23 @@ class _Scoring:
         folder = None
         if output is not None:
             make_folder(output)
-            folder = output / "logs" / stem
+            folder = output / "logs" / drive.name
             _write(folder, report, rows, [truth_track, *(r.track for r in recorded)], plan)
-        lost = tuple(f"{x.what} ({x.where})" for x in all_losses if x.severity == "lost")
-        outcome = LogOutcome(log=stem, file=self.log_input.path.name, sha256=sha256, lost=lost)
-        progress(stem, 1.0)
-        return LogResult(outcome, folder, report, tuple(rows))
+        progress(drive.name, 1.0)
+        return LogResult(outcome_of(drive, all_losses), folder, report, tuple(rows))
 
-    def _read_estimates(self, start_ns: int, end_ns: int) -> tuple[list[RecordedEstimate], list[Loss]]:
+    def _read_estimates(self, drive: Drive) -> tuple[list[RecordedEstimate], list[Loss]]:
         losses: list[Loss] = []
         recorded = []
         for estimate in self.estimates:
-            found, lost = read_estimate(self.log, estimate, start_ns, end_ns, self.config.window_s)
+            found, lost = read_estimate(
+                drive.log, estimate, drive.plan.start_ns, drive.plan.end_ns, drive.options.window_s
+            )
             for note in found.notes:
-                self.tell(f"{estimate.name}: {note}")
+                drive.tell(f"{estimate.name}: {note}")
             recorded.append(found)
             losses += lost
         return recorded, losses
-
-    def _read_sensors(self, plan: DrivePlan) -> tuple[Signals | None, tuple[Loss, ...], dict[str, int]]:
-        if not plan.alignment.channels:
-            self.tell("no IMU in the mapping: segments come from the truth alone")
-            return None, (), {}
-        sensors_alone = replace(plan, truth=None, mapping=replace(plan.mapping, truth={}, quality=None))
-        reader = DriveReader(self.log, sensors_alone, self.config.window_s)
-        seen = [w.signals for w in reader.windows() if len(w.signals)]
-        return (join_signals(seen) if seen else None), reader.losses, reader.samples or {}
 
     def _with_dependence(self, plan: DrivePlan, recorded: Sequence[RecordedEstimate]) -> DrivePlan:
         """Add the truth channels that one of the estimates is, as a recorded channel."""
@@ -275,6 +246,7 @@ class _Scoring:
 
     def _figures(
         self,
+        drive: Drive,
         plan: DrivePlan,
         recorded: Sequence[RecordedEstimate],
         truth: TruthTrack,
@@ -299,12 +271,12 @@ class _Scoring:
                 r.track,
                 at_stamps,
                 masks,
-                log=self.log_input.stem,
+                log=drive.name,
                 low_speed_m_s=self.vehicle.low_speed_blend_m_s,
                 not_independent={**plan.dependent, **same},
             )
             if not any(row.metric == "rmse" for row in figures):
-                self.tell(f"{r.track.name}: nowhere are estimate and truth known together, so there are no errors")
+                drive.tell(f"{r.track.name}: nowhere are estimate and truth known together, so there are no errors")
             # What the estimate does not claim is not missing from it.
             silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(r.track, n)).any()}
             rows += [
@@ -325,6 +297,16 @@ class _Scoring:
                 for s in find_intervals(r.track.stamps_ns, {"diverged": r.track.diverged})
             ]
         return sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
+
+
+def _read_sensors(drive: Drive) -> Signals | None:
+    """Return what the mapped sensors say, None without any; the drive then has the losses and samples of that."""
+    if not drive.plan.alignment.channels:
+        drive.tell("no IMU in the mapping: segments come from the truth alone")
+        return None
+    drive.plan = replace(drive.plan, truth=None, mapping=replace(drive.mapping, truth={}, quality=None))
+    seen = [w.signals for w in drive.windows() if len(w.signals)]
+    return join_signals(seen) if seen else None
 
 
 def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:

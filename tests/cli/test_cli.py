@@ -200,7 +200,7 @@ def test_view_finds_the_recording(tmp_path: Path) -> None:
 
 def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path) -> None:
     code = (
-        "import pdhef_logtool.run.pipeline as p\n"
+        "import pdhef_logtool.drive.reading as p\n"
         "def broken(*a, **k): raise RuntimeError('on purpose')\n"
         "p.plan_drive = broken\n"
         "import sys; from pdhef_logtool.cli.app import main\n"

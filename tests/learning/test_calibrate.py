@@ -11,7 +11,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.learning.drives import choose_drives
 from pdhef_logtool.learning.evidence.calibrate import (
     COVERED_WRONG,
     FOLDS,

@@ -19,7 +19,7 @@ from fake_drive_log import FakeLog, FakeTopic
 from residual_car import CAR, Motion, Wave, drive
 
 from pdhef_logtool.car.vehicle import VehicleParameters, vehicle_to_toml
-from pdhef_logtool.learning.network import extract_command
+from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, run_extraction
 from pdhef_logtool.logs.discovery import hash_log
@@ -110,7 +110,7 @@ def _extract(
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
     (tmp_path / "v.toml").write_text(vehicle_to_toml(car))
-    monkeypatch.setattr(extract_command, "open_log", lambda _path: log)
+    monkeypatch.setattr(reading, "open_log", lambda _path: log)
     config = RunConfig(vehicle=tmp_path / "v.toml", mapping=tmp_path / "m.toml", window_s=settings.pop("window_s", 7.0))
     return run_extraction([str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **settings))
 
@@ -291,7 +291,7 @@ def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> No
     assert result.exit_code == 3
     jsonschema.validate(result.manifest, SCHEMA)
     assert [f["log"] for f in result.manifest["failed"]] == ["bad"]
-    assert any(t.startswith("bad: ") for t in told)
+    assert any(t.startswith("bad is left out: ") for t in told)
     assert [d.name for d in read_dataset(tmp_path / "out").drives] == ["good"]
     with pytest.raises(LogError):
         run_extraction([str(logs / "bad.mcap")], tmp_path / "alone", ExtractSettings(RunConfig()))
@@ -358,7 +358,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     result = _pdhef("extract", log, "-o", str(out), "-v", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
     assert result.returncode == 0, result.stderr
     assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
-    assert result.stderr == ""
+    assert result.stderr.splitlines() == ["warning: dlc: perfect truth taken; /rtk/fix, /rtk/odometry not used"]
     (found,) = read_dataset(out).drives
     assert found.usable_rows > 0.99 * found.rows
     rtk = _pdhef("extract", log, "-o", str(tmp_path / "rtk"), "--prefer-truth", "rtk", "--split", "train", "--json")

@@ -18,11 +18,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
 from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.learning.drives import choose_drives, load_drive
 from pdhef_logtool.learning.evidence.trust import (
     MIN_BLOCKS,
     MIN_EXCITED_S,
@@ -40,7 +41,6 @@ from pdhef_logtool.learning.evidence.trust_command import (
     run_trust,
     seen_by_identification,
 )
-from pdhef_logtool.learning.noise.tune_drives import MAX_BYTES, DriveBench, TuneSetup
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
@@ -223,9 +223,9 @@ def _settings(sample_logs_dir: Path, folder: Path, **changes: object) -> TrustSe
 
 def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle, bundle = load_vehicle(sample_logs_dir / "vehicle.toml"), _bundle()
-    bench = DriveBench(TuneSetup(RunConfig(), vehicle, None, bundle, ()))
-    bench.load(0, find_logs([str(sample_logs_dir / "dlc.mcap")])[0], MAX_BYTES)
-    signals, truth = bench.take(0)
+    drive = load_drive(find_logs([str(sample_logs_dir / "dlc.mcap")])[0], vehicle, None, ReadOptions())[1]
+    assert drive is not None and drive.truth is not None
+    signals, truth = drive.signals, drive.truth
     passes = []
     run = NetworkService.run
     monkeypatch.setattr(NetworkService, "run", lambda *a: passes.append(1) or run(*a))
@@ -294,8 +294,7 @@ def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path,
 
 def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:
     vehicle = load_vehicle(sample_logs_dir / "vehicle.toml")
-    bench = DriveBench(TuneSetup(RunConfig(), vehicle, None, None, ()))
-    facts = bench.load(0, find_logs([str(sample_logs_dir / "dlc.mcap")])[0], MAX_BYTES)
+    facts, _ = load_drive(find_logs([str(sample_logs_dir / "dlc.mcap")])[0], vehicle, None, ReadOptions())
     spans: dict[str, str | float | int | list[str]] = {"drives": ["dlc: 0.00 to 7.00 s", "dlc_2: 0.00 to 7.00 s"]}
     assert seen_by_identification(vehicle, [facts]) == []
     identified = vehicle.model_copy(update={"identification": spans})

@@ -19,7 +19,7 @@ import torch
 from pdhef_logtool.car.vehicle import Network, default_vehicle, load_vehicle, vehicle_to_toml
 from pdhef_logtool.estimators.hybrid import hybrid_ukf
 from pdhef_logtool.evaluation.metrics import score_track
-from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.learning.drives import choose_drives
 from pdhef_logtool.learning.noise import tune_drives
 from pdhef_logtool.learning.noise.search import (
     FACTORS,
@@ -342,7 +342,7 @@ def test_drives_that_do_not_fit_are_refused(
 ) -> None:
     settings = _settings(sample_logs_dir, names=("phy-ukf-tuned",))
     facts = run_tuning([str(drives)], tmp_path / "car.toml", settings).drives
-    assert all(f.bytes_held > 100 * f.scored_stamps for f in facts)
+    assert all(f.bytes_held > 100 * f.counts["scored_stamps"] for f in facts)
     monkeypatch.setattr(tune_drives, "MAX_BYTES", sum(f.bytes_held for f in facts) - 1)
     with pytest.raises(EstimatorError, match="--start and --end"):
         run_tuning([str(drives)], tmp_path / "again.toml", settings)

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pdhef_logtool.drive.options import ReadOptions, parse_time, time_slice
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.run.config import RunConfig, load_config, parse_time, time_slice
+from pdhef_logtool.run.config import RunConfig, load_config
 
 START = 1_700_000_000_000_000_000
 END = START + 300_000_000_000
@@ -48,15 +49,15 @@ def test_rfc_3339_is_exact_to_the_microsecond(when: dt.datetime) -> None:
 
 
 def test_slice_is_cut_to_the_log() -> None:
-    assert time_slice(RunConfig(start="10", end="end-10s"), START, END) == (START + 10**10, END - 10**10)
-    assert time_slice(RunConfig(), START, END) == (START, END)
-    assert time_slice(RunConfig(end="1e9".replace("e9", "000")), START, END) == (START, END)
+    assert time_slice(ReadOptions(start="10", end="end-10s"), START, END) == (START + 10**10, END - 10**10)
+    assert time_slice(ReadOptions(), START, END) == (START, END)
+    assert time_slice(ReadOptions(end="1e9".replace("e9", "000")), START, END) == (START, END)
 
 
 @pytest.mark.parametrize(("start", "end"), [("400", None), ("20", "10"), ("10", "10"), (None, "1000000000000000")])
 def test_empty_slice_is_a_usage_error(start: str | None, end: str | None) -> None:
     with pytest.raises(UsageError, match="300"):
-        time_slice(RunConfig(start=start, end=end), START, END)
+        time_slice(ReadOptions(start=start, end=end), START, END)
 
 
 def test_flags_win_over_file_and_paths_are_relative_to_it(tmp_path: Path) -> None:

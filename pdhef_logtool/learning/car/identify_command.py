@@ -11,12 +11,12 @@ from pdhef_logtool.car.vehicle import Network, VehicleParameters, default_vehicl
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, identify, understeer_deg_per_g
+from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, tell_drive
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import choose_mapping, load_mapping
+from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EstimatorError, OutputError, UsageError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.run.config import RunConfig
 
 #: Other tyres, another nominal model: what was found with those of the starting file counts no more.
 NO_NETWORK_TRIED = "no network was tried on this vehicle"
@@ -40,6 +40,12 @@ class IdentifyResult:
     identification: Identification
     vehicle_file: Path
     plot_file: Path
+    records: tuple[DriveRecord, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all drives took part whole, 3 if not."""
+        return exit_code(self.records)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
@@ -47,6 +53,8 @@ class IdentifyResult:
         return {
             "vehicle": str(self.vehicle_file),
             "plot": str(self.plot_file),
+            "exit_code": self.exit_code,
+            **drives_document(self.records),
             "parameters": [
                 {
                     "name": p.name,
@@ -107,30 +115,14 @@ def run_identification(
     given = None if config.mapping is None else load_mapping(config.mapping)
     fit: list[FitDrive] = []
     held_out: list[FitDrive] = []
-    steering_wheel = False
+    records: list[DriveRecord] = []
     logs = find_logs(arguments)
     for number, log_input in enumerate(logs):
         progress(f"reading {log_input.stem}", 0.2 * number / len(logs))
-
-        def tell(text: str, name: str = log_input.stem) -> None:
-            warn(f"{name}: {text}")
-
-        log = open_log(log_input.path)
-        try:
-            mapping, _ = choose_mapping(
-                log,
-                given,
-                tell,
-                prefer_truth=config.prefer_truth,
-            )
-            drive = load_fit_drive(log_input.stem, log, mapping, start, *time_slice(config, log.start_ns, log.end_ns))
-            steering_wheel = steering_wheel or "steer_rad" not in mapping.signals
-            for loss in log.lost:
-                tell(f"{loss.what} ({loss.where})")
-        finally:
-            log.close()
+        record, drive = load_fit_drive(log_input, start, given, config.read_options)
+        records.append(record)
+        tell_drive(record, warn)
         if drive is None:
-            tell("no truth from which a sideslip follows; not used")
             continue
         kept, scored = split_drive(drive, holdout)
         fit.append(kept)
@@ -147,7 +139,7 @@ def run_identification(
         fit,
         held_out,
         start,
-        steering_wheel=steering_wheel,
+        steering_wheel=any(drive.steering_wheel for drive in fit),
         progress=lambda text, share: progress(text, 0.2 + 0.8 * share),
     )
     name = f"{start.name} (identified)" if not start.name.endswith("(identified)") else start.name
@@ -166,7 +158,7 @@ def run_identification(
         plot_identification(found, plot)
     except OSError as error:
         raise OutputError(expected="a place to write to", got=error.strerror or str(error), where=str(plot)) from None
-    return IdentifyResult(found, output, plot)
+    return IdentifyResult(found, output, plot, tuple(records))
 
 
 def _provenance(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,13 +12,19 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle, vehicle_sha256
-from pdhef_logtool.drive.friction import friction_source, friction_topic
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
-from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.drive.reading import friction_of
 from pdhef_logtool.estimators.registry import default_names, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
-from pdhef_logtool.learning.choosing_drives import Refusal, choose_drives
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    Refusal,
+    choose_drives,
+    drives_document,
+    exit_code,
+    load_drive,
+    tell_drive,
+)
 from pdhef_logtool.learning.evidence.calibrate import (
     COVERED,
     COVERED_WRONG,
@@ -34,15 +39,15 @@ from pdhef_logtool.learning.evidence.calibrate import (
 from pdhef_logtool.learning.network.extract_command import MAX_VARIATION
 from pdhef_logtool.learning.noise.tune_command import HELD_OUT
 from pdhef_logtool.learning.variation import Variation, vary
-from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
-from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import choose_mapping, load_mapping
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.mapping import load_mapping
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.estimating import estimate
 from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.watches.error_features import error_terms
 from pdhef_logtool.watches.intervals import (
@@ -92,32 +97,20 @@ class CalibrateSettings:
     any_split: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class DriveEntry:
-    """What is recorded of a drive; ``left_out`` says why it is not used, empty if it is."""
-
-    name: str
-    file: str
-    sha256: str
-    split: str
-    runs: int
-    left_out: str = ""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrateResult:
     """What the command found and wrote."""
 
     file: Path
     fitted: Mapping[str, Fitted]
-    drives: tuple[DriveEntry, ...]
-    left_out: tuple[DriveEntry, ...]
+    drives: tuple[DriveRecord, ...]
+    left_out: tuple[DriveRecord, ...]
     document: Mapping[str, Any]
 
     @property
     def exit_code(self) -> int:
-        """0 if all drives took part, 3 if some did not."""
-        return EXIT_PARTIAL if self.left_out else EXIT_OK
+        """0 if all drives took part whole, 3 if not."""
+        return exit_code((*self.drives, *self.left_out))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
@@ -158,14 +151,12 @@ def run_calibration(
     if model is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")
     samples: dict[str, list[Samples]] = {}
-    drives: list[DriveEntry] = []
+    drives: list[DriveRecord] = []
     for number, log_input in enumerate(inputs):
         progress(log_input.stem, RUNNING * number / len(inputs))
-        entry, found = _run_drive(log_input, number, settings, vehicle, mapping, model)
-        entry = replace(entry, split=splits.get(log_input.stem, ""))
-        if entry.left_out:
-            warn(f"{entry.name} is left out: {entry.left_out}")
-        drives.append(entry)
+        record, found = _run_drive(log_input, number, settings, vehicle, mapping, model)
+        drives.append(replace(record, split=splits.get(log_input.stem)))
+        tell_drive(record, warn)
         for name, part in found:
             samples.setdefault(name, []).append(part)
     used = tuple(d for d in drives if not d.left_out)
@@ -227,57 +218,38 @@ def _run_drive(
     vehicle: VehicleParameters,
     mapping: SignalMapping | None,
     model: ModelBundle | None,
-) -> tuple[DriveEntry, list[tuple[str, Samples]]]:
+) -> tuple[DriveRecord, list[tuple[str, Samples]]]:
     """Run the estimators on a drive, once as told and some times with a wrong vehicle; return errors and terms."""
     config = settings.config
-    sha256 = hash_log(log_input.path) if log_input.path.exists() else ""
-    entry = DriveEntry(log_input.stem, log_input.path.name, sha256, "", 0)
-    with closing(open_log(log_input.path)) as log:
-        chosen, _ = choose_mapping(log, mapping, lambda _text: None, prefer_truth=config.prefer_truth, tell_notes=False)
-        plan = plan_drive(log, chosen, vehicle, *time_slice(config, log.start_ns, log.end_ns))
-        if plan.truth is None or "sideslip_rad" not in plan.derivation:
-            return replace(entry, left_out="no true sideslip"), []
-        if "sideslip_rad" in plan.dependent:
-            return replace(entry, left_out=f"its truth is no truth: {plan.dependent['sideslip_rad']}"), []
-        windows = [
-            w for w in DriveReader(log, plan, config.window_s).windows() if len(w.signals) and w.truth is not None
-        ]
-    if not windows:
-        return replace(entry, left_out="no stamps with truth"), []
-    signals = join_signals([w.signals for w in windows])
-    truth = concatenate([replace(w.truth, covariance=np.empty((0, 3, 3))) for w in windows if w.truth is not None])
+    options = config.read_options
+    record, drive = load_drive(log_input, vehicle, mapping, options, fill_friction=False)
+    if drive is None or drive.truth is None:
+        return record, []
+    signals = drive.signals
     runs = [(vehicle, 1.0, False)]
     if settings.spread > 0.0:
-        told = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{sha256}"), WRONG_RUNS)
+        told = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{record.sha256}"), WRONG_RUNS)
         runs += [(one.vehicle, one.friction_factor, True) for one in told]
     found: list[tuple[str, Samples]] = []
     for assumed, factor, wrong in runs:
-        friction = friction_source(
-            config.friction,
-            assumed,
-            plan.alignment.available,
-            friction_topic(chosen),
-            use_speed=config.sensors == "full",
-            factor=factor,
-        )
-        seen = friction.fill(signals)
-        if not found and "friction" not in plan.alignment.available:
+        seen = friction_of(drive.plan, assumed, options, factor).fill(drive.signals)
+        if not found and "friction" not in drive.plan.alignment.available:
             signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
         estimators, _ = runnable(
             config.estimators or default_names(assumed, model),
             assumed,
-            plan.alignment.available,
-            use_speed=config.sensors == "full",
+            drive.plan.alignment.available,
+            use_speed=options.use_speed,
             model=model,
         )
-        for estimator in estimators:
-            track, _ = run_window(estimator, seen, None, None)
-            part = drive_samples(track, seen, signals, truth, vehicle, number, wrong=wrong)
-            if len(part) >= MIN_SAMPLES:
-                found.append((estimator.name, part))
+        for window in estimate(replace(drive, signals=seen), estimators, watched=False, drawn=False):
+            for track in window.tracks:
+                part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
+                if len(part) >= MIN_SAMPLES:
+                    found.append((track.name, part))
     if not found:
-        return replace(entry, left_out="no estimate with an interval where the truth is known"), []
-    return replace(entry, runs=len(runs)), found
+        return replace(record, left_out="no estimate with an interval where the truth is known"), []
+    return replace(record, counts={**record.counts, "runs": len(runs)}), found
 
 
 def drive_samples(
@@ -331,8 +303,8 @@ def _document(
     vehicle: VehicleParameters,
     model: ModelBundle | None,
     fitted: Mapping[str, Fitted],
-    drives: Sequence[DriveEntry],
-    left_out: Sequence[DriveEntry],
+    drives: Sequence[DriveRecord],
+    left_out: Sequence[DriveRecord],
 ) -> dict[str, Any]:
     """Return what is written; no date, so that the same command gives the same bytes."""
     config = settings.config.to_dict()
@@ -366,8 +338,7 @@ def _document(
             "sample_every_s": SAMPLE_EVERY_S,
         },
         "drives_sha256": hashlib.sha256("".join(sorted(d.sha256 for d in drives)).encode()).hexdigest(),
-        "drives": [{k: v for k, v in asdict(d).items() if k != "left_out"} for d in drives],
-        "left_out": [{"name": d.name, "file": d.file, "reason": d.left_out} for d in left_out],
+        **drives_document((*drives, *left_out)),
         "estimators": {
             name: {
                 **coefficients[name],

@@ -5,19 +5,29 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_sha256, vehicle_to_toml
+from pdhef_logtool.drive.options import NANOSECONDS_FROM, parse_time
+from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
 from pdhef_logtool.estimators.cautious import at_trust
 from pdhef_logtool.estimators.trust_policy import SHOWN_DIGITS
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.choosing_drives import Refusal, choose_drives
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    Refusal,
+    choose_drives,
+    drives_document,
+    exit_code,
+    load_drive,
+    tell_drive,
+)
 from pdhef_logtool.learning.evidence.trust import (
     BLOCK_S,
     EXCITED_M_S2,
@@ -35,16 +45,16 @@ from pdhef_logtool.learning.evidence.trust import (
     join_blocks,
 )
 from pdhef_logtool.learning.noise.tune_command import read_comments
-from pdhef_logtool.learning.noise.tune_drives import MAX_BYTES, DriveBench, DriveFacts, TuneSetup
+from pdhef_logtool.learning.noise.tune_drives import MIN_SCORED_STAMPS
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.run.config import NANOSECONDS_FROM, RunConfig, parse_time
+from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions, write_json
 
 FORMAT = "pdhef-trust"
@@ -89,14 +99,21 @@ class TrustResult:
     record_file: Path
     decision: TrustDecision
     network: Network
-    drives: tuple[DriveFacts, ...]
-    left_out: tuple[DriveFacts, ...]
+    drives: tuple[DriveRecord, ...]
+    left_out: tuple[DriveRecord, ...]
     rmse_deg: tuple[tuple[float, ...], ...]
 
     @property
     def exit_code(self) -> int:
-        """0 if all drives took part, 3 if some did not."""
-        return EXIT_PARTIAL if self.left_out else EXIT_OK
+        """0 if all drives took part whole, 3 if not."""
+        return exit_code((*self.drives, *self.left_out))
+
+    def drives_document(self) -> dict[str, Any]:
+        """Return the drives with their errors at each trust, and those left out."""
+        document = drives_document((*self.drives, *self.left_out))
+        for drive, rmse in zip(document["drives"], self.rmse_deg, strict=True):
+            drive["rmse_deg"] = list(rmse)
+        return document
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
@@ -110,10 +127,7 @@ class TrustResult:
             "evidence": self.network.evidence,
             "model_sha256": self.network.model_sha256,
             **_figures(d),
-            "drives": [
-                {"name": f.name, "rmse_deg": list(rmse)} for f, rmse in zip(self.drives, self.rmse_deg, strict=True)
-            ],
-            "left_out": [{"drive": f.name, "reason": f.left_out} for f in self.left_out],
+            **self.drives_document(),
         }
 
 
@@ -164,25 +178,31 @@ def run_trust(
     vehicle = load_vehicle(source)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
-    bench = DriveBench(TuneSetup(config, vehicle, mapping, model, ()))
     network = RepeatedNetwork(model, {})
-    loaded: list[DriveFacts] = []
+    needs = adaptive_hybrid_ukf(vehicle, network).needs
+
+    def lacking(drive: Drive) -> str:
+        missing = sorted(needs - drive.available)
+        return f"pd-hef needs {', '.join(missing)}" if missing else ""
+
+    loaded: list[DriveRecord] = []
     scored: list[BlockErrors] = []
     for number, log_input in enumerate(inputs):
         progress(log_input.stem, number / len(inputs))
-        facts = bench.load(number, log_input, MAX_BYTES)
-        if not facts.left_out:
-            signals, truth = bench.take(number)
-            missing = sorted(adaptive_hybrid_ukf(vehicle, network).needs - signals.available)
-            if missing:
-                facts = replace(facts, left_out=f"pd-hef needs {', '.join(missing)}")
-            else:
-                scored.append(errors_by_trust(vehicle, network, signals, truth, use_speed=config.sensors == "full"))
-        for text in facts.warnings:
-            warn(f"{facts.name}: {text}")
-        if facts.left_out:
-            warn(f"{facts.name} is left out: {facts.left_out}")
-        loaded.append(facts)
+        record, drive = load_drive(
+            log_input,
+            vehicle,
+            mapping,
+            config.read_options,
+            split=splits.get(log_input.stem),
+            refuse=lacking,
+            least_scored=MIN_SCORED_STAMPS,
+        )
+        tell_drive(record, warn)
+        loaded.append(record)
+        if drive is not None and drive.truth is not None:
+            use_speed = config.read_options.use_speed
+            scored.append(errors_by_trust(vehicle, network, drive.signals, drive.truth, use_speed=use_speed))
     drives = tuple(f for f in loaded if not f.left_out)
     if not drives:
         raise EstimatorError(
@@ -209,9 +229,9 @@ def run_trust(
         left_out=tuple(f for f in loaded if f.left_out),
         rmse_deg=tuple(_rmse_deg(b) for b in scored),
     )
-    record = _record(result, settings, vehicle, splits)
+    document = _record(result, settings, vehicle)
     write_bytes(output, trusted_toml(source, vehicle, found).encode())
-    write_json(result.record_file, record)
+    write_json(result.record_file, document)
     progress("done", 1.0)
     return result
 
@@ -241,7 +261,7 @@ def errors_by_trust(
 
 
 def seen_by_identification(
-    vehicle: VehicleParameters, drives: Sequence[DriveFacts], start_s: float = 0.0, end_s: float = math.inf
+    vehicle: VehicleParameters, drives: Sequence[DriveRecord], start_s: float = 0.0, end_s: float = math.inf
 ) -> list[str]:
     """Return a warning for each drive that the vehicle was identified on within [start_s, end_s) of the log."""
     spans = vehicle.identification.get("drives", [])
@@ -328,9 +348,7 @@ def _bound(bound: Any) -> dict[str, float | None]:
     return {name: None if np.isnan(value) else value for name, value in asdict(bound).items()}
 
 
-def _record(
-    result: TrustResult, settings: TrustSettings, vehicle: VehicleParameters, splits: Mapping[str, str]
-) -> dict[str, Any]:
+def _record(result: TrustResult, settings: TrustSettings, vehicle: VehicleParameters) -> dict[str, Any]:
     """Return the document of ``<stem>.trust.json``."""
     config = settings.config.to_dict()
     return {
@@ -362,18 +380,5 @@ def _record(
         "reason": result.decision.reason,
         "evidence": result.network.evidence,
         **_figures(result.decision),
-        "drives": [
-            {
-                "name": f.name,
-                "file": f.file,
-                "sha256": f.sha256,
-                "split": splits.get(f.name),
-                "seconds": round(f.seconds, 3),
-                "truth": list(f.truth),
-                "friction_from": f.friction_from,
-                "rmse_deg": list(rmse),
-            }
-            for f, rmse in zip(result.drives, result.rmse_deg, strict=True)
-        ],
-        "left_out": [{"name": f.name, "file": f.file, "reason": f.left_out} for f in result.left_out],
+        **result.drives_document(),
     }

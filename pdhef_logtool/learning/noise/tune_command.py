@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle, vehicle_sha256, vehicle_to_toml
-from pdhef_logtool.learning.choosing_drives import Refusal, choose_drives
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    Refusal,
+    choose_drives,
+    drives_document,
+    exit_code,
+    tell_drive,
+)
 from pdhef_logtool.learning.noise.search import (
     EXPLORING_SHARE,
     FACTORS,
@@ -31,10 +38,10 @@ from pdhef_logtool.learning.noise.search import (
     search,
     tuned_vehicle,
 )
-from pdhef_logtool.learning.noise.tune_drives import Benches, DriveFacts, TuneSetup, choose_names
+from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import PendingFile, write_bytes
 from pdhef_logtool.residual_model.bundle import open_model
 from pdhef_logtool.run.config import RunConfig
@@ -106,14 +113,14 @@ class TuneResult:
     tuning_file: Path
     plot_file: Path
     tuned: tuple[Tuned, ...]
-    drives: tuple[DriveFacts, ...]
-    left_out: tuple[DriveFacts, ...]
+    drives: tuple[DriveRecord, ...]
+    left_out: tuple[DriveRecord, ...]
     notes: tuple[str, ...]
 
     @property
     def exit_code(self) -> int:
-        """0 if all drives took part, 3 if some did not."""
-        return EXIT_PARTIAL if self.left_out else EXIT_OK
+        """0 if all drives took part whole, 3 if not."""
+        return exit_code((*self.drives, *self.left_out))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
@@ -122,8 +129,7 @@ class TuneResult:
             "tuning": str(self.tuning_file),
             "plot": str(self.plot_file),
             "exit_code": self.exit_code,
-            "drives": len(self.drives),
-            "left_out": [{"drive": d.name, "reason": d.left_out} for d in self.left_out],
+            **drives_document((*self.drives, *self.left_out)),
             "estimators": {
                 t.name: {
                     "trials": len(t.trials),
@@ -178,16 +184,13 @@ def run_tuning(
     with Benches(setup, min(jobs, len(inputs))) as benches:
         done = 0
 
-        def told(facts: DriveFacts) -> None:
+        def told(record: DriveRecord) -> None:
             nonlocal done
             done += 1
-            progress(f"reading {facts.name}", READING * done / len(inputs))
-            for text in facts.warnings:
-                warn(f"{facts.name}: {text}")
-            if facts.left_out:
-                warn(f"{facts.name} is left out for all estimators: {facts.left_out}")
+            progress(f"reading {record.name}", READING * done / len(inputs))
+            tell_drive(record, warn)
 
-        loaded = benches.load(inputs, told)
+        loaded = benches.load(inputs, splits, told)
         drives = tuple(d for d in loaded if not d.left_out)
         if not drives:
             raise EstimatorError(
@@ -220,7 +223,7 @@ def run_tuning(
         left_out=tuple(d for d in loaded if d.left_out),
         notes=notes,
     )
-    record = _record(result, settings, vehicle, splits, None if model is None else model.sha256)
+    record = _record(result, settings, vehicle, None if model is None else model.sha256)
     write_bytes(output, tuned_toml(config.vehicle, vehicle, tuned, record).encode())
     write_json(result.tuning_file, record)
     _plot(result)
@@ -337,7 +340,6 @@ def _record(
     result: TuneResult,
     settings: TuneSettings,
     vehicle: VehicleParameters,
-    splits: Mapping[str, str],
     model_sha256: str | None,
 ) -> dict[str, Any]:
     """Return the document of ``<stem>.tuning.json``."""
@@ -369,20 +371,7 @@ def _record(
             "low_speed_m_s": vehicle.low_speed_blend_m_s,
         },
         "drives_sha256": together,
-        "drives": [
-            {
-                "name": d.name,
-                "file": d.file,
-                "sha256": d.sha256,
-                "split": splits.get(d.name),
-                "seconds": round(d.seconds, 3),
-                "scored_stamps": d.scored_stamps,
-                "truth": list(d.truth),
-                "friction_from": d.friction_from,
-            }
-            for d in result.drives
-        ],
-        "left_out": [{"name": d.name, "file": d.file, "reason": d.left_out} for d in result.left_out],
+        **drives_document((*result.drives, *result.left_out)),
         "estimators": {
             t.name: {
                 "best_trial": t.best.number,

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from types import TracebackType
 from typing import Any, Protocol, Self
@@ -17,26 +17,23 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
-from pdhef_logtool.drive.friction import friction_source, friction_topic
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.drive.reading import MAX_BYTES, too_big
+from pdhef_logtool.drive.reading import Drive as ReadDrive
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, check_inputs
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator
 from pdhef_logtool.estimators.smoothed import SmoothedHybrid, smoothed_hybrid
-from pdhef_logtool.learning.noise.search import DriveError, drive_error, scorable_stamps, tuned_vehicle
-from pdhef_logtool.logs.discovery import LogInput, hash_log
-from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.learning.drives import DriveRecord, load_drive
+from pdhef_logtool.learning.noise.search import DriveError, drive_error, tuned_vehicle
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import choose_mapping
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.run.config import RunConfig
 
-#: Signals, truth and network output of all drives together may take this much memory.
-MAX_BYTES = 2 << 30
 #: A drive with fewer scored stamps says nothing of its own.
 MIN_SCORED_STAMPS = 100
 
@@ -193,22 +190,6 @@ def choose_names(names: Sequence[str] | None, model: ModelBundle | None) -> tupl
     return tuple(n for n in here if n in names)
 
 
-@dataclass(frozen=True, slots=True)
-class DriveFacts:
-    """What is recorded of a drive; ``left_out`` says why it is not scored, empty if it is."""
-
-    name: str
-    file: str
-    sha256: str
-    seconds: float
-    scored_stamps: int
-    truth: tuple[str, ...]
-    friction_from: str
-    bytes_held: int
-    warnings: tuple[str, ...]
-    left_out: str = ""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drive:
     signals: Signals
@@ -223,7 +204,7 @@ class DriveBench:
         self._setup = setup
         self._drives: dict[int, _Drive] = {}
 
-    def load(self, index: int, log_input: LogInput, max_bytes: int) -> DriveFacts:
+    def load(self, index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord:
         """Read a drive, run what its filters' noise does not change, and keep it under ``index``.
 
         Raises
@@ -231,72 +212,28 @@ class DriveBench:
         PdhefError
             The log cannot be read, or takes more than ``max_bytes``.
         """
-        setup, warnings = self._setup, list[str]()
-        sha256 = hash_log(log_input.path) if log_input.path.exists() else ""
-        log = open_log(log_input.path)
-        try:
-            mapping, _ = choose_mapping(
-                log, setup.mapping, warnings.append, prefer_truth=setup.config.prefer_truth, tell_notes=False
-            )
-            plan = plan_drive(log, mapping, setup.vehicle, *time_slice(setup.config, log.start_ns, log.end_ns))
+        setup = self._setup
 
-            friction = friction_source(
-                setup.config.friction,
-                setup.vehicle,
-                plan.alignment.available,
-                friction_topic(mapping),
-                use_speed=setup.use_speed,
-            )
+        def lacking(drive: ReadDrive) -> str:
+            missing = {name: sorted(TUNABLE[name].needs(setup) - drive.available) for name in setup.names}
+            return "; ".join(f"{name} needs {', '.join(what)}" for name, what in missing.items() if what)
 
-            def facts(held: int = 0, seconds: float = 0.0, scored: int = 0, left_out: str = "") -> DriveFacts:
-                return DriveFacts(
-                    name=log_input.stem,
-                    file=log_input.path.name,
-                    sha256=sha256,
-                    seconds=seconds,
-                    scored_stamps=scored,
-                    truth=tuple(sorted({source.label for source in mapping.truth.values()})),
-                    friction_from=friction.label,
-                    bytes_held=held,
-                    warnings=tuple(warnings),
-                    left_out=left_out,
-                )
-
-            if "sideslip_rad" in plan.dependent:
-                return facts(left_out=f"its truth is no truth: {plan.dependent['sideslip_rad']}")
-            missing = {name: sorted(TUNABLE[name].needs(setup) - plan.alignment.available) for name in setup.names}
-            lacking = "; ".join(f"{name} needs {', '.join(what)}" for name, what in missing.items() if what)
-            if plan.truth is None or lacking:
-                return facts(left_out=lacking or "no truth")
-            reader = DriveReader(log, plan, setup.config.window_s)
-            signals, truths, held = [], [], 0
-            for window in reader.windows():
-                if len(window.signals) == 0 or window.truth is None:
-                    continue
-                signals.append(window.signals)
-                truths.append(replace(window.truth, covariance=np.empty((0, 3, 3))))
-                held += _bytes(window.signals) + _bytes(window.truth)
-                if held > max_bytes:
-                    raise too_big(log_input.stem)
-            losses = [*log.lost, *reader.losses]
-            warnings += [f"{loss.what} ({loss.where})" for loss in losses if loss.severity == "lost"]
-        finally:
-            log.close()
-        low_speed = setup.vehicle.low_speed_blend_m_s
-        scored = sum(int(np.count_nonzero(scorable_stamps(t, low_speed))) for t in truths)
-        if scored < MIN_SCORED_STAMPS:
-            return facts(left_out=f"{scored} stamps with a true sideslip above {low_speed:g} m/s")
-        joined, truth = friction.fill(join_signals(signals)), concatenate(truths)
-        prepared = {name: TUNABLE[name].prepare(setup, joined) for name in setup.names}
-        held += sum(getattr(value, "nbytes", 0) for value in prepared.values())
-        self._drives[index] = _Drive(joined, truth, prepared)
-        seconds = float(joined.stamps_ns[-1] - joined.stamps_ns[0]) * 1e-9
-        return facts(held, seconds, scored)
-
-    def take(self, index: int) -> tuple[Signals, StateTrack]:
-        """Return signals [N] and truth [N] of a drive that was loaded, and keep it no longer."""
-        drive = self._drives.pop(index)
-        return drive.signals, drive.truth
+        record, whole = load_drive(
+            log_input,
+            setup.vehicle,
+            setup.mapping,
+            setup.config.read_options,
+            split=split,
+            refuse=lacking,
+            least_scored=MIN_SCORED_STAMPS,
+            max_bytes=max_bytes,
+        )
+        if whole is None or whole.truth is None:
+            return record
+        prepared = {name: TUNABLE[name].prepare(setup, whole.signals) for name in setup.names}
+        self._drives[index] = _Drive(whole.signals, whole.truth, prepared)
+        more = sum(getattr(value, "nbytes", 0) for value in prepared.values())
+        return replace(record, bytes_held=record.bytes_held + more)
 
     def score(self, tunings: Mapping[str, FilterTuning]) -> dict[str, dict[int, DriveError]]:
         """Return the errors of each estimator by drive."""
@@ -310,20 +247,6 @@ class DriveBench:
             }
             for name, tuning in tunings.items()
         }
-
-
-def too_big(where: str) -> EstimatorError:
-    """Return the error for drives that do not fit."""
-    return EstimatorError(
-        expected=f"drives whose signals and truth fit in {MAX_BYTES >> 20} MiB together",
-        got="more",
-        where=where,
-        remedy="give fewer drives, or a slice of each with --start and --end",
-    )
-
-
-def _bytes(record: Signals | StateTrack) -> int:
-    return sum(getattr(getattr(record, f.name), "nbytes", 0) for f in fields(record))
 
 
 class Benches:
@@ -345,25 +268,26 @@ class Benches:
         for pool in self._pools:
             pool.shutdown(wait=error is None, cancel_futures=True)
 
-    def load(self, inputs: Sequence[LogInput], told: Callable[[DriveFacts], None]) -> list[DriveFacts]:
-        """Read all drives; ``told`` is called for each in order.
+    def load(
+        self, inputs: Sequence[LogInput], splits: Mapping[str, str], told: Callable[[DriveRecord], None]
+    ) -> list[DriveRecord]:
+        """Read all drives, whose splits are known by name; ``told`` is called for each in order.
 
         Raises
         ------
         PdhefError
             A log cannot be read, or all together are too big.
         """
-        loaded: list[DriveFacts] = []
+        loaded: list[DriveRecord] = []
         held = 0
-        under_way: deque[Future[DriveFacts | _Refusal]] = deque()
+        under_way: deque[Future[DriveRecord | _Refusal]] = deque()
         for index, log_input in enumerate(inputs):
+            what = (index, log_input, splits.get(log_input.stem), MAX_BYTES - held)
             if self._local is not None:
-                under_way.append(_done(self._local.load(index, log_input, MAX_BYTES - held)))
+                under_way.append(_done(self._local.load(*what)))
             else:
                 # No more than one a process ahead, so that the bound on the memory is kept.
-                under_way.append(
-                    self._pools[index % len(self._pools)].submit(_load, index, log_input, MAX_BYTES - held)
-                )
+                under_way.append(self._pools[index % len(self._pools)].submit(_load, *what))
             while len(under_way) > (len(self._pools) if index + 1 < len(inputs) else 0):
                 facts = _result(under_way.popleft())
                 if isinstance(facts, _Refusal):
@@ -408,8 +332,8 @@ class _Refusal:
         return self.kind(expected=self.expected, got=self.got, where=self.where, remedy=self.remedy)
 
 
-def _done(facts: DriveFacts) -> Future[DriveFacts | _Refusal]:
-    future: Future[DriveFacts | _Refusal] = Future()
+def _done(facts: DriveRecord) -> Future[DriveRecord | _Refusal]:
+    future: Future[DriveRecord | _Refusal] = Future()
     future.set_result(facts)
     return future
 
@@ -422,9 +346,9 @@ def _open_bench(setup: TuneSetup) -> None:
     _here["bench"] = DriveBench(setup)
 
 
-def _load(index: int, log_input: LogInput, max_bytes: int) -> DriveFacts | _Refusal:
+def _load(index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord | _Refusal:
     try:
-        return _here["bench"].load(index, log_input, max_bytes)
+        return _here["bench"].load(index, log_input, split, max_bytes)
     except PdhefError as error:
         return _Refusal(type(error), error.expected, error.got, error.where, error.remedy)
 
