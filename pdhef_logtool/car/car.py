@@ -1,8 +1,8 @@
 """Everything that is known of one vehicle, as estimators and commands take it.
 
 A car is a folder: ``vehicle.toml`` is a person's and never rewritten; beside it stand the parts that commands write,
-each one its own (:mod:`~.parts`). A bare ``vehicle.toml`` is a car too, and may hold ``[filter.*]`` and ``[network]`` of
-an older file or of an export (:mod:`~.flat`). A part whose basis has changed is stale: it is not taken, and the car
+each one its own (:mod:`~.parts`). A bare ``vehicle.toml`` is a car too, and may hold ``[filter.*]`` and ``[network]``
+of an older file or of an export (:mod:`~.flat`). A part whose basis has changed is stale: it is not taken, and the car
 says so.
 """
 
@@ -149,8 +149,8 @@ class Car:
         """
         found = self.trust
         if found is None or not found.has_evidence:
-            why = f"no evidence that this network helps on {self.vehicle.name}; a drive with truth and pdhef trust give it"
-            return AllowedTrust(0.0, why)
+            why = f"no evidence that this network helps on {self.vehicle.name}"
+            return AllowedTrust(0.0, f"{why}; a drive with truth and pdhef trust give it")
         here = "" if self.network is None else self.network.sha256
         if found.network_sha256 is not None and found.network_sha256 != here:
             return AllowedTrust(
@@ -212,7 +212,7 @@ def _part(path: Path, kind: type[PartT]) -> PartT | None:
         return None
     what = f"a car's {path.name}"
     raw = read_json(path, what, VehicleError) if path.suffix == ".json" else read_toml(path, what, VehicleError)
-    return validated(kind, raw, where=str(path), error=VehicleError)
+    return validated(kind, raw, str(path), VehicleError, expected=f"the entries of {what}")
 
 
 def _network_of(car: Car, folder: Path | None, chosen: Path | str | None) -> tuple[str, Path | None]:
@@ -261,7 +261,7 @@ def load_intervals(path: Path) -> Intervals:
             where=str(file),
             remedy="pdhef calibrate makes it anew",
         )
-    return validated(Intervals, raw, where=str(file), error=VehicleError)
+    return validated(Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef calibrate")
 
 
 def read_history(folder: Path) -> list[dict[str, Any]]:

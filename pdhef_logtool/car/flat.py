@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 
-from pdhef_logtool.car.parts import FilterNoise, LearntOn, NoisyFilter, Sha256, Trust
-from pdhef_logtool.car.vehicle import Record, VehicleParameters, vehicle_from_dict
+from pdhef_logtool.car.parts import FilterNoise, FilterTables, LearntOn, Sha256, Trust
+from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters, vehicle_from_dict
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
 
@@ -31,14 +31,14 @@ class _Network(Record):
 
 class _Identification(Record):
     model_config = ConfigDict(frozen=True, extra="allow")
-    drives: tuple[str | LearntOn, ...] = ()
-    tuning_scores: tuple[str, ...] = ()
+    drives: Annotated[tuple[str | LearntOn, ...], Field(strict=False)] = ()
+    tuning_scores: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
 
 class _Tables(Record):
     """The tables that a vehicle.toml may hold beside physics and sensors."""
 
-    filter: dict[NoisyFilter, FilterNoise] = Field(default_factory=dict)
+    filter: FilterTables = Field(default_factory=dict)
     network: _Network | None = None
     identification: _Identification = _Identification()
 
@@ -64,7 +64,7 @@ def read_flat(path: Path) -> FlatCar:
     raw, where = dict(read_toml(path, "a vehicle TOML file", VehicleError)), str(path)
     given = {name: raw.pop(name) for name in _Tables.model_fields if name in raw}
     vehicle = vehicle_from_dict(raw, where=where)
-    tables = validated(_Tables, given, where=where, error=VehicleError)
+    tables = validated(_Tables, given, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
     noise: dict[str, FilterNoise] = dict(tables.filter)
     for score in _parsed(tables.identification.tuning_scores, _SCORE, f"{where}: identification.tuning_scores"):
         if score["name"] in noise:
@@ -81,6 +81,11 @@ def read_flat(path: Path) -> FlatCar:
     if network is not None:
         trust = Trust(trust_cap=network.trust_cap, evidence=network.evidence, network_sha256=network.model_sha256)
     return FlatCar(vehicle, noise, trust, tuple(drives))
+
+
+def load_vehicle(path: Path) -> VehicleParameters:
+    """Return physics and sensors of a vehicle.toml; raises VehicleError as :func:`read_flat`."""
+    return read_flat(path).vehicle
 
 
 def _parsed(texts: Sequence[str], form: re.Pattern[str], where: str) -> list[re.Match[str]]:
@@ -146,7 +151,7 @@ def vehicle_toml(vehicle: VehicleParameters, head: str = "", comments: Mapping[s
 
 def _plain(part: Record) -> dict[str, Any]:
     plain: dict[str, Any] = part.model_dump(mode="json", exclude_none=True)
-    return plain
+    return {k: v for k, v in plain.items() if v not in ([], {})}
 
 
 def _merge(table: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:

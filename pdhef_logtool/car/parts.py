@@ -11,15 +11,17 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field, model_validator
 
-from pdhef_logtool.car.vehicle import Finite, NonNegative, Positive, Record, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import NonNegative, Positive, Record, Tyres, VehicleParameters
+from pdhef_logtool.records.documents import one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 #: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
 NOISY_FILTERS = ("phy-ukf-tuned", "physics-plus", "pd-hef", "pd-hef-smoothed")
-NoisyFilter = Literal["phy-ukf-tuned", "physics-plus", "pd-hef", "pd-hef-smoothed"]
+#: Measurements that ``r_std`` is about.
+MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 #: Entries of a vehicle file that change no estimate.
 _NOT_PHYSICS = {"name", "truth_position_m"}
@@ -31,8 +33,11 @@ def digest(document: Any) -> str:
 
 
 def physics_sha256(vehicle: VehicleParameters) -> str:
-    """Return the digest of what a vehicle file says of physics and sensors, whatever its name, layout and comments."""
-    return digest(vehicle.model_dump(mode="json", exclude=_NOT_PHYSICS))
+    """Return the digest of what a vehicle file says of physics and sensors, whatever its name, layout and comments.
+
+    Entries at their defaults count as absent: one that a later version adds makes no car stale.
+    """
+    return digest(vehicle.model_dump(mode="json", exclude=_NOT_PHYSICS, exclude_defaults=True))
 
 
 class LearntOn(Record):
@@ -47,17 +52,17 @@ class LearntOn(Record):
 class FittedSensors(Record):
     """Constant biases that identification found."""
 
-    ay_bias_m_s2: Finite
-    yaw_rate_bias_rad_s: Finite
+    ay_bias_m_s2: float
+    yaw_rate_bias_rad_s: float
 
 
 class FittedValues(Record):
     """Entries of the vehicle file that identification found better values for; absent ones stay the file's."""
 
     yaw_inertia_kg_m2: Positive | None = None
-    steer_offset_rad: Finite | None = None
+    steer_offset_rad: float | None = None
     steering_ratio: Positive | None = None
-    roll_gradient_rad_per_m_s2: Finite | None = None
+    roll_gradient_rad_per_m_s2: float | None = None
     friction: Positive | None = None
     sensors: FittedSensors | None = None
     tyres: Tyres | None = None
@@ -75,18 +80,38 @@ class FilterNoise(Record):
 
     Attributes
     ----------
-    q_std : per square root of second, of v_x, v_y, yaw rate and, optionally, the a_x bias; empty: the filter's own.
+    q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
+        ``physics-plus`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
     physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, for filters that have one.
     score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
     """
 
-    q_std: Annotated[tuple[NonNegative, ...], Field(max_length=4)] = ()
-    r_std: dict[Literal["ay_m_s2", "yaw_rate_rad_s", "speed_m_s"], Positive] = Field(default_factory=dict)
+    q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
+    r_std: dict[Annotated[str, one_of(MEASUREMENTS)], Positive] = Field(default_factory=dict)
     physics_sha256: Sha256 | None = None
     network_sha256: Sha256 | None = None
     score_deg: Positive | None = None
     trial: int | None = None
+
+    @model_validator(mode="after")
+    def _one_entry_a_state(self) -> FilterNoise:
+        if len(self.q_std) not in (0, 3, 4, 6):
+            raise ValueError(f"q_std needs 3 or 4 entries (v_x, v_y, yaw rate, a_x bias), got {len(self.q_std)}")
+        return self
+
+
+def _axle_forces_belong_to_physics_plus(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
+    for name, table in tables.items():
+        if len(table.q_std) == 6 and name != "physics-plus":
+            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics-plus's")
+    return tables
+
+
+#: Noise by filter.
+FilterTables = Annotated[
+    dict[Annotated[str, one_of(NOISY_FILTERS)], FilterNoise], AfterValidator(_axle_forces_belong_to_physics_plus)
+]
 
 
 class Fit(Record):
@@ -99,10 +124,10 @@ class Fit(Record):
     version: Literal[1] = 1
     physics_sha256: Sha256
     values: FittedValues
-    filter: dict[NoisyFilter, FilterNoise] = Field(default_factory=dict)
-    drives: tuple[LearntOn, ...] = ()
+    filter: FilterTables = Field(default_factory=dict)
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     scores: dict[str, dict[str, float]] = Field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
 
 class Noise(Record):
@@ -110,9 +135,9 @@ class Noise(Record):
 
     format: Literal["pdhef-noise"] = "pdhef-noise"
     version: Literal[1] = 1
-    filter: dict[NoisyFilter, FilterNoise]
+    filter: FilterTables
     search: dict[str, Any] = Field(default_factory=dict)
-    drives: tuple[LearntOn, ...] = ()
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
 
 
 class Trust(Record):
@@ -133,7 +158,7 @@ class Trust(Record):
     evidence: str = "none"
     physics_sha256: Sha256 | None = None
     noise_sha256: Sha256 | None = None
-    drives: tuple[LearntOn, ...] = ()
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     figures: dict[str, Any] = Field(default_factory=dict)
 
     @property
@@ -203,7 +228,7 @@ class IntervalEntry(Record):
     inflation: Inflation
     unseen_factor: float = 1.0
     wrong_vehicle_factor: float | None = None
-    coverage: tuple[dict[str, Any], ...] = ()
+    coverage: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
 
 
 class Intervals(Record):
@@ -216,13 +241,13 @@ class Intervals(Record):
     version: Literal[1] = 1
     car: str
     physics_sha256: Sha256
-    roll_gradient_rad_per_m_s2: Finite
+    roll_gradient_rad_per_m_s2: float
     spread: Annotated[float, Field(ge=0)] = 0.0
-    entries: tuple[IntervalEntry, ...]
+    entries: Annotated[tuple[IntervalEntry, ...], Field(strict=False)]
     settings: dict[str, Any] = Field(default_factory=dict)
     fit: dict[str, Any] = Field(default_factory=dict)
-    drives: tuple[dict[str, Any], ...] = ()
-    left_out: tuple[dict[str, Any], ...] = ()
+    drives: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
+    left_out: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
     versions: dict[str, str] = Field(default_factory=dict)
 
 
@@ -234,7 +259,7 @@ class HistoryLine(Record):
     sha256: Sha256
     version: str
     settings: dict[str, Any] = Field(default_factory=dict)
-    drives: tuple[LearntOn, ...] = ()
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
 
 
 def noise_sha256(noise: Mapping[str, FilterNoise]) -> str:

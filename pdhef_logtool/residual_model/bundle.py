@@ -27,7 +27,10 @@ PAPER_FOLDER = "baselines/paper-network"
 
 #: Names instead of a folder: the network that comes with the package, and no network.
 SHIPPED, MANY_CARS, NO_MODEL = "default", "many-cars", "none"
-SHIPPED_FOLDERS = {name: Path(__file__).parents[1] / "models" / name for name in (SHIPPED, MANY_CARS)}
+SHIPPED_FOLDERS = {
+    SHIPPED: Path(__file__).parents[1] / "models" / "default" / "network",
+    MANY_CARS: Path(__file__).parents[1] / "models" / "many-cars",
+}
 
 #: What a network may predict, and how many numbers that is: rates of v_y and r that f_nom lacks, or v_y itself.
 RESIDUAL = "residual_rates"
