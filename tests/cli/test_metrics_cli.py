@@ -38,7 +38,16 @@ def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
     out = tmp_path_factory.mktemp("annotated")
     vehicle = str(sample_logs_dir / "vehicle.toml")
     made = _pdhef(
-        "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(out), "-e", "phy-ukf", "--annotate", "full", "-v", vehicle
+        "run",
+        str(sample_logs_dir / "dlc.mcap"),
+        "-o",
+        str(out),
+        "-e",
+        "phy-ukf",
+        "--annotate",
+        "full",
+        "--car",
+        vehicle,
     )
     assert made.returncode == 0, made.stderr
     return str(out / "logs/dlc/annotated.mcap")

@@ -21,7 +21,7 @@ from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge
 from rich.console import Console
 
 from pdhef_logtool.car.vehicle import FilterTuning, Network, default_vehicle
-from pdhef_logtool.cli.summary import render_run
+from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf

@@ -88,7 +88,7 @@ def test_the_report_says_the_cap_and_why(
 ) -> None:
     from rich.console import Console
 
-    from pdhef_logtool.cli.summary import render_run
+    from pdhef_logtool.cli.run_tables import render_run
 
     model = _bundle()
     model.save(tmp_path / "model")

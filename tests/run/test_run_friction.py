@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from pdhef_logtool.car.vehicle import load_vehicle, vehicle_to_toml
-from pdhef_logtool.cli.summary import render_run
+from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, run_extraction

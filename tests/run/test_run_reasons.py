@@ -15,7 +15,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from pdhef_logtool.cli.summary import render_run
+from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
