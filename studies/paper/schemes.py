@@ -28,6 +28,21 @@ SCHEMES: dict[str, str] = {
 }
 
 
+#: The paper's three, drawn in this order in the time histories; the last has a stand-in where this version lacks it.
+DRAWN = ("phy-ukf", "pure-lstm", "pd-hef")
+STAND_IN = "pd-hef-fixed-r"
+
+
+def hybrid_of(ran: Sequence[str]) -> str:
+    """Return the name of our hybrid filter among those that ran."""
+    return DRAWN[-1] if DRAWN[-1] in ran else STAND_IN
+
+
+def drawn(ran: Sequence[str]) -> tuple[str, ...]:
+    """Return the schemes of the time histories that ran."""
+    return tuple(n for n in (*DRAWN[:-1], hybrid_of(ran)) if n in ran)
+
+
 @dataclass(frozen=True, slots=True)
 class Scheme:
     """A scheme ready to run; ``uses_network`` where another network gives another result."""
