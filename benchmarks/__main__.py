@@ -1,8 +1,8 @@
 """Run the speed benchmarks and print one table.
 
-    python -m benchmarks [NAME ...] [--json] [--list] [--write-docs]
+    python -m benchmarks [NAME ...] [--json] [--list] [--write-docs] [--gate]
 
-Ends with 1 if a target is missed.
+With ``--gate`` it ends with 4 if a target is missed.
 """
 
 from __future__ import annotations
@@ -22,14 +22,6 @@ Written by `python -m benchmarks --write-docs`; `make bench` prints the same tab
 thread, the best of several interleaved rounds; ratios are to a peer in the same run. What each benchmark measures, and
 on what, heads its file in `benchmarks/`.
 """
-
-
-def other_tables() -> list[str]:
-    """Return the commands beside the benchmarks that make the tables behind frozen settings."""
-    own = {*NAMES, "__init__", "__main__", "measuring", "one_hour_log"}
-    found = [p for p in (ROOT / "benchmarks").glob("*.py") if p.stem not in own]
-    folders = [p.parent.name for p in (ROOT / "benchmarks").glob("*/__main__.py")]
-    return sorted([p.stem for p in found if "__main__" in p.read_text(encoding="utf-8")] + folders)
 
 
 def cells(figure: Figure) -> tuple[str, ...]:
@@ -61,7 +53,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Speed against peers in the same run.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; all when none is given")
     parser.add_argument("--json", action="store_true", help="print one JSON document")
-    parser.add_argument("--list", action="store_true", help="print the names, and the commands of the other tables")
+    parser.add_argument("--list", action="store_true", help="print the names")
     parser.add_argument("--write-docs", action="store_true", help="write docs/benchmarks.md (needs all benchmarks)")
     parser.add_argument("--gate", action="store_true", help="end with 4 if a target is missed")
     arguments = parser.parse_args()
@@ -71,7 +63,7 @@ def main() -> int:
     if arguments.write_docs and arguments.names:
         parser.error("--write-docs needs all benchmarks: give no names")
     if arguments.list:
-        print("\n".join([*NAMES, *(f"python -m benchmarks.{name}" for name in other_tables())]))
+        print("\n".join(NAMES))
         return 0
     figures: list[Figure] = []
     for name in arguments.names or NAMES:

@@ -97,9 +97,9 @@ def _window(rng: np.random.Generator, begin_s: int, length_s: int) -> list[Topic
 
     def columns(rate_hz: int, offset_ns: int) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         stamps_ns = _stamps(begin_s, length_s, rate_hz, offset_ns)
-        t = (stamps_ns - START_NS) * 1e-9
-        speed = 20.0 + 5.0 * np.sin(0.02 * t)
-        steer = 0.03 * np.sin(0.4 * t) * np.cos(0.03 * t)
+        t = np.asarray((stamps_ns - START_NS) * 1e-9, dtype=np.float64)
+        speed: FloatArray = 20.0 + 5.0 * np.sin(0.02 * t)
+        steer: FloatArray = 0.03 * np.sin(0.4 * t) * np.cos(0.03 * t)
         return stamps_ns, t, speed, steer, speed * steer / 2.7
 
     def noisy(values: FloatArray, std: float) -> FloatArray:

@@ -7,7 +7,7 @@ only through the factor of the row: 1.2 times it, or nothing at all. The bins ar
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,14 +18,15 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.windows import DriveReader, plan_drive
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error
+from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error, summarise_errors
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.watches.intervals import Calibration, calibrated
+from studies.independent_sim_logs import write_run
+from studies.pages import INDEPENDENT
 from studies.table_maths import interval_score
 
 SIDESLIP = "sideslip_rad"
@@ -136,24 +137,31 @@ def interval_rows(
     return rows
 
 
-def run_and_score(
-    estimators: Sequence[Estimator],
-    signals: Signals,
-    drive: ConditionDrive,
-    low_speed_m_s: float,
-    calibration: Calibration | None = None,
-) -> list[MetricRow]:
-    """Run estimators on signals and score each against the drive's truth, with calibrated intervals if any."""
-    rows: list[MetricRow] = []
-    for estimator in estimators:
-        track, _ = estimator.run(signals, None)
-        if calibration is not None and track.name in calibration.inflations:
-            track, _ = calibrated(track, signals, calibration)
-        rows += score(track, drive, low_speed_m_s)
-    return rows
+def sideslip_error(estimator: Estimator, signals: Signals, drive: ConditionDrive, low_speed_m_s: float) -> FloatArray:
+    """Run an estimator on signals; returns its sideslip error [N] in rad, NaN where it is not scored."""
+    track, _ = estimator.run(signals, None)
+    return signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
 
 
-def independent_runs(folder: Path) -> Iterable[tuple[Path, float]]:
-    """Yield the independent simulator's runs with their friction."""
-    for source in sorted(folder.glob("*.parquet")):
-        yield source, float(json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))["mu"])
+def root_mean_square(error: FloatArray) -> float:
+    """Return the root mean square of what is known of an error [N]; NaN for nothing."""
+    known = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+
+def rmse_row(drive: str, estimator: str, segment: str, error: FloatArray) -> list[MetricRow]:
+    """Return the sideslip RMSE over an error [N] in rad as a row; none where nothing is known."""
+    known = error[np.isfinite(error)]
+    if not known.size:
+        return []
+    rmse = summarise_errors(known)["rmse"]
+    return [MetricRow(drive, estimator, SIDESLIP, segment, "rmse", rmse, "rad", int(known.size))]
+
+
+def independent_runs(folder: Path) -> Iterable[tuple[Path, Path, float]]:
+    """Write the independent simulator's runs as logs into a folder, once; yield run, log and friction of each."""
+    for source in sorted(INDEPENDENT.glob("*.parquet")):
+        log = folder / f"{source.stem}.mcap"
+        if not log.is_file():
+            write_run(source, log)
+        yield source, log, float(json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))["mu"])

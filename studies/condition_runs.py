@@ -27,14 +27,15 @@ from pdhef_logtool.estimators.registry import make_estimator, runnable
 from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.evaluation.metrics import MetricRow, signal_error, summarise_errors
+from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
-from pdhef_logtool.watches.intervals import Calibration, find_calibration
+from pdhef_logtool.watches.intervals import Calibration, calibrated, find_calibration
 from studies import error_budget, fixed_grid
-from studies.condition_drives import SIDESLIP, read_drive, run_and_score, told
+from studies.condition_drives import read_drive, rmse_row, score, sideslip_error, told
+from studies.pages import ROOT
+from truthsim.vehicle_choice import choose_vehicle
 
-ROOT = Path(__file__).resolve().parents[1]
 FORMAT = 1
 COLUMNS = ("row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 _KEY, _NOTES = b"key", b"notes"
@@ -51,6 +52,7 @@ _SOURCES = (
     "studies/condition_drives.py",
     "studies/condition_runs.py",
     "studies/fixed_grid.py",
+    "studies/independent_sim_logs.py",
     "studies/table_maths.py",
 )
 _BUDGET_SOURCES = ("truthsim", "studies/error_budget.py", "studies/defaults/fit_nominal_tyres.py")
@@ -91,15 +93,22 @@ class Task:
     friction: float | None = None
     entry: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def use_speed(self) -> bool:
+        """Whether the row has wheel speeds."""
+        return self.assume.get("sensors") != "esp"
+
 
 @dataclass(frozen=True, slots=True)
 class RowResult:
     """What came of a row: figures in the columns ``COLUMNS``, and sentences on what did not run."""
 
-    row: str
-    kind: str
     table: pl.DataFrame
     notes: tuple[str, ...]
+
+
+#: A drive's figures in the columns ``COLUMNS`` but the row's name, and what did not run.
+_Done = tuple[Task, list[tuple[Any, ...]], list[str]]
 
 
 @cache
@@ -135,57 +144,53 @@ def run_rows(
     folder.mkdir(parents=True, exist_ok=True)
     done: dict[str, RowResult] = {}
     todo: list[Task] = []
-    keys = {name: row_key(setup, tasks) for name, tasks in rows.items() if tasks}
+    rows = {name: tasks for name, tasks in rows.items() if tasks}
+    keys = {name: row_key(setup, tasks) for name, tasks in rows.items()}
     for name, tasks in rows.items():
-        if not tasks:
-            continue
-        kept = _read(folder / f"{name}.parquet", name, tasks[0].kind, keys[name])
+        kept = _read(folder / f"{name}.parquet", keys[name])
         if kept is None:
             todo += tasks
         else:
             done[name] = kept
     if done:
         say(f"{title}: {len(done)} rows kept")
-    open_rows: dict[str, list[tuple[Task, list[tuple[Any, ...]], list[str]]]] = {}
+    open_rows: dict[str, list[_Done]] = {}
     began = time.monotonic()
     with _workers(setup, jobs) as work:
-        for count, (task, rows_of, notes) in enumerate(work(todo), start=1):
+        for count, done_now in enumerate(work(todo), start=1):
+            task = done_now[0]
             so_far = open_rows.setdefault(task.row, [])
-            so_far.append((task, rows_of, notes))
+            so_far.append(done_now)
             left = (time.monotonic() - began) / count * (len(todo) - count)
             say(f"\r{title}: {count} of {len(todo)} drives, {left:.0f} s left   ")
             if len(so_far) == len(rows[task.row]):
-                done[task.row] = _write(folder / f"{task.row}.parquet", task, so_far, keys[task.row])
+                done[task.row] = _write(folder / f"{task.row}.parquet", so_far, keys[task.row])
                 del open_rows[task.row]
     if todo:
         say(f"\n{title}: {len(todo)} drives in {time.monotonic() - began:.0f} s\n")
     return {name: done[name] for name in rows if name in done}
 
 
-def _read(path: Path, row: str, kind: str, key: str) -> RowResult | None:
+def _read(path: Path, key: str) -> RowResult | None:
     try:
         metadata = pq.read_metadata(path).metadata or {}
         if metadata.get(_KEY) != key.encode():
             return None
-        return RowResult(row, kind, pl.read_parquet(path), tuple(json.loads(metadata[_NOTES])))
+        return RowResult(pl.read_parquet(path), tuple(json.loads(metadata[_NOTES])))
     except (OSError, ValueError, KeyError):
         return None
 
 
-def _write(path: Path, task: Task, parts: list[tuple[Task, list[tuple[Any, ...]], list[str]]], key: str) -> RowResult:
+def _write(path: Path, parts: list[_Done], key: str) -> RowResult:
     # Processes finish in any order; the file does not show it.
     parts = sorted(parts, key=lambda p: p[0].log.as_posix())
     schema = dict.fromkeys(COLUMNS, pl.String) | {"value": pl.Float64, "n": pl.Int64}
-    table = pl.DataFrame([(task.row, *r) for _, rows, _ in parts for r in rows], schema=schema, orient="row")
+    table = pl.DataFrame([(task.row, *r) for task, rows, _ in parts for r in rows], schema=schema, orient="row")
     notes = tuple(dict.fromkeys(n for _, _, notes in parts for n in notes))
-    arrow = table.to_arrow()
-    arrow = arrow.replace_schema_metadata({_KEY: key.encode(), _NOTES: json.dumps(notes).encode()})
+    arrow = table.to_arrow().replace_schema_metadata({_KEY: key.encode(), _NOTES: json.dumps(notes).encode()})
     with PendingFile(path) as pending:
         pq.write_table(arrow, pending.path, compression="zstd")
-    return RowResult(task.row, task.kind, table, notes)
-
-
-_Done = tuple[Task, list[tuple[Any, ...]], list[str]]
+    return RowResult(table, notes)
 
 
 @contextmanager
@@ -211,11 +216,7 @@ def _workers(setup: Setup, jobs: int) -> Iterator[Callable[[list[Task]], Iterato
 
 def _run(setup: Setup, task: Task) -> _Done:
     rows, notes = {"score": _score, "grid": _grid, "budget": _budget}[task.kind](setup, task)
-    return task, [_cells(r) for r in rows], notes
-
-
-def _cells(r: MetricRow) -> tuple[Any, ...]:
-    return (r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.unit, r.n)
+    return task, [(r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.unit, r.n) for r in rows], notes
 
 
 @cache
@@ -250,16 +251,18 @@ def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     vehicle, _ = _loaded(setup.vehicle, setup.model)
     drive = read_drive(task.log, vehicle, task.log.stem, friction=task.friction)
     signals = told(drive, task.assume)
-    use_speed = task.assume.get("sensors") != "esp"
-    estimators, notes = _estimators(setup, signals.available, use_speed)
-    notes = list(notes)
+    estimators, skipped = _estimators(setup, signals.available, task.use_speed)
+    notes, calibration = list(skipped), _calibration(setup.model)
     rows: list[MetricRow] = []
     for estimator in estimators:
         try:
-            rows += run_and_score([estimator], signals, drive, vehicle.low_speed_blend_m_s, _calibration(setup.model))
+            track, _ = estimator.run(signals, None)
+            if calibration is not None and track.name in calibration.inflations:
+                track, _ = calibrated(track, signals, calibration)
+            rows += score(track, drive, vehicle.low_speed_blend_m_s)
         except Exception as error:  # noqa: BLE001 (one estimator's failure on one drive is a result, not an end)
             notes.append(f"{estimator.name} failed on {task.row}/{drive.name}: {type(error).__name__}: {error}")
-    base = _grid_base(setup, use_speed)
+    base = _grid_base(setup, task.use_speed)
     if base is not None:
         rows += fixed_grid.run_grid(base, signals, drive, vehicle.low_speed_blend_m_s)
     return rows, notes
@@ -267,7 +270,7 @@ def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
 
 def _grid(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     vehicle, _ = _loaded(setup.vehicle, setup.model)
-    base = _grid_base(setup, task.assume.get("sensors") != "esp")
+    base = _grid_base(setup, task.use_speed)
     if base is None:
         return [], []
     drive = read_drive(task.log, vehicle, task.log.stem)
@@ -276,7 +279,7 @@ def _grid(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
 
 @lru_cache(maxsize=256)
 def _fitted(car: str, friction: float, file: Path) -> VehicleParameters:
-    return error_budget.fit_vehicle(error_budget.choose_vehicle(car), friction, load_vehicle(file))
+    return error_budget.fit_vehicle(choose_vehicle(car), friction, load_vehicle(file))
 
 
 def _budget(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
@@ -285,23 +288,15 @@ def _budget(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     run = error_budget.drive_again(task.entry)
     fitted = _fitted(run.spec.vehicle, run.spec.friction, setup.vehicle)
     rows: list[MetricRow] = []
-    notes: list[str] = []
     for cause in (None, *error_budget.causes_of(run.spec, task.assume)):
         case = error_budget.without(run, cause, vehicle, task.assume, fitted)
         ready, _ = runnable(
             setup.estimators, case.vehicle, case.signals.available, use_speed=case.use_speed, model=model
         )
         for estimator in ready:
-            track, _ = estimator.run(case.signals, None)
-            error = signal_error(track, case.drive.truth, SIDESLIP, vehicle.low_speed_blend_m_s)
-            use = error[error == error]
-            if use.size:
-                rmse = summarise_errors(use)["rmse"]
-                name = "base" if cause is None else cause
-                rows.append(
-                    MetricRow(task.log.stem, estimator.name, SIDESLIP, name, "rmse", rmse, "rad", int(use.size))
-                )
-    return rows, notes
+            error = sideslip_error(estimator, case.signals, case.drive, vehicle.low_speed_blend_m_s)
+            rows += rmse_row(task.log.stem, estimator.name, cause or "base", error)
+    return rows, []
 
 
 def as_frame(results: dict[str, RowResult]) -> pl.DataFrame:

@@ -14,20 +14,20 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, check_names
+
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.sinks.report import tool_versions
 from studies import fixed_grid
 from studies.condition_drives import independent_runs
-from studies.condition_runs import ROOT, Setup, Task, as_frame, progress, run_rows
+from studies.condition_runs import Setup, Task, as_frame, progress, run_rows
 from studies.conditions_page import Facts, Tables, write_page
-from studies.independent_sim_logs import write_run
+from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, options
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
-INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
 INDEPENDENT_ROW = "independent-simulator"
 #: The drives on which the best fixed setting is chosen have the table's seed plus this.
 CALIBRATION_SEED_OFFSET = 1000
@@ -39,22 +39,18 @@ BUDGET = ("phy-ukf-tuned", "phy-ukf")
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the command line's options."""
-    parser = argparse.ArgumentParser(prog="python -m studies.conditions", description=__doc__.splitlines()[0])
-    parser.add_argument("--vehicle", type=Path, default=ROOT / "sample_logs" / "vehicle.toml")
+    parser = options("conditions", __doc__)
+    parser.add_argument("--vehicle", type=Path, default=SAMPLE_VEHICLE)
     parser.add_argument("--model", type=Path, help="model bundle; without one no hybrid filter runs")
     parser.add_argument("--estimators", default=",".join(DESCRIPTIONS), help="names, default all")
     parser.add_argument("--rows", default=",".join((*ROW_NAMES, INDEPENDENT_ROW)))
     parser.add_argument("--drives", type=int, default=30, help="drives a row")
-    parser.add_argument(
-        "--calibration-drives", type=int, default=10, help="drives a row to choose the fixed setting on"
-    )
-    parser.add_argument(
-        "--budget-drives", type=int, default=10, help="drives a row in the error budget; 0 leaves it out"
-    )
+    parser.add_argument("--calibration-drives", type=int, default=10, help="drives a row for the best fixed setting")
+    parser.add_argument("--budget-drives", type=int, default=10, help="drives a row in the error budget; 0: none")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "conditions")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
+    parser.add_argument("--out", type=Path, default=DOCS)
     given = parser.parse_args(arguments)
     given.estimators = tuple(given.estimators.split(","))
     given.rows = given.rows.split(",")
@@ -94,18 +90,14 @@ def independent(work: Path) -> list[Task]:
     """Return the independent simulator's runs as tasks, converted to logs; none where they are not there."""
     folder = work / INDEPENDENT_ROW
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = []
-    for source, friction in independent_runs(INDEPENDENT):
-        log = folder / f"{source.stem}.mcap"
-        if not log.is_file():
-            write_run(source, log)
-        digest = hashlib.sha256(source.read_bytes()).hexdigest()
-        tasks.append(Task("score", INDEPENDENT_ROW, log, digest, {}, friction=friction))
-    return tasks
+    return [
+        Task("score", INDEPENDENT_ROW, log, hashlib.sha256(source.read_bytes()).hexdigest(), {}, friction=friction)
+        for source, log, friction in independent_runs(folder)
+    ]
 
 
-def run(given: argparse.Namespace) -> Path:
-    """Do everything; returns the page."""
+def run(given: argparse.Namespace) -> None:
+    """Do everything."""
     setup = Setup(given.vehicle, given.model, given.estimators)
     tasks = simulated(given, "score", given.drives, given.seed)
     absent = ""
@@ -128,7 +120,7 @@ def run(given: argparse.Namespace) -> Path:
     if given.budget_drives > 0:
         names = tuple(dict.fromkeys([*[n for n in BUDGET if n in ran][:1], *[n for n in SUBJECTS if n in ran][:1]]))
         some = {
-            name: [Task("budget", t.row, t.log, t.sha256, t.assume, entry=t.entry) for t in row[: given.budget_drives]]
+            name: [replace(t, kind="budget") for t in row[: given.budget_drives]]
             for name, row in tasks.items()
             if name != INDEPENDENT_ROW
         }
@@ -147,26 +139,25 @@ def run(given: argparse.Namespace) -> Path:
         versions=tool_versions(),
         calibration_seed=given.seed + CALIBRATION_SEED_OFFSET,
     )
-    return write_page(given.out, facts, Tables(metrics, as_frame(calibration), as_frame(budget)))
+    write_page(given.out, facts, Tables(metrics, as_frame(calibration), as_frame(budget)))
 
 
 def _command(given: argparse.Namespace) -> str:
     """Return the command line that makes the page again; files by name only."""
-    words: list[Any] = ["python -m studies.conditions", "--vehicle", given.vehicle.name]
-    words += [] if given.model is None else ["--model", given.model.name]
-    words += ["--drives", given.drives, "--seed", given.seed, "--calibration-drives", given.calibration_drives]
-    words += ["--budget-drives", given.budget_drives]
-    return " ".join(map(str, words))
+    model = "" if given.model is None else f" --model {given.model.name}"
+    return (
+        f"python -m studies.conditions --vehicle {given.vehicle.name}{model} --drives {given.drives}"
+        f" --seed {given.seed} --calibration-drives {given.calibration_drives} --budget-drives {given.budget_drives}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the table; 1 with one line where an input is wrong."""
     try:
-        page = run(parse(arguments))
+        run(parse(arguments))
     except PdhefError as error:
         print(error, file=sys.stderr)
         return 1
-    print(page)
     return 0
 
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.evaluation.metrics import ALL, MetricRow, signal_error, summarise_errors
+from pdhef_logtool.evaluation.metrics import ALL, MetricRow, signal_error
 from pdhef_logtool.records.signals import Signals
-from studies.condition_drives import SIDESLIP, ConditionDrive, bin_masks
+from studies.condition_drives import SIDESLIP, ConditionDrive, bin_masks, rmse_row
 
 TRUSTS = (0.0, 0.5, 1.0)
 #: Factors on the 1-sigma of a_y and on all of the process noise, from those of the hybrid filter with fixed noise.
@@ -72,7 +72,4 @@ def run_grid(
         track, _ = at(base, setting).filter.run(signals, None, setting.trust * rate)
         error = signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
         for segment, mask in masks.items():
-            use = error[mask & (error == error)]
-            if use.size:
-                rmse = summarise_errors(use)["rmse"]
-                yield MetricRow(drive.name, setting.name, SIDESLIP, segment, "rmse", rmse, "rad", int(use.size))
+            yield from rmse_row(drive.name, setting.name, segment, error[mask])

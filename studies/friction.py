@@ -9,7 +9,6 @@ docs/friction.md.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -17,16 +16,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from pdhef_logtool.estimators.registry import make_estimator
 
-from benchmarks.measuring import ROOT
 from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION, FrictionBank
-from pdhef_logtool.estimators.registry import make_estimator
-from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
-from studies.condition_drives import SIDESLIP, ConditionDrive, read_drive
+from studies.condition_drives import ConditionDrive, read_drive, root_mean_square, sideslip_error
+from studies.pages import DOCS, SAMPLE_VEHICLE, fill, options, table, write
 from truthsim.drive import simulate_drive, write_drive
 
 FIRST_SEED = 6100
@@ -44,8 +42,7 @@ PLAN: dict[str, tuple[float, float | None]] = {
 ORDINARY = "road"
 ESTIMATORS = ("phy-ukf", "pd-hef")
 TOLD = ("true", "1", "0.85", "estimated")
-DOCUMENT = ROOT / "docs" / "friction.md"
-BEGIN, END = "<!-- measured: python -m studies.friction --write-docs -->", "<!-- end -->"
+DOCUMENT = DOCS / "friction.md"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,22 +75,16 @@ def measure(
     for name in ESTIMATORS:
         for how in TOLD:
             estimator = make_estimator(name, vehicle, use_speed=True, model=model)
-            track, _ = estimator.run(replace(drive.signals, friction=told[how]), None)
-            error = np.degrees(signal_error(track, drive.truth, SIDESLIP, vehicle.low_speed_blend_m_s))
+            given = replace(drive.signals, friction=told[how])
+            error = np.degrees(sideslip_error(estimator, given, drive, vehicle.low_speed_blend_m_s))
             rmse[name, how] = root_mean_square(error)
             rmse_seen[name, how] = root_mean_square(error[found.observable])
     return Outcome(manoeuvre, friction, np.abs(found.friction - drive.friction), found.observable, rmse, rmse_seen)
 
 
-def root_mean_square(error: FloatArray) -> float:
-    """Return the root mean square of what is known of an error [N]; NaN for nothing."""
-    known = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
-
-
 def measure_all(folder: Path) -> list[Outcome]:
     """Simulate and measure every drive; one that spins is left out, with a line on stderr."""
-    vehicle = load_vehicle(ROOT / "sample_logs" / "vehicle.toml")
+    vehicle = load_vehicle(SAMPLE_VEHICLE)
     model = open_model(None)
     if model is None:
         raise SystemExit("no shipped model: pdhef train writes one")
@@ -124,12 +115,9 @@ def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
     return {name: found for name, found in named.items() if found}
 
 
-def friction_table(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the table of the estimate itself."""
-    lines = [
-        "| drives, friction | drives | observable, % of the time | error there: median | 95 % | if none is seen |",
-        "| --- | ---: | ---: | ---: | ---: | ---: |",
-    ]
+def tables(outcomes: Sequence[Outcome]) -> str:
+    """Return the tables of the estimate itself, and of the sideslip errors: root mean square and median over drives."""
+    body = []
     for name, found in groups(outcomes).items():
         seen = np.concatenate([o.observable for o in found])
         error = np.concatenate([o.error for o in found])[seen]
@@ -137,59 +125,41 @@ def friction_table(outcomes: Sequence[Outcome]) -> list[str]:
         figures = ["", "", ""]
         if error.size:
             figures = [f"{v:.3f}" for v in (np.median(error), np.quantile(error, 0.95), np.median(prior))]
-        lines.append(f"| {name} | {len(found)} | {100 * seen.mean():.0f} | " + " | ".join(figures) + " |")
-    return lines
+        body.append([name, str(len(found)), f"{100 * seen.mean():.0f}", *figures])
+    head = ["drives, friction", "drives", "observable, % of the time", "error there: median", "95 %", "if none is seen"]
+    estimate = table(head, body, right_from=1)
 
-
-def sideslip_table(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the table of the sideslip errors: root mean square and median over the drives."""
     cells = [(e, how) for e in ESTIMATORS for how in TOLD]
     limit = [o for o in outcomes if o.manoeuvre != ORDINARY]
     rows = {m: [[o.rmse_deg[c] for o in outcomes if o.manoeuvre == m] for c in cells] for m in PLAN}
     rows["manoeuvres"] = [[o.rmse_deg[c] for o in limit] for c in cells]
-    seen = [o for o in limit if np.isfinite(o.rmse_seen_deg[cells[0]])]
-    rows["manoeuvres, where observable"] = [[o.rmse_seen_deg[c] for o in seen] for c in cells]
-    lines = [
-        "| drives | over them | " + " | ".join(f"{name}: {how}" for name, how in cells) + " |",
-        "| --- | --- |" + " ---: |" * len(cells),
-    ]
+    seen_at_all = [o for o in limit if np.isfinite(o.rmse_seen_deg[cells[0]])]
+    rows["manoeuvres, where observable"] = [[o.rmse_seen_deg[c] for o in seen_at_all] for c in cells]
+    body = []
     for name, columns in rows.items():
         pooled = [np.sqrt(np.mean(np.square(c))) for c in columns]
         median = [np.median(c) for c in columns]
         for how, values in ((f"{len(columns[0])}, root mean square", pooled), ("median", median)):
-            lines.append(f"| {name} | {how} | " + " | ".join(f"{v:.3f}" for v in values) + " |")
-    return lines
+            body.append([name, how, *(f"{v:.3f}" for v in values)])
+    sideslip = table(["drives", "over them", *(f"{name}: {how}" for name, how in cells)], body, right_from=2)
+    last = FIRST_SEED + len(PLAN) * len(FRICTIONS)
+    drives = f"{len(outcomes)} drives of seeds {FIRST_SEED + 1} to {last}: {', '.join(PLAN)}."
+    told = "Sideslip RMSE of the drives in degrees, by the friction told:"
+    return "\n\n".join([drives, estimate, told, sideslip])
 
 
-def tables(outcomes: Sequence[Outcome]) -> str:
-    """Return both tables as Markdown."""
-    return "\n".join(
-        [
-            f"{len(outcomes)} drives of seeds {FIRST_SEED + 1} to {FIRST_SEED + len(PLAN) * len(FRICTIONS)}: "
-            f"{', '.join(PLAN)}.",
-            "",
-            *friction_table(outcomes),
-            "",
-            "Sideslip RMSE of the drives in degrees, by the friction told:",
-            "",
-            *sideslip_table(outcomes),
-        ]
-    )
-
-
-def main() -> int:
+def main() -> None:
     """Measure, print, and write if asked for."""
-    parser = argparse.ArgumentParser(prog="python -m studies.friction", description=__doc__.splitlines()[0])
+    parser = options("friction", __doc__)
     parser.add_argument("--write-docs", action="store_true", help=f"put the tables into {DOCUMENT.name}")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         text = tables(measure_all(Path(folder)))
     print(text)
     if arguments.write_docs:
-        head, rest = DOCUMENT.read_text(encoding="utf-8").split(BEGIN)
-        DOCUMENT.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
-    return 0
+        page = DOCUMENT.read_text(encoding="utf-8")
+        write(DOCUMENT, fill(page, {"measured": text}, DOCUMENT.name))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -10,19 +10,19 @@ the repository: ``out/`` is ignored by git.
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.signals import WHEELS
+from studies.pages import INDEPENDENT, ROOT, options
 from truthsim.recording import STEERING_REPORT, quaternion
 
 START_NS = 1_767_225_600_000_000_000
 RADIUS_M = 0.30
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def write_run(source: Path, target: Path) -> int:
@@ -32,7 +32,7 @@ def write_run(source: Path, target: Path) -> int:
     column = {name: run[name].to_numpy().astype(np.float64) for name in run.columns}
     stamps = START_NS + np.round((column["t"] - column["t"][0]) * 1e6).astype(np.int64) * 1000
     zero = np.zeros(stamps.shape[0])
-    topics = {
+    topics: dict[str, tuple[str, dict[str, Any], dict[str, Any], str | None]] = {
         "/imu/data": (
             "sensor_msgs/msg/Imu",
             {"header.frame_id": "base_link", "orientation_covariance": [-1.0] + [0.0] * 8},
@@ -93,6 +93,8 @@ def main(source: Path, target: Path) -> None:
 
 
 if __name__ == "__main__":
-    given = [Path(argument) for argument in sys.argv[1:]]
-    defaults = [ROOT.parent / "shared" / "data" / "independent_sim", ROOT / "out" / "independent_sim"]
-    main(*given, *defaults[len(given) :])
+    parser = options("independent_sim_logs", __doc__)
+    parser.add_argument("source", type=Path, nargs="?", default=INDEPENDENT)
+    parser.add_argument("target", type=Path, nargs="?", default=ROOT / "out" / "independent_sim")
+    given = parser.parse_args()
+    main(given.source, given.target)

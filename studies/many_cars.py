@@ -9,9 +9,7 @@ has measured his car would have it. Drives are split by car.
 
 from __future__ import annotations
 
-import argparse
 import os
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_to_toml
 from pdhef_logtool.records.errors import SimulationError
 from studies.error_budget import fit_vehicle
+from studies.pages import options
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
@@ -143,9 +142,9 @@ def write_cars(
     return run_jobs(planned, folder, head, processes=jobs)
 
 
-def main() -> int:
+def main() -> None:
     """Write the set."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options("many_cars", __doc__)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/many-cars"))
     parser.add_argument("--cars", type=int, default=CARS)
     parser.add_argument("--drives", type=int, default=DRIVES_PER_CAR, help="of each car")
@@ -153,18 +152,11 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), help="sedan, suv, hatchback")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     given = parser.parse_args()
-    manifest = write_cars(
-        given.output,
-        cars=given.cars,
-        drives=given.drives,
-        seed=given.seed,
-        jobs=given.jobs,
-        kinds=tuple(given.kinds),
-    )
+    how = {"cars": given.cars, "drives": given.drives, "seed": given.seed, "jobs": given.jobs}
+    manifest = write_cars(given.output, **how, kinds=tuple(given.kinds))
     made = sum("sha256" in e for e in manifest["drives"])
     print(f"{made} drives of {given.cars} cars in {given.output}")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

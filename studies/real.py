@@ -12,7 +12,6 @@ and ends with 0, and the page holds figures only.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import tempfile
@@ -24,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator, runnable
 from pdhef_logtool.estimators.trust_policy import allowed_trust
+from scipy.signal import butter, sosfilt
 
 from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle
 from pdhef_logtool.drive.windows import DriveReader, plan_drive
@@ -37,17 +37,16 @@ from pdhef_logtool.learning.evidence.trust_command import errors_by_trust
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.signals import FloatArray, Signals, join_signals
+from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.run.config import RunConfig, time_slice
-from studies.conditions_page import number, table
-from studies.identify_250lm import _features as regression_features
+from studies.condition_drives import SIDESLIP
+from studies.fine_tuning import train_on_parts
+from studies.pages import DOCS, DRIVES, ROOT, number, options, table, write
 
-ROOT = Path(__file__).resolve().parents[1]
-DRIVES = ROOT.parent / "shared" / "data" / "drives"
 REFERENCE = ROOT / "tests" / "reference"
 #: Share of the fit part that the network learns from; the rest, behind a guard, stops its training.
 TRAIN_SHARE, GUARD_S = 0.8, 5.0
@@ -65,10 +64,11 @@ class Part:
     start_s: float = 0.0
     end_s: float | None = None
 
-    def config(self, **more: object) -> RunConfig:
-        """Return the slice as a configuration."""
+    @property
+    def config(self) -> RunConfig:
+        """The slice as a configuration."""
         end = None if self.end_s is None else f"{self.end_s:g}"
-        return replace(RunConfig(start=f"{self.start_s:g}", end=end), **more)
+        return RunConfig(start=f"{self.start_s:g}", end=end)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +85,7 @@ class Case:
     remark: str = ""
 
 
+_SPINS = "Drifts and spins; the origin of the true body frame against the CG is not stated."
 CASES = (
     Case(
         "250lm",
@@ -104,7 +105,7 @@ CASES = (
         "f1tenth",
         Part("f1tenth_hoons_run2.bag"),
         1.0,
-        "Drifts and spins; the origin of the true body frame against the CG is not stated.",
+        _SPINS,
     ),
     Case(
         "f1tenth-hoons",
@@ -114,7 +115,7 @@ CASES = (
         "f1tenth",
         Part("f1tenth_xray_run24.bag"),
         1.0,
-        "Drifts and spins; the origin of the true body frame against the CG is not stated.",
+        _SPINS,
     ),
     Case(
         "v40",
@@ -142,7 +143,7 @@ class Result:
 
     name: str
     error: FloatArray
-    stamps_ns: np.ndarray
+    stamps_ns: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,7 +164,7 @@ def files(case: Case) -> tuple[Path, Path]:
 def read_part(part: Part, mapping_file: Path, vehicle: VehicleParameters) -> Scored:
     """Read a slice as ``pdhef run`` does, with the vehicle's offsets and biases taken off."""
     with closing(open_log(DRIVES / part.log)) as log:
-        start, end = time_slice(part.config(), log.start_ns, log.end_ns)
+        start, end = time_slice(part.config, log.start_ns, log.end_ns)
         plan = plan_drive(log, load_mapping(mapping_file), vehicle, start, end)
         windows = [w for w in DriveReader(log, plan, 600.0).windows() if len(w.signals)]
     truth = concatenate([w.truth for w in windows if w.truth is not None])
@@ -185,7 +186,7 @@ def run_case(case: Case, model: ModelBundle | None, trials: int, say: Say) -> li
         for e in [*ready, *half_trust(ready, network, vehicle)]:
             say(f"{case.name}: {e.name}, {label}")
             track, _ = e.run(part.signals, None)
-            error = signal_error(track, part.truth, "sideslip_rad", case.min_speed_m_s)
+            error = signal_error(track, part.truth, SIDESLIP, case.min_speed_m_s)
             shown = e.name if e.causal else f"{e.name} (not causal)"
             if network is not None and e.name in ("pd-hef", "pd-hef-smoothed"):
                 shown += f" at trust {allowed_trust(vehicle, network).cap:g}"
@@ -262,7 +263,7 @@ def identify(case: Case, part: Part, folder: Path, say: Say) -> Path:
     mapping_file, catalogue_file = files(case)
     say(f"{case.name}: identification")
     out = folder / "identified.toml"
-    config = part.config(vehicle=catalogue_file, mapping=mapping_file)
+    config = replace(part.config, vehicle=catalogue_file, mapping=mapping_file)
     run_identification([str(DRIVES / part.log)], out, config, holdout=0.0)
     return out
 
@@ -273,32 +274,35 @@ def tune(case: Case, part: Part, vehicle: Path, model: Path | None, trials: int,
 
     say(f"{case.name}: tuning, {trials} trials")
     out = folder / "tuned.toml"
-    config = part.config(vehicle=vehicle, mapping=files(case)[0], model=model)
+    config = replace(part.config, vehicle=vehicle, mapping=files(case)[0], model=model)
     run_tuning([str(DRIVES / part.log)], out, TuneSettings(config, trials=trials), warn=say)
     return out
 
 
 def train(case: Case, part: Part, vehicle: Path, folder: Path, init: ModelBundle | None, say: Say) -> ModelBundle:
     """Train a network on the first share of the fit part, stopped by the rest of it; ``init`` is its start."""
-    from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
-    from pdhef_logtool.learning.network.extract_command import ExtractSettings, run_extraction
-    from pdhef_logtool.learning.network.train_command import make_recipe, train_on
-
     say(f"{case.name}: training {folder.name}")
     cut, end_s = split_at_s(part)
     blocks = {"train": replace(part, end_s=cut), "validation": replace(part, start_s=cut + GUARD_S, end_s=end_s)}
-    sets: list[Dataset] = []
-    for split, block in blocks.items():
-        config = block.config(vehicle=vehicle, mapping=files(case)[0])
-        run_extraction([str(DRIVES / part.log)], folder / split, ExtractSettings(config, split=split))
-        sets.append(read_dataset(folder / split))
-    both = replace(sets[0], drives=sets[0].drives + sets[1].drives)
-    recipe = make_recipe(paper=False, seed=0, epochs=None, device="cpu")
-    # A minute or two of driving: a small network; and a trained one moves gently.
-    recipe = (
-        replace(recipe, learning_rate=5e-4, epochs=15) if init is not None else replace(recipe, hidden=32, layers=1)
-    )
-    return train_on(both, folder / "model", recipe, init=init).bundle
+    configs = {split: replace(b.config, vehicle=vehicle, mapping=files(case)[0]) for split, b in blocks.items()}
+    return train_on_parts({split: ([DRIVES / part.log], c) for split, c in configs.items()}, folder, init)
+
+
+def regression_features(drive: FitDrive, *, low_pass: bool) -> FloatArray:
+    """Return δ, a_y, r, r/v_x, a_y/v_x², δ v_x, a_x and 1 at the stamps [N, 8], as old as an estimator has them.
+
+    With ``low_pass`` all go through a causal 2 Hz filter first.
+    """
+    s = drive.signals
+    known = np.isfinite(s.speed_m_s)
+    speed = np.interp(s.stamps_ns, s.stamps_ns[known], s.speed_m_s[known])
+    turning, sideways, steered = s.yaw_rate_rad_s / speed, s.ay_m_s2 / speed**2, s.steer_rad * speed
+    columns = [s.steer_rad, s.ay_m_s2, s.yaw_rate_rad_s, turning, sideways, steered, s.ax_m_s2]
+    x = np.nan_to_num(np.stack(columns, axis=1))
+    if low_pass:
+        x = sosfilt(butter(2, 2.0, fs=100.0, output="sos"), x, axis=0)
+    x = x[np.maximum(released_steps(s.ready_ns, s.stamps_ns), 0)]
+    return np.column_stack([x, np.ones(len(x))])
 
 
 def regressions(case: Case, part: Part, mapping_file: Path, vehicle: VehicleParameters) -> list[Result]:
@@ -320,7 +324,7 @@ def regressions(case: Case, part: Part, mapping_file: Path, vehicle: VehiclePara
 
 def _fit_drive(part: Part, mapping_file: Path, vehicle: VehicleParameters) -> FitDrive:
     with closing(open_log(DRIVES / part.log)) as log:
-        start, end = time_slice(part.config(), log.start_ns, log.end_ns)
+        start, end = time_slice(part.config, log.start_ns, log.end_ns)
         drive = load_fit_drive(part.log, log, load_mapping(mapping_file), vehicle, start, end)
     assert drive is not None
     return drive
@@ -352,11 +356,11 @@ def _interval(found: Interval, sign: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the cases and write the page."""
-    parser = argparse.ArgumentParser(prog="python -m studies.real", description=__doc__.splitlines()[0])
+    parser = options("real", __doc__)
     parser.add_argument("--model", type=Path)
     parser.add_argument("--trials", type=int, default=64)
     parser.add_argument("--cases", default=",".join(c.name for c in CASES))
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
+    parser.add_argument("--out", type=Path, default=DOCS)
     given = parser.parse_args(arguments)
     if not DRIVES.is_dir():
         print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
@@ -383,13 +387,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             continue
         lines += [f"## {case.title}", "", f"Scored above {case.min_speed_m_s:g} m/s. {case.remark}", ""]
         try:
-            lines += [case_table(run_case(case, model, given.trials, say))]
+            lines += [case_table(run_case(case, model, given.trials, say)), ""]
         except PdhefError as error:
             say(str(error))
             lines += [f"Not done: {error}", ""]
-    page = given.out / "real.md"
-    write_bytes(page, "\n".join(lines).encode())
-    print(page)
+    write(given.out / "real.md", "\n".join(lines))
     return 0
 
 

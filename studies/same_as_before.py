@@ -93,9 +93,13 @@ def main(arguments: list[str] | None = None) -> int:
     differences = list(compare(before, after))
     unexplained = 0
     for case, estimator, what, text in differences:
-        fault = MENDED.get((case, estimator, what)) or MENDED.get((case, estimator, "*")) or MENDED.get((case, "*", what))
+        fault = (
+            MENDED.get((case, estimator, what)) or MENDED.get((case, estimator, "*")) or MENDED.get((case, "*", what))
+        )
         unexplained += fault is None
-        print(f"{'MENDED' if fault else 'DIFFERS'} {case} {estimator} {what}: {text}" + (f" ({fault})" if fault else ""))
+        print(
+            f"{'MENDED' if fault else 'DIFFERS'} {case} {estimator} {what}: {text}" + (f" ({fault})" if fault else "")
+        )
     print(f"{len(differences)} differences, {unexplained} of them not explained")
     return 1 if unexplained else 0
 

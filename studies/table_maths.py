@@ -49,6 +49,11 @@ def percentiles(values: FloatArray, levels: tuple[float, ...] = (10.0, 50.0, 90.
     return tuple(np.percentile(known, levels).tolist()) if known.size else (float("nan"),) * len(levels)
 
 
+def median(values: FloatArray) -> float:
+    """Return the median over drives [N]; NaN without any."""
+    return percentiles(values, (50.0,))[0]
+
+
 def geometric_mean(values: FloatArray) -> float:
     """Return exp(mean(log x)) of positive values; NaN if one of them is not."""
     known = np.asarray(values, dtype=np.float64)

@@ -10,7 +10,6 @@ they are: the page shows peaks, ratios and lags alone.
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from pathlib import Path
@@ -18,7 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import WHEELS, FloatArray
+from studies.pages import DOCS, INDEPENDENT, fill, table, write
+from studies.pictures import STYLE, save, subplots
 from truthsim.drive import simulate_drive
 from truthsim.linear_theory import (
     axle_stiffness_n_per_rad,
@@ -29,15 +30,13 @@ from truthsim.linear_theory import (
 from truthsim.manoeuvres import Plan
 from truthsim.motion import Motion, simulate_motion
 from truthsim.tyres import Tyre, forces_n, slip_rates
+from truthsim.vehicle import GRAVITY_M_S2 as G
 from truthsim.vehicle import Vehicle
 from truthsim.vehicle_files import VEHICLES, load_vehicle
 
-G = 9.80665
 DRY = 0.85
-ROOT = Path(__file__).resolve().parents[1]
-INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
-WHEELS = ("fl", "fr", "rl", "rr")
 COLOURS = {"sedan": "#1f5fa8", "suv": "#b5482a", "hatchback": "#3b8550"}
+_SAVED_DPI = 80
 
 
 def degrees(radians: FloatArray | float) -> Any:
@@ -51,30 +50,9 @@ def open_loop(speed_m_s: float, steer_rad: FloatArray) -> Plan:
 
 
 def figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, Any]:
-    """Return a figure and its axes, [rows, columns]."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update(
-        {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "lines.linewidth": 1.4, "legend.fontsize": 8}
-    )
-    return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained")
-
-
-def save(fig: Any, folder: Path, name: str) -> None:
-    """Write a figure as a small PNG without a time in it, so that the same figure is the same file."""
-    import matplotlib.pyplot as plt
-
-    fig.savefig(folder / f"{name}.png", dpi=80, metadata={"Software": None})
-    plt.close(fig)
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    """Return a figure and its axes, [rows, columns]; of a single one the axes themselves."""
+    fig, axes = subplots(rows, columns, width, height, {**STYLE, "lines.linewidth": 1.4})
+    return fig, axes if axes.size > 1 else axes[0, 0]
 
 
 def free_rolling(car: Vehicle) -> Vehicle:
@@ -97,8 +75,7 @@ def slope(motion: Motion, column: FloatArray) -> float:
 
 def steady_state(folder: Path) -> dict[str, str]:
     """Understeer curves, load transfer, and the table of gradients."""
-    fig, axes = figure(1, 1, 6.4, 3.8)
-    ax = axes[0, 0]
+    fig, ax = figure(1, 1, 6.4, 3.8)
     rows = []
     for name in VEHICLES:
         car = load_vehicle(name)
@@ -131,13 +108,12 @@ def steady_state(folder: Path) -> dict[str, str]:
         title="Understeer: slow ramp at 80 km/h, mu 0.85 (dashed: linear theory)",
     )
     ax.legend()
-    save(fig, folder, "understeer")
+    save(fig, folder / "understeer.png", _SAVED_DPI)
 
     car = load_vehicle("sedan")
     motion = ramp(car, 0.05)
     a_y = motion.column("ay_m_s2")
-    fig, axes = figure(1, 1, 6.4, 3.8)
-    ax = axes[0, 0]
+    fig, ax = figure(1, 1, 6.4, 3.8)
     shades = dict(zip(WHEELS, ("#7fb0e0", "#1f5fa8", "#e8a487", "#b5482a"), strict=True))
     names = dict(zip(WHEELS, ("front left", "front right", "rear left", "rear right"), strict=True))
     wheelbase = car.cg_to_front_axle_m + car.cg_to_rear_axle_m
@@ -148,22 +124,12 @@ def steady_state(folder: Path) -> dict[str, str]:
         static = 0.5 * car.mass_kg * G * arm / wheelbase
         moved = steady_roll(car)[1][0 if front else 1] * (1.0 if wheel[1] == "r" else -1.0)
         ax.plot(a_y / G, (static + moved * a_y) / 1e3, "--", color="black", linewidth=0.8)
-    ax.set(
-        xlabel="lateral acceleration to the left, g",
-        ylabel="wheel load, kN",
-        title="Load transfer of the sedan (dashed: statics)",
-    )
+    ax.set(xlabel="lateral acceleration to the left, g", ylabel="wheel load, kN")
+    ax.set_title("Load transfer of the sedan (dashed: statics)")
     ax.legend()
-    save(fig, folder, "load_transfer")
-    head = [
-        "vehicle",
-        "understeer, deg/g",
-        "roll, deg/g",
-        "load moved in front, N/g",
-        "at the rear, N/g",
-        "largest a_y at mu 0.85, g",
-    ]
-    return {"gradients": table(head, rows)}
+    save(fig, folder / "load_transfer.png", _SAVED_DPI)
+    head = "vehicle | understeer, deg/g | roll, deg/g | load moved in front, N/g | at the rear, N/g"
+    return {"gradients": table([*head.split(" | "), "largest a_y at mu 0.85, g"], rows)}
 
 
 def measured_response(car: Vehicle, frequency: float, speed: float) -> tuple[list[complex], float]:
@@ -213,7 +179,7 @@ def responses(folder: Path) -> dict[str, str]:
             axes[row, k].set_xticks([0.3, 0.5, 1.0, 2.0, 3.0], ["0.3", "0.5", "1", "2", "3"])
             axes[row, k].minorticks_off()
     axes[0, 0].legend()
-    save(fig, folder, "frequency_response")
+    save(fig, folder / "frequency_response.png", _SAVED_DPI)
     rows = [[name, f"{100 * gain:.2f} %", f"{phase:.2f}°"] for name, (gain, phase) in worst.items()]
     return {"responses": table(["0.3 to 3 Hz, 60 and 100 km/h", "largest amplitude error", "phase error"], rows)}
 
@@ -227,14 +193,13 @@ def build_up(tyre: Tyre, alpha: float, speed: float, metres: float) -> tuple[Flo
         _, side, scaled = forces_n(tyre, 0.0, slip, load, DRY)
         force.append(side)
         slip += step * slip_rates(tyre, 0.0, slip, scaled, speed, -np.tan(alpha) * speed, speed)[1]
-    return np.arange(len(force)) * step * speed, np.array(force)
+    return np.asarray(np.arange(len(force)) * step * speed), np.array(force, dtype=np.float64)
 
 
 def relaxation(folder: Path) -> dict[str, str]:
     """Force over distance after a step of the slip angle, and what the whole car's front axle shows."""
     tyre = Tyre()
-    fig, axes = figure(1, 1, 6.4, 3.8)
-    ax = axes[0, 0]
+    fig, ax = figure(1, 1, 6.4, 3.8)
     for alpha, colour in ((0.3, "#1f5fa8"), (3.0, "#3b8550"), (8.0, "#b5482a")):
         for speed, dash in ((10.0, "-"), (30.0, ":")):
             x, force = build_up(tyre, np.radians(alpha), speed, 3.0)
@@ -242,21 +207,18 @@ def relaxation(folder: Path) -> dict[str, str]:
             ax.plot(x, force / steady, dash, color=colour, label=f"{alpha:g} deg, {speed:g} m/s")
     x = np.linspace(0.0, 3.0, 200)
     ax.plot(x, 1.0 - np.exp(-x / tyre.lateral_relaxation_m), "--", color="black", linewidth=1.0, label="1 - exp(-x/σ)")
-    ax.set(
-        xlabel="distance rolled after the step, m",
-        ylabel="lateral force over its final value",
-        title="Build-up of the lateral force",
-    )
+    ax.set(xlabel="distance rolled after the step, m", ylabel="lateral force over its final value")
+    ax.set_title("Build-up of the lateral force")
     ax.legend()
-    save(fig, folder, "relaxation")
+    save(fig, folder / "relaxation.png", _SAVED_DPI)
     rows = []
     car = load_vehicle("sedan")
     for speed in (10.0, 20.0, 40.0):
         t = np.arange(0.0, 3.0, 1e-3)
         motion = simulate_motion(open_loop(speed, 0.002 * np.sin(4 * np.pi * t)), DRY, vehicle=car, period_s=0.001)
         force = motion.column("fy_fl_n") + motion.column("fy_fr_n")
-        alpha = 0.5 * (motion.column("slip_angle_fl_rad") + motion.column("slip_angle_fr_rad"))
-        basis = np.stack([alpha, -np.gradient(force, 1e-3)], axis=1)[300:-2]
+        slip = 0.5 * (motion.column("slip_angle_fl_rad") + motion.column("slip_angle_fr_rad"))
+        basis = np.stack([slip, -np.gradient(force, 1e-3)], axis=1)[300:-2]
         (_, tau), *_ = np.linalg.lstsq(basis, force[300:-2], rcond=None)
         rows.append(
             [f"{speed:g}", f"{1e3 * tau:.1f}", f"{1e3 * tyre.lateral_relaxation_m / speed:.1f}", f"{tau * speed:.3f}"]
@@ -296,7 +258,7 @@ def traces(folder: Path) -> dict[str, str]:
         for ax in axes[-1]:
             ax.set_xlabel("time, s")
         fig.suptitle(title)
-        save(fig, folder, name)
+        save(fig, folder / f"{name}.png", _SAVED_DPI)
         unit = drive.friction * G
         peaks = {c: float(np.abs(truth[c]).max()) for c in ("yaw_rate_rad_s", "roll_rad")}
         rows.append(
@@ -309,15 +271,8 @@ def traces(folder: Path) -> dict[str, str]:
                 f"{min(float(truth[f'fz_{w}_n'].min()) for w in WHEELS):.0f}",
             ]
         )
-    head = [
-        "manoeuvre",
-        "largest a_y",
-        "yaw rate, deg/s",
-        "sideslip, deg",
-        "roll, deg",
-        "lightest wheel, N",
-    ]
-    return {"peaks": table(head, rows)}
+    head = "manoeuvre | largest a_y | yaw rate, deg/s | sideslip, deg | roll, deg | lightest wheel, N"
+    return {"peaks": table(head.split(" | "), rows)}
 
 
 def speed() -> dict[str, str]:
@@ -440,33 +395,15 @@ def independent() -> dict[str, str]:
                 ratio = np.abs(mine).max() / np.abs(theirs).max()
                 line += [f"{factor * np.abs(mine).max():.3g}", f"{ratio:.2f}", lag]
             rows.append(line)
-    head = [
-        "run",
-        "quantity",
-        "other: peak",
-        "sedan: peak",
-        "ratio",
-        "later by",
-        "like the other: peak",
-        "ratio",
-        "later by",
-    ]
+    head = ["run", "quantity", "other: peak"]
+    for car_name in ("sedan", "like the other"):
+        head += [f"{car_name}: peak", "ratio", "later by"]
     own = axle_stiffness_n_per_rad(Vehicle(), DRY)
     words = (
         f"Cornering stiffness of the axles, kN/rad: other {stiffness[0] / 1e3:.0f} and {stiffness[1] / 1e3:.0f}, "
         f"sedan {own[0] / 1e3:.0f} and {own[1] / 1e3:.0f} before compliance.\n\n"
     )
     return {"independent": words + table(head, rows)}
-
-
-def fill(page: str, blocks: dict[str, str]) -> str:
-    """Put the blocks between their comments; a block without a place is an error."""
-    for name, text in blocks.items():
-        pattern = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-        if len(pattern.findall(page)) != 1:
-            raise SystemExit(f"docs/truthsim.md: expected one place for {name}")
-        page = pattern.sub(lambda found, text=text: f"{found[1]}{text}\n{found[2]}", page)
-    return page
 
 
 def main(docs: Path) -> None:
@@ -479,12 +416,10 @@ def main(docs: Path) -> None:
     blocks.update(speed())
     blocks.update(independent())
     path = docs / "truthsim.md"
-    temporary = path.with_suffix(".md.part")
-    temporary.write_text(fill(path.read_text(encoding="utf-8"), blocks), encoding="utf-8")
-    temporary.replace(path)
+    write(path, fill(path.read_text(encoding="utf-8"), blocks, "docs/truthsim.md"))
     for name, text in blocks.items():
         print(f"{name}\n{text}\n")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs")
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS)

@@ -11,7 +11,6 @@ is for the model card. Logs that are there already as they should be are kept.
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -28,6 +27,7 @@ from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.residual_model.bundle import PAPER_FOLDER
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.watches.intervals import FILE, UNSURE_FILE
+from studies.pages import options
 
 HOME = Path("pdhef_logtool/models/default")
 VEHICLE = Path("sample_logs/vehicle.toml")
@@ -52,7 +52,7 @@ field = "friction"
 
 def main(arguments: list[str] | None = None) -> int:
     """Train and write the model folder."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options("defaults.train_default", __doc__)
     parser.add_argument("--seed", type=int, default=0, help="of weights, order and dropout; the data stay the same")
     parser.add_argument("-o", "--output", type=Path, default=HOME, help="model folder")
     parser.add_argument("--work", type=Path, default=Path("out/train-default"), help="logs and dataset; kept")

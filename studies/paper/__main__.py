@@ -8,19 +8,18 @@ seeds, which are trained first where they are not there yet (``python -m studies
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 
-from benchmarks.measuring import ROOT
 from pdhef_logtool.car.vehicle import load_vehicle
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, load_bundle
+from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, options, write
 from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
+from studies.paper.figures import draw
 from studies.paper.page import write_page
-from studies.paper.pictures import draw
 from studies.paper.results import VEHICLE_FILE, document, gather
 
 #: The shipped network, which is training seed 0.
@@ -28,8 +27,6 @@ SHIPPED = ROOT / "pdhef_logtool" / "models" / "default"
 #: Further training seeds are trained into folders here; ignored by git.
 TRAINED = ROOT / "out" / "paper"
 TRAINING_SEEDS = (0, 1, 2)
-#: A vehicle file beside the weights belongs to them; without one it is that of the sample logs.
-SAMPLE_VEHICLE = ROOT / "sample_logs" / VEHICLE_FILE
 
 
 def is_model(folder: Path) -> bool:
@@ -40,9 +37,7 @@ def is_model(folder: Path) -> bool:
 def default_models() -> dict[int, Path]:
     """Return the model folders by training seed; what is missing is trained."""
     if not is_model(SHIPPED):
-        raise SystemExit(
-            f"there is no shipped network in {SHIPPED.relative_to(ROOT)}: name model folders with --models"
-        )
+        raise SystemExit(f"no shipped network in {SHIPPED.relative_to(ROOT)}: name model folders with --models")
     folders = {TRAINING_SEEDS[0]: SHIPPED}
     for seed in TRAINING_SEEDS[1:]:
         folder = TRAINED / f"model-seed-{seed}"
@@ -63,17 +58,17 @@ def named_models(folders: list[Path]) -> dict[int, Path]:
 
 
 def vehicle_file(folder: Path) -> Path:
-    """Return the vehicle file that belongs to a model folder."""
+    """Return the vehicle file beside the weights, which belongs to them, or that of the sample logs."""
     beside = folder / VEHICLE_FILE
     return beside if beside.is_file() else SAMPLE_VEHICLE
 
 
 def main() -> int:
     """Run what the command line asks for."""
-    parser = argparse.ArgumentParser(prog="python -m studies.paper", description="The paper's experiment, run again.")
+    parser = options("paper", __doc__)
     parser.add_argument("--models", nargs="+", type=Path, metavar="DIR", help="model folders, one a training seed")
     parser.add_argument("--vehicle", type=Path, metavar="FILE", help="nominal vehicle; that of the first model")
-    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs", metavar="DOCS", help="folder of paper.md")
+    parser.add_argument("-o", "--output", type=Path, default=DOCS, metavar="DOCS", help="folder of paper.md")
     parser.add_argument("--noise-seeds", type=int, default=NOISE_SEEDS, metavar="N", help=f"{NOISE_SEEDS} by default")
     arguments = parser.parse_args()
     if arguments.noise_seeds < 1:
@@ -97,8 +92,7 @@ def main() -> int:
     draw(results, pictures)
     text = json.dumps(document(results), indent=1, allow_nan=False)
     (pictures / "results.json").write_text(text + "\n", encoding="utf-8")
-    (arguments.output / "paper.md").write_text(write_page(results), encoding="utf-8")
-    print(f"wrote {arguments.output / 'paper.md'}")
+    write(arguments.output / "paper.md", write_page(results))
     return 0
 
 

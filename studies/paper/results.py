@@ -24,7 +24,6 @@ from studies.paper.experiment import (
     Scenario,
     run_experiment,
 )
-from studies.paper.figures import hybrid_of
 from studies.paper.probes import (
     History,
     Inflation,
@@ -35,7 +34,7 @@ from studies.paper.probes import (
     residual_fit,
     trust_curve,
 )
-from studies.paper.schemes import SCHEMES
+from studies.paper.schemes import SCHEMES, hybrid_of
 from studies.paper.step_time import StepTime, step_times
 from truthsim.suite import is_held_out
 

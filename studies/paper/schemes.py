@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pdhef_logtool.estimators.registry import ALIASES, DESCRIPTIONS, runnable
+
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.registry import ALIASES, DESCRIPTIONS, runnable
 from pdhef_logtool.residual_model.bundle import ModelBundle
 
 #: All schemes that belong in the tables (METHOD §10), with one line each for the page.
@@ -26,6 +27,21 @@ SCHEMES: dict[str, str] = {
     "pd-hef-fixed-r": "our hybrid filter, full trust, fixed R",
     "pd-hef": "our hybrid filter with its adaptive mechanism",
 }
+
+
+#: The paper's three, drawn in this order in the time histories; the last has a stand-in where this version lacks it.
+DRAWN = ("phy-ukf", "pure-lstm", "pd-hef")
+STAND_IN = "pd-hef-fixed-r"
+
+
+def hybrid_of(ran: Sequence[str]) -> str:
+    """Return the name of our hybrid filter among those that ran."""
+    return DRAWN[-1] if DRAWN[-1] in ran else STAND_IN
+
+
+def drawn(ran: Sequence[str]) -> tuple[str, ...]:
+    """Return the schemes of the time histories that ran."""
+    return tuple(n for n in (*DRAWN[:-1], hybrid_of(ran)) if n in ran)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ import torch
 from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.registry import MODEL_ESTIMATORS, NOT_CAUSAL, make_estimator
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 
@@ -37,7 +38,6 @@ from pdhef_logtool.estimators.physics import (
     PosteriorSteps,
     StepLinks,
 )
-from pdhef_logtool.estimators.registry import MODEL_ESTIMATORS, NOT_CAUSAL, make_estimator
 from pdhef_logtool.estimators.smoothed import SMOOTHED_Q_STD, SmoothedHybrid, smooth_steps, smoothed_hybrid
 from pdhef_logtool.records.reasons import (
     BURST_AY,

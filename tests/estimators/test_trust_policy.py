@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-
-from pdhef_logtool.car.vehicle import Network, VehicleParameters, default_vehicle, load_vehicle, vehicle_to_toml
 from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.estimators.trust_policy import CAP_WITHOUT_EVIDENCE, allowed_trust
+
+from pdhef_logtool.car.vehicle import Network, VehicleParameters, default_vehicle, load_vehicle, vehicle_to_toml
 from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES

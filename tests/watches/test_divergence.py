@@ -15,13 +15,13 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.registry import make_estimator
 from reference_car import cut, make_signals
 from rich.console import Console
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle, load_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveReader, plan_drive
-from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.records.signals import Signals, join_signals
