@@ -3,8 +3,8 @@
     python -m studies.same_as_before COMMIT [--work out/same] [--keep]
 
 Both trees run the same logs on this machine, with the same interpreter and libraries: the sample logs, and where
-``../shared`` is there the recorded 250 LM, whole and damaged. Compared are the columns of estimates.parquet, the values of
-metrics.parquet, and payloads and stamps of every topic below ``/pdhef``. A difference that mends a fault stands in
+``../shared`` is there the recorded 250 LM, whole and damaged. Compared are the columns of estimates.parquet, the values
+of metrics.parquet, and payloads and stamps of every topic below ``/pdhef``. A difference that mends a fault stands in
 :data:`MENDED` with that fault; any other ends with 1.
 """
 
@@ -47,13 +47,13 @@ def cases(shipped: str) -> tuple[Case, ...]:
     samples = tuple(f"sample_logs/{name}" for name in _SAMPLES)
     lm = "{drives}/revs_250lm_a.mcap"
     known = (*_REFERENCE, *_MAPPING)
+    samples_car = ("--vehicle", "sample_logs/vehicle.toml")
     return (
         Case("samples", ("run", *samples, "--vehicle", shipped)),
         Case("low-friction", ("run", "sample_logs/sweep.mcap", "--vehicle", shipped, "--friction", "0.3")),
         Case(
             "untuned",
-            ("run", "sample_logs/dlc.mcap", "sample_logs/faults.mcap", "--vehicle", "sample_logs/vehicle.toml")
-            + ("--sensors", "esp"),
+            ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--sensors", "esp"),
         ),
         Case(
             "default-car",
@@ -64,9 +64,11 @@ def cases(shipped: str) -> tuple[Case, ...]:
         Case("250lm-flipped", ("run", "{drives}/faulty/revs_250lm_a_flipped_byte.mcap", *known), 3),
         Case("250lm-car", ("identify", lm, *known, "--end", "150", "--holdout", "0")),
         Case("250lm-identified", ("run", lm, "--vehicle", "{out}/250lm-car.toml", *_MAPPING, "--start", "155")),
-        Case("recorded", ("metrics", "{out}/samples/logs/dlc/annotated.mcap", "--estimate", "/pdhef/phy_ukf/state")
-             + ("--vehicle", "sample_logs/vehicle.toml")),
-    )  # fmt: skip
+        Case(
+            "recorded",
+            ("metrics", "{out}/samples/logs/dlc/annotated.mcap", "--estimate", "/pdhef/phy_ukf/state", *samples_car),
+        ),
+    )
 
 
 #: By case, estimator and column (or topic): the fault that a difference mends.
@@ -93,13 +95,10 @@ def main(arguments: list[str] | None = None) -> int:
     differences = list(compare(before, after))
     unexplained = 0
     for case, estimator, what, text in differences:
-        fault = (
-            MENDED.get((case, estimator, what)) or MENDED.get((case, estimator, "*")) or MENDED.get((case, "*", what))
-        )
-        unexplained += fault is None
-        print(
-            f"{'MENDED' if fault else 'DIFFERS'} {case} {estimator} {what}: {text}" + (f" ({fault})" if fault else "")
-        )
+        places = ((case, estimator, what), (case, estimator, "*"), (case, "*", what))
+        fault = next((MENDED[p] for p in places if p in MENDED), "")
+        unexplained += not fault
+        print(f"{'MENDED' if fault else 'DIFFERS'} {case} {estimator} {what}: {text}" + (f" ({fault})" if fault else ""))
     print(f"{len(differences)} differences, {unexplained} of them not explained")
     return 1 if unexplained else 0
 

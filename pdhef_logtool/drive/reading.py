@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source, friction_topic
 from pdhef_logtool.drive.options import ReadOptions, time_slice
@@ -187,7 +188,7 @@ class Drive:
 
 def read_drive(
     log: LogInput | Path | str,
-    vehicle: VehicleParameters,
+    car: Car,
     mapping: Mapping | None = None,
     options: ReadOptions = _AS_IT_IS,
     *,
@@ -230,9 +231,9 @@ def read_drive(
             chosen = adjust(opened, chosen, told)
             check_mapping(chosen, opened)
         slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
-        plan = plan_drive(opened, chosen, vehicle, *slice_ns, require_imu=require_sensors)
+        plan = plan_drive(opened, chosen, car.vehicle, *slice_ns, require_imu=require_sensors)
         _tell_doubts(plan, told)
-        friction = friction_of(plan, vehicle, options)
+        friction = friction_of(plan, car.vehicle, options)
         if friction.note:
             told(friction.note)
     except BaseException:

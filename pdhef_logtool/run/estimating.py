@@ -9,8 +9,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import no_samples
 from pdhef_logtool.drive.windows import DrivePlan, DriveWindow, with_look_ahead
+from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, run_window
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.signals import Signals
@@ -94,6 +96,15 @@ def estimate(
         yield Estimated(signals, truth, drawn_truth, tuple(tracks), window.share_done)
     if start is None:
         raise no_samples(drive.path)
+
+
+def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
+    """Return what puts the car's intervals on the tracks of estimators, by what they really are."""
+    algorithms = {}
+    for estimator in estimators:
+        other = getattr(estimator, "calibrated_as", None)
+        algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
+    return TrackCalibrator(car.intervals, algorithms)
 
 
 class DeadReckoning:

@@ -9,11 +9,13 @@ from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_sha256
+from pdhef_logtool.car.car import SHOWN_DIGITS, Car
+from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.base import Estimator, notes_of
-from pdhef_logtool.estimators.registry import NOT_CAUSAL, Skipped, default_names, runnable
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
 from pdhef_logtool.records.errors import (
@@ -27,9 +29,8 @@ from pdhef_logtool.records.errors import (
     UsageError,
 )
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, IntArray, Loss, Signals, join_signals
-from pdhef_logtool.residual_model.bundle import SHIPPED, ModelBundle, open_model
 from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.estimating import estimate
+from pdhef_logtool.run.estimating import calibrator, estimate
 from pdhef_logtool.run.track_store import TrackStore
 from pdhef_logtool.sinks.base import TRUTH, Event, Sink
 from pdhef_logtool.sinks.report import (
@@ -46,7 +47,7 @@ from pdhef_logtool.sinks.report import (
     tool_versions,
     write_json,
 )
-from pdhef_logtool.watches.intervals import Calibration, TrackCalibrator, find_calibration
+from pdhef_logtool.watches.intervals import TrackCalibrator
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
@@ -139,13 +140,13 @@ def run_logs(
         The output folder cannot be written.
     """
     inputs = find_logs(arguments)
-    vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
+    car = Car.load(config.car, network=config.network, intervals=config.intervals)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
-    model = open_model(config.model)
-    calibration = find_calibration(config.calibration, config.model)
     thresholds = read_thresholds(config, junit)
-    if config.vehicle is None:
-        warn(f"no --vehicle: the default {vehicle.name} is assumed, so the model-based estimates are of another car")
+    if config.car is None:
+        warn(f"no --car: the default {car.vehicle.name} is assumed, so the model-based estimates are of another car")
+    for note in car.notes:
+        warn(note)
     make_folder(output)
     results: list[LogResult] = []
     for number, log_input in enumerate(inputs):
@@ -154,9 +155,7 @@ def run_logs(
             progress(text, (number + share) / len(inputs))
 
         try:
-            result = run_log(
-                log_input, output, config, vehicle, mapping, model, calibration, progress=of_all, warn=warn
-            )
+            result = run_log(log_input, output, config, car, mapping, progress=of_all, warn=warn)
         except Exception as error:  # one bad log never stops the others, whatever is wrong with it
             if len(inputs) == 1:
                 raise
@@ -165,7 +164,7 @@ def run_logs(
             outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
             result = LogResult(outcome, None, None, ())
         results.append(judge(result, thresholds))
-    write_run(output, config.to_dict(), results, model)
+    write_run(output, config.to_dict(), results, car)
     write_verdicts(junit, results)
     return RunResult(output, tuple(results))
 
@@ -205,10 +204,8 @@ def run_log(
     log_input: LogInput,
     output: Path,
     config: RunConfig,
-    vehicle: VehicleParameters,
+    car: Car,
     mapping: Mapping | None,
-    model: ModelBundle | None = None,
-    calibration: Calibration | None = None,
     *,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
@@ -221,29 +218,32 @@ def run_log(
         Nothing of the log can be used; nothing is then left under a final name.
     """
     progress(log_input.stem, 0.0)
-    with read_drive(log_input, vehicle, mapping, config.read_options, tell=warn) as drive:
-        ready, skipped = _choose_estimators(drive, config, vehicle, model)
-        stands_for = {e.name: getattr(e, "calibrated_as", e.name) for e in ready}
-        intervals = TrackCalibrator(
-            calibration, vehicle_sha256(vehicle), None if model is None else model.sha256, stands_for
-        )
+    with read_drive(log_input, car, mapping, config.read_options, tell=warn) as drive:
+        ready, skipped = _choose_estimators(drive, config, car)
+        algorithms = {e.name: resolve(e) for e in ready}
+        intervals = calibrator(car, ready)
         folder = output / "logs" / drive.name
-        sinks = _open_sinks(folder, drive, config, vehicle)
+        sinks = _open_sinks(folder, drive, config, car)
         try:
             with TrackStore(folder) as store:
                 signals = _estimate(drive, ready, intervals, sinks, store, progress)
-                rows, events, reasons = _evaluate(store, ready, signals, drive, vehicle)
+                rows, events, reasons = _evaluate(store, ready, signals, drive, car)
+            rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in rows]
             if drive.friction.bank is not None:
                 events = sorted([*events, *friction_events(drive.friction, signals.stamps_ns)], key=in_time)
             losses = merge_losses([drive.losses, *(sink.lost for sink in sinks)])
             ran = [
                 EstimatorFacts(
-                    e.name, causal=e.causal, notes=(*notes_of(e), *intervals.notes(e.name)), reasons=reasons[e.name]
+                    e.name,
+                    causal=e.causal,
+                    notes=(*notes_of(e), *intervals.notes(e.name)),
+                    reasons=reasons[e.name],
+                    algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
                 )
-                for e in ready
+                for e, a in zip(ready, algorithms.values(), strict=True)
             ]
-            left_out = [EstimatorFacts(s.name, causal=s.name not in NOT_CAUSAL, skipped=s.reason) for s in skipped]
-            facts = report_facts(drive, vehicle, [*ran, *left_out], rows, events, losses)
+            left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in skipped]
+            facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
             report = build_report(replace(facts, friction=friction_facts(drive.friction)))
             from pdhef_logtool.sinks.parquet import write_metrics
 
@@ -262,22 +262,20 @@ def run_log(
     return LogResult(outcome, folder, report, tuple(rows))
 
 
+def _short(algorithm: Algorithm | None) -> str:
+    return "" if algorithm is None else algorithm.sha256[:SHOWN_DIGITS]
+
+
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     """Return how a log that was read is recorded in run.json."""
     return LogOutcome(log=drive.name, file=drive.path.name, sha256=drive.sha256, lost=lost_texts(losses))
 
 
 def _choose_estimators(
-    drive: Drive, config: RunConfig, vehicle: VehicleParameters, model: ModelBundle | None
+    drive: Drive, config: RunConfig, car: Car
 ) -> tuple[list[Estimator], list[Skipped]]:
     """Return the estimators that can run and those that cannot; raises EstimatorError if none can."""
-    estimators, skipped = runnable(
-        config.estimators or default_names(vehicle, model),
-        vehicle,
-        drive.available,
-        use_speed=drive.options.use_speed,
-        model=model,
-    )
+    estimators, skipped = runnable(config.estimators, car, drive.available, Options(drive.options.use_speed))
     for skip in skipped:
         drive.tell(f"{skip.name} is skipped: {skip.reason}")
     if not estimators:
@@ -290,7 +288,7 @@ def _choose_estimators(
     return estimators, skipped
 
 
-def _open_sinks(folder: Path, drive: Drive, config: RunConfig, vehicle: VehicleParameters) -> list[Sink]:
+def _open_sinks(folder: Path, drive: Drive, config: RunConfig, car: Car) -> list[Sink]:
     from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
     from pdhef_logtool.sinks.parquet import EstimatesSink
     from pdhef_logtool.sinks.rerun import RerunSink
@@ -306,7 +304,8 @@ def _open_sinks(folder: Path, drive: Drive, config: RunConfig, vehicle: VehicleP
                 log_name=drive.name,
                 input_hash=drive.sha256,
                 start_ns=drive.plan.start_ns,
-                min_speed_m_s=vehicle.low_speed_blend_m_s,
+                min_speed_m_s=car.vehicle.low_speed_blend_m_s,
+                colours={s.name: s.colour for s in SPECS},
             )
         )
     except BaseException:
@@ -349,7 +348,7 @@ def _evaluate(
     estimators: Sequence[Estimator],
     signals: Signals,
     drive: Drive,
-    vehicle: VehicleParameters,
+    car: Car,
 ) -> tuple[list[MetricRow], list[Event], dict[str, tuple[ReasonFacts, ...] | None]]:
     """Score the stored tracks, one whole track in memory at a time besides the truth.
 
@@ -361,8 +360,8 @@ def _evaluate(
     from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
 
     stem, truth = drive.name, store.read(TRUTH)
-    masks = segment_masks(signals, truth, vehicle)
-    slow = vehicle.low_speed_blend_m_s
+    masks = segment_masks(signals, truth, car.vehicle)
+    slow = car.vehicle.low_speed_blend_m_s
     rows: list[MetricRow] = []
     reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
     events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(signals.stamps_ns, without_whole(masks))]
@@ -407,7 +406,7 @@ def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
 
 def report_facts(
     drive: Drive,
-    vehicle: VehicleParameters,
+    car: Car,
     estimators: Sequence[EstimatorFacts],
     rows: Sequence[MetricRow],
     events: Sequence[Event],
@@ -444,8 +443,8 @@ def report_facts(
         ),
         signals=[SourceFacts(n, s.label, SIGNAL_UNITS[n], samples.get(s.label, 0)) for n, s in mapping.signals.items()],
         missing_signals=list(drive.missing),
-        vehicle_name=vehicle.name,
-        vehicle_sha256=vehicle_sha256(vehicle),
+        vehicle_name=car.vehicle.name,
+        vehicle_sha256=car.physics_sha256,
         estimators=list(estimators),
         truth=TruthFacts(
             quantities=[
@@ -493,11 +492,12 @@ def make_folder(output: Path) -> None:
 
 
 def write_run(
-    output: Path, config: dict[str, Any], results: Sequence[LogResult], model: ModelBundle | None = None
+    output: Path, config: dict[str, Any], results: Sequence[LogResult], car: Car | None = None
 ) -> None:
     """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values."""
     from pdhef_logtool.sinks.parquet import write_metrics
 
-    used = None if model is None else {"name": str(config["model"] or SHIPPED), "sha256": model.sha256}
+    network = None if car is None else car.network
+    used = None if car is None or network is None else {"name": Path(car.network_name).name, "sha256": network.sha256}
     write_metrics(output / "metrics.parquet", [row for r in results for row in r.rows])
     write_json(output / "run.json", build_run(tool_versions(), config, used, [r.outcome for r in results]))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle, load_vehicle
+from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
 from pdhef_logtool.drive.truth import (
@@ -50,6 +50,7 @@ from pdhef_logtool.records.signals import (
     join_signals,
 )
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
+from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.run.estimating import DeadReckoning, first_pose
@@ -104,16 +105,16 @@ def score_log(
         There is no estimate, no truth, or nothing of the log can be used.
     """
     log_input = one_log(argument)
-    vehicle = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
+    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
     thresholds = read_thresholds(config, junit)
-    if config.vehicle is None:
-        slow = vehicle.low_speed_blend_m_s
+    if config.car is None:
+        slow = car.vehicle.low_speed_blend_m_s
         warn(
-            f"no --vehicle: the truth is taken to be measured at the centre of gravity, sideslip is scored above "
-            f"{slow:g} m/s, and segments are cut at friction {vehicle.assumed_friction:g}"
+            f"no --car: the truth is taken to be measured at the centre of gravity, sideslip is scored above "
+            f"{slow:g} m/s, and segments are cut at friction {car.vehicle.assumed_friction:g}"
         )
-    scoring = _Scoring(config, vehicle, warn, estimates, truth, name)
+    scoring = _Scoring(config, car, warn, estimates, truth, name)
     with scoring.read(log_input, mapping) as drive:
         result = judge(scoring.score(drive, output, progress), thresholds)
     if output is not None:
@@ -138,13 +139,13 @@ class _Scoring:
     def __init__(
         self,
         config: RunConfig,
-        vehicle: VehicleParameters,
+        car: Car,
         warn: Tell,
         estimates: Sequence[str],
         truth: Sequence[str],
         name: str | None,
     ) -> None:
-        self.config, self.vehicle, self.warn = config, vehicle, warn
+        self.config, self.car, self.warn = config, car, warn
         self._asked, self._truth, self._name = estimates, truth, name
         self.estimates: tuple[EstimateSource, ...] = ()
 
@@ -178,7 +179,7 @@ class _Scoring:
 
         options = replace(self.config.read_options, friction=None)
         return read_drive(
-            log_input, self.vehicle, mapping, options, tell=self.warn, adjust=choose, require_sensors=False
+            log_input, self.car, mapping, options, tell=self.warn, adjust=choose, require_sensors=False
         )
 
     def score(self, drive: Drive, output: Path | None, progress: Progress) -> LogResult:
@@ -202,7 +203,7 @@ class _Scoring:
         for r in recorded:
             samples |= r.samples
         facts = report_facts(
-            drive, self.vehicle,
+            drive, self.car,
             [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded],
             rows, events, all_losses, samples,
         )  # fmt: skip
@@ -260,7 +261,7 @@ class _Scoring:
         dependent: dict[str, str] = {}
         for r in recorded:
             at_stamps = truth_at(truth, r.track.stamps_ns, plan.truth_latency_s)
-            masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.vehicle)
+            masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.car.vehicle)
             same = {
                 name: f"the truth's {name} equals that of the estimate {r.track.name}"
                 for name in SCORED_SIGNALS
@@ -272,7 +273,7 @@ class _Scoring:
                 at_stamps,
                 masks,
                 log=drive.name,
-                low_speed_m_s=self.vehicle.low_speed_blend_m_s,
+                low_speed_m_s=self.car.vehicle.low_speed_blend_m_s,
                 not_independent={**plan.dependent, **same},
             )
             if not any(row.metric == "rmse" for row in figures):
@@ -289,7 +290,7 @@ class _Scoring:
     def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:
         from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
 
-        masks = without_whole(segment_masks(signals, truth, self.vehicle))
+        masks = without_whole(segment_masks(signals, truth, self.car.vehicle))
         events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(truth.stamps_ns, masks)]
         for r in recorded:
             events += [
