@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import datetime as dt
 import re
-import tomllib
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.estimators.registry import check_names
+from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 
-ANNOTATE = ("full", "sidecar", "none")
-SENSOR_SUITES = ("full", "esp")
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
 WINDOW_S = 600.0
@@ -23,9 +25,23 @@ _FILES = ("vehicle", "mapping", "thresholds", "model", "calibration")
 _KEYWORDS = {"model": ("default", "many-cars", "none"), "calibration": ("none", "unsure")}
 
 
-@dataclass(frozen=True, slots=True)
+def _as_text(value: object) -> object:
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if plain or isinstance(value, dt.date) else value
+
+
+#: As users write it; in a file also a number or a TOML date. No time is longer.
+Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
+#: As a list or with commas.
+Names = Annotated[
+    tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
+]
+Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True))
 class RunConfig:
-    """Everything that decides a run's numbers and outputs.
+    """Everything that decides a run's numbers and outputs; its types are checked wherever one is made.
 
     Attributes
     ----------
@@ -44,16 +60,16 @@ class RunConfig:
     thresholds : limits that the figures are held against; None = no gate.
     """
 
-    estimators: tuple[str, ...] | None = None
+    estimators: Names | None = None
     vehicle: Path | None = None
     mapping: Path | None = None
-    start: str | None = None
-    end: str | None = None
+    start: Time | None = None
+    end: Time | None = None
     annotate: Literal["full", "sidecar", "none"] = "full"
     sensors: Literal["full", "esp"] = "full"
-    friction: str | float = "auto"
+    friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    window_s: float = WINDOW_S
+    window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     thresholds: Path | None = None
     model: Path | None = None
     calibration: Path | None = None
@@ -78,54 +94,30 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
     UsageError
         The file is missing or wrong, or a value is none of those allowed.
     """
-    config = RunConfig()
     if path is None and Path("pdhef.toml").is_file():
         path = Path("pdhef.toml")
-    if path is not None:
-        config = replace(config, **_read_file(path))
-    config = replace(config, **{k: v for k, v in flags.items() if v is not None})
-    _check(config)
-    return replace(config, friction=parse_friction(config.friction))
-
-
-def _read_file(path: Path) -> dict[str, Any]:
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(expected="a configuration TOML file", got=str(error), where=str(path)) from None
-    known = {f.name for f in fields(RunConfig)}
-    unknown = sorted(set(raw) - known)
-    if unknown:
-        raise UsageError(expected=f"keys out of {', '.join(sorted(known))}", got=", ".join(unknown), where=str(path))
-    if "estimators" in raw:
-        names = raw["estimators"]
-        raw["estimators"] = tuple(names.split(",") if isinstance(names, str) else names)
-    for key in _FILES:
-        if key in raw:
-            value = str(raw[key])
-            raw[key] = Path(value) if value in _KEYWORDS.get(key, ()) else path.parent / value
-    for key in ("start", "end"):
-        if key in raw:
-            raw[key] = str(raw[key])
-    return raw
-
-
-def _check(config: RunConfig) -> None:
+    raw = {} if path is None else _read_file(path)
+    given = {key: value for key, value in flags.items() if value is not None}
+    if "friction" in given:
+        given["friction"] = parse_friction(given["friction"])
+    for where, entries in ((str(path), raw), ("options", {**raw, **given})):
+        config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
     if config.estimators is not None:
         check_names(config.estimators)
-    for name, value, allowed in (
-        ("annotate", config.annotate, ANNOTATE),
-        ("sensors", config.sensors, SENSOR_SUITES),
-        ("prefer_truth", config.prefer_truth, ("perfect", "rtk")),
-    ):
-        if value not in allowed:
-            raise UsageError(expected=f"one of {', '.join(allowed)}", got=repr(value), where=name)
-    if not isinstance(config.window_s, (int, float)) or not config.window_s >= 1.0:
-        raise UsageError(expected="a window of at least 1 s", got=repr(config.window_s), where="window_s")
     # Times are understood without a log, so that a typing error is told before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:
             parse_time(text, 0, 0, option=name)
+    return config
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    raw = read_toml(path, "a configuration TOML file", UsageError)
+    for key in _FILES:
+        value = raw.get(key)
+        if isinstance(value, str):
+            raw[key] = Path(value) if value in _KEYWORDS.get(key, ()) else path.parent / value
+    return raw
 
 
 def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:

@@ -14,7 +14,6 @@ is scaled row and column alike, so that its correlations stay. Estimates themsel
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -23,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pdhef_logtool.records.documents import read_json
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -208,12 +208,7 @@ def load_calibration(path: Path) -> Calibration:
     """
     file = path / FILE if path.is_dir() else path
     remedy = "pdhef calibrate writes one"
-    try:
-        data = file.read_bytes()
-        document = json.loads(data)
-    except (OSError, ValueError) as error:
-        raise ModelError(expected="a calibration file", got=str(error), where=str(file), remedy=remedy) from None
-    said = document if isinstance(document, dict) else {}
+    said = read_json(file, "a calibration file", ModelError, remedy)
     if said.get("format") != FORMAT or said.get("version") != FORMAT_VERSION:
         got = f"{said.get('format')} {said.get('version')}"
         raise ModelError(expected=f"{FORMAT} {FORMAT_VERSION}", got=got, where=str(file), remedy=remedy)
@@ -226,9 +221,9 @@ def load_calibration(path: Path) -> Calibration:
             model_sha256=None if said.get("model_sha256") is None else str(said["model_sha256"]),
             spread=_finite(said["settings"]["vary"]),
             name=file.name,
-            sha256=hashlib.sha256(data).hexdigest(),
+            sha256=hashlib.sha256(file.read_bytes()).hexdigest(),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (OSError, LookupError, TypeError, ValueError, OverflowError, AttributeError) as error:
         raise ModelError(
             expected="the entries of a calibration file", got=f"{error!r}", where=str(file), remedy=remedy
         ) from None
