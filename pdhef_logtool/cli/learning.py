@@ -112,7 +112,7 @@ def train(
     "pdhef tune logs/ --split validation --car mycar -o mycar --trials 256",
     notes="Every estimator gets the same search space, drives and number of trials. All trials and a plot of them "
     "are kept with the car. Drives that a set's manifest marks test or extrapolation are refused (docs/tune.md).",
-    shared="sensors friction model signal_map",
+    shared="sensors friction network model signal_map",
     car="The car whose filter noise is tuned",
 )
 def tune(
@@ -151,7 +151,7 @@ def tune(
     notes="Give driving that neither the network nor the car was fitted to; drives that a manifest marks train or "
     "validation are refused. The filter runs at trust 0, 0.25, 0.5, 0.75 and 1. The cap is 1 only if a bootstrap of "
     "blocks confirms the gain, at most 0.5 on a mean gain, else 0 (docs/trust.md). All figures are kept with the car.",
-    shared="sensors friction model",
+    shared="sensors friction network model",
     car="The car of the drives",
 )
 def trust(
@@ -178,7 +178,7 @@ def trust(
     "pdhef calibrate logs/ --car mycar --vary 0 -o mycar",
     notes="Give drives of many kinds that neither network nor filter noise was fitted to; drives that a set's "
     "manifest marks test or extrapolation are refused (docs/calibrate.md).",
-    shared="estimators sensors friction model",
+    shared="estimators sensors friction network model",
     car="The car that the estimators run with",
 )
 def calibrate(

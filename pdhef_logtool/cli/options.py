@@ -48,18 +48,15 @@ _OPTIONS: dict[str, Any] = {
     "prefer_truth": Annotated[_Text, Option(help="perfect or rtk: which truth of a simulated log counts.")],
     "thresholds": Annotated[_File, Option(help="thresholds.toml: limits on figures; exit code 4 if one is broken.")],
     "config_file": Annotated[_File, Option("--config", help="pdhef.toml; flags win over it.")],
+    "network": Annotated[_File, Option(help="Instead of the car's: a folder, default, many-cars, or none.")],
+    "intervals": Annotated[_File, Option(help="Instead of the car's: a file of calibrate, unsure (wide), or none.")],
     "vehicle": Annotated[_File, Option("--vehicle", "-v", hidden=True)],
     "model": Annotated[_File, Option(hidden=True)],
     "calibration": Annotated[_File, Option(hidden=True)],
     "signal_map": Annotated[_File, Option(hidden=True)],
 }
 #: Options of old that still work, and what stands for them now.
-_ALIASES = {
-    "vehicle": "car",
-    "model": "car (its network)",
-    "calibration": "car (its intervals)",
-    "signal_map": "mapping",
-}
+_ALIASES = {"vehicle": "car", "model": "network", "calibration": "intervals", "signal_map": "mapping"}
 
 
 def command(
@@ -121,10 +118,7 @@ def run_config(options: dict[str, Any]) -> RunConfig:
         say(f"notice: --{alias.replace('_', '-')} is now --{now}")
         if now in flags:
             raise UsageError(expected=f"--{now} or its alias", got="both", where=f"--{now}")
-        if now in _OPTIONS:
-            flags[now] = flags.pop(alias)
-    if "car" in flags:
-        flags["vehicle"] = flags.pop("car")
+        flags[now] = flags.pop(alias)
     if "estimators" in flags:
         flags["estimators"] = split_names(flags["estimators"])
     return load_config(flags.pop("config_file", None), flags)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping as MappingABC
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.mapping.records import (
     AUTO_STAMP,
@@ -25,6 +23,7 @@ from pdhef_logtool.mapping.records import (
     SignalSource,
     StampUnit,
 )
+from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 
@@ -110,13 +109,7 @@ def load_mapping(path: Path) -> Mapping:
     MappingError
         The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
     """
-    try:
-        with path.open("rb") as f:
-            raw: dict[str, Any] = tomllib.load(f)
-    except FileNotFoundError:
-        raise MappingError(expected="a mapping TOML file", got="no such file", where=str(path)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise MappingError(expected="a mapping TOML file", got=str(error), where=str(path)) from None
+    raw = read_toml(path, "a mapping TOML file", MappingError)
     return mapping_from_dict(raw, where=str(path), folder=path.parent)
 
 
@@ -130,7 +123,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     """
     problems: list[str] = []
     sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised")
-    problems += [f"{key}: unknown table{_near(key, sections)}" for key in raw if key not in sections]
+    problems += [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
     quality = _read_gate(raw["truth_quality"], problems) if "truth_quality" in raw else None
@@ -138,7 +131,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     can = _read_can(raw["can"], folder, problems) if "can" in raw else None
     fill = raw.get("fill_recognised", False)
     if not isinstance(fill, bool):
-        problems.append(f"fill_recognised: true or false expected, got {fill!r}")
+        problems.append("fill_recognised: should be true or false")
         fill = False
     mapping = Mapping(
         signals=signals,
@@ -165,11 +158,6 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     return mapping
 
 
-def _near(name: str, known: tuple[str, ...]) -> str:
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f" (did you mean {close[0]}?)" if close else ""
-
-
 def _read_section(
     raw: object, section: str, known: tuple[str, ...], other: tuple[str, ...], problems: list[str]
 ) -> dict[str, SignalSource]:
@@ -183,12 +171,10 @@ def _read_section(
             if name in other:
                 problems.append(f"{where}: belongs under [{'truth' if section == 'signals' else 'signals'}.{name}]")
             else:
-                problems.append(f"{where}: unknown name{_near(name, known)}")
+                problems.append(unknown(name, known, section))
             continue
-        try:
-            model = _SourceTable.model_validate(table)
-        except ValidationError as error:
-            problems += _pydantic_problems(error, where, tuple(_SourceTable.model_fields))
+        model = checked(_SourceTable, table, where, problems)
+        if model is None:
             continue
         problem = _shape_problem(name, model)
         if problem:
@@ -226,10 +212,8 @@ def _read_estimates(raw: object, problems: list[str]) -> dict[str, dict[str, Sig
 
 
 def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | None:
-    try:
-        model = _CanTable.model_validate(raw)
-    except ValidationError as error:
-        problems += _pydantic_problems(error, "can", tuple(_CanTable.model_fields))
+    model = checked(_CanTable, raw, "can", problems)
+    if model is None:
         return None
     files = model.dbc if isinstance(model.dbc, list) else [model.dbc]
     return CanSettings(dbc=tuple(folder / f for f in files), **model.model_dump(exclude={"dbc"}))
@@ -251,10 +235,8 @@ def _shape_problem(name: str, model: _SourceTable) -> str:
 
 
 def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
-    try:
-        model = _GateTable.model_validate(raw)
-    except ValidationError as error:
-        problems += _pydantic_problems(error, "truth_quality", tuple(_GateTable.model_fields))
+    model = checked(_GateTable, raw, "truth_quality", problems)
+    if model is None:
         return None
     return QualityGate(
         topic=model.topic,
@@ -267,22 +249,6 @@ def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
         clock=model.clock,
         latency_s=model.latency_s,
     )
-
-
-def _pydantic_problems(error: ValidationError, where: str, keys: tuple[str, ...]) -> list[str]:
-    found: dict[str, list[str]] = {}
-    for e in error.errors(include_url=False):
-        key = str(e["loc"][0]) if e["loc"] else ""
-        at = f"{where}.{key}" if key else where
-        if e["type"] == "extra_forbidden":
-            text = f"unknown entry{_near(key, keys)}"
-        elif e["type"] == "missing":
-            text = "is missing"
-        else:
-            text = e["msg"].removeprefix("Value error, ")
-        found.setdefault(at, []).append(text)
-    # A union reports one message an alternative; together they are one problem.
-    return [f"{at}: {' or '.join(dict.fromkeys(texts))}" for at, texts in found.items()]
 
 
 def _contradictions(mapping: Mapping) -> list[str]:

@@ -2,56 +2,82 @@
 
 from __future__ import annotations
 
-import tomllib
-from dataclasses import asdict, dataclass, fields, replace
+import datetime as dt
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.drive.friction import parse_friction
-from pdhef_logtool.drive.options import SENSOR_SUITES, WINDOW_S, ReadOptions, parse_time
-from pdhef_logtool.estimators.registry import check_names
+from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
+from pdhef_logtool.estimators.table import check_names
+from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.readings import POSSIBLE_FRICTION
+from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 
-ANNOTATE = ("full", "sidecar", "none")
-_FILES = ("vehicle", "mapping", "thresholds", "model", "calibration")
+_FILES = ("car", "mapping", "thresholds", "network", "intervals")
 #: What may stand in place of a file.
-_KEYWORDS = {"model": ("default", "many-cars", "none"), "calibration": ("none", "unsure")}
+_KEYWORDS = {
+    "car": tuple(SHIPPED_CARS),
+    "network": (*SHIPPED_FOLDERS, NO_MODEL),
+    "intervals": (NO_INTERVALS, UNSURE),
+}
+#: Keys of older files, and what they are now.
+FORMER_KEYS = {"vehicle": "car", "model": "network", "calibration": "intervals"}
 
 
-@dataclass(frozen=True, slots=True)
+def _as_text(value: object) -> object:
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if plain or isinstance(value, dt.date) else value
+
+
+#: As users write it; in a file also a number or a TOML date. No time is longer.
+Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
+#: As a list or with commas.
+Names = Annotated[
+    tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
+]
+Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True))
 class RunConfig:
-    """Everything that decides a run's numbers and outputs.
+    """Everything that decides a run's numbers and outputs; its types are checked wherever one is made.
 
     Attributes
     ----------
-    estimators : names, in the order of the tables; None = every one that the vehicle file suits.
-    vehicle, mapping : files; None = the default sedan, recognised types.
+    estimators : names, in the order of the tables; None = every one that the car suits.
+    car : a car's folder, a vehicle.toml, or ``saloon``, the shipped one; None = the default sedan.
+    mapping : file; None = recognised types.
     start, end : slice as given (:func:`~pdhef_logtool.drive.options.parse_time`); None = the log's own.
     annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only.
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
-    friction : ``auto`` is the log's own, else the vehicle file's, else estimated; ``file``, ``estimate``, or a number.
+    friction : ``auto`` is the log's own, else the car's, else estimated; ``file``, ``estimate``, or a number.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
-    model : folder of a model bundle for the hybrid filters; None = the shipped one, ``many-cars`` = the shipped one for
-        any car, ``none`` = no network.
-    calibration : file of ``pdhef calibrate``; None = that beside the model, if any; ``none`` = intervals as they
-        are; ``unsure`` = the wide one beside the model, for a car that may have changed since its file was made.
+    network : instead of the car's: a folder, ``default``, ``many-cars`` (the shipped one for any car), ``none``.
+    intervals : instead of the car's: a file of ``pdhef calibrate``, ``none`` (intervals as they are), ``unsure`` (wide
+        ones, for a car that may have changed since its file was made).
     thresholds : limits that the figures are held against; None = no gate.
     """
 
-    estimators: tuple[str, ...] | None = None
-    vehicle: Path | None = None
+    estimators: Names | None = None
+    car: Path | None = None
     mapping: Path | None = None
-    start: str | None = None
-    end: str | None = None
+    start: Time | None = None
+    end: Time | None = None
     annotate: Literal["full", "sidecar", "none"] = "full"
     sensors: Literal["full", "esp"] = "full"
-    friction: str | float = "auto"
+    friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
-    window_s: float = WINDOW_S
+    window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     thresholds: Path | None = None
-    model: Path | None = None
-    calibration: Path | None = None
+    network: Path | None = None
+    intervals: Path | None = None
 
     @property
     def read_options(self) -> ReadOptions:
@@ -78,51 +104,28 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
     UsageError
         The file is missing or wrong, or a value is none of those allowed.
     """
-    config = RunConfig()
     if path is None and Path("pdhef.toml").is_file():
         path = Path("pdhef.toml")
-    if path is not None:
-        config = replace(config, **_read_file(path))
-    config = replace(config, **{k: v for k, v in flags.items() if v is not None})
-    _check(config)
-    return replace(config, friction=parse_friction(config.friction))
-
-
-def _read_file(path: Path) -> dict[str, Any]:
-    try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(expected="a configuration TOML file", got=str(error), where=str(path)) from None
-    known = {f.name for f in fields(RunConfig)}
-    unknown = sorted(set(raw) - known)
-    if unknown:
-        raise UsageError(expected=f"keys out of {', '.join(sorted(known))}", got=", ".join(unknown), where=str(path))
-    if "estimators" in raw:
-        names = raw["estimators"]
-        raw["estimators"] = tuple(names.split(",") if isinstance(names, str) else names)
-    for key in _FILES:
-        if key in raw:
-            value = str(raw[key])
-            raw[key] = Path(value) if value in _KEYWORDS.get(key, ()) else path.parent / value
-    for key in ("start", "end"):
-        if key in raw:
-            raw[key] = str(raw[key])
-    return raw
-
-
-def _check(config: RunConfig) -> None:
+    raw = {} if path is None else _read_file(path)
+    given = {key: value for key, value in flags.items() if value is not None}
+    if "friction" in given:
+        given["friction"] = parse_friction(given["friction"])
+    for where, entries in ((str(path), raw), ("options", {**raw, **given})):
+        config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
     if config.estimators is not None:
         check_names(config.estimators)
-    for name, value, allowed in (
-        ("annotate", config.annotate, ANNOTATE),
-        ("sensors", config.sensors, SENSOR_SUITES),
-        ("prefer_truth", config.prefer_truth, ("perfect", "rtk")),
-    ):
-        if value not in allowed:
-            raise UsageError(expected=f"one of {', '.join(allowed)}", got=repr(value), where=name)
-    if not isinstance(config.window_s, (int, float)) or not config.window_s >= 1.0:
-        raise UsageError(expected="a window of at least 1 s", got=repr(config.window_s), where="window_s")
     # Times are understood without a log, so that a typing error is told before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:
             parse_time(text, 0, 0, option=name)
+    return config
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    raw = read_toml(path, "a configuration TOML file", UsageError)
+    raw = {FORMER_KEYS.get(key, key): value for key, value in raw.items()}
+    for key in _FILES:
+        value = raw.get(key)
+        if isinstance(value, str):
+            raw[key] = Path(value) if value in _KEYWORDS.get(key, ()) else path.parent / value
+    return raw

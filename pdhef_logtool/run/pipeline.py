@@ -13,8 +13,8 @@ from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import Algorithm
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
-from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses

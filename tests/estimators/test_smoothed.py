@@ -522,16 +522,16 @@ def test_what_it_says_of_itself(rough):
 
 def test_the_noise_is_its_own_tables_then_the_filters():
     network = NetworkService(BUNDLE)
-    filters = {"pd-hef": FilterTuning(q_std=(0.1, 0.2), r_std={"ay_m_s2": 0.7})}
-    own = {"pd-hef-smoothed": FilterTuning(q_std=(0.1, 0.05), r_std={"yaw_rate_rad_s": 0.002})}
+    filters = {"pd-hef": FilterTuning(q_std=(0.1, 0.2, 0.04), r_std={"ay_m_s2": 0.7})}
+    own = {"pd-hef-smoothed": FilterTuning(q_std=(0.1, 0.05, 0.02), r_std={"yaw_rate_rad_s": 0.002})}
 
     def noise(tables: dict[str, FilterTuning]) -> tuple[tuple[float, ...], tuple[float, ...]]:
         hybrid = smoothed_hybrid(VEHICLE.model_copy(update={"filter": tables}), network).hybrid
         return hybrid.q_std, hybrid.r_std
 
     assert noise({}) == (SMOOTHED_Q_STD, HYBRID_R_STD)
-    assert noise(filters) == ((0.1, 0.2, *HYBRID_Q_STD[2:]), (0.7, HYBRID_R_STD[1]))
-    assert noise(filters | own) == ((0.1, 0.05, *SMOOTHED_Q_STD[2:]), (HYBRID_R_STD[0], 0.002))
+    assert noise(filters) == ((0.1, 0.2, 0.04, *HYBRID_Q_STD[3:]), (0.7, HYBRID_R_STD[1]))
+    assert noise(filters | own) == ((0.1, 0.05, 0.02, *SMOOTHED_Q_STD[3:]), (HYBRID_R_STD[0], 0.002))
     assert smoothed_hybrid(VEHICLE, network, trust=0.3).hybrid.trust == 0.3
 
 

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import datetime as dt
+import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from pdhef_logtool.drive.options import ReadOptions, parse_time, time_slice
 from pdhef_logtool.records.errors import UsageError
@@ -88,13 +91,66 @@ def test_file_of_the_working_directory_is_found(tmp_path: Path, monkeypatch: pyt
         ("window_s = 0.1", "0.1"),
         ("start = soon", "TOML"),
         ('end = "later"', "later"),
+        ("estimators = 3", r"estimators: should be a valid tuple, got 3"),
+        ("estimators = [3]", r"estimators\.0: should be a valid string, got 3"),
+        ("window_s = true", r"window_s: should be a valid number, got True"),
+        ('window_s = "60"', r"window_s: should be a valid number, got '60'"),
+        ("window_s = inf", "window_s"),
+        ("window_s = nan", "window_s"),
+        ("start = true", r"start: should be a valid string, got True"),
+        ("end = [1]", "end: should be a valid string"),
+        (f'end = "{"9" * 400}"', "end: String should have at most 64 characters"),
+        ("vehicle = 3", r"vehicle: should be a path, got 3"),
+        ("annotate = 3", "annotate: should be 'full', 'sidecar' or 'none', got 3"),
+        ('friction = "0.4"', "friction: "),
+        ("friction = 0.0", "friction: "),
+        ("friction = true", "friction: "),
+        ('model = ["none"]', "model: should be a path"),
+        ("windows_s = 3", r"windows_s: unknown, did you mean window_s\?"),
+        ('vehicel = "car.toml"', r"vehicel: unknown, did you mean vehicle\?"),
     ],
 )
 def test_wrong_files_name_what_is_wrong(tmp_path: Path, text: str, named: str) -> None:
     file = tmp_path / "c.toml"
     file.write_text(text)
-    with pytest.raises(UsageError, match=named):
+    with pytest.raises(UsageError, match=named) as caught:
         load_config(file, {})
+    assert caught.value.exit_code == 2
+    assert "\n" not in str(caught.value)
+
+
+def test_all_problems_of_a_file_come_at_once(tmp_path: Path) -> None:
+    file = tmp_path / "c.toml"
+    file.write_text('estimators = 3\nwindow_s = true\nanotate = "full"\n')
+    with pytest.raises(UsageError, match=r"c\.toml.*estimators: .*; window_s: .*; anotate: unknown"):
+        load_config(file, {})
+
+
+def test_a_wrong_option_is_no_fault_of_the_file(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text('annotate = "none"\n')
+    with pytest.raises(UsageError, match=r"^options: .*annotate: should be .*, got 'all'"):
+        load_config(tmp_path / "c.toml", {"annotate": "all"})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("10", "10"), ("2.5", "2.5"), ('"end-5s"', "end-5s"), ("2026-01-31T12:00:00Z", "2026-01-31 12:00:00+00:00")],
+)
+def test_a_time_is_a_number_a_text_or_a_date(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "c.toml").write_text(f"end = {text}\n")
+    assert load_config(tmp_path / "c.toml", {}).end == said
+
+
+def test_estimators_may_be_a_text_with_commas(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text('estimators = "zero,gyro"\n')
+    assert load_config(tmp_path / "c.toml", {}).estimators == ("zero", "gyro")
+
+
+def test_a_configuration_is_checked_wherever_it_is_made() -> None:
+    config = RunConfig(window_s=60)
+    assert (config.window_s, pickle.loads(pickle.dumps(config))) == (60.0, config)
+    with pytest.raises(ValidationError, match="window_s"):
+        replace(config, window_s=True)  # type: ignore[arg-type]
 
 
 def test_missing_file_is_a_usage_error(tmp_path: Path) -> None:
