@@ -17,11 +17,12 @@ import numpy as np
 from scipy.signal import butter, sosfilt
 
 from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_interval
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive
 from pdhef_logtool.learning.car.identify_command import run_identification
-from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.release import released_steps
 from pdhef_logtool.run.config import RunConfig
@@ -84,11 +85,9 @@ def main() -> None:
                 error = signal_error(read_track(file, name), truth, "sideslip_rad", 3.0)
                 model_free = name in ("zero", "kinematic")
                 rows.append((name if model_free else f"{name}, {label}", *_rmse_deg(error, truth.stamps_ns)))
-    log = open_log(LOG)
-    vehicle, mapping = load_vehicle(catalogue_file), load_mapping(mapping_file)
-    fit = load_fit_drive("fit", log, mapping, vehicle, log.start_ns, log.start_ns + FIT_END_S * 10**9)
-    score = load_fit_drive("score", log, mapping, vehicle, log.start_ns + SCORE_START_S * 10**9, log.end_ns)
-    log.close()
+    catalogue, mapping = load_vehicle(catalogue_file), load_mapping(mapping_file)
+    _, fit = load_fit_drive(LogInput(LOG, "fit"), catalogue, mapping, ReadOptions(end=str(FIT_END_S)))
+    _, score = load_fit_drive(LogInput(LOG, "score"), catalogue, mapping, ReadOptions(start=str(SCORE_START_S)))
     assert fit is not None and score is not None
     for low_pass in (False, True):
         known = np.isfinite(fit.truth.sideslip_rad)
