@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +15,17 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.drive import reading
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error, summarise_errors
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import auto_map
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from studies.independent_sim_logs import write_run
 from studies.pages import INDEPENDENT
 from studies.table_maths import interval_score
@@ -64,18 +65,20 @@ def read_drive(path: Path, vehicle: VehicleParameters, name: str, *, friction: f
 
     The perfect truth stands on the sensors' clock, so that no latency is looked for: a stuck gyro would bend it.
     """
-    with closing(open_log(path)) as log:
-        mapping = auto_map(log).mapping
-        if friction is None:
-            mapping = replace(
-                mapping,
-                signals={**mapping.signals, "friction": _FRICTION},
-                truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y},
-            )
-        plan = replace(plan_drive(log, mapping, vehicle, log.start_ns, log.end_ns), latency=None)
-        windows = [w for w in DriveReader(log, plan, 600.0).windows() if len(w.signals)]
-    signals = join_signals([w.signals for w in windows])
-    truth = concatenate([w.truth for w in windows if w.truth is not None])
+
+    def with_true_friction(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
+        return replace(
+            mapping,
+            signals={**mapping.signals, "friction": _FRICTION},
+            truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y},
+        )
+
+    adjust = with_true_friction if friction is None else None
+    with reading.read_drive(path, vehicle, options=ReadOptions(friction=None), adjust=adjust) as drive:
+        drive.plan = replace(drive.plan, latency=None)
+        whole = drive.whole()
+    signals, truth = whole.signals, whole.truth
+    assert truth is not None
     if friction is not None:
         constant = np.full(len(signals), friction)
         signals = replace(signals, friction=constant, available=signals.available | {"friction"})

@@ -26,7 +26,7 @@ from pdhef_logtool.estimators.trust_policy import allowed_trust
 from scipy.signal import butter, sosfilt
 
 from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference, block_bootstrap_interval
@@ -34,15 +34,16 @@ from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive
 from pdhef_logtool.learning.evidence.trust import decide_cap
 from pdhef_logtool.learning.evidence.trust_command import errors_by_trust
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.release import released_steps
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.run.config import RunConfig
 from studies.condition_drives import SIDESLIP
 from studies.fine_tuning import train_on_parts
 from studies.pages import DOCS, DRIVES, ROOT, number, options, table, write
@@ -163,13 +164,11 @@ def files(case: Case) -> tuple[Path, Path]:
 
 def read_part(part: Part, mapping_file: Path, vehicle: VehicleParameters) -> Scored:
     """Read a slice as ``pdhef run`` does, with the vehicle's offsets and biases taken off."""
-    with closing(open_log(DRIVES / part.log)) as log:
-        start, end = time_slice(part.config, log.start_ns, log.end_ns)
-        plan = plan_drive(log, load_mapping(mapping_file), vehicle, start, end)
-        windows = [w for w in DriveReader(log, plan, 600.0).windows() if len(w.signals)]
-    truth = concatenate([w.truth for w in windows if w.truth is not None])
-    signals = join_signals([w.signals for w in windows])
-    return Scored(signals, truth, tuple(sorted(plan.dependent)), plan.alignment.available)
+    options = replace(part.config.read_options, friction=None)
+    with read_drive(DRIVES / part.log, vehicle, load_mapping(mapping_file), options) as drive:
+        whole = drive.whole()
+    assert whole.truth is not None
+    return Scored(whole.signals, whole.truth, tuple(sorted(whole.plan.dependent)), drive.available)
 
 
 def run_case(case: Case, model: ModelBundle | None, trials: int, say: Say) -> list[Result]:
@@ -323,9 +322,8 @@ def regressions(case: Case, part: Part, mapping_file: Path, vehicle: VehiclePara
 
 
 def _fit_drive(part: Part, mapping_file: Path, vehicle: VehicleParameters) -> FitDrive:
-    with closing(open_log(DRIVES / part.log)) as log:
-        start, end = time_slice(part.config, log.start_ns, log.end_ns)
-        drive = load_fit_drive(part.log, log, load_mapping(mapping_file), vehicle, start, end)
+    log_input = LogInput(DRIVES / part.log, part.log)
+    _, drive = load_fit_drive(log_input, vehicle, load_mapping(mapping_file), part.config.read_options)
     assert drive is not None
     return drive
 

@@ -98,7 +98,8 @@ def main(arguments: list[str] | None = None) -> int:
         places = ((case, estimator, what), (case, estimator, "*"), (case, "*", what))
         fault = next((MENDED[p] for p in places if p in MENDED), "")
         unexplained += not fault
-        print(f"{'MENDED' if fault else 'DIFFERS'} {case} {estimator} {what}: {text}" + (f" ({fault})" if fault else ""))
+        verdict = f" MENDED: {fault}" if fault else " DIFFERS"
+        print(f"{case} {estimator} {what}: {text}{verdict}")
     print(f"{len(differences)} differences, {unexplained} of them not explained")
     return 1 if unexplained else 0
 

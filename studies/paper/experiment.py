@@ -10,19 +10,18 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import Network, VehicleParameters
-from pdhef_logtool.drive.windows import DriveReader, DriveWindow, plan_drive
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.evaluation.metrics import MetricRow, score_track
 from pdhef_logtool.evaluation.segments import segment_masks
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import choose_mapping
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle
@@ -35,7 +34,6 @@ GRAVITY_M_S2 = 9.80665
 #: Sensor errors of the reported drives; sample logs have seeds of one digit, tuning drives from 1000 on.
 FIRST_NOISE_SEED = 52_001
 NOISE_SEEDS = 8
-WINDOW_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,10 +176,9 @@ def read_simulated(scenario: Scenario, noise_seed: int, nominal: VehicleParamete
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.mcap"
         write_drive(drive, path)
-        with closing(open_log(path)) as log:
-            mapping, _ = choose_mapping(log, None, lambda _text: None, prefer_truth="perfect")
-            plan = plan_drive(log, mapping, vehicle, log.start_ns, log.end_ns)
-            windows = tuple(w for w in DriveReader(log, plan, WINDOW_S).windows() if len(w.signals))
+        with read_drive(path, vehicle, options=ReadOptions(friction=None)) as read:
+            plan = read.plan
+            windows = tuple(w for w in read.windows() if len(w.signals))
     facts = {
         "scenario": scenario.name,
         "noise_seed": noise_seed,
