@@ -29,7 +29,7 @@ def inspect(
     write_mapping: Annotated[Path | None, Option(help="Write a ready-to-edit mapping.toml (never overwrites).")] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Show what a log holds and what maps to what. Also rates, gaps, jitter, and what is missing."""
+    """Show what a log holds and what maps to what. Rates, gaps and jitter are shown too, and what is missing."""
     from pdhef_logtool.inspection import inspect_log, render_inspection
     from pdhef_logtool.inspection import write_mapping as write_mapping_file
     from pdhef_logtool.mapping import load_mapping

@@ -30,7 +30,7 @@ def identify(
     holdout: Annotated[float, Option(help="Share at the end of each slice that is only scored, once.")] = 0.25,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Fit a car to its drives: tyres, steering, biases. And its roll gradient and filter noise."""
+    """Fit a car's tyres, steering and biases to its drives. Roll gradient and filter noise are fitted too."""
     from pdhef_logtool.learning.car.identify_command import run_identification
 
     with console.progress() as bar:
@@ -53,7 +53,7 @@ def extract(
     logs: options.TruthLogs,
     output: Annotated[Path, Option("--output", "-o", help="Folder of the dataset.")],
     config: RunConfig,
-    truth_smoothing: Annotated[str, Option(help="auto (by its noise), none, or half a window in s.")] = "auto",
+    truth_smoothing: Annotated[str, Option(help="auto (by its noise), none, or seconds to either side.")] = "auto",
     split: Annotated[str | None, Option(help="train, validation or test for all drives of this command.")] = None,
     seed: Annotated[int, Option(help="Seed of the split by drive.")] = 0,
     vary: Annotated[float, Option(help="Make friction and car wrong by this spread for a part of the drives.")] = 0.0,
@@ -61,7 +61,7 @@ def extract(
     resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings are as they were.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write the residual dataset that train learns from. It is what a car's physics leave unexplained."""
+    """Write the residual dataset that train learns from. A residual is what a car's physics leave unexplained."""
     from pdhef_logtool.learning.network.extract_command import ExtractSettings, run_extraction
 
     settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed, vary=vary)
@@ -134,7 +134,7 @@ def tune(
     jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Tune the noise of a car's filters for sideslip. All are searched alike, on drives with truth."""
+    """Tune the noise of a car's filters for sideslip. All filters are searched alike."""
     from pdhef_logtool.learning.noise.tune_command import TuneSettings, run_tuning
 
     names = None if estimators is None else options.split_names(estimators)
@@ -163,7 +163,7 @@ def trust(
     seed: Annotated[int, Option(help="Seed of the bootstrap.")] = 0,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Find how far the network may be trusted on a car. Drives with truth tell it."""
+    """Find how far the network may be trusted on a car. Without truth in the drives it cannot be told."""
     from pdhef_logtool.learning.evidence.trust_command import TrustSettings, run_trust
 
     settings = TrustSettings(config, seed=seed, split=split, any_split=any_split)

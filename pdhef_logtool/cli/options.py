@@ -26,7 +26,7 @@ CarOutput = Annotated[
 JsonFlag = Annotated[bool, Option("--json", help="One JSON document on stdout instead of tables.")]
 JunitFile = Annotated[Path | None, Option(help="Write the verdicts of --thresholds as JUnit XML, for CI.")]
 Split = Annotated[str | None, Option(help="Only drives of this split, by the manifest of their set.")]
-AnySplit = Annotated[bool, Option("--any-split", help="Take drives of every split, even of those that are refused.")]
+AnySplit = Annotated[bool, Option("--any-split", help="Take drives of every split, even of those refused otherwise.")]
 Jobs = Annotated[int, Option("--jobs", "-j", help="Processes at work; changes no number.")]
 
 _Text = str | None
@@ -36,7 +36,7 @@ _OPTIONS: dict[str, Any] = {
     "car": Annotated[_File, Option()],
     "estimators": Annotated[_Text, Option("--estimators", "-e", help="Comma-separated; see pdhef estimators.")],
     "mapping": Annotated[
-        _File, Option("--mapping", "-m", help="mapping.toml: topic.field -> signal; default: by type.")
+        _File, Option("--mapping", "-m", help="mapping.toml: topic.field -> signal; default: by message type.")
     ],
     "start": Annotated[_Text, Option(help="Start of the slice of each log: 12.5, +10s, end-5s, ns, or RFC 3339.")],
     "end": Annotated[_Text, Option(help="End of the slice of each log, as --start.")],

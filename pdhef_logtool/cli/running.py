@@ -61,7 +61,7 @@ def run(
     "ay_m_s2, their *_std_*, valid. Scales, offsets, signs and several estimators stand in a mapping file, one "
     "[estimates.NAME.SIGNAL] table a signal.",
     shared="thresholds config_file",
-    car="The car, for the place of its truth, friction and lowest speed",
+    car="The car (place of its truth, friction, lowest speed)",
 )
 def metrics(
     log: options.Log,
@@ -81,7 +81,7 @@ def metrics(
     junit: options.JunitFile = None,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Score an estimate that the log itself holds. Whoever made it: the figures are those of run."""
+    """Score an estimate that the log itself holds. The figures are those of pdhef run."""
     from pdhef_logtool.run.recorded_estimates import score_log
 
     with console.progress() as bar:
