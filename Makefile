@@ -9,13 +9,13 @@ CAR := pdhef_logtool/models/default/vehicle.toml
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: train-default help demo test check lint format bench samples docs-truthsim paper switches clean
+.PHONY: help demo test check lint format bench train-default samples conditions real switches docs-truthsim paper clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
 	@echo "make check    formatting, lint, types, import contracts, tests"
-	@echo "make bench    speed against peers, and the tuning tables"
+	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions VEHICLE=car.toml MODEL=model  docs/conditions.md: every estimator on the condition table"

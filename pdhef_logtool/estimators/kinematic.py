@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.estimators.table import Options
 
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
-#: Chosen against the truth of simulated drives by ``benchmarks/tune_kinematic_leak.py``, which is to its advantage.
+#: Chosen against the truth of simulated drives by ``studies.defaults.tune_kinematic_leak``, which is to its advantage.
 LEAK_S = 0.7
 STANDSTILL_SPEED_M_S = 0.05
 

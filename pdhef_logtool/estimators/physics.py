@@ -4,7 +4,7 @@ State [v_x, v_y, r, b_ax]; b_ax is a slow bias of the longitudinal accelerometer
 behind it: the biases of a_y, yaw rate and steering angle, and the force scale s, by which model and residual are taken
 to be wrong: (1 + s) times their forces, an Ornstein-Uhlenbeck process (METHOD §12, §15). Measurements [a_y, r, v_x],
 each of which may be missing at any step. Without options this is the paper's physics baseline and frozen: R at sensor
-level from the vehicle file, Q by innovation likelihood (``benchmarks/tune_physics_q.py``).
+level from the vehicle file, Q by innovation likelihood (``studies.defaults.tune_physics_q``).
 
 Over a step the inputs are the mean of those at its two ends: both are known when the step is taken, and the residual
 targets are made the same way.
@@ -68,8 +68,8 @@ U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED = 0, 1, 2, 3, 4
 INPUTS = 5
 
 #: Process noise, 1-sigma per square root of second, of v_x, v_y, r and the a_x bias. Chosen by innovation likelihood
-#: over simulated drives (``benchmarks/tune_physics_q.py``, its result beside it) and frozen: the drives were those of
-#: the simulator's first, planar vehicle, and a baseline does not follow every change of the simulator.
+#: over simulated drives (``studies.defaults.tune_physics_q``, its result in ``results/``) and frozen: the drives were
+#: those of the simulator's first, planar vehicle, and a baseline does not follow every change of the simulator.
 PHY_UKF_Q_STD = (0.089, 0.31, 0.062, 0.021)
 #: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk (METHOD §1).
 NO_AX_Q_STD = 3.0
