@@ -73,7 +73,7 @@ class Car:
     vehicle : physics and sensors, what identification found included.
     own : physics and sensors as the person's file has them.
     noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only what belongs to ``vehicle``.
-    network, network_name : the residual network, None without; trust : what was found of it.
+    network, network_name, network_folder : the residual network, None without; trust : what was found of it.
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives that ``vehicle`` was identified on.
     source : folder or file, None for the default car. notes : what is stale, and why.
@@ -84,6 +84,7 @@ class Car:
     noise: Mapping[str, FilterNoise] = field(default_factory=lambda: MappingProxyType({}))
     network: ModelBundle | None = None
     network_name: str = NO_MODEL
+    network_folder: Path | None = None
     trust: Trust | None = None
     intervals: Intervals | None = None
     learnt_on: tuple[LearntOn, ...] = ()
@@ -128,7 +129,9 @@ class Car:
         car = _with_parts(cls(flat.vehicle, flat.vehicle, source=source), flat, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
-        return replace(car, network=bundle, network_name=name, intervals=_intervals_of(folder, intervals))
+        return replace(
+            car, network=bundle, network_name=name, network_folder=home, intervals=_intervals_of(folder, intervals)
+        )
 
     @property
     def physics_sha256(self) -> str:
@@ -166,13 +169,24 @@ class Car:
                 return AllowedTrust(0.0, f"the car's evidence was found with other {what}; pdhef trust gives it anew")
         return AllowedTrust(found.trust_cap, found.evidence)
 
+    def with_fit(self, fit: Fit) -> Car:
+        """Return the car as identification found it; what was found of a network with other tyres counts no more."""
+        vehicle = fit.values.applied_to(self.own)
+        if not vehicle.name.endswith("(identified)"):
+            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
+        noise = {**self.noise, **fit.filter}
+        return replace(self, vehicle=vehicle, noise=noise, trust=None, learnt_on=fit.drives)
+
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
         """Return the car with another noise of one filter."""
         return replace(self, noise={**self.noise, name: noise})
 
     def with_vehicle(self, vehicle: VehicleParameters) -> Car:
-        """Return the car with other physics, made wrong on purpose, and everything else as it is."""
-        return replace(self, vehicle=vehicle)
+        """Return the car with other physics, made wrong on purpose, and everything else as it is, its trust too."""
+        trust = self.trust
+        if trust is not None and trust.physics_sha256 == self.physics_sha256:
+            trust = trust.model_copy(update={"physics_sha256": None})
+        return replace(self, vehicle=vehicle, trust=trust)
 
 
 def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
@@ -184,11 +198,8 @@ def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
         own = physics_sha256(vehicle)
         fit = _part(folder / FIT_FILE, Fit)
         if fit is not None and fit.physics_sha256 == own:
-            vehicle = fit.values.applied_to(vehicle)
-            if not vehicle.name.endswith("(identified)"):
-                vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
-            learnt_on = fit.drives
-            noise |= fit.filter
+            car = replace(car, noise=noise).with_fit(fit)
+            vehicle, noise, learnt_on, trust = car.vehicle, dict(car.noise), car.learnt_on, None
         elif fit is not None:
             notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "pdhef identify"))
         tuned = _part(folder / NOISE_FILE, Noise)

@@ -119,12 +119,19 @@ def flat_toml(
     _merge(document, _plain(before), _plain(after))
     tables: dict[str, Any] = {}
     if noise:
-        tables["filter"] = {name: _plain(one) for name, one in noise.items()}
+        # In one file all belongs together: digests would only stand in the way of a person's hand.
+        plain = {name: _plain(one) for name, one in noise.items()}
+        tables["filter"] = {n: {k: v for k, v in one.items() if "sha256" not in k} for n, one in plain.items()}
     if trust is not None:
         found = {"trust_cap": trust.trust_cap, "evidence": trust.evidence, "model_sha256": trust.network_sha256}
         tables["network"] = {k: v for k, v in found.items() if v is not None}
-    if identification:
-        tables["identification"] = dict(identification)
+    known = (
+        {k: v for k, v in document.get("identification", {}).unwrap().items() if k != "tuning_scores"}
+        if ("identification" in document)
+        else {}
+    )
+    if known or identification:
+        tables["identification"] = {**known, **identification}
     for name, table in tables.items():
         document.pop(name, None)
         document[name] = table

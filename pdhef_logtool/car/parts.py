@@ -67,6 +67,14 @@ class FittedValues(Record):
     sensors: FittedSensors | None = None
     tyres: Tyres | None = None
 
+    @classmethod
+    def between(cls, own: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
+        """Return the entries of ``fitted`` that are another vehicle's than ``own``."""
+        found = {k: getattr(fitted, k) for k in cls.model_fields if getattr(fitted, k) != getattr(own, k)}
+        if "sensors" in found:
+            found["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
+        return cls(**found)
+
     def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
         """Return the vehicle with these values in place of its own."""
         update: dict[str, Any] = {k: v for k in type(self).model_fields if (v := getattr(self, k)) is not None}
@@ -246,8 +254,7 @@ class Intervals(Record):
     entries: Annotated[tuple[IntervalEntry, ...], Field(strict=False)]
     settings: dict[str, Any] = Field(default_factory=dict)
     fit: dict[str, Any] = Field(default_factory=dict)
-    drives: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
-    left_out: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     versions: dict[str, str] = Field(default_factory=dict)
 
 

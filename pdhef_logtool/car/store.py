@@ -21,7 +21,7 @@ from pdhef_logtool.car.car import HISTORY_FILE, VEHICLE_FILE, Car
 from pdhef_logtool.car.flat import flat_toml, vehicle_toml
 from pdhef_logtool.car.parts import HistoryLine, LearntOn, digest
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.files import cannot_write, write_bytes
+from pdhef_logtool.records.files import PendingFile, cannot_write, write_bytes
 
 #: Writes one file at the path that it is given, or is its content.
 Content = bytes | Callable[[Path], object]
@@ -107,10 +107,7 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
                     shutil.rmtree(fresh / name)
                 shutil.copytree(folder, fresh / name, dirs_exist_ok=True)
             for name, content in change.files.items():
-                if isinstance(content, bytes):
-                    (fresh / name).write_bytes(content)
-                else:
-                    content(fresh / name)
+                _write(fresh / name, content)
             _log(fresh, change)
             fresh.chmod(0o777 & ~_umask())
             _take_place(fresh, output)
@@ -121,13 +118,40 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
     return output / change.part
 
 
-def export_flat(
-    source: Car, after: Car, output: Path, identification: Mapping[str, Any], comments: Mapping[str, str] | None = None
-) -> None:
-    """Write everything that is known of a car but its intervals to one vehicle.toml; raises OutputError."""
+def write_change(
+    source: Car, after: Car, output: Path, change: Change, comments: Mapping[str, str] | None = None
+) -> Path:
+    """Write what a command learnt to a car's folder, or flat where ``output`` ends in ``.toml``; return what was written.
+
+    Parameters
+    ----------
+    after : the car with the change. comments : beside entries of the flat file, by dotted name.
+
+    Raises
+    ------
+    OutputError, UsageError
+        See :func:`update_car`.
+    """
+    if output.suffix != ".toml":
+        return update_car(source, output, change)
     text = vehicle_file(source).decode("utf-8")
-    flat = flat_toml(text, source.own, after.vehicle, after.noise, after.trust, identification, comments)
+    provenance = {k: v for k, v in change.settings.items() if v not in (None, [], {})}
+    if after.learnt_on:
+        provenance["drives"] = [d.model_dump(mode="json") for d in after.learnt_on]
+    flat = flat_toml(text, source.own, after.vehicle, after.noise, after.trust, provenance, comments)
     write_bytes(output, flat.encode())
+    for name, content in change.files.items():
+        if name != change.part:
+            with PendingFile(output.with_name(f"{output.stem}.{name}")) as pending:
+                _write(pending.path, content)
+    return output
+
+
+def _write(path: Path, content: Content) -> None:
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        content(path)
 
 
 def _log(folder: Path, change: Change) -> None:

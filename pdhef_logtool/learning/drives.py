@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts, read_drive
 from pdhef_logtool.drive.windows import DrivePlan
@@ -21,7 +22,11 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, UsageError
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.sinks.report import tool_versions
 
+#: What of the configuration decides what is learnt.
+_SETTINGS = ("car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth")
 #: Drives that are named in an error.
 _NAMED = 3
 
@@ -36,22 +41,57 @@ class Refusal:
     remedy: str
 
 
-class Choice(Protocol):
-    """What a command's settings say: only drives of ``split`` (None: all), and whether no split is refused."""
+@dataclass(frozen=True, slots=True)
+class LearnSettings:
+    """What decides what a command learns, beside the logs.
 
-    @property
-    def split(self) -> str | None:
-        """The split, None for all."""
-        ...
+    Attributes
+    ----------
+    config : car, network, mapping, slice, sensors, which truth, estimators where they matter.
+    seed : of whatever is drawn. split : only drives that their set's manifest puts into this split.
+    any_split : do not refuse drives of the splits that the command refuses.
+    """
 
-    @property
-    def any_split(self) -> bool:
-        """Whether no split is refused."""
-        ...
+    config: RunConfig
+    seed: int = 0
+    split: str | None = None
+    any_split: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what no seed is; raises UsageError."""
+        if self.seed < 0:
+            raise UsageError(expected="a seed of at least 0", got=str(self.seed), where="--seed")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as JSON-able values; files by name only."""
+        config = self.config.to_dict()
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "config"}
+        return {**{k: config[k] for k in _SETTINGS}, **own}
+
+
+def open_car(config: RunConfig) -> Car:
+    """Return the car of a command that learns of it; raises UsageError where none is named."""
+    if config.car is None:
+        raise UsageError(
+            expected="a car", got="none", where="--car", remedy="pdhef identify makes one from a vehicle.toml"
+        )
+    return Car.load(config.car, network=config.network, intervals=config.intervals)
+
+
+def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:
+    """Return how every record of a command begins; no date, so that the same command gives the same bytes."""
+    return {
+        "format": kind,
+        "version": version,
+        "versions": tool_versions(),
+        "settings": settings.to_dict(),
+        "car": {"name": car.vehicle.name, "physics_sha256": car.physics_sha256},
+        "network_sha256": None if car.network is None else car.network.sha256,
+    }
 
 
 def choose_drives(
-    inputs: Sequence[LogInput], choice: Choice, refusal: Refusal
+    inputs: Sequence[LogInput], choice: LearnSettings, refusal: Refusal
 ) -> tuple[list[LogInput], dict[str, str]]:
     """Return the logs to take, and by name the split that the manifest of a set beside a log gives it.
 
@@ -123,6 +163,12 @@ class DriveRecord:
     left_out: str = ""
     counts: Mapping[str, int] = field(default_factory=dict)
     bytes_held: int = 0
+
+    @property
+    def learnt_on(self) -> LearntOn:
+        """The drive as a car remembers it."""
+        start_s, end_s = self.span_s or (0.0, 0.0)
+        return LearntOn(name=self.name, sha256=self.sha256, start_s=round(start_s, 2), end_s=round(end_s, 2))
 
     @property
     def lost(self) -> tuple[str, ...]:
@@ -198,7 +244,7 @@ def no_true_sideslip(plan: DrivePlan) -> str:
 
 def load_drive(
     log_input: LogInput,
-    vehicle: VehicleParameters,
+    car: Car,
     mapping: SignalMapping | None,
     options: ReadOptions,
     *,
@@ -220,13 +266,13 @@ def load_drive(
     PdhefError
         The log cannot be read, or takes more than ``max_bytes``.
     """
-    with read_drive(log_input, vehicle, mapping, options) as drive:
+    with read_drive(log_input, car, mapping, options) as drive:
         left_out = no_true_sideslip(drive.plan) or refuse(drive)
         if left_out:
             return record_of(drive, split=split, left_out=left_out), None
         whole = drive.whole(fill_friction=fill_friction, max_bytes=max_bytes)
         assert whole.truth is not None
-        slow = vehicle.low_speed_blend_m_s
+        slow = car.vehicle.low_speed_blend_m_s
         scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
         if scored < least_scored or not np.isfinite(whole.truth.sideslip_rad).any():
             left_out = f"{scored} stamps with a true sideslip above {slow:g} m/s"

@@ -271,9 +271,7 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     return LogOutcome(log=drive.name, file=drive.path.name, sha256=drive.sha256, lost=lost_texts(losses))
 
 
-def _choose_estimators(
-    drive: Drive, config: RunConfig, car: Car
-) -> tuple[list[Estimator], list[Skipped]]:
+def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[Estimator], list[Skipped]]:
     """Return the estimators that can run and those that cannot; raises EstimatorError if none can."""
     estimators, skipped = runnable(config.estimators, car, drive.available, Options(drive.options.use_speed))
     for skip in skipped:
@@ -491,9 +489,7 @@ def make_folder(output: Path) -> None:
         ) from None
 
 
-def write_run(
-    output: Path, config: dict[str, Any], results: Sequence[LogResult], car: Car | None = None
-) -> None:
+def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult], car: Car | None = None) -> None:
     """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values."""
     from pdhef_logtool.sinks.parquet import write_metrics
 

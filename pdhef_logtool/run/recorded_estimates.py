@@ -178,9 +178,7 @@ class _Scoring:
             return chosen
 
         options = replace(self.config.read_options, friction=None)
-        return read_drive(
-            log_input, self.car, mapping, options, tell=self.warn, adjust=choose, require_sensors=False
-        )
+        return read_drive(log_input, self.car, mapping, options, tell=self.warn, adjust=choose, require_sensors=False)
 
     def score(self, drive: Drive, output: Path | None, progress: Progress) -> LogResult:
         """Read, compare and, with a folder, write."""

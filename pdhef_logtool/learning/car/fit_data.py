@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.logs.discovery import LogInput
@@ -48,15 +48,16 @@ class FitDrive:
 
 
 def load_fit_drive(
-    log_input: LogInput, vehicle: VehicleParameters, mapping: Mapping | None, options: ReadOptions
+    log_input: LogInput, car: Car, mapping: Mapping | None, options: ReadOptions
 ) -> tuple[DriveRecord, FitDrive | None]:
     """Read a slice of a log; None, and the reason in the record, when it has no true sideslip.
 
-    The vehicle gives geometry only (lever arms, steering ratio, wheel radius).
+    The car gives geometry only (lever arms, steering ratio, wheel radius).
     """
+    vehicle = car.vehicle
     sensors = vehicle.sensors.model_copy(update={"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0})
     as_measured = vehicle.model_copy(update={"steer_offset_rad": 0.0, "sensors": sensors})
-    record, whole = load_drive(log_input, as_measured, mapping, replace(options, friction=None))
+    record, whole = load_drive(log_input, car.with_vehicle(as_measured), mapping, replace(options, friction=None))
     if whole is None or whole.truth is None:
         return record, None
     independent = "yaw_rate_rad_s" not in whole.plan.dependent

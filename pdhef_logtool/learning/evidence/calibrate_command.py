@@ -1,28 +1,33 @@
-"""``pdhef calibrate`` from drives with truth to ``calibration.json`` beside a model."""
+"""``pdhef calibrate`` from drives with truth to the intervals of a car, filed by what ran."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle, vehicle_sha256
+from pdhef_logtool.car.car import INTERVALS_FILE, Car
+from pdhef_logtool.car.parts import Algorithm, IntervalEntry, Intervals
+from pdhef_logtool.car.store import Change, check_output, update_car
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import friction_of
-from pdhef_logtool.estimators.registry import default_names, runnable
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.table import Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
 from pdhef_logtool.learning.drives import (
     DriveRecord,
+    LearnSettings,
     Refusal,
     choose_drives,
     drives_document,
     exit_code,
     load_drive,
+    open_car,
     tell_drive,
 )
 from pdhef_logtool.learning.evidence.calibrate import (
@@ -43,20 +48,13 @@ from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
-from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.estimating import estimate
-from pdhef_logtool.sinks.report import tool_versions, write_json
+from pdhef_logtool.sinks.report import json_bytes, tool_versions
 from pdhef_logtool.watches.error_features import error_terms
-from pdhef_logtool.watches.intervals import (
-    FILE,
-    FORMAT,
-    FORMAT_VERSION,
-    inflations_document,
-    yaw_rate_terms,
-)
+from pdhef_logtool.watches.intervals import yaw_rate_terms
 
 DEFAULT_SPREAD = 0.1
 #: Neighbouring errors are alike: one sample in this time is kept.
@@ -79,22 +77,10 @@ REFUSED = Refusal(
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrateSettings:
-    """What decides the result, beside the logs.
+class CalibrateSettings(LearnSettings):
+    """With the ``spread`` by which friction and vehicle are made wrong in further runs of every drive; 0 = none."""
 
-    Attributes
-    ----------
-    config : vehicle, mapping, model, estimators, slice, sensors, which truth; the other entries are not used.
-    spread : by which friction and vehicle are made wrong in further runs of every drive; 0 = none.
-    seed : of that. split : only drives that their set's manifest puts into this split.
-    any_split : do not refuse held-out drives.
-    """
-
-    config: RunConfig
     spread: float = DEFAULT_SPREAD
-    seed: int = 0
-    split: str | None = None
-    any_split: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,22 +88,21 @@ class CalibrateResult:
     """What the command found and wrote."""
 
     file: Path
-    fitted: Mapping[str, Fitted]
-    drives: tuple[DriveRecord, ...]
-    left_out: tuple[DriveRecord, ...]
-    document: Mapping[str, Any]
+    intervals: Intervals
+    records: tuple[DriveRecord, ...]
 
     @property
     def exit_code(self) -> int:
         """0 if all drives took part whole, 3 if not."""
-        return exit_code((*self.drives, *self.left_out))
+        return exit_code(self.records)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
-        return {"calibration": str(self.file), "exit_code": self.exit_code, **self.document}
+        intervals = self.intervals.model_dump(mode="json")
+        return {"file": str(self.file), "exit_code": self.exit_code, **intervals, **drives_document(self.records)}
 
 
-def run_calibration(
+def calibrate(
     arguments: Sequence[str],
     output: Path,
     settings: CalibrateSettings,
@@ -125,11 +110,11 @@ def run_calibration(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Warn = lambda _text: None,
 ) -> CalibrateResult:
-    """Fit the calibration of every estimator that gives an interval; write it to ``output``.
+    """Fit the intervals of every algorithm that gives one; write them to the car ``output``.
 
     Parameters
     ----------
-    arguments : logs, folders, glob patterns. output : a .json file, or the folder of a model.
+    arguments : logs, folders, glob patterns. output : a car's folder, or a .json file for the intervals alone.
 
     Raises
     ------
@@ -141,68 +126,56 @@ def run_calibration(
         There are too few drives with truth.
     """
     config = settings.config
-    file = _output_file(output)
-    _check(settings)
-    assert config.vehicle is not None
-    vehicle = load_vehicle(config.vehicle)
-    model = open_model(config.model)
+    if not 0.0 <= settings.spread <= MAX_VARIATION:
+        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.spread), where="--vary")
+    if output.suffix == ".toml":
+        raise UsageError(
+            expected="a car's folder, or a file name that ends in .json", got=output.name, where="--output",
+            remedy="intervals have no place in a vehicle.toml",
+        )  # fmt: skip
+    car = open_car(config)
+    if output.suffix != ".json":
+        check_output(car, output)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
-    if model is not None and "train" in splits.values():
+    if car.network is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")
     samples: dict[str, list[Samples]] = {}
-    drives: list[DriveRecord] = []
+    ran: dict[str, tuple[str, Algorithm]] = {}
+    records: list[DriveRecord] = []
     for number, log_input in enumerate(inputs):
         progress(log_input.stem, RUNNING * number / len(inputs))
-        record, found = _run_drive(log_input, number, settings, vehicle, mapping, model)
-        drives.append(replace(record, split=splits.get(log_input.stem)))
+        record, found = _run_drive(log_input, number, settings, car, mapping)
+        records.append(replace(record, split=splits.get(log_input.stem)))
         tell_drive(record, warn)
-        for name, part in found:
-            samples.setdefault(name, []).append(part)
-    used = tuple(d for d in drives if not d.left_out)
-    fitted: dict[str, Fitted] = {}
-    for number, (name, parts) in enumerate(samples.items()):
+        for name, algorithm, part in found:
+            ran.setdefault(algorithm.structure, (name, algorithm))
+            samples.setdefault(algorithm.structure, []).append(part)
+    entries: list[IntervalEntry] = []
+    for number, (structure, parts) in enumerate(samples.items()):
+        name, algorithm = ran[structure]
         progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
         joined = join_samples(parts)
         count = int(np.unique(joined.drive[~joined.wrong]).size)
         if count < MIN_DRIVES:
             warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
             continue
-        fitted[name] = fit_inflation(joined)
-    if not fitted:
+        entries.append(_entry(name, algorithm, fit_inflation(joined)))
+    if not entries:
         raise EstimatorError(
             expected=f"at least {MIN_DRIVES} drives with a true sideslip",
-            got=f"{len(used)}",
+            got=str(sum(not r.left_out for r in records)),
             where="calibrate",
             remedy="give more drives; the same number of short drives of many kinds is worth more than a long one",
         )
-    left_out = tuple(d for d in drives if d.left_out)
-    document = _document(settings, vehicle, model, fitted, used, left_out)
-    write_json(file, document)
-    return CalibrateResult(file, fitted, used, left_out, document)
-
-
-def _output_file(output: Path) -> Path:
+    intervals = _intervals(settings, car, entries, records)
+    data = json_bytes(intervals.model_dump(mode="json"))
     if output.suffix == ".json":
-        return output
-    if not output.is_dir():
-        raise UsageError(
-            expected="the folder of a model, or a file name that ends in .json",
-            got=f"no folder {output.name}",
-            where="--output",
-        )
-    return output / FILE
-
-
-def _check(settings: CalibrateSettings) -> None:
-    if settings.config.vehicle is None:
-        raise UsageError(
-            expected="a vehicle file", got="none", where="--vehicle", remedy="pdhef identify writes one of your car"
-        )
-    if not 0.0 <= settings.spread <= MAX_VARIATION:
-        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.spread), where="--vary")
-    if settings.seed < 0:
-        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
+        write_bytes(output, data)
+        return CalibrateResult(output, intervals, tuple(records))
+    used = tuple(r.learnt_on for r in records if not r.left_out)
+    change = Change("calibrate", INTERVALS_FILE, {INTERVALS_FILE: data}, settings=settings.to_dict(), drives=used)
+    return CalibrateResult(update_car(car, output, change), intervals, tuple(records))
 
 
 def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
@@ -215,14 +188,13 @@ def _run_drive(
     log_input: LogInput,
     number: int,
     settings: CalibrateSettings,
-    vehicle: VehicleParameters,
+    car: Car,
     mapping: SignalMapping | None,
-    model: ModelBundle | None,
-) -> tuple[DriveRecord, list[tuple[str, Samples]]]:
+) -> tuple[DriveRecord, list[tuple[str, Algorithm, Samples]]]:
     """Run the estimators on a drive, once as told and some times with a wrong vehicle; return errors and terms."""
-    config = settings.config
+    config, vehicle = settings.config, car.vehicle
     options = config.read_options
-    record, drive = load_drive(log_input, vehicle, mapping, options, fill_friction=False)
+    record, drive = load_drive(log_input, car, mapping, options, fill_friction=False)
     if drive is None or drive.truth is None:
         return record, []
     signals = drive.signals
@@ -230,23 +202,19 @@ def _run_drive(
     if settings.spread > 0.0:
         told = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{record.sha256}"), WRONG_RUNS)
         runs += [(one.vehicle, one.friction_factor, True) for one in told]
-    found: list[tuple[str, Samples]] = []
+    found: list[tuple[str, Algorithm, Samples]] = []
     for assumed, factor, wrong in runs:
         seen = friction_of(drive.plan, assumed, options, factor).fill(drive.signals)
         if not found and "friction" not in drive.plan.alignment.available:
             signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
-        estimators, _ = runnable(
-            config.estimators or default_names(assumed, model),
-            assumed,
-            drive.plan.alignment.available,
-            use_speed=options.use_speed,
-            model=model,
-        )
+        presumed = car if assumed is vehicle else car.with_vehicle(assumed)
+        available = drive.plan.alignment.available
+        estimators, _ = runnable(config.estimators, presumed, available, Options(options.use_speed))
         for window in estimate(replace(drive, signals=seen), estimators, watched=False, drawn=False):
-            for track in window.tracks:
+            for estimator, track in zip(estimators, window.tracks, strict=True):
                 part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
                 if len(part) >= MIN_SAMPLES:
-                    found.append((track.name, part))
+                    found.append((track.name, resolve(estimator), part))
     if not found:
         return replace(record, left_out="no estimate with an interval where the truth is known"), []
     return replace(record, counts={**record.counts, "runs": len(runs)}), found
@@ -298,54 +266,35 @@ def drive_samples(
     )
 
 
-def _document(
-    settings: CalibrateSettings,
-    vehicle: VehicleParameters,
-    model: ModelBundle | None,
-    fitted: Mapping[str, Fitted],
-    drives: Sequence[DriveRecord],
-    left_out: Sequence[DriveRecord],
-) -> dict[str, Any]:
-    """Return what is written; no date, so that the same command gives the same bytes."""
-    config = settings.config.to_dict()
-    coefficients = inflations_document({n: f.inflation for n, f in fitted.items()})
-    return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "versions": tool_versions(),
-        "settings": {
-            **{
-                k: config[k]
-                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
-            },
-            "split": settings.split,
-            "any_split": settings.any_split,
-            "vary": settings.spread,
-            "vary_seed": settings.seed,
-        },
-        "vehicle": {
-            "name": vehicle.name,
-            "file": config["vehicle"],
-            "sha256": vehicle_sha256(vehicle),
-            "roll_gradient_rad_per_m_s2": vehicle.roll_gradient_rad_per_m_s2,
-        },
-        "model_sha256": None if model is None else model.sha256,
-        "fit": {
+def _entry(name: str, algorithm: Algorithm, fitted: Fitted) -> IntervalEntry:
+    return IntervalEntry(
+        estimator=name,
+        algorithm=algorithm,
+        inflation=fitted.inflation,
+        unseen_factor=fitted.unseen_factor,
+        wrong_vehicle_factor=fitted.wrong_factor,
+        coverage=tuple(asdict(c) for c in fitted.coverage),
+    )
+
+
+def _intervals(
+    settings: CalibrateSettings, car: Car, entries: Sequence[IntervalEntry], records: Sequence[DriveRecord]
+) -> Intervals:
+    """Return the part that is written; no date, so that the same command gives the same bytes."""
+    return Intervals(
+        car=car.vehicle.name,
+        physics_sha256=car.physics_sha256,
+        roll_gradient_rad_per_m_s2=car.vehicle.roll_gradient_rad_per_m_s2,
+        spread=settings.spread,
+        entries=tuple(entries),
+        settings=settings.to_dict(),
+        fit={
             "covered": COVERED,
             "folds": FOLDS,
             "covered_with_wrong_vehicle": COVERED_WRONG,
             "wrong_runs": WRONG_RUNS,
             "sample_every_s": SAMPLE_EVERY_S,
         },
-        "drives_sha256": hashlib.sha256("".join(sorted(d.sha256 for d in drives)).encode()).hexdigest(),
-        **drives_document((*drives, *left_out)),
-        "estimators": {
-            name: {
-                **coefficients[name],
-                "unseen_factor": f.unseen_factor,
-                "wrong_vehicle_factor": f.wrong_factor,
-                "coverage": [asdict(c) for c in f.coverage],
-            }
-            for name, f in fitted.items()
-        },
-    }
+        drives=tuple(r.learnt_on for r in records if not r.left_out),
+        versions=tool_versions(),
+    )

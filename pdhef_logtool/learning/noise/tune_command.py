@@ -1,23 +1,29 @@
-"""``pdhef tune`` from logs to a vehicle file with tuned filter noise, the record of every trial, and a plot."""
+"""``pdhef tune`` from logs to a car with tuned filter noise, the record of every trial, and a plot."""
 
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle, vehicle_sha256, vehicle_to_toml
+from pdhef_logtool.car.car import NOISE_FILE, Car
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import FilterNoise, Noise
+from pdhef_logtool.car.store import Change, Content, check_output, write_change
+from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
+    LearnSettings,
     Refusal,
     choose_drives,
     drives_document,
     exit_code,
+    open_car,
+    record_head,
     tell_drive,
 )
 from pdhef_logtool.learning.noise.search import (
@@ -36,19 +42,15 @@ from pdhef_logtool.learning.noise.search import (
     filter_tuning,
     score_drives,
     search,
-    tuned_vehicle,
 )
 from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
-from pdhef_logtool.records.files import PendingFile, write_bytes
-from pdhef_logtool.residual_model.bundle import open_model
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.sinks.report import tool_versions, write_json
+from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 #: Splits of a set that figures are reported on: noise that was tuned there would make them worthless.
 HELD_OUT = ("test", "extrapolation")
 DEFAULT_TRIALS = 128
@@ -67,30 +69,18 @@ REFUSED = Refusal(
 
 
 @dataclass(frozen=True, slots=True)
-class TuneSettings:
-    """What decides the result, beside the logs.
+class TuneSettings(LearnSettings):
+    """With ``names`` of the estimators (None = all that are usually tuned), and ``trials`` of each."""
 
-    Attributes
-    ----------
-    config : vehicle, mapping, model, slice, sensors, which truth; the other entries are not used.
-    names : estimators; None = all that can be tuned.
-    trials : of each estimator. seed : of the search.
-    split : only drives that their set's manifest puts into this split. any_split : do not refuse held-out drives.
-    """
-
-    config: RunConfig
     names: tuple[str, ...] | None = None
     trials: int = DEFAULT_TRIALS
-    seed: int = 0
-    split: str | None = None
-    any_split: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tuned:
     """What came out for one estimator.
 
-    ``before`` is the score of the noise that the vehicle file had, None if it had none; ``errors`` are the best
+    ``before`` is the score of the noise that the car had, None if it had none; ``errors`` are the best
     trial's by drive.
     """
 
@@ -101,7 +91,7 @@ class Tuned:
 
     @property
     def best(self) -> Trial:
-        """The trial that is written to the vehicle file."""
+        """The trial that the car gets."""
         return best_trial(self.trials)
 
 
@@ -109,9 +99,7 @@ class Tuned:
 class TuneResult:
     """What the command found and wrote; ``drives`` are those that were scored."""
 
-    vehicle_file: Path
-    tuning_file: Path
-    plot_file: Path
+    car: Path
     tuned: tuple[Tuned, ...]
     drives: tuple[DriveRecord, ...]
     left_out: tuple[DriveRecord, ...]
@@ -125,9 +113,7 @@ class TuneResult:
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         return {
-            "vehicle": str(self.vehicle_file),
-            "tuning": str(self.tuning_file),
-            "plot": str(self.plot_file),
+            "car": str(self.car),
             "exit_code": self.exit_code,
             **drives_document((*self.drives, *self.left_out)),
             "estimators": {
@@ -144,7 +130,7 @@ class TuneResult:
         }
 
 
-def run_tuning(
+def tune(
     arguments: Sequence[str],
     output: Path,
     settings: TuneSettings,
@@ -153,7 +139,7 @@ def run_tuning(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Warn = lambda _text: None,
 ) -> TuneResult:
-    """Tune the noise of estimators alike; write ``output`` (vehicle.toml), ``<stem>.tuning.json`` and its plot.
+    """Tune the noise of estimators alike; write them to the car ``output`` with a record of all trials and its plot.
 
     Parameters
     ----------
@@ -169,18 +155,21 @@ def run_tuning(
         No drive can be scored.
     """
     config = settings.config
-    _check(output, settings, jobs)
-    assert config.vehicle is not None
-    vehicle = load_vehicle(config.vehicle)
-    model = None if config.model is None else open_model(config.model)
-    names = choose_names(settings.names, model)
+    if settings.trials < MIN_TRIALS:
+        raise UsageError(expected=f"at least {MIN_TRIALS} trials", got=str(settings.trials), where="--trials")
+    if jobs < 1:
+        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
+    car = open_car(config)
+    check_output(car, output)
+    names = choose_names(settings.names, car, with_network=config.network is not None or car.trust is not None)
+    has_network = any(spec_of(n).network for n in names)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
-    if model is not None and "train" in splits.values():
+    if has_network and "train" in splits.values():
         warn(
             "drives of split train: a network is better there than in service, and its filter's noise is tuned to that"
         )
     mapping = None if config.mapping is None else load_mapping(config.mapping)
-    setup = TuneSetup(config, vehicle, mapping, model, names)
+    setup = TuneSetup(config, car, mapping, names)
     with Benches(setup, min(jobs, len(inputs))) as benches:
         done = 0
 
@@ -199,7 +188,7 @@ def run_tuning(
                 where="tune",
                 remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
             )
-        before = benches.score({n: vehicle.filter[n] for n in names if n in vehicle.filter})
+        before = benches.score({n: car.noise[n] for n in names if n in car.noise})
 
         def tell(trial: int) -> None:
             progress(f"trial {trial} of {settings.trials}", READING + (1.0 - READING) * trial / settings.trials)
@@ -214,108 +203,44 @@ def run_tuning(
     notes = _notes(tuned)
     for note in notes:
         warn(note)
-    result = TuneResult(
-        vehicle_file=output,
-        tuning_file=output.with_suffix(".tuning.json"),
-        plot_file=output.with_suffix(".tuning.png"),
-        tuned=tuned,
-        drives=drives,
-        left_out=tuple(d for d in loaded if d.left_out),
-        notes=notes,
+    result = TuneResult(output, tuned, drives, tuple(d for d in loaded if d.left_out), notes)
+    record, summary = _record(result, settings, car), _summary(settings)
+    noise = {t.name: _noise(t, car) for t in tuned}
+    part = Noise(
+        filter={**_kept(car), **noise},
+        search={**summary, "drives_sha256": record["drives_sha256"]},
+        drives=tuple(d.learnt_on for d in drives),
     )
-    record = _record(result, settings, vehicle, None if model is None else model.sha256)
-    write_bytes(output, tuned_toml(config.vehicle, vehicle, tuned, record).encode())
-    write_json(result.tuning_file, record)
-    _plot(result)
-    return result
-
-
-def tuned_toml(source: Path, vehicle: VehicleParameters, tuned: Sequence[Tuned], record: Mapping[str, Any]) -> str:
-    """Return the vehicle file with the best noise of each estimator and where it is from; comments are kept."""
-    provenance: dict[str, str | float | int | list[str]] = {
-        k: v for k, v in vehicle.identification.items() if not k.startswith("tuning_")
+    head = "Written by pdhef tune. It belongs to the physics of this car: use it with no other."
+    files: dict[str, Content] = {
+        NOISE_FILE: part_toml(part, head).encode(),
+        "noise.record.json": json_bytes(record),
+        "noise.png": lambda path: _plot(result, path),
     }
-    provenance |= {
-        "tuning_drives_sha256": record["drives_sha256"],
-        "tuning_drives": len(record["drives"]),
-        "tuning_trials": record["search"]["trials"],
-        "tuning_seed": record["search"]["seed"],
-        "tuning_space": [f"{f.name} {f.low:g} to {f.high:g} {f.unit}" for f in FACTORS],
-        "tuning_objective": record["search"]["objective"],
-        "tuning_scores": [f"{t.name}: {t.best.score.objective_deg:.4f} deg at trial {t.best.number}" for t in tuned],
-    }
-    comments = {
-        entry: note
-        for entry, note in read_comments(source.read_text(encoding="utf-8")).items()
-        if not any(entry.startswith(f"filter.{t.name}.") for t in tuned)
-    }
-    for t in tuned:
-        vehicle = tuned_vehicle(vehicle, t.name, filter_tuning(t.best.values))
-        comments[f"filter.{t.name}.q_std"] = "pdhef tune; v_x, v_y, yaw rate"
-    return vehicle_to_toml(vehicle.model_copy(update={"identification": provenance}), comments)
+    change = Change("tune", NOISE_FILE, files, settings={**settings.to_dict(), **summary}, drives=part.drives)
+    after = replace(car, noise={**car.noise, **noise})
+    return replace(result, car=write_change(car, after, output, change))
 
 
-def read_comments(text: str) -> dict[str, str]:
-    """Return the comments of a vehicle file as :func:`~pdhef_logtool.car.vehicle.vehicle_to_toml` takes them.
-
-    Those at the head stand under ``""``, those behind a value under its dotted entry; others are not kept.
-    """
-    found: dict[str, str] = {}
-    head: list[str] | None = []
-    table = ""
-    for line in (raw.strip() for raw in text.splitlines()):
-        if line.startswith("#"):
-            if head is not None:
-                head.append(line.lstrip("# "))
-            continue
-        if head is not None:
-            found |= {"": "\n".join(head)} if head else {}
-            head = None
-        at = line.find("#")
-        while at >= 0:
-            entry = _entry(line[:at])
-            if entry is not None:
-                if "=" in entry:
-                    found[table + entry.split("=")[0]] = line[at:].lstrip("# ")
-                break
-            at = line.find("#", at + 1)
-        name = _entry(line if at < 0 else line[:at]) or ""
-        if name and "=" not in name:
-            table = name + "."
-    return found
+def _noise(tuned: Tuned, car: Car) -> FilterNoise:
+    """Return the noise of the best trial with what it belongs to."""
+    network = car.network if spec_of(tuned.name).network else None
+    return filter_tuning(tuned.best.values).model_copy(
+        update={
+            "physics_sha256": car.physics_sha256,
+            "network_sha256": None if network is None else network.sha256,
+            "score_deg": round(tuned.best.score.objective_deg, 4),
+            "trial": tuned.best.number,
+        }
+    )
 
 
-def _entry(text: str) -> str | None:
-    """Return ``a.b`` of a table's line, ``key=`` of an entry's, None if the text is no whole line of TOML."""
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        return None
-    if not text.lstrip().startswith("["):
-        return f"{next(iter(document))}=" if document else None
-    keys = []
-    while isinstance(document, dict) and document:
-        key, document = next(iter(document.items()))
-        keys.append(key)
-    return ".".join(keys)
+def _kept(car: Car) -> dict[str, FilterNoise]:
+    """Return what the car's noise part holds of other filters."""
+    return {n: one for n, one in car.noise.items() if one.score_deg is not None}
 
 
 # ---- the record ----
-
-
-def _check(output: Path, settings: TuneSettings, jobs: int) -> None:
-    if settings.config.vehicle is None:
-        raise UsageError(
-            expected="a vehicle file", got="none", where="--vehicle", remedy="pdhef identify writes one of your car"
-        )
-    if output.suffix != ".toml":
-        raise UsageError(expected="a file name that ends in .toml", got=output.name, where="--output")
-    if settings.trials < MIN_TRIALS:
-        raise UsageError(expected=f"at least {MIN_TRIALS} trials", got=str(settings.trials), where="--trials")
-    if settings.seed < 0:
-        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
-    if jobs < 1:
-        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
 
 
 def _named(values: Sequence[float]) -> dict[str, float]:
@@ -330,45 +255,30 @@ def _notes(tuned: Sequence[Tuned]) -> tuple[str, ...]:
             notes.append(f"{t.name}: the best {', '.join(ends)} stands at an end of the search space")
         if t.before is not None and t.before.objective_deg < t.best.score.objective_deg:
             notes.append(
-                f"{t.name}: the noise that the vehicle file had is better on these drives "
+                f"{t.name}: the noise that the car had is better on these drives "
                 f"({t.before.objective_deg:.4f} deg) than all trials: give more --trials"
             )
     return tuple(notes)
 
 
-def _record(
-    result: TuneResult,
-    settings: TuneSettings,
-    vehicle: VehicleParameters,
-    model_sha256: str | None,
-) -> dict[str, Any]:
-    """Return the document of ``<stem>.tuning.json``."""
-    config = settings.config.to_dict()
+def _summary(settings: TuneSettings) -> dict[str, Any]:
+    objective = "geometric mean over drives of the sideslip RMSE, each with the floor added as squares"
+    return {"trials": settings.trials, "seed": settings.seed, "objective": objective}
+
+
+def _record(result: TuneResult, settings: TuneSettings, car: Car) -> dict[str, Any]:
+    """Return the document of ``noise.record.json``."""
     together = hashlib.sha256("".join(sorted(d.sha256 for d in result.drives)).encode()).hexdigest()
     return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "versions": tool_versions(),
-        "settings": {
-            **{
-                k: config[k]
-                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
-            },
-            "split": settings.split,
-            "any_split": settings.any_split,
-        },
-        "vehicle": {"name": vehicle.name, "sha256": vehicle_sha256(vehicle)},
-        "model_sha256": model_sha256,
+        **record_head(FORMAT, FORMAT_VERSION, settings, car),
         "search": {
-            "trials": settings.trials,
-            "seed": settings.seed,
+            **_summary(settings),
             "space": [asdict(f) for f in FACTORS],
             "exploring_share": EXPLORING_SHARE,
             "step_shares": [STEP_FIRST, STEP_LAST],
-            "objective": "geometric mean over drives of the sideslip RMSE, each with the floor added as squares",
             "floor_deg": float(f"{np.degrees(FLOOR_RAD):.6g}"),
             "min_availability": MIN_AVAILABILITY,
-            "low_speed_m_s": vehicle.low_speed_blend_m_s,
+            "low_speed_m_s": car.vehicle.low_speed_blend_m_s,
         },
         "drives_sha256": together,
         **drives_document((*result.drives, *result.left_out)),
@@ -391,7 +301,7 @@ def _record(
     }
 
 
-def _plot(result: TuneResult) -> None:
+def _plot(result: TuneResult, path: Path) -> None:
     """Draw the best objective so far over the trials, and every trial as a dot."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -416,5 +326,4 @@ def _plot(result: TuneResult) -> None:
     )
     axes.grid(alpha=0.3, which="both")
     axes.legend(frameon=False)
-    with PendingFile(result.plot_file) as pending:
-        figure.savefig(pending.path, format="png", metadata={"Software": None})
+    figure.savefig(path, format="png", metadata={"Software": None})
