@@ -121,7 +121,7 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
 def write_change(
     source: Car, after: Car, output: Path, change: Change, comments: Mapping[str, str] | None = None
 ) -> Path:
-    """Write what a command learnt to a car's folder, or flat where ``output`` ends in ``.toml``; return what was written.
+    """Write what a command learnt to a car's folder, or flat where ``output`` ends in ``.toml``; return where.
 
     Parameters
     ----------

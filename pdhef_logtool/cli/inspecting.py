@@ -46,12 +46,12 @@ def inspect(
 @options.command(commands)
 def estimators(as_json: options.JsonFlag = False) -> None:
     """List the estimators that run can use."""
-    from pdhef_logtool.estimators.registry import DESCRIPTIONS
+    from pdhef_logtool.estimators.table import SPECS
 
     if as_json:
-        console.print_json({"estimators": [{"name": n, "description": d} for n, d in DESCRIPTIONS.items()]})
+        console.print_json({"estimators": [{"name": s.name, "description": s.text} for s in SPECS]})
         return
     table = console.table("name", "what it is")
-    for name, description in DESCRIPTIONS.items():
-        table.add_row(name, description)
+    for spec in SPECS:
+        table.add_row(spec.name, spec.text)
     console.stdout().print(table)

@@ -31,10 +31,10 @@ def identify(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Fit a car's tyres, steering and biases to its drives. Roll gradient and filter noise are fitted too."""
-    from pdhef_logtool.learning.car.identify_command import run_identification
+    from pdhef_logtool.learning.car.identify_command import identify as fit
 
     with console.progress() as bar:
-        result = run_identification(logs, output, config, holdout=holdout, progress=bar, warn=console.warn)
+        result = fit(logs, output, config, holdout=holdout, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_identification, as_json)
 
 
@@ -62,11 +62,12 @@ def extract(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Write the residual dataset that train learns from. A residual is what a car's physics leave unexplained."""
-    from pdhef_logtool.learning.network.extract_command import ExtractSettings, run_extraction
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings
+    from pdhef_logtool.learning.network.extract_command import extract as write_residuals
 
     settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed, vary=vary)
     with console.progress() as bar:
-        result = run_extraction(logs, output, settings, jobs=jobs, resume=resume, progress=bar, warn=console.warn)
+        result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_extraction, as_json)
 
 
@@ -135,12 +136,13 @@ def tune(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Tune the noise of a car's filters for sideslip. All filters are searched alike."""
-    from pdhef_logtool.learning.noise.tune_command import TuneSettings, run_tuning
+    from pdhef_logtool.learning.noise.tune_command import TuneSettings
+    from pdhef_logtool.learning.noise.tune_command import tune as search_noise
 
     names = None if estimators is None else options.split_names(estimators)
-    settings = TuneSettings(config, names, trials=trials, seed=seed, split=split, any_split=any_split)
+    settings = TuneSettings(config=config, names=names, trials=trials, seed=seed, split=split, any_split=any_split)
     with console.progress() as bar:
-        result = run_tuning(logs, output, settings, jobs=jobs, progress=bar, warn=console.warn)
+        result = search_noise(logs, output, settings, jobs=jobs, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_tuning, as_json)
 
 
@@ -164,11 +166,12 @@ def trust(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Find how far the network may be trusted on a car. Without truth in the drives it cannot be told."""
-    from pdhef_logtool.learning.evidence.trust_command import TrustSettings, run_trust
+    from pdhef_logtool.learning.drives import LearnSettings
+    from pdhef_logtool.learning.evidence.trust_command import trust as try_network
 
-    settings = TrustSettings(config, seed=seed, split=split, any_split=any_split)
+    settings = LearnSettings(config=config, seed=seed, split=split, any_split=any_split)
     with console.progress() as bar:
-        result = run_trust(logs, output, settings, progress=bar, warn=console.warn)
+        result = try_network(logs, output, settings, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_trust, as_json)
 
 
@@ -192,9 +195,10 @@ def calibrate(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Fit the 95 % intervals of a car's estimators. Each regime of driving has its own."""
-    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, run_calibration
+    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings
+    from pdhef_logtool.learning.evidence.calibrate_command import calibrate as fit_intervals
 
-    settings = CalibrateSettings(config, spread=vary, seed=seed, split=split, any_split=any_split)
+    settings = CalibrateSettings(config=config, spread=vary, seed=seed, split=split, any_split=any_split)
     with console.progress() as bar:
-        result = run_calibration(logs, output, settings, progress=bar, warn=console.warn)
+        result = fit_intervals(logs, output, settings, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_calibration, as_json)

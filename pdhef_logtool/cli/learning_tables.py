@@ -27,7 +27,7 @@ def render_identification(result: IdentifyResult, console: Console) -> None:
         interval = f"{p.low:.4g} to {p.high:.4g}" if p.excited else "-"
         remark = "filter noise" if p.tuning else "" if p.excited else "kept: not excited further"
         parameters.add_row(p.name, f"{p.value:.5g}", interval, f"{p.prior:.4g}", p.unit, remark)
-    scores = table("part", ">seconds", ">β = 0", ">phy-ukf, starting file", ">phy-ukf-tuned, identified")
+    scores = table("part", ">seconds", ">β = 0", ">phy-ukf, starting car", ">phy-ukf-tuned, identified")
     for s in found.scores:
         errors = (f"{value:.3f}°" for value in (s.zero_deg, s.start_file_deg, s.identified_deg))
         scores.add_row(s.part, f"{s.seconds:.1f}", *errors)
@@ -37,7 +37,7 @@ def render_identification(result: IdentifyResult, console: Console) -> None:
     console.print(scores)
     for note in found.notes:
         console.print(f"  {note}")
-    console.print(f"vehicle in {result.vehicle_file}, plot in {result.plot_file}", soft_wrap=True)
+    console.print(f"car in {result.car}", soft_wrap=True)
 
 
 def render_extraction(result: ExtractResult, console: Console) -> None:
@@ -90,7 +90,7 @@ def render_tuning(result: TuneResult, console: Console) -> None:
     """Print the best noise of each estimator and its sideslip error; all had the same drives and trials."""
     from pdhef_logtool.learning.noise.search import FACTORS
 
-    errors = (">\nobjective °", ">\nmedian °", ">\npooled °", ">file's own\nobjective °")
+    errors = (">\nobjective °", ">\nmedian °", ">\npooled °", ">car's own\nobjective °")
     tuned = table("\nestimator", *(f">{f.name}\n{f.unit}" for f in FACTORS), *errors)
     for t in result.tuned:
         best, before = t.best.score, None if t.before is None else t.before.objective_deg
@@ -100,8 +100,7 @@ def render_tuning(result: TuneResult, console: Console) -> None:
     console.print(tuned)
     trials = len(result.tuned[0].trials)
     console.print(f"{len(result.drives)} drives, {trials} trials of each estimator")
-    files = f"vehicle in {result.vehicle_file}, trials in {result.tuning_file}, plot in {result.plot_file}"
-    console.print(files, soft_wrap=True)
+    console.print(f"car in {result.car}", soft_wrap=True)
 
 
 def render_trust(result: TrustResult, console: Console) -> None:
@@ -118,20 +117,20 @@ def render_trust(result: TrustResult, console: Console) -> None:
     seconds = f"{d.scored_s:.0f} s scored, {d.excited_s:.0f} s of them excited"
     console.print(f"{len(result.drives)} drives, {d.blocks} blocks, {seconds}")
     console.print(f"trust cap {d.cap:g}: {d.reason}")
-    console.print(f"vehicle in {result.vehicle_file}, figures in {result.record_file}", soft_wrap=True)
+    console.print(f"car in {result.car}", soft_wrap=True)
 
 
 def render_calibration(result: CalibrateResult, console: Console) -> None:
     """Print how the 95 % intervals of sideslip stand before and after, on drives that were not fitted to."""
     widths = (">covered %\nbefore", ">\nafter", ">width / normal\nbefore", ">\nafter")
-    intervals = table("\nestimator", "\nvehicle file", "grip\nuse", ">\ndrives", ">RMSE\n°", *widths)
-    for name, fitted in result.fitted.items():
-        for c in fitted.coverage:
-            covered = (f"{100.0 * share:.1f}" for share in (c.covered_before, c.covered_after))
-            width = (f"{ratio:.2f}" for ratio in (c.width_before, c.width_after))
-            given = "made wrong" if c.wrong_vehicle else "as given"
-            rmse = cell(c.rmse_rad, math.degrees(1.0), 4)
-            intervals.add_row(name, given, c.bin, str(c.drives), rmse, *covered, *width)
+    intervals = table("\nestimator", "\ncar", "grip\nuse", ">\ndrives", ">RMSE\n°", *widths)
+    for entry in result.intervals.entries:
+        for c in entry.coverage:
+            covered = (f"{100.0 * c[key]:.1f}" for key in ("covered_before", "covered_after"))
+            width = (f"{c[key]:.2f}" for key in ("width_before", "width_after"))
+            given = "made wrong" if c["wrong_vehicle"] else "as given"
+            rmse = cell(c["rmse_rad"], math.degrees(1.0), 4)
+            intervals.add_row(entry.estimator, given, c["bin"], str(c["drives"]), rmse, *covered, *width)
     console.print("95 % intervals of sideslip, each drive judged by a fit without it; width over 3.92 x RMSE")
     console.print(intervals)
-    console.print(f"{len(result.drives)} drives; calibration in {result.file}", soft_wrap=True)
+    console.print(f"{len(result.intervals.drives)} drives; intervals in {result.file}", soft_wrap=True)

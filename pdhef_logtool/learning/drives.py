@@ -41,7 +41,7 @@ class Refusal:
     remedy: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LearnSettings:
     """What decides what a command learns, beside the logs.
 

@@ -10,7 +10,7 @@ from typing import Any
 from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
-from pdhef_logtool.car.store import Change, check_output, write_change
+from pdhef_logtool.car.store import Change, Content, check_output, write_change
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
@@ -159,16 +159,10 @@ def identify(
         f"Understeer {understeer_deg_per_g(fitted):.2f} deg/g."
     )
     comments = _comments(found)
-    change = Change(
-        "identify",
-        FIT_FILE,
-        {
-            FIT_FILE: part_toml(part, head, {f"values.{k}": v for k, v in comments.items()}).encode(),
-            "fit.png": _plot(found),
-        },
-        settings={"holdout_share": holdout, "notes": list(found.notes)},
-        drives=drives,
-    )
+    text = part_toml(part, head, {f"values.{k}": v for k, v in comments.items()})
+    files: dict[str, Content] = {FIT_FILE: text.encode(), "fit.png": _plot(found)}
+    settings = {"holdout_share": holdout, "notes": list(found.notes)}
+    change = Change("identify", FIT_FILE, files, settings=settings, drives=drives)
     after = car.with_fit(part)
     return IdentifyResult(found, write_change(car, after, output, change, comments), tuple(records))
 

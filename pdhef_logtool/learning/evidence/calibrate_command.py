@@ -76,7 +76,7 @@ REFUSED = Refusal(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CalibrateSettings(LearnSettings):
     """With the ``spread`` by which friction and vehicle are made wrong in further runs of every drive; 0 = none."""
 

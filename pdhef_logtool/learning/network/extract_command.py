@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_sha256
+from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.drive.reading import friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
-from pdhef_logtool.estimators.parallel_physics import parallel_filter
+from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, record_of, set_manifest, tell_drive
 from pdhef_logtool.learning.network.dataset import (
     FORMAT,
@@ -48,6 +48,7 @@ from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
 
@@ -100,7 +101,7 @@ class ExtractSettings:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
         config = self.config.to_dict()
-        used = ("vehicle", "mapping", "start", "end", "sensors", "prefer_truth")
+        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth")
         return {
             **{k: config[k] for k in used},
             **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
@@ -155,13 +156,13 @@ class _Job:
     log_input: LogInput
     output: Path
     settings: ExtractSettings
-    vehicle: VehicleParameters
+    car: Car
     mapping: SignalMapping | None
     listed_split: str | None
     resume: bool
 
 
-def run_extraction(
+def extract(
     arguments: Sequence[str],
     output: Path,
     settings: ExtractSettings,
@@ -208,7 +209,7 @@ def run_extraction(
         progress(result.record.name, done / len(work))
     results = tuple(by_log[job.log_input.stem] for job in work)
     used = {r.entry["vehicle_sha256"] for r in results if r.entry is not None}
-    vehicles = {vehicle_sha256(job.vehicle): job.vehicle for job in work}
+    vehicles = {job.car.physics_sha256: job.car.vehicle for job in work}
     manifest = write_manifest(
         output,
         [r.entry for r in results if r.entry is not None],
@@ -260,20 +261,17 @@ def _plan_jobs(
     resume: bool,
     warn: Warn,
 ) -> Iterator[_Job]:
-    chosen = None if settings.config.vehicle is None else load_vehicle(settings.config.vehicle)
-    files, manifests = cache(load_vehicle), cache(set_manifest)
-    told = False
-    for log_input in inputs:
-        listed = _listed(log_input.path, manifests(log_input.path.parent))
-        vehicle = chosen
-        if vehicle is None and listed.vehicle is not None:
-            vehicle = files(listed.vehicle)
-        if vehicle is None:
-            vehicle = default_vehicle()
-            if not told:
-                warn(f"no --vehicle: residuals are those of the default {vehicle.name}")
-                told = True
-        yield _Job(log_input, output, settings, vehicle, mapping, listed.split, resume)
+    cars, manifests = cache(_car), cache(set_manifest)
+    listed = [_listed(i.path, manifests(i.path.parent)) for i in inputs]
+    for log_input, entry in zip(inputs, listed, strict=True):
+        car = cars(settings.config.car or entry.vehicle)
+        yield _Job(log_input, output, settings, car, mapping, entry.split, resume)
+    if settings.config.car is None and any(entry.vehicle is None for entry in listed):
+        warn(f"no --car: residuals are those of the default {cars(None).vehicle.name}")
+
+
+def _car(path: Path | None) -> Car:
+    return Car.load(path, network=NO_MODEL, intervals=NO_INTERVALS)
 
 
 def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[DriveResult]:
@@ -336,11 +334,11 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             losses = tuple(Loss(**x) for x in entry["losses"])
             record = DriveRecord(stem, name, source, split, entry["duration_s"], losses=losses)
             return DriveResult(record, entry, kept=True)
-    with read_drive(job.log_input, job.vehicle, job.mapping, settings.config.read_options) as drive:
+    with read_drive(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
         drive.plan = plan = _strict_truth(drive.plan)
         _check_plan(plan, job)
         smoothing = _choose_smoothing(plan, settings)
-        told = vary(job.vehicle, settings.vary, f"{settings.seed}:{source}")
+        told = vary(job.car.vehicle, settings.vary, f"{settings.seed}:{source}")
         drive.friction = friction_of(plan, told.vehicle, drive.options, told.friction_factor)
 
         def windows() -> Iterator[Any]:
@@ -368,7 +366,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 "source": {"file": name, "sha256": source},
                 "split": split,
                 "split_from": split_from,
-                "vehicle_sha256": vehicle_sha256(job.vehicle),
+                "vehicle_sha256": job.car.physics_sha256,
                 "settings_sha256": fingerprint,
                 "period_s": plan.alignment.grid_period_s,
                 **counts.to_dict(),
@@ -438,7 +436,7 @@ def _check_plan(plan: DrivePlan, job: _Job) -> None:
             where=where,
             remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
         )
-    missing = sorted(parallel_filter(job.vehicle).needs - plan.alignment.available)
+    missing = sorted(spec_of("phy-ukf").needs - plan.alignment.available)
     if missing:
         raise EstimatorError(
             expected="the signals of the physics filter",
@@ -528,9 +526,9 @@ def _fingerprint(job: _Job, split: str) -> str:
     mapping = job.settings.config.mapping
     document = {
         "format": FORMAT_VERSION,
-        "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "vehicle", "mapping")},
+        "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
-        "vehicle": vehicle_sha256(job.vehicle),
+        "vehicle": job.car.physics_sha256,
         "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
         "versions": tool_versions(),
     }

@@ -68,7 +68,7 @@ REFUSED = Refusal(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TuneSettings(LearnSettings):
     """With ``names`` of the estimators (None = all that are usually tuned), and ``trials`` of each."""
 
