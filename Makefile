@@ -9,11 +9,13 @@ CAR := pdhef_logtool/models/default/vehicle.toml
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: train-default help demo test check lint format bench samples docs-truthsim paper switches clean
+.PHONY: train-default help demo test quick mutants check lint format bench samples docs-truthsim paper switches clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
+	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores"
+	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make bench    speed against peers, and the tuning tables"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
@@ -56,6 +58,15 @@ $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/
 
 test: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+quick: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow"
+
+# Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.
+SEED ?= 1
+COUNT ?= 30
+mutants: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m studies.mutants --seed $(SEED) --count $(COUNT) --jobs $(JOBS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .

@@ -21,6 +21,8 @@ from pdhef_logtool.records.errors import OutputError
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.samples import SAMPLES, write_sample, write_samples
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = {
     "/imu/data": "sensor_msgs/msg/Imu",
