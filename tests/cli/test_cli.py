@@ -71,6 +71,7 @@ def test_version() -> None:
     assert _pdhef("--version").stdout == f"pdhef {__version__}\n"
 
 
+@pytest.mark.slow
 def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Path, tmp_path: Path) -> None:
     result = _pdhef(
         "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path), "--annotate", "none", "-e", "zero,phy-ukf"
@@ -82,6 +83,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
     assert all(len(line) <= 100 for line in result.stdout.splitlines() if "outputs in" not in line)
 
 
+@pytest.mark.slow
 def test_json_is_one_document_with_what_was_written(sample_logs_dir: Path, tmp_path: Path) -> None:
     result = _pdhef(
         "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path), "--annotate", "none", "-e", "zero", "--json"
@@ -91,6 +93,7 @@ def test_json_is_one_document_with_what_was_written(sample_logs_dir: Path, tmp_p
     assert document["logs"][0]["report"] == json.loads((tmp_path / "logs/dlc/report.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("content", [b"", b"hello, this is no log\n", os.urandom(1000)])
 def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "no.mcap").write_bytes(content)
@@ -110,6 +113,7 @@ def test_missing_log_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
     assert "none.mcap" in _one_line_error(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [
@@ -211,6 +215,7 @@ def test_options_of_old_mean_what_they_meant(capsys: pytest.CaptureFixture[str])
     assert capsys.readouterr().err.count("notice: ") == 5
 
 
+@pytest.mark.slow
 def test_unknown_manoeuvre_names_those_that_there_are(tmp_path: Path) -> None:
     result = _pdhef("simulate", "moose", "-o", str(tmp_path / "x.mcap"))
     assert result.returncode == 2
@@ -218,6 +223,7 @@ def test_unknown_manoeuvre_names_those_that_there_are(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
     mapping = tmp_path / "mapping.toml"
@@ -234,6 +240,7 @@ def test_inspect_writes_a_mapping_that_run_takes(sample_logs_dir: Path, tmp_path
     assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_inspect_never_overwrites_a_mapping(sample_logs_dir: Path, tmp_path: Path) -> None:
     mapping = tmp_path / "mapping.toml"
     mapping.write_text("# mine\n")
@@ -243,6 +250,7 @@ def test_inspect_never_overwrites_a_mapping(sample_logs_dir: Path, tmp_path: Pat
     assert mapping.read_text() == "# mine\n"
 
 
+@pytest.mark.slow
 def test_simulate_writes_a_log_that_inspect_reads(tmp_path: Path) -> None:
     log = tmp_path / "dlc.mcap"
     made = _pdhef("simulate", "dlc", "--speed", "80", "--seed", "3", "-o", str(log), "--json")
@@ -276,6 +284,7 @@ def test_view_finds_the_recording(tmp_path: Path) -> None:
     assert find_recording(tmp_path / "logs" / "b", None).parent.name == "b"
 
 
+@pytest.mark.slow
 def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path) -> None:
     code = (
         "import pdhef_logtool.drive.reading as p\n"
@@ -294,6 +303,7 @@ def test_a_bug_of_ours_is_one_line_too(sample_logs_dir: Path, tmp_path: Path) ->
     assert "Traceback" in asked.stderr
 
 
+@pytest.mark.slow
 def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "no_truth.mcap")
     result = _pdhef("run", log, "-o", str(tmp_path), "--annotate", "none", "-e", "zero,open-loop,phy-ukf")

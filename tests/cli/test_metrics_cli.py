@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 ESTIMATE = ("--estimate", "/pdhef/phy_ukf/state")
 LIMITS = """

@@ -14,6 +14,8 @@ import pytest
 
 from truthsim.manoeuvres import MANOEUVRES
 
+pytestmark = pytest.mark.slow
+
 
 def pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(

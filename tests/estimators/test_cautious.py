@@ -24,6 +24,8 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
 TABLES = {n: FilterTuning(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics-plus")}
 COLUMNS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "covariance", "nis", "valid", "reason")

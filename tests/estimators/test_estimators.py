@@ -20,6 +20,8 @@ from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
+pytestmark = pytest.mark.slow
+
 #: With the noise that ``phy-ukf-tuned`` looks for in the vehicle file.
 TUNING = FilterTuning(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle().model_copy(update={"filter": {"phy-ukf-tuned": TUNING}})

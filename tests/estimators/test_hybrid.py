@@ -25,6 +25,8 @@ from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = default_vehicle()
 COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis", "valid")
 

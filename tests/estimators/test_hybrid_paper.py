@@ -27,6 +27,8 @@ from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = default_vehicle()
 GRAVITY = 9.80665
 

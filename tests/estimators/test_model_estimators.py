@@ -25,6 +25,8 @@ from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = default_vehicle()
 NAMES = ("pd-hef", "pd-hef-paper", "pure-lstm", "linear-regression")
 

@@ -32,6 +32,8 @@ from pdhef_logtool.car.nominal_points import (
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators import physics
 
+pytestmark = pytest.mark.slow
+
 FORMULA_CAR = default_vehicle().model_copy(
     update={"imu_position_m": (0.4, -0.3), "roll_gradient_rad_per_m_s2": 0.009, "low_speed_blend_m_s": 4.0}
 )

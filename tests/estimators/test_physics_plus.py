@@ -48,6 +48,8 @@ from pdhef_logtool.estimators.physics_plus import (
 from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, make_estimator
 from pdhef_logtool.records.signals import Signals
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = default_vehicle()
 TRACK_M, CG_HEIGHT_M, G = 1.57, 0.64, 9.80665
 ROLL_GAIN = G * 0.0105

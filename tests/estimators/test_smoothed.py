@@ -58,6 +58,8 @@ from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 from pdhef_logtool.sinks.report import report_markdown
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = default_vehicle()
 ALL = 10**6  # seconds: a block that holds every drive
 NS = 10**9

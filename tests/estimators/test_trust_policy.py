@@ -21,6 +21,8 @@ from pdhef_logtool.run.pipeline import run_logs
 from pdhef_logtool.sinks.parquet import read_track
 from pdhef_logtool.sinks.report import report_markdown
 
+pytestmark = pytest.mark.slow
+
 EVIDENCE = "a gain on one drive: 0.41° at trust 0, 0.33° at 0.5"
 
 

@@ -33,6 +33,8 @@ from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, combined, load_calibration
 
+pytestmark = pytest.mark.slow
+
 
 def _samples(rng: np.random.Generator, std: FloatArray, terms: FloatArray, drives: int = 30) -> Samples:
     """Samples of drives whose errors have a size of their own, [n], as those of real drives have."""

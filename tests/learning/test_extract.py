@@ -255,6 +255,7 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
         read_dataset(copy)
 
 
+@pytest.mark.slow
 def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
     logs = [str(sample_logs_dir / name) for name in ("sweep.mcap", "dlc.mcap")]
     again = run_extraction(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=4), jobs=2)
@@ -265,6 +266,7 @@ def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_
         ).read_bytes()
 
 
+@pytest.mark.slow
 def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(dataset.output, out)
@@ -352,6 +354,7 @@ def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
 
+@pytest.mark.slow
 def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "residuals"
     log = str(sample_logs_dir / "dlc.mcap")
@@ -374,6 +377,7 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
         assert np.corrcoef(found.targets[both, i], other.targets[both, i])[0, 1] > 0.95
 
 
+@pytest.mark.slow
 def test_errors_are_one_line(tmp_path: Path) -> None:
     result = _pdhef("extract", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
     assert result.returncode != 0

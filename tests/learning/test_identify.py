@@ -22,6 +22,8 @@ from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 
+pytestmark = pytest.mark.slow
+
 CAR = VehicleParameters(
     name="test car",
     mass_kg=1500.0,

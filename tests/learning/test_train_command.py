@@ -18,6 +18,8 @@ from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 
+pytestmark = pytest.mark.slow
+
 
 def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "pdhef_logtool", *arguments]

@@ -49,6 +49,8 @@ from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.run.config import RunConfig
 
+pytestmark = pytest.mark.slow
+
 PERIOD_NS = 10_000_000
 
 

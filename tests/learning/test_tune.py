@@ -47,6 +47,8 @@ from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 
+pytestmark = pytest.mark.slow
+
 OPTIMA = {"a": (0.3, 0.05, 1.5, 0.004), "b": (0.02, 0.4, 0.2, 0.02)}
 
 

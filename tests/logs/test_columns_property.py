@@ -16,6 +16,8 @@ from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 
+pytestmark = pytest.mark.slow
+
 T0 = 1_700_000_000_000_000_000
 SEPARATOR = "\n" + "=" * 80 + "\nMSG: "
 NUMBERS = {

@@ -16,6 +16,8 @@ from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 from pdhef_logtool.sinks.schema import load_schema
 
+pytestmark = pytest.mark.slow
+
 OUTPUTS = {"annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.json"}
 
 NO_TRUTH_MAPPING = """

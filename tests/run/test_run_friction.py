@@ -23,6 +23,8 @@ from pdhef_logtool.run.config import RunConfig, load_config
 from pdhef_logtool.run.pipeline import RunResult, run_logs
 from pdhef_logtool.sinks.schema import load_schema
 
+pytestmark = pytest.mark.slow
+
 #: The road of the drives with this vehicle file.
 SLIPPERY = 0.3
 

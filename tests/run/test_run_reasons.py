@@ -28,6 +28,8 @@ from pdhef_logtool.sinks.schema import load_schema
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
+pytestmark = pytest.mark.slow
+
 START_S, END_S = 2.0, 4.0
 
 

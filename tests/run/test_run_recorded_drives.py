@@ -13,6 +13,8 @@ import pytest
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
 
+pytestmark = pytest.mark.slow
+
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 
 

@@ -25,6 +25,8 @@ from studies.conditions_page import choose_fixed
 from studies.error_budget import causes_of, drive_again, fit_vehicle, without
 from truthsim.vehicle_choice import choose_vehicle
 
+pytestmark = pytest.mark.slow
+
 NAMES = "zero,phy-ukf,pd-hef-fixed-r"
 ROWS = ("in-domain", "friction-plus-20", "gyro-dropped")
 

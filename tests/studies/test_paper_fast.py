@@ -17,6 +17,8 @@ from studies.paper.experiment import FIRST_NOISE_SEED, A, B, Experiment, Run, ru
 from studies.paper.page import number, percent
 from studies.paper.results import load_models
 
+pytestmark = pytest.mark.slow
+
 #: Largest sideslip RMSE in degrees by scenario and scheme.
 SIDESLIP_BOUNDS_DEG: dict[tuple[str, str], float] = {
     ("A", "pd-hef-fixed-r"): 0.05,

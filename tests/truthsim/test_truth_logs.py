@@ -19,6 +19,8 @@ from studies.defaults import fit_nominal_tyres
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.samples import SAMPLES, write_sample, write_samples
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = {
     "/imu/data": "sensor_msgs/msg/Imu",

@@ -32,6 +32,8 @@ from pdhef_logtool.sinks.report import diverged_line, report_markdown
 from pdhef_logtool.watches.divergence import DivergenceCarry, DivergenceWatch, wrong_branch
 from truthsim.drive import simulate_drive, write_drive
 
+pytestmark = pytest.mark.slow
+
 IMU_X_M, IMU_Y_M = 0.8, -0.3
 VEHICLE = default_vehicle().model_copy(update={"imu_position_m": (IMU_X_M, IMU_Y_M, 0.0)})
 TILT = 1.0 + GRAVITY_M_S2 * VEHICLE.roll_gradient_rad_per_m_s2
