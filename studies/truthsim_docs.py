@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.records.signals import WHEELS, FloatArray
+from studies.defaults.fit_nominal_tyres import axle_loads_n
 from studies.pages import DOCS, INDEPENDENT, fill, table, write
 from studies.pictures import STYLE, save, subplots
 from truthsim.drive import simulate_drive
@@ -116,12 +117,11 @@ def steady_state(folder: Path) -> dict[str, str]:
     fig, ax = figure(1, 1, 6.4, 3.8)
     shades = dict(zip(WHEELS, ("#7fb0e0", "#1f5fa8", "#e8a487", "#b5482a"), strict=True))
     names = dict(zip(WHEELS, ("front left", "front right", "rear left", "rear right"), strict=True))
-    wheelbase = car.cg_to_front_axle_m + car.cg_to_rear_axle_m
+    loads_n = axle_loads_n(car)
     for wheel in WHEELS:
         ax.plot(a_y / G, motion.column(f"fz_{wheel}_n") / 1e3, color=shades[wheel], label=names[wheel])
         front = wheel[0] == "f"
-        arm = car.cg_to_rear_axle_m if front else car.cg_to_front_axle_m
-        static = 0.5 * car.mass_kg * G * arm / wheelbase
+        static = 0.5 * loads_n["front" if front else "rear"]
         moved = steady_roll(car)[1][0 if front else 1] * (1.0 if wheel[1] == "r" else -1.0)
         ax.plot(a_y / G, (static + moved * a_y) / 1e3, "--", color="black", linewidth=0.8)
     ax.set(xlabel="lateral acceleration to the left, g", ylabel="wheel load, kN")
