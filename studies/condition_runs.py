@@ -215,7 +215,7 @@ def _workers(setup: Setup, jobs: int) -> Iterator[Callable[[list[Task]], Iterato
 
 
 def _run(setup: Setup, task: Task) -> _Done:
-    rows, notes = {"score": _score, "grid": _grid, "budget": _budget}[task.kind](setup, task)
+    rows, notes = (_budget if task.kind == "budget" else _score)(setup, task)
     return task, [(r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.unit, r.n) for r in rows], notes
 
 
@@ -254,7 +254,7 @@ def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     estimators, skipped = _estimators(setup, signals.available, task.use_speed)
     notes, calibration = list(skipped), _calibration(setup.model)
     rows: list[MetricRow] = []
-    for estimator in estimators:
+    for estimator in estimators if task.kind == "score" else ():
         try:
             track, _ = estimator.run(signals, None)
             if calibration is not None and track.name in calibration.inflations:
@@ -266,15 +266,6 @@ def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     if base is not None:
         rows += fixed_grid.run_grid(base, signals, drive, vehicle.low_speed_blend_m_s)
     return rows, notes
-
-
-def _grid(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
-    vehicle, _ = _loaded(setup.vehicle, setup.model)
-    base = _grid_base(setup, task.use_speed)
-    if base is None:
-        return [], []
-    drive = read_drive(task.log, vehicle, task.log.stem)
-    return list(fixed_grid.run_grid(base, told(drive, task.assume), drive, vehicle.low_speed_blend_m_s)), []
 
 
 @lru_cache(maxsize=256)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -317,15 +318,14 @@ def _fixed(figures: Figures, rows: Sequence[str], chosen: Chosen | None, facts: 
     if chosen is None or not settings:
         return ""
     body = []
+    subject = facts.subject or fixed_grid.BEST
     for row in rows:
         medians = {s: median(figures.get(row, s)[0]) for s in settings if figures.get(row, s)[0].size}
         pooled = {s: pooled_rmse(*figures.get(row, s)) for s in medians}
         if medians:
             m, p = (min(d, key=d.__getitem__) for d in (medians, pooled))
-            subject = facts.subject or fixed_grid.BEST
             own = median(figures.get(row, subject)[0]), pooled_rmse(*figures.get(row, subject))
             body.append([row, m, _deg(medians[m]), _deg(own[0]), p, _deg(pooled[p]), _deg(own[1])])
-    subject = facts.subject or fixed_grid.BEST
     return "\n".join(
         [
             "## The best single fixed setting",
@@ -338,10 +338,7 @@ def _fixed(figures: Figures, rows: Sequence[str], chosen: Chosen | None, facts: 
             _table(["setting", "on the calibration drives, deg"], [[s, _deg(v)] for s, v in chosen.ranking[:5]]),
             "What nobody could have known beforehand, the best setting of each row on its own drives:",
             "",
-            _table(
-                ["row", "best by median", "deg", f"`{subject}`", "best pooled", "deg", f"`{subject}`"],
-                body,
-            ),
+            _table(["row", "best by median", "deg", f"`{subject}`", "best pooled", "deg", f"`{subject}`"], body),
         ]
     )
 
@@ -412,10 +409,8 @@ def _lags(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
 
     if not names:
         return ""
-    title = (
-        "## Lag of sideslip / yaw rate in ms\n\nBy cross-correlation with the truth, median over drives; + is late.\n"
-    )
-    return f"{title}\n{_grid(rows, names, cell)}"
+    what = "By cross-correlation with the truth, median over drives; + is late."
+    return f"## Lag of sideslip / yaw rate in ms\n\n{what}\n\n{_grid(rows, names, cell)}"
 
 
 def _budget(budget: pl.DataFrame, rows: Sequence[str]) -> str:
@@ -481,44 +476,41 @@ def _write_parquet(folder: Path, tables: Tables, rows: Sequence[str], names: Seq
             frame.write_parquet(pending.path, compression="zstd", compression_level=19)
 
 
-def _axes(rows: Sequence[str], row_height: float) -> tuple[Any, Any]:
-    fig, axes = subplots(1, 1, 9.0, 1.5 + row_height * len(rows), {})
-    return fig, axes[0, 0]
+def _plot_rows(path: Path, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> None:
+    """Median with the span from the 10th to the 90th percentile, a line a row."""
+    spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
+    label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
+    _plot(path, rows, spans, label, row_height=0.32, alpha=0.6, markers="os^")
 
 
-def _finish(fig: Any, axes: Any, path: Path, rows: Sequence[str], label: str) -> None:
+def _plot_ratios(path: Path, figures: Figures, rows: Sequence[str], subject: str, references: Sequence[str]) -> None:
+    """Ratios of medians with their intervals."""
+    spans = {}
+    for reference in references:
+        bounds = [ratios(figures, r, subject, reference)[0] for r in rows]
+        spans[reference] = np.array([(b.low, b.value, b.high) for b in bounds])
+    label = f"median sideslip RMSE of {subject} over that of the reference, 95 % interval"
+    _plot(path, rows, spans, label, row_height=0.3, alpha=0.7, markers="o", limits={1.0: "-", MARGIN: ":"})
+
+
+def _plot(
+    path: Path, rows: Sequence[str], spans: Mapping[str, FloatArray], label: str, *,
+    row_height: float, alpha: float, markers: str, limits: Mapping[float, str] = MappingProxyType({}),
+) -> None:  # fmt: skip
+    """Draw low, middle and high [rows, 3] of every name, a line a row."""
+    fig, grid = subplots(1, 1, 9.0, 1.5 + row_height * len(rows), {})
+    axes = grid[0, 0]
+    step = 0.75 / max(len(spans), 1)
+    for i, (name, span) in enumerate(spans.items()):
+        y = np.arange(len(rows)) + (i - 0.5 * (len(spans) - 1)) * step
+        marker, colour = markers[i // 10 % len(markers)], f"C{i % 10}"
+        axes.hlines(y, span[:, 0], span[:, 2], color=colour, linewidth=1.0, alpha=alpha)
+        axes.plot(span[:, 1], y, marker, markersize=3.0, color=colour, label=name)
+    for at, dash in limits.items():
+        axes.axvline(at, color="black", linewidth=0.8, linestyle=dash)
     axes.set(xscale="log", xlabel=label)
     axes.set_yticks(range(len(rows)), rows)
     axes.invert_yaxis()
     axes.grid(alpha=0.3, axis="x")
     axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     save(fig, path)
-
-
-def _plot_rows(path: Path, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> None:
-    """Median with the span from the 10th to the 90th percentile, a line a row."""
-    figure, axes = _axes(rows, 0.32)
-    step = 0.75 / max(len(names), 1)
-    for i, name in enumerate(names):
-        spans = np.degrees([percentiles(figures.get(r, name)[0]) for r in rows]).reshape(-1, 3)
-        y = np.arange(len(rows)) + (i - 0.5 * (len(names) - 1)) * step
-        colour = f"C{i}" if i < 10 else f"C{i - 10}"
-        axes.hlines(y, spans[:, 0], spans[:, 2], color=colour, linewidth=1.0, alpha=0.6)
-        axes.plot(spans[:, 1], y, "os^"[i // 10 % 3], markersize=3.0, color=colour, label=name)
-    label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
-    _finish(figure, axes, path, rows, label)
-
-
-def _plot_ratios(path: Path, figures: Figures, rows: Sequence[str], subject: str, references: Sequence[str]) -> None:
-    """Ratios of medians with their intervals."""
-    figure, axes = _axes(rows, 0.3)
-    step = 0.75 / len(references)
-    for i, reference in enumerate(references):
-        bounds = [ratios(figures, r, subject, reference)[0] for r in rows]
-        y = np.arange(len(rows)) + (i - 0.5 * (len(references) - 1)) * step
-        axes.hlines(y, [b.low for b in bounds], [b.high for b in bounds], color=f"C{i}", linewidth=1.0, alpha=0.7)
-        axes.plot([b.value for b in bounds], y, "o", markersize=3.0, color=f"C{i}", label=reference)
-    axes.axvline(1.0, color="black", linewidth=0.8)
-    axes.axvline(MARGIN, color="black", linewidth=0.8, linestyle=":")
-    label = f"median sideslip RMSE of {subject} over that of the reference, 95 % interval"
-    _finish(figure, axes, path, rows, label)

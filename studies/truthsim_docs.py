@@ -10,7 +10,6 @@ they are: the page shows peaks, ratios and lags alone.
 
 from __future__ import annotations
 
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.records.signals import WHEELS, FloatArray
-from studies.pages import DOCS, INDEPENDENT, fill, table, write
+from studies.defaults.fit_nominal_tyres import axle_loads_n
+from studies.pages import DOCS, INDEPENDENT, fill, options, table, write
 from studies.pictures import STYLE, save, subplots
 from truthsim.drive import simulate_drive
 from truthsim.linear_theory import (
@@ -88,16 +88,10 @@ def steady_state(folder: Path) -> dict[str, str]:
         rear = slope(motion, 0.5 * (motion.column("fz_rr_n") - motion.column("fz_rl_n")))
         front_theory, rear_theory = steady_roll(car)[1]
         a_y = motion.column("ay_m_s2") / G
-        rows.append(
-            [
-                name,
-                f"{degrees(understeer) * G:.2f} / {degrees(theory) * G:.2f}",
-                f"{degrees(roll) * G:.2f} / {degrees(roll_theory) * G:.2f}",
-                f"{front * G:.0f} / {front_theory * G:.0f}",
-                f"{rear * G:.0f} / {rear_theory * G:.0f}",
-                f"{a_y.max():.2f}",
-            ]
-        )
+        angles = ((degrees(understeer), degrees(theory)), (degrees(roll), degrees(roll_theory)))
+        loads = ((front, front_theory), (rear, rear_theory))
+        cells = [f"{own * G:.2f} / {said * G:.2f}" for own, said in angles]
+        rows.append([name, *cells, *(f"{own * G:.0f} / {said * G:.0f}" for own, said in loads), f"{a_y.max():.2f}"])
         ax.plot(a_y, degrees(beyond), color=COLOURS[name], label=f"{name}, simulated")
         line = np.array([0.0, 0.5])
         ax.plot(line, degrees(theory) * G * line, "--", color=COLOURS[name], linewidth=1.0)
@@ -116,12 +110,11 @@ def steady_state(folder: Path) -> dict[str, str]:
     fig, ax = figure(1, 1, 6.4, 3.8)
     shades = dict(zip(WHEELS, ("#7fb0e0", "#1f5fa8", "#e8a487", "#b5482a"), strict=True))
     names = dict(zip(WHEELS, ("front left", "front right", "rear left", "rear right"), strict=True))
-    wheelbase = car.cg_to_front_axle_m + car.cg_to_rear_axle_m
+    loads_n = axle_loads_n(car)
     for wheel in WHEELS:
         ax.plot(a_y / G, motion.column(f"fz_{wheel}_n") / 1e3, color=shades[wheel], label=names[wheel])
         front = wheel[0] == "f"
-        arm = car.cg_to_rear_axle_m if front else car.cg_to_front_axle_m
-        static = 0.5 * car.mass_kg * G * arm / wheelbase
+        static = 0.5 * loads_n["front" if front else "rear"]
         moved = steady_roll(car)[1][0 if front else 1] * (1.0 if wheel[1] == "r" else -1.0)
         ax.plot(a_y / G, (static + moved * a_y) / 1e3, "--", color="black", linewidth=0.8)
     ax.set(xlabel="lateral acceleration to the left, g", ylabel="wheel load, kN")
@@ -236,13 +229,11 @@ def traces(folder: Path) -> dict[str, str]:
         drive = simulate_drive(manoeuvre, seed=1)
         t, truth = drive.times_s, drive.truth
         fig, axes = figure(3, 2, 8.4, 6.4)
+        felt = [("ay_m_s2", "a_y", 1 / G), ("specific_force_y_m_s2", "felt by the leaning IMU", 1 / G)]
         panels = (
             ("road-wheel angle, deg", [("steer_rad", "", degrees(1.0))]),
             ("yaw rate, deg/s", [("yaw_rate_rad_s", "", degrees(1.0))]),
-            (
-                "acceleration, g",
-                [("ay_m_s2", "a_y", 1 / G), ("specific_force_y_m_s2", "felt by the leaning IMU", 1 / G)],
-            ),
+            ("acceleration, g", felt),
             ("sideslip, deg", [("sideslip_rad", "", degrees(1.0))]),
             ("roll, deg", [("roll_rad", "", degrees(1.0))]),
             ("wheel load, kN", [(f"fz_{w}_n", w, 1e-3) for w in WHEELS]),
@@ -260,17 +251,11 @@ def traces(folder: Path) -> dict[str, str]:
         fig.suptitle(title)
         save(fig, folder / f"{name}.png", _SAVED_DPI)
         unit = drive.friction * G
-        peaks = {c: float(np.abs(truth[c]).max()) for c in ("yaw_rate_rad_s", "roll_rad")}
-        rows.append(
-            [
-                title.split(",")[0],
-                f"{drive.peak_ay_m_s2 / G:.2f} g = {drive.peak_ay_m_s2 / unit:.2f} mu g",
-                f"{degrees(peaks['yaw_rate_rad_s']):.1f}",
-                f"{degrees(drive.peak_sideslip_rad):.2f}",
-                f"{degrees(peaks['roll_rad']):.2f}",
-                f"{min(float(truth[f'fz_{w}_n'].min()) for w in WHEELS):.0f}",
-            ]
-        )
+        yaw_rate, roll = (degrees(float(np.abs(truth[c]).max())) for c in ("yaw_rate_rad_s", "roll_rad"))
+        largest = f"{drive.peak_ay_m_s2 / G:.2f} g = {drive.peak_ay_m_s2 / unit:.2f} mu g"
+        angles = [f"{yaw_rate:.1f}", f"{degrees(drive.peak_sideslip_rad):.2f}", f"{roll:.2f}"]
+        lightest = min(float(truth[f"fz_{w}_n"].min()) for w in WHEELS)
+        rows.append([title.split(",")[0], largest, *angles, f"{lightest:.0f}"])
     head = "manoeuvre | largest a_y | yaw rate, deg/s | sideslip, deg | roll, deg | lightest wheel, N"
     return {"peaks": table(head.split(" | "), rows)}
 
@@ -285,9 +270,8 @@ def speed() -> dict[str, str]:
         seconds.append(time.perf_counter() - start)
     # In steps of 50, so that the page does not change with every build.
     times = int(120.0 / min(seconds) // 50 * 50)
-    return {
-        "speed": f"more than {times} times real time on one core (a drive on the road, driver and sensors included)."
-    }
+    what = "times real time on one core (a drive on the road, driver and sensors included)."
+    return {"speed": f"more than {times} {what}"}
 
 
 #: What is known of the other simulator's car and differs from the sedan: no bars, short relaxation, no compliance,
@@ -422,4 +406,6 @@ def main(docs: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS)
+    parser = options("truthsim_docs", __doc__)
+    parser.add_argument("docs", type=Path, nargs="?", default=DOCS)
+    main(parser.parse_args().docs)

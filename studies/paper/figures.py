@@ -18,7 +18,7 @@ from studies.paper.comparison import spread
 from studies.paper.experiment import BURST_S, GRAVITY_M_S2, A, B, Experiment
 from studies.paper.probes import RESIDUAL_ROWS, History, ResidualFit, TrustCurve
 from studies.paper.results import Results
-from studies.paper.schemes import STAND_IN, drawn
+from studies.paper.schemes import DRAWN
 from studies.paper.step_time import StepTime
 from studies.pictures import STYLE, save, subplots
 
@@ -217,7 +217,9 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
                 if s is None:
                     continue
                 ax.barh(k, s.median, color=COLOURS.get(name, OTHERS), height=0.72)
-                ax.plot([s.low, s.high], [k, k], color="#222222" if name != STAND_IN else "#bbbbbb", linewidth=1.1)
+                ax.plot(
+                    [s.low, s.high], [k, k], color="#222222" if name != "pd-hef-fixed-r" else "#bbbbbb", linewidth=1.1
+                )
             theirs = published.RMSE.get((scenario, figure))
             if theirs is not None:
                 ax.axvline(theirs, color="#222222", linestyle=":", linewidth=1.4)
@@ -255,7 +257,7 @@ def step_time_bars(folder: Path, times: Mapping[str, StepTime]) -> None:
 
 def draw(r: Results, folder: Path) -> None:
     """Write the PNGs of Figures 9 to 23 into a folder, under the names that the page uses."""
-    schemes = drawn(r.ran)
+    schemes = [n for n in DRAWN if n in r.ran]
     if r.histories:
         convergence(folder, r.histories)
     seed = r.models[0].seed

@@ -12,7 +12,7 @@ from studies.paper import published
 from studies.paper.comparison import BOOTSTRAP_DRAWS, LEVEL, Improvement, Spread
 from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B
 from studies.paper.results import BASELINES, SCENARIOS, Results
-from studies.paper.schemes import SCHEMES, drawn
+from studies.paper.schemes import DRAWN, HYBRID, SCHEMES
 from truthsim.manoeuvres import PATH_STEP_M, iso_3888_2_line_m
 from truthsim.sensors import SensorNoise
 from truthsim.suite import is_held_out
@@ -193,13 +193,13 @@ def _figure_10(r: Results) -> str:
 
 def _figure_position(r: Results, scenario: str, title: str, picture: str) -> str:
     lines = []
-    for name in drawn(r.ran):
+    for name in DRAWN:
         drift, side = r.spread(scenario, name, "position_m"), r.spread(scenario, name, "lateral_1s_m")
         if drift and side:
             lines.append(f"`{name}` {ranged(drift)} m, after 1 s {ranged(side)} m to the side")
     facts = f"Dead reckoning from the true pose at the start, RMSE of the distance: {'; '.join(lines)}."
     found = Findings()
-    gain = r.improvement(scenario, r.hybrid, "phy-ukf", "lateral_1s_m")
+    gain = r.improvement(scenario, HYBRID, "phy-ukf", "lateral_1s_m")
     found.gain(gain, "the lateral error after 1 s against `phy-ukf`:")
     if scenario == A.name:
         phy, paper = published.PHY_RMSE[scenario, "position_m"], published.RMSE[scenario, "position_m"]
@@ -222,7 +222,7 @@ def _figure_position(r: Results, scenario: str, title: str, picture: str) -> str
 
 def _against_paper(r: Results, scenario: str, figure: str, unit: str, found: Findings) -> None:
     """Compare our hybrid and ``phy-ukf`` with what the paper says of its own."""
-    for name, values in ((r.hybrid, published.RMSE), ("phy-ukf", published.PHY_RMSE)):
+    for name, values in ((HYBRID, published.RMSE), ("phy-ukf", published.PHY_RMSE)):
         s, theirs = r.spread(scenario, name, figure), values.get((scenario, figure))
         if s is None or theirs is None:
             continue
@@ -234,23 +234,23 @@ def _figure_state(
     r: Results, scenario: str, figure: str, unit: str, title: str, picture: str,
     more: Callable[[Results, str, Findings], None],
 ) -> str:  # fmt: skip
-    lines = [f"`{n}` {ranged(s)} {unit}" for n in drawn(r.ran) if (s := r.spread(scenario, n, figure))]
+    lines = [f"`{n}` {ranged(s)} {unit}" for n in DRAWN if (s := r.spread(scenario, n, figure))]
     seed = r.experiment.drives[scenario].noise_seed
     facts = f"RMSE: {'; '.join(lines)}. Drawn: noise seed {seed}, training seed {r.models[0].seed}."
     found = Findings()
-    found.gain(r.improvement(scenario, r.hybrid, "phy-ukf", figure), f"`{r.hybrid}` against `phy-ukf`")
+    found.gain(r.improvement(scenario, HYBRID, "phy-ukf", figure), f"`{HYBRID}` against `phy-ukf`")
     _against_paper(r, scenario, figure, unit, found)
     more(r, scenario, found)
     return found.part(title, picture, facts)
 
 
 def _lags(r: Results, scenario: str, figure: str) -> str:
-    return ", ".join(f"`{n}` {ranged(s)} ms" for n in drawn(r.ran) if (s := r.spread(scenario, n, figure)))
+    return ", ".join(f"`{n}` {ranged(s)} ms" for n in DRAWN if (s := r.spread(scenario, n, figure)))
 
 
 def _later(r: Results, scenario: str, figure: str) -> bool | None:
     """Tell whether ``phy-ukf`` lags more than our hybrid; None where one of them has no lag."""
-    phy, ours = (r.spread(scenario, n, figure) for n in ("phy-ukf", r.hybrid))
+    phy, ours = (r.spread(scenario, n, figure) for n in ("phy-ukf", HYBRID))
     return None if phy is None or ours is None else abs(phy.median) - abs(ours.median) >= LATER_MS
 
 
@@ -273,11 +273,11 @@ def _yaw_rate_notes(r: Results, scenario: str, found: Findings) -> None:
         if gyro.high < min(phy, paper):
             whole = f"the gyro passed through, delay and all, has {ranged(gyro)} rad/s"
             found.say(False, f"{phy:g} → {paper:g} rad/s is implausible: {whole}")
-    own = r.spread(scenario, r.hybrid, "yaw_rate_rad_s")
+    own = r.spread(scenario, HYBRID, "yaw_rate_rad_s")
     if gyro is not None and own is not None:
         better = own.median < gyro.median
         both = f"({number(own.median)} and {number(gyro.median)} rad/s)"
-        found.say(better, f"`{r.hybrid}` is {'' if better else 'no '}better than the gyro {both}")
+        found.say(better, f"`{HYBRID}` is {'' if better else 'no '}better than the gyro {both}")
     if scenario == A.name:
         later = _later(r, scenario, "yaw_rate_lag_ms")
         if later is not None:
@@ -359,7 +359,7 @@ def _figure_20(r: Results) -> str:
         rest = f"at the same time of the drive without a burst it reaches {number(i.without_burst)} times R_0"
         quiet = i.without_burst <= 1.5
         found.say(quiet, rest + (", quiet where there is no noise" if quiet else ": model error is read as noise"))
-    for name in (n for n in ("pd-hef-paper", r.hybrid) if n in r.inflations):
+    for name in (n for n in ("pd-hef-paper", HYBRID) if n in r.inflations):
         gain = r.improvement(BURST.name, name, "pd-hef-fixed-r")
         found.gain(gain, f"sideslip of `{name}` in the burst against fixed R:")
     if not r.inflations:
@@ -398,7 +398,7 @@ def _figure_22(r: Results) -> str:
     found = Findings()
     for scenario in (A.name, B.name):
         for baseline in ("phy-ukf", "phy-ukf-tuned", "physics-plus"):
-            gain = r.improvement(scenario, r.hybrid, baseline)
+            gain = r.improvement(scenario, HYBRID, baseline)
             if gain is not None:
                 text = f"sideslip in {scenario} against `{baseline}` {gain_text(gain)}"
                 found.say(gain.low > published.IMPROVEMENT, text)
@@ -417,10 +417,10 @@ def _figure_23(r: Results) -> str:
     head = ("scheme", "µs a step, median", "fastest … slowest round")
     rows = [(f"`{n}`", number(t.median_us), f"{number(t.low_us)} … {number(t.high_us)}") for n, t in r.times.items()]
     found = Findings()
-    own, phy = r.times.get(r.hybrid), r.times.get("phy-ukf")
+    own, phy = r.times.get(HYBRID), r.times.get("phy-ukf")
     if own is not None:
         share = own.median_us / (1e3 * published.CYCLE_MS)
-        found.say(share < 1.0, f"`{r.hybrid}` takes {percent(share)} of a {published.CYCLE_MS:g} ms cycle")
+        found.say(share < 1.0, f"`{HYBRID}` takes {percent(share)} of a {published.CYCLE_MS:g} ms cycle")
     if own is not None and phy is not None:
         theirs = published.STEP_MS["pd-hef"] / published.STEP_MS["phy-ukf"]
         near, words = beside(own.median_us / phy.median_us, theirs)
@@ -459,8 +459,8 @@ def _gain_table(r: Results) -> str:
         for baseline in BASELINES:
             cells = [scenario.name, f"`{baseline}`"]
             wanted = ("sideslip_deg", "yaw_rate_rad_s", "ay_g", "lateral_1s_m")
-            gains = [r.improvement(scenario.name, r.hybrid, baseline, f) for f in wanted]
-            if baseline != r.hybrid and any(gains):
+            gains = [r.improvement(scenario.name, HYBRID, baseline, f) for f in wanted]
+            if baseline != HYBRID and any(gains):
                 rows.append([*cells, *("–" if g is None else f"{gain_text(g)} · {judged(g)}" for g in gains)])
     return table(("scenario", "against", "sideslip", "yaw rate", "a_y", "lateral 1 s"), rows)
 
@@ -579,7 +579,7 @@ after the true pose; a lag above 0 is late.
 
 {_result_table(r, BURST.name)}
 
-### `{r.hybrid}` against the others
+### `{HYBRID}` against the others
 
 By how much its RMSE, pooled over the seeds, is lower; in brackets the {percent(LEVEL)} bounds of a bootstrap that
 draws noise seeds in pairs ({BOOTSTRAP_DRAWS} draws of {len(seeds)}; so few make the bounds rather too narrow). Each
@@ -589,7 +589,7 @@ scenario is one manoeuvre with other sensor errors: this says nothing about othe
 
 ## The paper's figures
 
-Time histories show `phy-ukf`, `pure-lstm` and `{r.hybrid}`, where this version has them. A figure counts as the paper's
+Time histories show `phy-ukf`, `pure-lstm` and `{HYBRID}`, where this version has them. A figure counts as the paper's
 where it lies within {percent(NEAR[0])} and {percent(NEAR[1])} of it; a scheme as better where both bounds say so.
 
 {chr(10).join(figures)}"""

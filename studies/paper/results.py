@@ -34,7 +34,7 @@ from studies.paper.probes import (
     residual_fit,
     trust_curve,
 )
-from studies.paper.schemes import SCHEMES, hybrid_of
+from studies.paper.schemes import HYBRID, SCHEMES
 from studies.paper.step_time import StepTime, step_times
 from truthsim.suite import is_held_out
 
@@ -52,7 +52,7 @@ class Results:
 
     Attributes
     ----------
-    ran : schemes in the order of the tables. hybrid : the name of our hybrid filter among them.
+    ran : schemes in the order of the tables.
     histories : by training seed. fits : residual fits by scenario, one a model.
     curves : β over |a_y| by scenario and scheme. inflations : of R by scheme.
     """
@@ -71,11 +71,6 @@ class Results:
         """Schemes that ran."""
         there = {r.scheme for r in self.experiment.runs}
         return tuple(n for n in SCHEMES if n in there)
-
-    @property
-    def hybrid(self) -> str:
-        """Our hybrid filter: ``pd-hef`` if this version has it."""
-        return hybrid_of(self.ran)
 
     def spread(self, scenario: str, scheme: str, figure: str) -> Spread | None:
         """See :func:`~studies.paper.comparison.spread`."""
@@ -150,13 +145,13 @@ def document(results: Results) -> dict[str, Any]:
         for scenario in scenarios
     }
     gains = [
-        {"scenario": scenario, "scheme": r.hybrid, "baseline": b, "figure": f, **asdict(gain), "proven": gain.proven}
+        {"scenario": scenario, "scheme": HYBRID, "baseline": b, "figure": f, **asdict(gain), "proven": gain.proven}
         for scenario in scenarios
         for b in BASELINES
-        if b in r.ran and b != r.hybrid
+        if b in r.ran and b != HYBRID
         for f in FIGURES
         if not f.endswith(("_relative", "_ms")) and f != "diverged"
-        if (gain := r.improvement(scenario, r.hybrid, b, f)) is not None
+        if (gain := r.improvement(scenario, HYBRID, b, f)) is not None
     ]
     residuals = {
         scenario: [

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pdhef_logtool.estimators.registry import ALIASES, DESCRIPTIONS, runnable
-
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.registry import runnable
 from pdhef_logtool.residual_model.bundle import ModelBundle
 
 #: All schemes that belong in the tables (METHOD §10), with one line each for the page.
@@ -29,19 +28,9 @@ SCHEMES: dict[str, str] = {
 }
 
 
-#: The paper's three, drawn in this order in the time histories; the last has a stand-in where this version lacks it.
-DRAWN = ("phy-ukf", "pure-lstm", "pd-hef")
-STAND_IN = "pd-hef-fixed-r"
-
-
-def hybrid_of(ran: Sequence[str]) -> str:
-    """Return the name of our hybrid filter among those that ran."""
-    return DRAWN[-1] if DRAWN[-1] in ran else STAND_IN
-
-
-def drawn(ran: Sequence[str]) -> tuple[str, ...]:
-    """Return the schemes of the time histories that ran."""
-    return tuple(n for n in (*DRAWN[:-1], hybrid_of(ran)) if n in ran)
+#: Our hybrid filter, and the paper's three in the order in which the time histories draw them.
+HYBRID = "pd-hef"
+DRAWN = ("phy-ukf", "pure-lstm", HYBRID)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,12 +49,6 @@ def schemes_for(
     ready: list[Scheme] = []
     missing: dict[str, str] = {}
     for name in names:
-        if name in ALIASES:
-            missing[name] = f"in this version the name stands for `{ALIASES[name]}`"
-            continue
-        if name not in DESCRIPTIONS:
-            missing[name] = "this version has no such estimator"
-            continue
         estimators, skipped = runnable((name,), vehicle, available, model=bundle)
         if skipped:
             missing[name] = skipped[0].reason

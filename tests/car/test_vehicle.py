@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from pdhef_logtool.car.vehicle import default_vehicle, load_vehicle, vehicle_from_dict
+from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.vehicle import default_vehicle, vehicle_from_dict
 from pdhef_logtool.records.errors import VehicleError
 
 FILES = Path(__file__).parents[1] / "reference" / "vehicles"
