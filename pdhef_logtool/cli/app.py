@@ -62,7 +62,7 @@ def main() -> NoReturn:
             error.show()  # pdhef alone is asked for its help
         else:
             command = error.ctx.command_path if error.ctx else "pdhef"
-            say(f"{command}: {' '.join(error.format_message().split())}; see {command} --help")
+            say(f"{command}: {' '.join(error.format_message().split()).rstrip('.')}; see {command} --help")
         code = error.exit_code
     except (KeyboardInterrupt, typer.Abort):
         say("pdhef: interrupted; nothing half-written was left under its final name")

@@ -358,7 +358,7 @@ def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "residuals"
     log = str(sample_logs_dir / "dlc.mcap")
-    result = _pdhef("extract", log, "-o", str(out), "-v", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
+    result = _pdhef("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
     assert result.returncode == 0, result.stderr
     assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
     assert result.stderr.splitlines() == ["warning: dlc: perfect truth taken; /rtk/fix, /rtk/odometry not used"]

@@ -34,7 +34,7 @@ def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
         # One drive gives three parts only because there are no other sample drives of this length.
         part = folder / split
         done = _pdhef(
-            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(part), "--vehicle", vehicle, "--split", split,
+            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(part), "--car", vehicle, "--split", split,
             "--start", start, "--end", end,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr

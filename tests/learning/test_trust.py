@@ -328,7 +328,7 @@ def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -
 def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Path) -> None:
     _bundle().save(tmp_path / "model")
     words = [sys.executable, "-m", "pdhef_logtool", "trust", str(sample_logs_dir / "dlc.mcap"),
-             "-v", str(sample_logs_dir / "vehicle.toml"), "--model", str(tmp_path / "model"),
+             "--car", str(sample_logs_dir / "vehicle.toml"), "--model", str(tmp_path / "model"),
              "-o", str(tmp_path / "car.toml")]  # fmt: skip
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     shown = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)

@@ -289,7 +289,7 @@ def test_processes_change_nothing_and_the_command_prints_json(
     for jobs in ("1", "2"):
         output = tmp_path / jobs / "car.toml"
         done = subprocess.run(
-            [sys.executable, "-m", "pdhef_logtool", "tune", str(drives), "--split", "validation", "-v", vehicle,
+            [sys.executable, "-m", "pdhef_logtool", "tune", str(drives), "--split", "validation", "--car", vehicle,
              "-o", str(output), "-e", "phy-ukf-tuned", "--trials", "4", "--jobs", jobs, "--json"],
             capture_output=True, text=True, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"},
         )  # fmt: skip
