@@ -134,7 +134,7 @@ def test_all_problems_are_reported_together(tmp_path):
         ("[filter.phy-ukf-tuned]", "[filter.phy_ukf_tuned]", "did you mean filter.phy-ukf-tuned?"),
         ("mass_kg = 1440.0", 'mass_kg = "1440"', "mass_kg: should be a valid number, got '1440'"),
         ("mass_kg = 1440.0", "mass_kg = true", "mass_kg: should be a valid number, got True"),
-        ("imu_position_m = [0.1, 0.0, 0.2]", 'imu_position_m = "100"', "imu_position_m: should be a valid tuple"),
+        ("imu_position_m = [0.1, 0.0, 0.2]", 'imu_position_m = "100"', "imu_position_m: should be a list, got '100'"),
         ("imu_position_m = [0.1, 0.0, 0.2]", "imu_position_m = [100.0, 0.0, 200.0]", "imu_position_m.0"),
         ('name = "sedan"', "name = 3", "name: should be a valid string, got 3"),
         ("friction = 0.85", "friction = 85.0", "friction"),
