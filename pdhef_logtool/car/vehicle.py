@@ -205,9 +205,10 @@ class VehicleParameters(_Record):
     def _relations(self) -> Iterator[tuple[str, str, tuple[float, ...], float, float]]:
         """Yield what it is, its entries beside the axles' distances, its values (one may do), and their range."""
         length = self.wheelbase_m
-        # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model, a guess of its authors.
+        # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model, a guess of its authors
+        # that a fit may still double.
         inertia = self.yaw_inertia_kg_m2 / (self.mass_kg * self.cg_to_front_axle_m * self.cg_to_rear_axle_m)
-        yield "I_z / (m l_f l_r)", "mass_kg yaw_inertia_kg_m2", (inertia,), 0.2, 5.0
+        yield "I_z / (m l_f l_r)", "mass_kg yaw_inertia_kg_m2", (inertia,), 0.15, 8.0
         for axle, front in (("front", True), ("rear", False)):
             load, over = self.axle_load_n(front), f"over static load of the {axle} axle"
             if getattr(self.tyres, axle).D_n is not None:
