@@ -136,9 +136,10 @@ class VehicleParameters(Record):
 
     @model_validator(mode="after")
     def _entries_agree(self) -> VehicleParameters:
+        axles = ("cg_to_front_axle_m", "cg_to_rear_axle_m")
         wrong = [
-            f"{', '.join(self._told(e) for e in entries)} contradict one another: {what} is {values[0]:.3g}, "
-            f"plausible is {low:g} to {high:g}"
+            f"{', '.join(self._told(e) for e in (*entries.split(), *axles))} contradict one another: {what} is "
+            f"{values[0]:.3g}, plausible is {low:g} to {high:g}"
             for what, entries, values, low, high in self._relations()
             if min(values) > high or max(values) < low
         ]
@@ -147,46 +148,36 @@ class VehicleParameters(Record):
         return self
 
     def _told(self, entry: str) -> str:
-        return (
-            entry if entry in self.model_fields_set or "." in entry else f"{entry} (left out: {getattr(self, entry)})"
-        )
+        given = entry in self.model_fields_set or "." in entry
+        return entry if given else f"{entry} (left out: {getattr(self, entry)})"
 
-    def _relations(self) -> Iterator[tuple[str, tuple[str, ...], tuple[float, ...], float, float]]:
-        """Yield what it is, its entries, its values (one inside is enough), and the range of any vehicle."""
-        axles = ("cg_to_front_axle_m", "cg_to_rear_axle_m")
-        wheelbase, product = self.wheelbase_m, self.cg_to_front_axle_m * self.cg_to_rear_axle_m
-        # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model, a guess of its authors.
-        inertia = self.yaw_inertia_kg_m2 / (self.mass_kg * product)
-        yield "I_z / (m l_f l_r)", ("mass_kg", "yaw_inertia_kg_m2", *axles), (inertia,), 0.2, 5.0
+    def _relations(self) -> Iterator[tuple[str, str, tuple[float, ...], float, float]]:
+        """Yield what it is, its entries beside the axles' distances, its values (one may do), and their range."""
+        length = self.wheelbase_m
+        # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model, a guess of its authors
+        # that a fit may still double.
+        inertia = self.yaw_inertia_kg_m2 / (self.mass_kg * self.cg_to_front_axle_m * self.cg_to_rear_axle_m)
+        yield "I_z / (m l_f l_r)", "mass_kg yaw_inertia_kg_m2", (inertia,), 0.15, 8.0
         for axle, front in (("front", True), ("rear", False)):
-            load = self.axle_load_n(front)
+            load, over = self.axle_load_n(front), f"over static load of the {axle} axle"
             if getattr(self.tyres, axle).D_n is not None:
-                # A friction of 0.1 (ice that the file calls 1) to a racing tyre's 2, twice that for a crude curve.
-                entries = (f"tyres.{axle}.D_n", "mass_kg", *axles)
+                # From ice that the file calls friction 1 to a racing tyre's 2, twice that for a crude curve.
                 peak = self.magic_formula(front, 1.0)[2] / load
-                yield f"peak force over static load of the {axle} axle", entries, (peak,), 0.1, 5.0
+                yield f"peak force {over}", f"tyres.{axle}.D_n mass_kg", (peak,), 0.1, 5.0
             # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 3 scales it with friction, so that a
             # curve may be a plausible one at friction 1 or at the file's.
-            stiffness = tuple(
-                self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction)
-            )
-            what = f"cornering stiffness over static load of the {axle} axle in 1/rad"
-            yield what, (f"tyres.{axle}", "mass_kg", *axles), stiffness, 2.0, 100.0
+            slopes = tuple(self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction))
+            yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 2.0, 100.0
         # A kart is as wide as long, a coach's wheelbase is three times its track.
-        yield "track over wheelbase", ("track_m", *axles), (self.track_m / wheelbase,), 0.15, 1.5
+        yield "track over wheelbase", "track_m", (self.track_m / length,), 0.15, 1.5
         # A laden truck: 2.2 m over 3.5 m.
-        yield "height of the CG over wheelbase", ("cg_height_m", *axles), (self.cg_height_m / wheelbase,), 0.0, 1.2
+        yield "height of the CG over wheelbase", "cg_height_m", (self.cg_height_m / length,), 0.0, 1.2
         # 0.2 for cars; 1.5 for a 1:10 car with the default.
-        yield (
-            "relaxation length over wheelbase",
-            ("relaxation_length_m", *axles),
-            (self.relaxation_length_m / wheelbase,),
-            0.0,
-            3.0,
-        )
-        # Speed over sqrt(g L), as speeds scale with size: 0.6 for the default sedan, 0.17 for the 1:10 car.
-        blend = self.low_speed_blend_m_s / math.sqrt(GRAVITY_M_S2 * wheelbase)
-        yield "low-speed limit over sqrt(g wheelbase)", ("low_speed_blend_m_s", *axles), (blend,), 0.0, 3.0
+        relaxation = self.relaxation_length_m / length
+        yield "relaxation length over wheelbase", "relaxation_length_m", (relaxation,), 0.0, 3.0
+        # Speeds scale with √(g L): 0.6 for the default sedan, 0.17 for the 1:10 car.
+        blend = self.low_speed_blend_m_s / math.sqrt(GRAVITY_M_S2 * length)
+        yield "low-speed limit over sqrt(g wheelbase)", "low_speed_blend_m_s", (blend,), 0.0, 3.0
 
     @property
     def wheelbase_m(self) -> float:

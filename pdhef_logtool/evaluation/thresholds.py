@@ -209,17 +209,8 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
         allowed = [native, *(u for u, of in _CONVERSIONS if of == native)]
         problems.append(f"{where}.unit: {table.signal} {table.metric} is in {' or '.join(allowed)}, not {unit!r}")
         return None
-    return Threshold(
-        signal=table.signal,
-        metric=table.metric,
-        estimator=table.estimator,
-        segment=table.segment,
-        minimum=table.min,
-        maximum=table.max,
-        unit=unit,
-        factor=factor,
-        optional=table.optional,
-    )
+    rest = table.model_dump(exclude={"min", "max", "unit"})
+    return Threshold(minimum=table.min, maximum=table.max, unit=unit, factor=factor, **rest)
 
 
 def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow], *, log: str) -> list[Verdict]:

@@ -180,19 +180,8 @@ def _read_section(
         if problem:
             problems.append(f"{where}: {problem}")
             continue
-        out[name] = SignalSource(
-            name=name,
-            topic=model.topic,
-            field=tuple(model.field) if isinstance(model.field, list) else model.field,
-            stamp=model.stamp,
-            scale=tuple(model.scale) if isinstance(model.scale, list) else model.scale,
-            offset=tuple(model.offset) if isinstance(model.offset, list) else model.offset,
-            latency_s=model.latency_s,
-            valid_min=model.valid_min,
-            valid_max=model.valid_max,
-            stamp_unit=model.stamp_unit,
-            clock=model.clock,
-        )
+        values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in model.model_dump().items()}
+        out[name] = SignalSource(name=name, **values)
     return out
 
 
@@ -238,17 +227,8 @@ def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
     model = checked(_GateTable, raw, "truth_quality", problems)
     if model is None:
         return None
-    return QualityGate(
-        topic=model.topic,
-        field=model.field,
-        minimum=model.min,
-        maximum=model.max,
-        values=tuple(model.values),
-        stamp=model.stamp,
-        stamp_unit=model.stamp_unit,
-        clock=model.clock,
-        latency_s=model.latency_s,
-    )
+    values = model.model_dump(exclude={"min", "max", "values"})
+    return QualityGate(minimum=model.min, maximum=model.max, values=tuple(model.values), **values)
 
 
 def _contradictions(mapping: Mapping) -> list[str]:

@@ -155,6 +155,7 @@ def _problems(error: ValidationError, model: type, raw: object, table: str) -> l
         else:
             text = e["msg"].removeprefix("Value error, ")
             text = text.replace("Input should", "should").replace("an instance of Path", "a path")
+            text = text.replace("a valid tuple", "a list")
             # A table's problem says itself which entries it is about.
             text += f", got {value!r:.60}" if isinstance(value, str | int | float) else ""
         found.setdefault(at, []).append(text)

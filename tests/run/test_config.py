@@ -91,7 +91,7 @@ def test_file_of_the_working_directory_is_found(tmp_path: Path, monkeypatch: pyt
         ("window_s = 0.1", "0.1"),
         ("start = soon", "TOML"),
         ('end = "later"', "later"),
-        ("estimators = 3", r"estimators: should be a valid tuple, got 3"),
+        ("estimators = 3", r"estimators: should be a list, got 3"),
         ("estimators = [3]", r"estimators\.0: should be a valid string, got 3"),
         ("window_s = true", r"window_s: should be a valid number, got True"),
         ('window_s = "60"', r"window_s: should be a valid number, got '60'"),
