@@ -76,6 +76,7 @@ class Drive:
 
     name: str
     log: DriveLog
+    car: Car
     options: ReadOptions
     plan: DrivePlan
     missing: tuple[str, ...]
@@ -239,7 +240,7 @@ def read_drive(
     except BaseException:
         opened.close()
         raise
-    return Drive(log_input.stem, opened, options, plan, missing, notes, friction, tell)
+    return Drive(log_input.stem, opened, car, options, plan, missing, notes, friction, tell)
 
 
 def one_log(argument: str) -> LogInput:

@@ -52,7 +52,7 @@ class Estimated:
     share_done: float
 
 
-def estimate(
+def estimate_windows(
     drive: Readable,
     estimators: Sequence[Estimator],
     *,

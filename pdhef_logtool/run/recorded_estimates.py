@@ -63,10 +63,10 @@ from pdhef_logtool.run.pipeline import (
     outcome_of,
     read_thresholds,
     report_facts,
-    without_whole,
     write_run,
     write_verdicts,
 )
+from pdhef_logtool.run.scoring import without_whole
 from pdhef_logtool.sinks.base import TRUTH, Event
 from pdhef_logtool.sinks.report import EstimatorFacts, build_report, write_json
 

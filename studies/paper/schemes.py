@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pdhef_logtool.estimators.registry import runnable
+
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.registry import runnable
 from pdhef_logtool.residual_model.bundle import ModelBundle
 
 #: All schemes that belong in the tables (METHOD §10), with one line each for the page.

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.registry import DESCRIPTIONS, MODEL_ESTIMATORS, check_names, make_estimator, runnable
 from reference_car import cut, drive, keep, make_signals, rolling_drive, slalom, tanh_tyre, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, FilterTuning, Tyres, default_vehicle
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, MODEL_ESTIMATORS, check_names, make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps

@@ -10,11 +10,11 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from pdhef_logtool.estimators.registry import make_estimator, runnable
 
 from pdhef_logtool.car.vehicle import FilterTuning, default_vehicle
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.registry import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate

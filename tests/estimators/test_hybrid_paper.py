@@ -11,13 +11,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.registry import check_names, runnable
 from reference_car import cut, drive, forces, runge_kutta, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
 from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf, adapted_noise
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.registry import check_names, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals

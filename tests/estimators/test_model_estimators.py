@@ -12,10 +12,10 @@ import test_estimators as properties
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.registry import make_estimator, runnable
 from reference_car import cut, drive, keep, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.registry import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.release import MAX_PREDICTION_S
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals

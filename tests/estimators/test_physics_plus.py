@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, make_estimator
 from reference_car import (
     FRICTION,
     FRONT_M,
@@ -45,7 +46,6 @@ from pdhef_logtool.estimators.physics_plus import (
     PhysicsPlusUkf,
     physics_plus,
 )
-from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, make_estimator
 from pdhef_logtool.records.signals import Signals
 
 pytestmark = pytest.mark.slow

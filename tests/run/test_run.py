@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-
 from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, DEFAULT_MODEL_ESTIMATORS, TUNED_ESTIMATORS
+
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs

@@ -12,9 +12,9 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from pdhef_logtool.estimators.registry import make_estimator
 
 from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
-from pdhef_logtool.estimators.registry import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES

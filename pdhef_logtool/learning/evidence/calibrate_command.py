@@ -51,7 +51,7 @@ from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.run.estimating import estimate
+from pdhef_logtool.run.estimating import estimate_windows
 from pdhef_logtool.sinks.report import json_bytes, tool_versions
 from pdhef_logtool.watches.error_features import error_terms
 from pdhef_logtool.watches.intervals import yaw_rate_terms
@@ -210,7 +210,7 @@ def _run_drive(
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
         available = drive.plan.alignment.available
         estimators, _ = runnable(config.estimators, presumed, available, Options(options.use_speed))
-        for window in estimate(replace(drive, signals=seen), estimators, watched=False, drawn=False):
+        for window in estimate_windows(replace(drive, signals=seen), estimators, watched=False, drawn=False):
             for estimator, track in zip(estimators, window.tracks, strict=True):
                 part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
                 if len(part) >= MIN_SAMPLES:
