@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -112,8 +112,10 @@ class Drive:
 
     @property
     def losses(self) -> tuple[Loss, ...]:
-        """What could not be used; complete once all windows were read."""
-        return merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
+        """What could not be used; complete once all windows were read. Files are named without their folder."""
+        found = merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
+        folder = f"{self.path.parent}/"
+        return tuple(replace(x, where=x.where.removeprefix(folder)) for x in found)
 
     @property
     def lost_texts(self) -> tuple[str, ...]:

@@ -190,7 +190,7 @@ class _Scoring:
         truth, truth_losses, samples = read_truth(drive.log, plan, drive.options.window_s)
         progress(drive.name, 0.6)
         signals = _read_sensors(drive)
-        all_losses = merge_losses([drive.log.lost, losses, truth_losses, drive.losses])
+        all_losses = merge_losses([drive.losses, losses, truth_losses])
         progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
