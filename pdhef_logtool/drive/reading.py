@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from pdhef_logtool.car.vehicle import VehicleParameters
@@ -90,11 +89,6 @@ class Drive:
         return self.log.path
 
     @property
-    def kind(self) -> str:
-        """Format of the log."""
-        return self.log.kind
-
-    @property
     def mapping(self) -> Mapping:
         """The mapping that it is read with."""
         return self.plan.mapping
@@ -116,11 +110,6 @@ class Drive:
         found = merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
         folder = f"{self.path.parent}/"
         return tuple(replace(x, where=x.where.removeprefix(folder)) for x in found)
-
-    @property
-    def lost_texts(self) -> tuple[str, ...]:
-        """What of the input is gone, in words."""
-        return lost_texts(self.losses)
 
     @property
     def samples(self) -> dict[str, int]:
@@ -180,9 +169,7 @@ class Drive:
         """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the log."""
         self.close()
 

@@ -434,7 +434,7 @@ def report_facts(
         log=LogFacts(
             name=drive.name,
             file=drive.path.name,
-            kind=drive.kind,
+            kind=log.kind,
             sha256=drive.sha256,
             start_ns=plan.start_ns,
             end_ns=plan.end_ns,

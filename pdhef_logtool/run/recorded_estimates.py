@@ -24,7 +24,7 @@ from pdhef_logtool.drive.truth import (
     share_equal,
     truth_at,
 )
-from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.drive.windows import DrivePlan, since
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import (
@@ -365,7 +365,7 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
         derived = derive_truth(channels, plan=plan.truth)
         tracks.append(_rows(derived.track, done_ns, until))
         done_ns = until
-        channels = {n: _since(c, until - plan.truth.margin_ns) for n, c in channels.items()}
+        channels = {n: since(c, until - plan.truth.margin_ns) for n, c in channels.items()}
     if plan.truth is None or not sum(len(t) for t in tracks):
         raise MappingError(
             expected="truth in the chosen slice",
@@ -394,16 +394,6 @@ _TRUTH_COLUMNS = (
     "y_m",
     "yaw_rad",
 )
-
-
-def _since(channel: Channel, stamp_ns: int) -> Channel:
-    first = int(np.searchsorted(channel.stamps_ns, stamp_ns))
-    return replace(
-        channel,
-        stamps_ns=channel.stamps_ns[first:],
-        arrival_ns=channel.arrival_ns[first:],
-        values=channel.values[first:],
-    )
 
 
 def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:

@@ -27,7 +27,7 @@ from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.noise.search import DriveError, drive_error, tuned_vehicle
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.bundle import ModelBundle
@@ -280,7 +280,7 @@ class Benches:
         """
         loaded: list[DriveRecord] = []
         held = 0
-        under_way: deque[Future[DriveRecord | _Refusal]] = deque()
+        under_way: deque[Future[DriveRecord]] = deque()
         for index, log_input in enumerate(inputs):
             what = (index, log_input, splits.get(log_input.stem), MAX_BYTES - held)
             if self._local is not None:
@@ -289,14 +289,12 @@ class Benches:
                 # No more than one a process ahead, so that the bound on the memory is kept.
                 under_way.append(self._pools[index % len(self._pools)].submit(_load, *what))
             while len(under_way) > (len(self._pools) if index + 1 < len(inputs) else 0):
-                facts = _result(under_way.popleft())
-                if isinstance(facts, _Refusal):
-                    raise facts.error()
-                loaded.append(facts)
-                held += facts.bytes_held
+                record = _result(under_way.popleft())
+                loaded.append(record)
+                held += record.bytes_held
                 if held > MAX_BYTES:
-                    raise too_big(facts.name)
-                told(facts)
+                    raise too_big(record.name)
+                told(record)
         return loaded
 
     def score(self, tunings: Mapping[str, FilterTuning]) -> dict[str, list[DriveError]]:
@@ -318,23 +316,9 @@ def _result(future: Future[Any]) -> Any:
         ) from None
 
 
-@dataclass(frozen=True, slots=True)
-class _Refusal:
-    """An error on its way between processes: exceptions with named arguments cannot be pickled."""
-
-    kind: type[PdhefError]
-    expected: str
-    got: str
-    where: str
-    remedy: str
-
-    def error(self) -> PdhefError:
-        return self.kind(expected=self.expected, got=self.got, where=self.where, remedy=self.remedy)
-
-
-def _done(facts: DriveRecord) -> Future[DriveRecord | _Refusal]:
-    future: Future[DriveRecord | _Refusal] = Future()
-    future.set_result(facts)
+def _done(record: DriveRecord) -> Future[DriveRecord]:
+    future: Future[DriveRecord] = Future()
+    future.set_result(record)
     return future
 
 
@@ -346,11 +330,8 @@ def _open_bench(setup: TuneSetup) -> None:
     _here["bench"] = DriveBench(setup)
 
 
-def _load(index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord | _Refusal:
-    try:
-        return _here["bench"].load(index, log_input, split, max_bytes)
-    except PdhefError as error:
-        return _Refusal(type(error), error.expected, error.got, error.where, error.remedy)
+def _load(index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord:
+    return _here["bench"].load(index, log_input, split, max_bytes)
 
 
 def _score(tunings: dict[str, FilterTuning]) -> dict[str, dict[int, DriveError]]:
