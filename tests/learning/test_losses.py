@@ -38,7 +38,7 @@ def _run(*arguments: object) -> tuple[dict[str, Any], list[str]]:
     return json.loads(result.stdout), result.stderr.splitlines()
 
 
-def _compare(folder: Path, common: tuple[object, ...], end_s: int) -> None:
+def _compare(folder: Path, common: tuple[object, ...], end_s: int, estimate: str) -> None:
     log, out = folder / "cut.mcap", folder / "out"
     for name in COPIES[1:]:
         shutil.copy(log, folder / f"{name}.mcap")
@@ -49,6 +49,8 @@ def _compare(folder: Path, common: tuple[object, ...], end_s: int) -> None:
     expected = ran["logs"][0]["report"]["losses"]
     lost = [x for x in expected if x["severity"] == "lost"]
     assert [x["kind"] for x in lost] == ["truncated"]
+    scored, _ = _run("metrics", log, *common, "--estimate", estimate)
+    assert scored["logs"][0]["report"]["losses"] == expected
     warning = f"warning: cut: {lost[0]['what']} (cut.mcap)"
     commands: dict[str, tuple[object, ...]] = {
         "identify": (log, "-o", folder / "identified.toml", *common, "--holdout", 0),
@@ -69,13 +71,20 @@ def _compare(folder: Path, common: tuple[object, ...], end_s: int) -> None:
 def test_a_truncated_log_is_told_alike_by_all_commands(sample_logs_dir: Path, tmp_path: Path) -> None:
     whole = (sample_logs_dir / "road.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 4])
-    _compare(tmp_path, ("--vehicle", sample_logs_dir / "vehicle.toml"), 35)
+    _compare(
+        tmp_path, ("--vehicle", sample_logs_dir / "vehicle.toml"), 35, "sideslip_rad=/truth/perfect/state.sideslip_rad"
+    )
 
 
 def test_the_truncated_250_lm_is_told_alike_by_all_commands(shared_dir: Path, tmp_path: Path) -> None:
     shutil.copyfile(shared_dir / "data/drives/faulty/revs_250lm_a_truncated60.mcap", tmp_path / "cut.mcap")
     vehicle, mapping = REFERENCE / "vehicles" / "revs_250lm.toml", REFERENCE / "mappings" / "revs_250lm.toml"
-    _compare(tmp_path, ("--vehicle", vehicle, "--mapping", mapping), 60)
+    _compare(
+        tmp_path,
+        ("--vehicle", vehicle, "--mapping", mapping),
+        60,
+        "vx_m_s=/vehicle/status/velocity_status.longitudinal_velocity",
+    )
 
 
 def _record(name: str, *, severity: str = "", left_out: str = "") -> DriveRecord:
@@ -108,3 +117,12 @@ def test_one_wording_for_what_is_told() -> None:
     assert document["drives"][0]["losses"][0]["severity"] == "lost"
     assert document["left_out"][0]["reason"] == "why"
     json.dumps(document, allow_nan=False)
+
+
+def test_a_damaged_chunk_is_counted_once(shared_dir: Path) -> None:
+    log = shared_dir / "data/drives/faulty/revs_250lm_a_flipped_byte.mcap"
+    mapping = REFERENCE / "mappings" / "revs_250lm.toml"
+    speed = "vx_m_s=/vehicle/status/velocity_status.longitudinal_velocity"
+    scored, _ = _run("metrics", log, "--mapping", mapping, "--estimate", speed)
+    (lost,) = (x for x in scored["logs"][0]["report"]["losses"] if x["severity"] == "lost")
+    assert lost["what"].startswith(f"{lost['count']} messages lost")
