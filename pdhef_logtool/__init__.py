@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.evidence.trust_command import trust as trust
     from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as extract
-    from pdhef_logtool.learning.network.train_command import train as train
+    from pdhef_logtool.learning.network.train_command import run_training as train
     from pdhef_logtool.learning.noise.tune_command import TuneSettings as TuneSettings
     from pdhef_logtool.learning.noise.tune_command import tune as tune
     from pdhef_logtool.mapping import load_mapping as load_mapping
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from pdhef_logtool.run.frames import choose as choose
     from pdhef_logtool.run.frames import estimate as estimate
     from pdhef_logtool.run.frames import score as score
-    from pdhef_logtool.run.pipeline import run as run
+    from pdhef_logtool.run.pipeline import run_logs as run
 
 __version__ = "0.1.0"
 
-#: Where each name stands; it is imported when it is first asked for.
+#: Where each name stands, ``module`` or ``module:name there``; it is imported when it is first asked for.
 _HOMES = {
     "Car": "car.car",
     "ReadOptions": "drive.options",
@@ -46,7 +46,7 @@ _HOMES = {
     "trust": "learning.evidence.trust_command",
     "ExtractSettings": "learning.network.extract_command",
     "extract": "learning.network.extract_command",
-    "train": "learning.network.train_command",
+    "train": "learning.network.train_command:run_training",
     "TuneSettings": "learning.noise.tune_command",
     "tune": "learning.noise.tune_command",
     "load_mapping": "mapping",
@@ -56,7 +56,7 @@ _HOMES = {
     "choose": "run.frames",
     "estimate": "run.frames",
     "score": "run.frames",
-    "run": "run.pipeline",
+    "run": "run.pipeline:run_logs",
 }
 __all__ = sorted(_HOMES)
 
@@ -65,4 +65,5 @@ def __getattr__(name: str) -> Any:
     """Import what is asked for: ``import pdhef_logtool`` itself loads nothing."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    module, _, own_name = _HOMES[name].partition(":")
+    return getattr(import_module(f"{__name__}.{module}"), own_name or name)

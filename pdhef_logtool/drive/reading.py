@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from pdhef_logtool.car.car import Car
@@ -92,11 +91,6 @@ class Drive:
         return self.log.path
 
     @property
-    def kind(self) -> str:
-        """Format of the log."""
-        return self.log.kind
-
-    @property
     def mapping(self) -> Mapping:
         """The mapping that it is read with."""
         return self.plan.mapping
@@ -114,13 +108,10 @@ class Drive:
 
     @property
     def losses(self) -> tuple[Loss, ...]:
-        """What could not be used; complete once all windows were read."""
-        return merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
-
-    @property
-    def lost_texts(self) -> tuple[str, ...]:
-        """What of the input is gone, in words."""
-        return lost_texts(self.losses)
+        """What could not be used; complete once all windows were read. Files are named without their folder."""
+        found = merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
+        folder = f"{self.path.parent}/"
+        return tuple(replace(x, where=x.where.removeprefix(folder)) for x in found)
 
     @property
     def samples(self) -> dict[str, int]:
@@ -180,9 +171,7 @@ class Drive:
         """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the log."""
         self.close()
 

@@ -42,11 +42,8 @@ class Estimates:
 
         from pdhef_logtool.sinks.parquet import track_table
 
-        frames = [
-            pl.DataFrame(track_table(track)).with_columns(pl.col("estimator").cast(pl.String))
-            for track in self.tracks.values()
-        ]
-        return pl.concat(frames)
+        frames = (pl.DataFrame(track_table(track)) for track in self.tracks.values())
+        return pl.concat(f.with_columns(pl.col("estimator").cast(pl.String)) for f in frames)
 
 
 def choose(drive: Drive, names: Sequence[str] | None = None) -> tuple[list[Estimator], list[Skipped]]:

@@ -113,7 +113,7 @@ class RunResult:
         }
 
 
-def run(
+def run_logs(
     arguments: Sequence[str],
     output: Path,
     config: RunConfig,
@@ -377,7 +377,7 @@ def report_facts(
         log=LogFacts(
             name=drive.name,
             file=drive.path.name,
-            kind=drive.kind,
+            kind=log.kind,
             sha256=drive.sha256,
             start_ns=plan.start_ns,
             end_ns=plan.end_ns,
