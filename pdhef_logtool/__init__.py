@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.evidence.trust_command import trust as trust
     from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as extract
-    from pdhef_logtool.learning.network.train_command import run_training as train
+    from pdhef_logtool.learning.network.train_command import run_training as train  # noqa: F401
     from pdhef_logtool.learning.noise.tune_command import TuneSettings as TuneSettings
     from pdhef_logtool.learning.noise.tune_command import tune as tune
     from pdhef_logtool.mapping import load_mapping as load_mapping
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.run.frames import choose as choose
     from pdhef_logtool.run.frames import estimate as estimate
     from pdhef_logtool.run.frames import score as score
-    from pdhef_logtool.run.pipeline import run_logs as run
+    from pdhef_logtool.run.pipeline import run_logs as run  # noqa: F401
 
 __version__ = "0.1.0"
 
