@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[2]
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
     *("inspect", "estimators", "run", "metrics", "view", "simulate", "simulate suite", "simulate conditions"),
@@ -20,7 +21,7 @@ COMMANDS = (
 def _pdhef(
     *arguments: str, cwd: Path | None = None, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "100", **(env or {})}
+    environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT), **(env or {})}
     return subprocess.run([*PDHEF, *arguments], capture_output=True, text=True, cwd=cwd, env=environment, check=False)
 
 
