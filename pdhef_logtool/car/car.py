@@ -219,7 +219,7 @@ def _stale(what: str, why: str, command: str) -> str:
 
 def _part(path: Path, kind: type[PartT]) -> PartT | None:
     """Return a part of a folder, None if there is none; raises VehicleError."""
-    if not path.is_file():
+    if not path.exists():
         return None
     what = f"a car's {path.name}"
     raw = read_json(path, what, VehicleError) if path.suffix == ".json" else read_toml(path, what, VehicleError)

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from pdhef_logtool.car.parts import FilterNoise, FilterTables, LearntOn, Sha256, Trust
-from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters, vehicle_from_dict
+from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
 
@@ -35,8 +35,8 @@ class _Identification(Record):
     tuning_scores: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
 
-class _Tables(Record):
-    """The tables that a vehicle.toml may hold beside physics and sensors."""
+class _FlatFile(VehicleParameters):
+    """A vehicle.toml with the tables that it may hold beside physics and sensors."""
 
     filter: FilterTables = Field(default_factory=dict)
     network: _Network | None = None
@@ -61,10 +61,11 @@ def read_flat(path: Path) -> FlatCar:
     VehicleError
         The file is missing, is no TOML, or holds wrong, unknown or missing entries; all of them are named at once.
     """
-    raw, where = dict(read_toml(path, "a vehicle TOML file", VehicleError)), str(path)
-    given = {name: raw.pop(name) for name in _Tables.model_fields if name in raw}
-    vehicle = vehicle_from_dict(raw, where=where)
-    tables = validated(_Tables, given, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
+    raw, where = read_toml(path, "a vehicle TOML file", VehicleError), str(path)
+    tables = validated(_FlatFile, raw, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
+    own = VehicleParameters.model_fields
+    given = tables.model_fields_set & own.keys()
+    vehicle = VehicleParameters.model_construct(given, **{name: getattr(tables, name) for name in own})
     noise: dict[str, FilterNoise] = dict(tables.filter)
     for score in _parsed(tables.identification.tuning_scores, _SCORE, f"{where}: identification.tuning_scores"):
         if score["name"] in noise:

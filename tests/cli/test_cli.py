@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[2]
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
     *("inspect", "estimators", "run", "metrics", "view", "simulate", "simulate suite", "simulate conditions"),
@@ -20,7 +21,7 @@ COMMANDS = (
 def _pdhef(
     *arguments: str, cwd: Path | None = None, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "100", **(env or {})}
+    environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT), **(env or {})}
     return subprocess.run([*PDHEF, *arguments], capture_output=True, text=True, cwd=cwd, env=environment, check=False)
 
 
@@ -78,7 +79,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
     )  # fmt: skip
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
-    assert "no --vehicle" in result.stderr
+    assert "no --car" in result.stderr
     assert "warning" not in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines() if "outputs in" not in line)
 
@@ -181,17 +182,17 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
             ("run", "no", "--vehicle", "a.toml", "--model", "none", "--calibration", "none"),
             [
                 "--vehicle is now --car",
-                "--model is now --car (its network)",
-                "--calibration is now --car (its intervals)",
+                "--model is now --network",
+                "--calibration is now --intervals",
             ],
         ),
         (("metrics", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
         (("extract", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
         (("identify", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
-        (("tune", "no", "--model", "m"), ["--model is now --car (its network)"]),
+        (("tune", "no", "--model", "m"), ["--model is now --network"]),
         (("tune", "no", "--signal-map", "m.toml"), ["--signal-map is now --mapping"]),
-        (("trust", "no", "--model", "m"), ["--model is now --car (its network)"]),
-        (("calibrate", "no", "--model", "m"), ["--model is now --car (its network)"]),
+        (("trust", "no", "--model", "m"), ["--model is now --network"]),
+        (("calibrate", "no", "--model", "m"), ["--model is now --network"]),
         (("run", "no", "--car", "a.toml"), []),
     ],
 )
@@ -208,7 +209,9 @@ def test_options_of_old_mean_what_they_meant(capsys: pytest.CaptureFixture[str])
 
     assert run_config({"car": Path("a"), "vehicle": None}) == run_config({"vehicle": Path("a")})
     assert run_config({"signal_map": Path("m")}).mapping == Path("m")
-    assert run_config({"model": Path("n"), "calibration": Path("c")}).calibration == Path("c")
+    assert run_config({"model": Path("n"), "calibration": Path("c")}) == run_config(
+        {"network": Path("n"), "intervals": Path("c")}
+    )
     assert run_config({"estimators": "zero, phy-ukf,"}).estimators == ("zero", "phy-ukf")
     with pytest.raises(UsageError, match="--car or its alias"):
         run_config({"car": Path("a"), "vehicle": Path("a")})
