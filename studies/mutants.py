@@ -27,6 +27,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = "pdhef_logtool"
@@ -201,7 +202,7 @@ class _Finder(ast.NodeVisitor):
         """Leave what only narrows types alone."""
 
 
-def _flip(operator: ast.AST) -> ast.AST:
+def _flip(operator: ast.AST) -> Any:
     return _OPPOSITE[type(operator)]()
 
 
