@@ -5,6 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.records.version import __version__
+
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car as Car
     from pdhef_logtool.drive.options import ReadOptions as ReadOptions
@@ -29,8 +31,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.run.frames import estimate as estimate
     from pdhef_logtool.run.frames import score as score
     from pdhef_logtool.run.pipeline import run_logs as run  # noqa: F401
-
-__version__ = "0.1.0"
 
 #: Where each name stands, ``module`` or ``module:name there``; it is imported when it is first asked for.
 _HOMES = {
@@ -58,7 +58,7 @@ _HOMES = {
     "score": "run.frames",
     "run": "run.pipeline:run_logs",
 }
-__all__ = sorted(_HOMES)
+__all__ = ["__version__", *sorted(_HOMES)]
 
 
 def __getattr__(name: str) -> Any:

@@ -45,7 +45,7 @@ class _FlatFile(VehicleParameters):
 
 @dataclass(frozen=True, slots=True)
 class FlatCar:
-    """What one file says of a car; ``provenance`` is its ``[identification]`` as it stands."""
+    """What one file says of a car."""
 
     vehicle: VehicleParameters
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
@@ -129,7 +129,7 @@ def flat_toml(
     known = document.unwrap().get("identification", {})
     if provenance := {k: v for k, v in {**known, **identification}.items() if k != "tuning_scores"}:
         tables["identification"] = provenance
-    for name in _Tables.model_fields:
+    for name in ("filter", "network", "identification"):
         document.pop(name, None)
     _merge(document, {}, tables)
     _comment(document, comments or {})

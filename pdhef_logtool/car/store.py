@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool import __version__
 from pdhef_logtool.car.car import HISTORY_FILE, VEHICLE_FILE, Car
 from pdhef_logtool.car.flat import flat_toml, vehicle_toml
 from pdhef_logtool.car.parts import HistoryLine, LearntOn, digest
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.files import PendingFile, cannot_write, write_bytes
+from pdhef_logtool.records.version import __version__
 
 #: Writes one file at the path that it is given, or is its content.
 Content = bytes | Callable[[Path], object]
