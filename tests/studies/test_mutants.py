@@ -11,6 +11,8 @@ import pytest
 from studies import mutants
 from studies.mutants import FOLDERS, ROOT, Mutant
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def drawn() -> list[Mutant]:
