@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import functools
 import json
 import os
 import random
@@ -206,7 +207,8 @@ def _flip(operator: ast.AST) -> Any:
     return _OPPOSITE[type(operator)]()
 
 
-def possible(package: str, root: Path = ROOT) -> list[Mutant]:
+@functools.cache
+def possible(package: str, root: Path = ROOT) -> tuple[Mutant, ...]:
     """Return every fault that can be put into a package, in order of files and lines."""
     trees = {p: ast.parse(p.read_bytes()) for p in sorted((root / SOURCES).rglob("*.py"))}
     at_import = {name for tree in trees.values() for name in _called_at_import(tree)}
@@ -216,7 +218,7 @@ def possible(package: str, root: Path = ROOT) -> list[Mutant]:
             finder = _Finder(package, path.relative_to(root).as_posix(), path.read_bytes(), at_import)
             finder.visit(tree)
             found += finder.found
-    return found
+    return tuple(found)
 
 
 def _called_at_import(tree: ast.Module) -> Iterator[str]:
@@ -232,7 +234,7 @@ def draw(packages: Sequence[str], count: int, seed: int, root: Path = ROOT) -> l
     drawn: list[Mutant] = []
     for n, package in enumerate(packages):
         rng = random.Random(f"{seed} {package}")
-        left = possible(package, root)
+        left = list(possible(package, root))
         kinds = sorted({m.kind for m in left})
         rng.shuffle(kinds)
         for i in range(count // len(packages) + (n < count % len(packages))):
