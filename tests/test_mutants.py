@@ -7,9 +7,9 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+from mutants import FOLDERS, ROOT, Mutant
 
 from studies import mutants
-from studies.mutants import FOLDERS, ROOT, Mutant
 
 pytestmark = pytest.mark.slow
 

@@ -1,6 +1,6 @@
 """Mutants: small faults put into the code one at a time, to see whether the tests notice.
 
-    python -m studies.mutants [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused] [--json FILE]
+    python tests/mutants.py [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused] [--json FILE]
 
 A seeded draw spreads the faults over five packages, over kinds of faults and over functions: no function gets two.
 What only words a message is left alone, and so is what no test can tell apart by construction. Each mutant lives in a
