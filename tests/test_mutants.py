@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from mutants import FOLDERS, ROOT, Mutant
 
-from studies import mutants
+import mutants
 
 pytestmark = pytest.mark.slow
 
