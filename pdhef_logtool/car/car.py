@@ -129,8 +129,18 @@ class Car:
         car = _with_parts(cls(flat.vehicle, flat.vehicle, source=source), flat, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
+        stale = [n for n, one in car.noise.items() if bundle and one.network_sha256 not in (None, bundle.sha256)]
         return replace(
-            car, network=bundle, network_name=name, network_folder=home, intervals=_intervals_of(folder, intervals)
+            car,
+            noise={n: one for n, one in car.noise.items() if n not in stale},
+            network=bundle,
+            network_name=name,
+            network_folder=home,
+            intervals=_intervals_of(folder, intervals),
+            notes=(
+                *car.notes,
+                *(_stale(f"noise of {n}", "it belongs to another network", "pdhef tune") for n in stale),
+            ),
         )
 
     @property

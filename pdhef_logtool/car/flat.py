@@ -133,9 +133,8 @@ def flat_toml(
     )
     if known or identification:
         tables["identification"] = {**known, **identification}
-    for name, table in tables.items():
-        document.pop(name, None)
-        document[name] = table
+    stand = {name: document[name].unwrap() for name in tables if name in document}
+    _merge(document, stand, tables)
     _comment(document, comments or {})
     return tomlkit.dumps(document)
 
