@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -83,26 +82,10 @@ class AdaptiveCarry:
     waiting: MixtureSteps
 
 
-class Evidence(NamedTuple):
-    """What the mixture is made of, by step, [K]: innovations of a_y [K, 2] of F1 and F2, and state of F1."""
-
-    dt_s: FloatArray
-    innovations: FloatArray
-    starts: BoolArray
-    skip: BoolArray
-    ay: FloatArray
-    noise_std: FloatArray
-    usual_std: FloatArray
-    vx: FloatArray
-    vy: FloatArray
-    vy_variance: FloatArray
-    yaw_rate: FloatArray
-
-
 @njit(cache=True)
-def _weights(evidence_of, low, high, memory, out):  # type: ignore[no-untyped-def]
+def _weights(steps, low, high, memory, out):  # type: ignore[no-untyped-def]
     """Write the weight of F2 at each step; ``memory`` is updated in place."""
-    dt, innovations, starts, skip, ay, noise, usual, vx, vy, vy_variance, yaw_rate = evidence_of
+    dt, innovations, starts, skip, ay, noise, usual, vx, vy, vy_variance, yaw_rate = steps
     for k in range(dt.shape[0]):
         step = dt[k] if dt[k] <= RESTART_GAP_S else 0.0
         if starts[k] or step == 0.0:
@@ -280,7 +263,7 @@ class AdaptiveHybridUkf:
         starts: BoolArray = ~np.isfinite(plain.prior[:, VX])
         skip = faults.reason & BURST_AY > 0
         out = np.empty(count)
-        given = Evidence(
+        given = (
             dt, innovations, starts, skip, faults.filtered.ay_m_s2, faults.noise_std[:, AY], faults.usual_std[:, AY],
             plain.x[:, VX], plain.x[:, VY], plain.P[:, VY, VY], plain.x[:, YAW_RATE],
         )  # fmt: skip

@@ -33,46 +33,7 @@ from pdhef_logtool.car.nominal_model import (
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators.filter_shell import (
-    AX_BIAS,
-    INITIAL_STD,
-    M_INITIALISED,
-    M_RATE_R,
-    M_RATE_VY,
-    MEASUREMENTS,
-    STATES,
-    U_AX,
-    U_AX_KNOWN,
-    U_FRICTION,
-    U_STEER,
-    VX,
-    VY,
-    YAW_RATE,
-    Z_AY,
-    Z_SPEED,
-    Z_YAW_RATE,
-    Due,
-    Held,
-    Meanwhile,
-    Now,
-    PosteriorSteps,
-    Predicted,
-    ShellCarry,
-    Tuning,
-    add_process_noise,
-    all_finite,
-    carry_on,
-    diverges,
-    make_tuning,
-    make_window,
-    make_work,
-    meanwhile,
-    no_posterior,
-    released_track,
-    remember,
-    resume,
-)
-from pdhef_logtool.estimators.filter_shell import MEMORY as SHELL_MEMORY
+from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, FilterCarry
@@ -95,12 +56,12 @@ PROCESS_NOISE_GAIN = 3.0
 PAPER_R_NORM = 0.1
 
 # Behind the entries of the shell's memory: β, and C of Eq 22 a measurement.
-M_TRUST, M_INNOVATION = SHELL_MEMORY, SHELL_MEMORY + 1
-MEMORY = M_INNOVATION + MEASUREMENTS
+M_TRUST, M_INNOVATION = shell.MEMORY, shell.MEMORY + 1
+MEMORY = M_INNOVATION + shell.MEASUREMENTS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PaperSteps(PosteriorSteps):
+class PaperSteps(shell.PosteriorSteps):
     """Posteriors, and by step, [K]: ``trust`` is β_k, ``r_scale`` R_k / R_0 of a_y.
 
     ``residual_rate`` is the network's at the step, before β.
@@ -116,7 +77,7 @@ class PaperCarry:
 
     physics: FilterCarry
     network: NetworkCarry
-    own: ShellCarry[PaperSteps]
+    own: shell.ShellCarry[PaperSteps]
 
 
 class Parallel(NamedTuple):
@@ -135,26 +96,29 @@ def _propagate(chi, over, rate, dt, p):  # type: ignore[no-untyped-def]
     A residual counts where the model is dynamic: it knows nothing of the kinematic range.
     """
     rate_vy, rate_r = rate
-    share = dynamic_share(chi[0, VX], p) * dt
-    n = substeps(chi[0, VX], dt, over.friction, p)
+    share = dynamic_share(chi[0, shell.VX], p) * dt
+    n = substeps(chi[0, shell.VX], dt, over.friction, p)
     for i in range(chi.shape[0]):
+        ax = over.ax - chi[i, shell.AX_BIAS]
         vx, vy, r = rk4_step(
-            chi[i, VX], chi[i, VY], chi[i, YAW_RATE], over.steer, over.ax - chi[i, AX_BIAS], over.friction, dt, n, p
+            chi[i, shell.VX], chi[i, shell.VY], chi[i, shell.YAW_RATE], over.steer, ax, over.friction, dt, n, p
         )  # fmt: skip
-        chi[i, VX] = vx
-        chi[i, VY] = vy + share * rate_vy
-        chi[i, YAW_RATE] = r + share * rate_r
+        chi[i, shell.VX] = vx
+        chi[i, shell.VY] = vy + share * rate_vy
+        chi[i, shell.YAW_RATE] = r + share * rate_r
 
 
 @njit(cache=True)
 def _measure(chi, steer, friction, rate_vy, p, zeta):  # type: ignore[no-untyped-def]
     """Write what the sensors would read at sigma points chi [s, 4] to zeta [s, 3]."""
-    residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, VX], p) * rate_vy
+    residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, shell.VX], p) * rate_vy
     for i in range(chi.shape[0]):
-        ay = measured_lateral_acceleration(chi[i, VX], chi[i, VY], chi[i, YAW_RATE], steer, friction, p)
-        zeta[i, Z_AY] = ay + residual
-        zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
-        zeta[i, Z_SPEED] = chi[i, VX]
+        ay = measured_lateral_acceleration(
+            chi[i, shell.VX], chi[i, shell.VY], chi[i, shell.YAW_RATE], steer, friction, p
+        )
+        zeta[i, shell.Z_AY] = ay + residual
+        zeta[i, shell.Z_YAW_RATE] = chi[i, shell.YAW_RATE]
+        zeta[i, shell.Z_SPEED] = chi[i, shell.VX]
 
 
 @njit(cache=True)
@@ -185,56 +149,56 @@ def _filter(window, tuning, r0, p, parallel, belief, out, adapted):  # type: ign
     x, P, memory = belief
     out_x, out_P, _, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_trust, out_r_scale = adapted
-    n = STATES
-    chi, L, zeta, z_hat, S, Pxz, nu, _, _, use = make_work(n)
+    n = shell.STATES
+    chi, L, zeta, z_hat, S, Pxz, nu, _, _, use = shell.make_work(n)
     for k in range(dt.shape[0]):
         steer, friction, has_ax, ok = (
-            inputs[k, U_STEER],
-            inputs[k, U_FRICTION],
-            inputs[k, U_AX_KNOWN] > 0.0,
+            inputs[k, shell.U_STEER],
+            inputs[k, shell.U_FRICTION],
+            inputs[k, shell.U_AX_KNOWN] > 0.0,
             start_ok[k],
         )
         z_ay = ay[k] if ok else math.nan  # without steering no a_y can be predicted
         z_speed = speed[k] if rules.use_speed else math.nan
-        now = Now(dt[k], steer, inputs[k, U_AX], has_ax, friction, ok, ok, z_ay, yaw_rate[k], z_speed)
+        now = shell.Now(dt[k], steer, inputs[k, shell.U_AX], has_ax, friction, ok, ok, z_ay, yaw_rate[k], z_speed)
         out_r_scale[k] = 1.0
-        if not math.isfinite(prior[k, VX]):
-            memory[M_INITIALISED] = 0.0
-        if memory[M_INITIALISED] == 0.0:
+        if not math.isfinite(prior[k, shell.VX]):
+            memory[shell.M_INITIALISED] = 0.0
+        if memory[shell.M_INITIALISED] == 0.0:
             if ok:
-                memory[M_INITIALISED] = 1.0
+                memory[shell.M_INITIALISED] = 1.0
                 memory[M_TRUST] = NOMINAL_TRUST
                 P[:, :] = 0.0
                 for i in range(n):
                     x[i] = start_x[k, i]
                     P[i, i] = initial_std[i] ** 2
-                for i in range(MEASUREMENTS):
+                for i in range(shell.MEASUREMENTS):
                     memory[M_INNOVATION + i] = math.nan
                 out_valid[k] = True
         else:
             nominal = measured_lateral_acceleration(
-                prior[k, VX], prior[k, VY], prior[k, YAW_RATE], steer, friction, p
+                prior[k, shell.VX], prior[k, shell.VY], prior[k, shell.YAW_RATE], steer, friction, p
             )  # fmt: skip
             trust = fuzzy_trust(abs(ay[k] - nominal), abs(ay[k]) / (friction * GRAVITY_M_S2))
             if math.isfinite(trust):
                 memory[M_TRUST] = trust
             trust = memory[M_TRUST]
-            rate_vy, rate_r = trust * memory[M_RATE_VY], trust * memory[M_RATE_R]
+            rate_vy, rate_r = trust * memory[shell.M_RATE_VY], trust * memory[shell.M_RATE_R]
             draw_sigma_points(x, P, scale, L, chi)
-            over = meanwhile(now, memory)
+            over = shell.meanwhile(now, memory)
             _propagate(chi, over, (rate_vy, rate_r), dt[k], p)
             mean_and_covariance(chi, wm, wc, x, P)
-            add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust) * dt[k])  # Eq 26
-            alive = all_finite(x, P)
+            shell.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust) * dt[k])  # Eq 26
+            alive = shell.all_finite(x, P)
             out_prior[k] = x
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
                 _measure(chi, steer, friction, rate_vy, p, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                nu[Z_AY] = now.ay - z_hat[Z_AY]
-                nu[Z_YAW_RATE] = now.yaw_rate - z_hat[Z_YAW_RATE]
-                nu[Z_SPEED] = now.speed - z_hat[Z_SPEED]
-                for i in range(MEASUREMENTS):
+                nu[shell.Z_AY] = now.ay - z_hat[shell.Z_AY]
+                nu[shell.Z_YAW_RATE] = now.yaw_rate - z_hat[shell.Z_YAW_RATE]
+                nu[shell.Z_SPEED] = now.speed - z_hat[shell.Z_SPEED]
+                for i in range(shell.MEASUREMENTS):
                     use[i] = math.isfinite(nu[i])
                     r = r0[i]
                     if use[i]:
@@ -243,19 +207,19 @@ def _filter(window, tuning, r0, p, parallel, belief, out, adapted):  # type: ign
                         memory[M_INNOVATION + i] = c
                     elif math.isfinite(memory[M_INNOVATION + i]):
                         r = max(r0[i], memory[M_INNOVATION + i] - S[i, i])
-                    if i == Z_AY:
+                    if i == shell.Z_AY:
                         out_r_scale[k] = r / r0[i]
                     S[i, i] += r
                 nis, dof, out_likelihood[k] = kalman_update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k] = nis
                     out_dof[k] = dof
-                alive = all_finite(x, P)
+                alive = shell.all_finite(x, P)
             out_valid[k] = alive and ok
-            out_diverged[k] = not alive or diverges(rules, x, memory)
+            out_diverged[k] = not alive or shell.diverges(rules, x, memory)
             if not alive:
-                memory[M_INITIALISED] = 0.0
-        remember(k, now, rate, memory)
+                memory[shell.M_INITIALISED] = 0.0
+        shell.remember(k, now, rate, memory)
         out_trust[k] = memory[M_TRUST]
         out_x[k] = x
         out_P[k] = P
@@ -268,7 +232,7 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
     held_x, held_P, inputs, rate = held
     out_x, out_P, out_ay = predicted
     q_std, _, _, _, wm, wc, scale, _ = tuning
-    n = STATES
+    n = shell.STATES
     chi = np.empty((2 * n + 1, n))
     L = np.empty((n, n))
     x = np.empty(n)
@@ -281,16 +245,23 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
         if k >= 0:
             x[:] = held_x[k]
             P[:, :] = held_P[k]
-            over = Meanwhile(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+            over = shell.Meanwhile(
+                inputs[k, shell.U_STEER],
+                inputs[k, shell.U_AX],
+                inputs[k, shell.U_AX_KNOWN] > 0.0,
+                inputs[k, shell.U_FRICTION],
+            )
             rate_vy, rate_r = trust[k] * rate[k, 0], trust[k] * rate[k, 1]
             if horizon_s[m] > 0.0:
                 draw_sigma_points(x, P, scale, L, chi)
                 _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], p)
                 mean_and_covariance(chi, wm, wc, x, P)
-                add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust[k]) * horizon_s[m])
-            if all_finite(x, P):
-                ay = planar_lateral_acceleration(x[VX], x[VY], x[YAW_RATE], over.steer, over.friction, p)
-                out_ay[m] = ay + dynamic_share(x[VX], p) * rate_vy
+                shell.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust[k]) * horizon_s[m])
+            if shell.all_finite(x, P):
+                ay = planar_lateral_acceleration(
+                    x[shell.VX], x[shell.VY], x[shell.YAW_RATE], over.steer, over.friction, p
+                )
+                out_ay[m] = ay + dynamic_share(x[shell.VX], p) * rate_vy
             else:
                 x[:] = math.nan
                 P[:, :] = math.nan
@@ -336,7 +307,7 @@ class PaperHybridUkf:
         s = self.vehicle.sensors
         std = np.array([s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s])
         variance: FloatArray = std**2
-        variance[Z_AY] = max(variance[Z_AY], PAPER_R_NORM)
+        variance[shell.Z_AY] = max(variance[shell.Z_AY], PAPER_R_NORM)
         return variance
 
     @property
@@ -344,9 +315,9 @@ class PaperHybridUkf:
         return model_parameters(self.vehicle)
 
     @property
-    def _tuning(self) -> Tuning:
+    def _tuning(self) -> shell.Tuning:
         r_std = np.sqrt(self.measurement_variance)
-        return make_tuning(self.vehicle, self.q_std, r_std, INITIAL_STD, use_speed=self.use_speed)
+        return shell.make_tuning(self.vehicle, self.q_std, r_std, shell.INITIAL_STD, use_speed=self.use_speed)
 
     def run(self, signals: Signals, carry: PaperCarry | None) -> tuple[StateTrack, PaperCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
@@ -355,17 +326,17 @@ class PaperHybridUkf:
             signals,
             carry.physics if carry else None,
         )
-        starts = ~np.isfinite(physics.prior[:, VX])
+        starts = ~np.isfinite(physics.prior[:, shell.VX])
         rate, network = self.network.run(features, starts, carry.network if carry else None)
         steps, own = self._filter_steps(signals, physics, rate, carry.own if carry else None)
         if carry is not None:
             steps = carry.own.steps.joined(steps)
-        held = Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
+        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
 
-        def predict(due: Due, predicted: Predicted) -> None:
+        def predict(due: shell.Due, predicted: shell.Predicted) -> None:
             _predict_outputs(due, held, steps.trust, self._tuning, self._parameters, predicted)
 
-        track, released = released_track(self.name, signals.stamps_ns, steps, predict)
+        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict)
         track = replace(
             track,
             network_trust=np.where(track.valid, steps.trust[released.at], np.nan),
@@ -374,17 +345,22 @@ class PaperHybridUkf:
         return track, PaperCarry(after, network, replace(own, steps=steps.since(released.needed)))
 
     def _filter_steps(
-        self, signals: Signals, physics: PosteriorSteps, rate: FloatArray, carry: ShellCarry[PaperSteps] | None
-    ) -> tuple[PaperSteps, ShellCarry[PaperSteps]]:
+        self,
+        signals: Signals,
+        physics: shell.PosteriorSteps,
+        rate: FloatArray,
+        carry: shell.ShellCarry[PaperSteps] | None,
+    ) -> tuple[PaperSteps, shell.ShellCarry[PaperSteps]]:
         """Filter on measurement time; the steps, and the carry with none of them in it."""
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
-        belief, count = resume(carry, STATES, MEMORY), len(signals)
+        belief, count = shell.resume(carry, shell.STATES, MEMORY), len(signals)
         parallel = Parallel(physics.x, physics.prior, physics.inputs, physics.valid)
-        out, adapted = no_posterior(count, STATES)._replace(inputs=physics.inputs), (np.empty(count), np.empty(count))
-        _filter(
-            make_window(signals, carry, rate), self._tuning, self.measurement_variance, self._parameters, parallel,
-            belief, out, adapted,
-        )  # fmt: skip
+        out, adapted = (
+            shell.no_posterior(count, shell.STATES)._replace(inputs=physics.inputs),
+            (np.empty(count), np.empty(count)),
+        )
+        window, r0 = shell.make_window(signals, carry, rate), self.measurement_variance
+        _filter(window, self._tuning, r0, self._parameters, parallel, belief, out, adapted)
         steps = PaperSteps(signals.stamps_ns, signals.ready_ns, *out, rate, *adapted)
-        return steps, carry_on(belief, steps, carry, slip)
+        return steps, shell.carry_on(belief, steps, carry, slip)

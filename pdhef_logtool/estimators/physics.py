@@ -39,53 +39,7 @@ from pdhef_logtool.car.nominal_points import (
     work_size,
 )
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.filter_shell import (
-    AX_BIAS,
-    GATE_INFLATION,
-    INITIAL_STD,
-    M_INITIALISED,
-    M_RATE_R,
-    M_RATE_VY,
-    M_STILL,
-    MEASUREMENTS,
-    STATES,
-    U_AX,
-    U_AX_KNOWN,
-    U_FRICTION,
-    U_STEER,
-    VX,
-    VY,
-    YAW_RATE,
-    Z_AY,
-    Z_SPEED,
-    Z_YAW_RATE,
-    Due,
-    Held,
-    Meanwhile,
-    PosteriorSteps,
-    Predicted,
-    Sample,
-    ShellCarry,
-    Tuning,
-    add_process_noise,
-    all_finite,
-    begin_step,
-    carry_on,
-    diverges,
-    finish_step,
-    gate,
-    innovate,
-    make_tuning,
-    make_window,
-    make_work,
-    meanwhile,
-    no_posterior,
-    open_gate,
-    released_track,
-    resume,
-    settle,
-    starts,
-)
+from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -113,7 +67,7 @@ FORCE_SCALE_TIME_S = 2.0
 LINK_NONE, LINK_WHOLE, LINK_BIASES = 0, 1, 2
 
 #: What this filter takes from window to window.
-FilterCarry: TypeAlias = ShellCarry[PosteriorSteps]
+FilterCarry: TypeAlias = shell.ShellCarry[shell.PosteriorSteps]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,9 +116,9 @@ def _propagate(chi, over, rate, dt, layout, p, points):  # type: ignore[no-untyp
     for i in range(chi.shape[0]):
         at = place(i)
         half = share * points[at + AT_FORCE]
-        chi[i, VX] = points[at + AT_VX]
-        chi[i, VY] = points[at + AT_VY] + half * rate_vy
-        chi[i, YAW_RATE] = points[at + AT_YAW_RATE] + half * rate_r
+        chi[i, shell.VX] = points[at + AT_VX]
+        chi[i, shell.VY] = points[at + AT_VY] + half * rate_vy
+        chi[i, shell.YAW_RATE] = points[at + AT_YAW_RATE] + half * rate_r
         if layout.force_scale >= 0:
             chi[i, layout.force_scale] *= keep
 
@@ -181,11 +135,11 @@ def _set_points(chi, steer, ax, more, layout, points):  # type: ignore[no-untype
         i = column if column < s else 0
         force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + chi[i, layout.force_scale])
         at = place(column)
-        points[at + AT_VX] = chi[i, VX]
-        points[at + AT_VY] = chi[i, VY] + more_vy * force
-        points[at + AT_YAW_RATE] = chi[i, YAW_RATE] + more_r * force
+        points[at + AT_VX] = chi[i, shell.VX]
+        points[at + AT_VY] = chi[i, shell.VY] + more_vy * force
+        points[at + AT_YAW_RATE] = chi[i, shell.YAW_RATE] + more_r * force
         points[at + AT_STEER] = steer if layout.bias < 0 else steer - chi[i, layout.bias + 2]
-        points[at + AT_AX] = ax - chi[i, AX_BIAS]
+        points[at + AT_AX] = ax - chi[i, shell.AX_BIAS]
         points[at + AT_FORCE] = force
 
 
@@ -197,18 +151,18 @@ def _measure(chi, steer, friction, rate_vy, layout, p, points, zeta):  # type: i
     measure_points(points, friction, p)
     for i in range(chi.shape[0]):
         at = place(i)
-        zeta[i, Z_AY] = points[at + AT_AY] + points[at + AT_FORCE] * residual
-        zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
-        zeta[i, Z_SPEED] = chi[i, VX]
+        zeta[i, shell.Z_AY] = points[at + AT_AY] + points[at + AT_FORCE] * residual
+        zeta[i, shell.Z_YAW_RATE] = chi[i, shell.YAW_RATE]
+        zeta[i, shell.Z_SPEED] = chi[i, shell.VX]
         if layout.bias >= 0:
-            zeta[i, Z_AY] += chi[i, layout.bias]
-            zeta[i, Z_YAW_RATE] += chi[i, layout.bias + 1]
+            zeta[i, shell.Z_AY] += chi[i, layout.bias]
+            zeta[i, shell.Z_YAW_RATE] += chi[i, layout.bias + 1]
 
 
 @njit(cache=True)
 def _add_process_noise(P, q_std, ax_known, dt, layout):  # type: ignore[no-untyped-def]
     """Add what a step of ``dt`` s makes uncertain: random walks, and the force scale that returns to 0."""
-    add_process_noise(P, q_std, ax_known, dt)
+    shell.add_process_noise(P, q_std, ax_known, dt)
     if layout.force_scale >= 0:
         forgotten = 1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S)
         P[layout.force_scale, layout.force_scale] += FORCE_SCALE_STD**2 * forgotten
@@ -239,26 +193,26 @@ def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-u
     out_link, out_predicted_P, out_cross = links
     linked = out_link.shape[0] > 0
     n = x.shape[0]
-    chi, L, zeta, z_hat, S, Pxz, nu, at_gate, given, use = make_work(n)
+    chi, L, zeta, z_hat, S, Pxz, nu, at_gate, given, use = shell.make_work(n)
     chi_before = np.empty((2 * n + 1, n))
     points = np.empty(work_size(2 * n + 1))
     for k in range(dt.shape[0]):
-        sample = Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
-        now = begin_step(sample, rules, memory)
-        if memory[M_INITIALISED] == 0.0:
-            out_valid[k] = starts(now, p.rear_m, initial_std, x, P, memory)
+        sample = shell.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
+        now = shell.begin_step(sample, rules, memory)
+        if memory[shell.M_INITIALISED] == 0.0:
+            out_valid[k] = shell.starts(now, p.rear_m, initial_std, x, P, memory)
         else:
-            rate_vy, rate_r = memory[M_RATE_VY], memory[M_RATE_R]
+            rate_vy, rate_r = memory[shell.M_RATE_VY], memory[shell.M_RATE_R]
             draw_sigma_points(x, P, scale, L, chi)
             if linked:
                 chi_before[:, :] = chi
-            over = meanwhile(now, memory)
+            over = shell.meanwhile(now, memory)
             _propagate(chi, over, (rate_vy, rate_r), now.dt, layout, p, points)
             mean_and_covariance(chi, wm, wc, x, P)
             if linked:
                 _cross_covariance(chi_before, chi, x, wc, out_cross[k])
             _add_process_noise(P, q_std, over.ax_known, now.dt, layout)
-            alive = all_finite(x, P)
+            alive = shell.all_finite(x, P)
             if linked:
                 out_predicted_P[k] = P
             for i in range(n):
@@ -267,9 +221,9 @@ def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-u
                 draw_sigma_points(x, P, scale, L, chi)
                 _measure(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                verdict = gate(now, memory, nu, S, at_gate, given, use)
-                for i in range(MEASUREMENTS):
+                shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                verdict = shell.gate(now, memory, nu, S, at_gate, given, use)
+                for i in range(shell.MEASUREMENTS):
                     if given[i]:
                         out_nu[k, i] = nu[i]
                 if verdict.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
@@ -277,29 +231,29 @@ def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-u
                 if verdict.opens:
                     for i in range(n):
                         for j in range(n):
-                            P[i, j] *= GATE_INFLATION
+                            P[i, j] *= shell.GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
                     draw_sigma_points(x, P, scale, L, chi)
                     _measure(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                    innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                    open_gate(use, memory)
+                    shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                    shell.open_gate(use, memory)
                 nis, dof, likelihood = kalman_update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k] = nis
                     out_dof[k] = dof
                     if not verdict.outside:
                         out_likelihood[k] = likelihood
-                settle(now, verdict, rules, standstill_std, x, P, memory)
-                alive = all_finite(x, P)
+                shell.settle(now, verdict, rules, standstill_std, x, P, memory)
+                alive = shell.all_finite(x, P)
             out_valid[k] = alive and now.steer_ok
-            out_diverged[k] = not alive or diverges(rules, x, memory)
+            out_diverged[k] = not alive or shell.diverges(rules, x, memory)
             if not alive:
-                memory[M_INITIALISED] = 0.0
+                memory[shell.M_INITIALISED] = 0.0
             elif linked:
-                out_link[k] = LINK_BIASES if memory[M_STILL] >= rules.still_after_s else LINK_WHOLE
-        finish_step(k, now, residual_rate, rules, memory, out_inputs)
+                out_link[k] = LINK_BIASES if memory[shell.M_STILL] >= rules.still_after_s else LINK_WHOLE
+        shell.finish_step(k, now, residual_rate, rules, memory, out_inputs)
         for i in range(n):
             out_x[k, i] = x[i]
             for j in range(n):
@@ -329,21 +283,26 @@ def _predict_outputs(due, held, tuning, layout, p, predicted):  # type: ignore[n
         x[:] = held_x[k]
         P[:, :] = held_P[k]
         rate_vy, rate_r = residual_rate[k, 0], residual_rate[k, 1]
-        over = Meanwhile(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+        over = shell.Meanwhile(
+            inputs[k, shell.U_STEER],
+            inputs[k, shell.U_AX],
+            inputs[k, shell.U_AX_KNOWN] > 0.0,
+            inputs[k, shell.U_FRICTION],
+        )
         if horizon_s[m] > 0.0:
             draw_sigma_points(x, P, scale, L, chi)
             _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], layout, p, points)
             mean_and_covariance(chi, wm, wc, x, P)
             _add_process_noise(P, q_std, over.ax_known, horizon_s[m], layout)
-            if not all_finite(x, P):
+            if not shell.all_finite(x, P):
                 x[:] = math.nan
                 P[:, :] = math.nan
         out_x[m] = x
         out_P[m] = P
         angle = over.steer if layout.bias < 0 else over.steer - x[layout.bias + 2]
         force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + x[layout.force_scale])
-        ay = planar_lateral_acceleration(x[VX], x[VY], x[YAW_RATE], angle, over.friction, p, force)
-        out_ay[m] = ay + force * dynamic_share(x[VX], p) * rate_vy
+        ay = planar_lateral_acceleration(x[shell.VX], x[shell.VY], x[shell.YAW_RATE], angle, over.friction, p, force)
+        out_ay[m] = ay + force * dynamic_share(x[shell.VX], p) * rate_vy
 
 
 @dataclass(frozen=True, slots=True)
@@ -391,19 +350,19 @@ class PhysicsUkf:
     @property
     def layout(self) -> StateLayout:
         """Where the optional states stand."""
-        after = STATES + (BIAS_STATES if self.bias_states else 0)
-        return StateLayout(STATES if self.bias_states else -1, after if self.force_scale else -1)
+        after = shell.STATES + (BIAS_STATES if self.bias_states else 0)
+        return StateLayout(shell.STATES if self.bias_states else -1, after if self.force_scale else -1)
 
     @property
-    def _tuning(self) -> Tuning:
+    def _tuning(self) -> shell.Tuning:
         s = self.vehicle.sensors
-        initial, walk = [*INITIAL_STD], [*self.q_std]
+        initial, walk = [*shell.INITIAL_STD], [*self.q_std]
         if self.bias_states:
             initial += [s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s, s.steer_bias_std_rad]
             walk += BIAS_WALK_STD
         if self.force_scale:
             initial += [FORCE_SCALE_STD]
-        return make_tuning(
+        return shell.make_tuning(
             self.vehicle,
             walk,
             self.measurement_std,
@@ -418,7 +377,7 @@ class PhysicsUkf:
         carry: FilterCarry | None,
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
-    ) -> tuple[PosteriorSteps, FilterCarry]:
+    ) -> tuple[shell.PosteriorSteps, FilterCarry]:
         """Run the filter on measurement time only; the steps and the carry with no pending steps in it.
 
         ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
@@ -433,7 +392,7 @@ class PhysicsUkf:
         carry: FilterCarry | None,
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
-    ) -> tuple[PosteriorSteps, FilterCarry, StepLinks]:
+    ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
         """Return what :meth:`filter_steps` does, bit for bit, and what ties the steps together."""
         return self._steps(signals, carry, residual_rate, extra_r, linked=True)
 
@@ -445,17 +404,17 @@ class PhysicsUkf:
         extra_r: FloatArray | None,
         *,
         linked: bool,
-    ) -> tuple[PosteriorSteps, FilterCarry, StepLinks]:
+    ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
-        window, tuning = make_window(signals, carry, residual_rate, extra_r), self._tuning
+        window, tuning = shell.make_window(signals, carry, residual_rate, extra_r), self._tuning
         count, n = len(signals), len(tuning.initial_std)
-        belief, out = resume(carry, n), no_posterior(count, n)
+        belief, out = shell.resume(carry, n), shell.no_posterior(count, n)
         tied = count if linked else 0
         links = LinkColumns(np.full(tied, LINK_NONE), np.zeros((tied, n, n)), np.zeros((tied, n, n)))
         _filter(window, tuning, self.layout, self._parameters, belief, out, links)
-        steps = PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
-        return steps, carry_on(belief, steps, carry, slip), StepLinks(*links)
+        steps = shell.PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
+        return steps, shell.carry_on(belief, steps, carry, slip), StepLinks(*links)
 
     def run(
         self,
@@ -469,17 +428,17 @@ class PhysicsUkf:
         return self.outputs(signals, carry, steps, after)
 
     def outputs(
-        self, signals: Signals, carry: FilterCarry | None, steps: PosteriorSteps, after: FilterCarry
+        self, signals: Signals, carry: FilterCarry | None, steps: shell.PosteriorSteps, after: FilterCarry
     ) -> tuple[StateTrack, FilterCarry]:
         """Predict to the window's stamps what :meth:`filter_steps` returned for it; the carry keeps waiting steps."""
         if carry is not None:
             steps = carry.steps.joined(steps)
-        held = Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
+        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
 
-        def predict(due: Due, predicted: Predicted) -> None:
+        def predict(due: shell.Due, predicted: shell.Predicted) -> None:
             _predict_outputs(due, held, self._tuning, self.layout, self._parameters, predicted)
 
-        track, released = released_track(self.name, signals.stamps_ns, steps, predict)
+        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict)
         return track, replace(after, steps=steps.since(released.needed))
 
 

@@ -17,49 +17,7 @@ from numba import njit
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.filter_shell import (
-    AX_BIAS,
-    GATE_INFLATION,
-    M_INITIALISED,
-    MEASUREMENTS,
-    STANDSTILL_STD,
-    U_AX,
-    U_AX_KNOWN,
-    U_FRICTION,
-    U_STEER,
-    VX,
-    VY,
-    YAW_RATE,
-    Z_AY,
-    Z_SPEED,
-    Z_YAW_RATE,
-    Due,
-    Held,
-    Meanwhile,
-    PosteriorSteps,
-    Predicted,
-    Sample,
-    Tuning,
-    add_process_noise,
-    all_finite,
-    begin_step,
-    carry_on,
-    diverges,
-    finish_step,
-    gate,
-    innovate,
-    make_tuning,
-    make_window,
-    make_work,
-    meanwhile,
-    no_posterior,
-    open_gate,
-    released_track,
-    resume,
-    settle,
-    starts,
-)
-from pdhef_logtool.estimators.filter_shell import INITIAL_STD as PHYSICS_INITIAL_STD
+from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators.lagged_forces import (
     ForceParameters,
     force_parameters,
@@ -83,7 +41,7 @@ from pdhef_logtool.watches.speed_slip import believable
 NAME = "physics-plus"
 
 #: Forces over the mass, m/s²; the entries before them are those of ``phy-ukf``.
-FRONT_FORCE, REAR_FORCE = AX_BIAS + 1, AX_BIAS + 2
+FRONT_FORCE, REAR_FORCE = shell.AX_BIAS + 1, shell.AX_BIAS + 2
 STATES = REAR_FORCE + 1
 #: Where the biases stand if there are any; those that only the sensors feel are last.
 STEER_BIAS, AY_BIAS, YAW_RATE_BIAS = STATES, STATES + 1, STATES + 2
@@ -94,7 +52,7 @@ _WALK_STD = (BIAS_WALK_STD[2], BIAS_WALK_STD[0], BIAS_WALK_STD[1])
 #: no ``[filter.physics-plus]``. By innovation likelihood over simulated drives, as that of ``phy-ukf``
 #: (``benchmarks/tune_physics_plus_q.py``, its result beside it).
 PHYSICS_PLUS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
-INITIAL_STD = (*PHYSICS_INITIAL_STD, 0.5, 0.5)
+INITIAL_STD = (*shell.INITIAL_STD, 0.5, 0.5)
 #: 1-sigma of an axle's force over the mass at a standstill, m/s².
 STANDSTILL_FORCE_STD = 0.05
 
@@ -106,7 +64,7 @@ def _propagate(chi, over, dt, p, f):  # type: ignore[no-untyped-def]
     Points that differ from the centre in the sensors' biases alone (the last columns of a lower Cholesky factor) move
     with it.
     """
-    n = lagged_substeps(chi[0, VX], dt, over.friction, p, f)
+    n = lagged_substeps(chi[0, shell.VX], dt, over.friction, p, f)
     size = chi.shape[1]
     biased = size > STATES
     for i in range(chi.shape[0]):
@@ -115,12 +73,12 @@ def _propagate(chi, over, dt, p, f):  # type: ignore[no-untyped-def]
             continue
         angle = over.steer - chi[i, STEER_BIAS] if biased else over.steer
         vx, vy, r, ff, fr = lagged_rk4_step(
-            chi[i, VX], chi[i, VY], chi[i, YAW_RATE], chi[i, FRONT_FORCE], chi[i, REAR_FORCE], angle,
-            over.ax - chi[i, AX_BIAS], over.friction, dt, n, p, f,
+            chi[i, shell.VX], chi[i, shell.VY], chi[i, shell.YAW_RATE], chi[i, FRONT_FORCE], chi[i, REAR_FORCE], angle,
+            over.ax - chi[i, shell.AX_BIAS], over.friction, dt, n, p, f,
         )  # fmt: skip
-        chi[i, VX] = vx
-        chi[i, VY] = vy
-        chi[i, YAW_RATE] = r
+        chi[i, shell.VX] = vx
+        chi[i, shell.VY] = vy
+        chi[i, shell.YAW_RATE] = r
         chi[i, FRONT_FORCE] = ff
         chi[i, REAR_FORCE] = fr
 
@@ -130,7 +88,7 @@ def _axle_forces(x, angle, friction, p, f):  # type: ignore[no-untyped-def]
     """Return the axles' forces over the mass in state x [n]: its own, or the tyres' at once where nothing lags."""
     if f.relaxation_length_m > 0.0:
         return x[FRONT_FORCE], x[REAR_FORCE]
-    return settled_forces(x[VX], x[VY], x[YAW_RATE], angle, friction, p, f)
+    return settled_forces(x[shell.VX], x[shell.VY], x[shell.YAW_RATE], angle, friction, p, f)
 
 
 @njit(cache=True)
@@ -140,12 +98,12 @@ def _measure(chi, steer, friction, p, f, zeta):  # type: ignore[no-untyped-def]
     for i in range(chi.shape[0]):
         angle = steer - chi[i, STEER_BIAS] if biased else steer
         front, rear = _axle_forces(chi[i], angle, friction, p, f)
-        zeta[i, Z_AY] = lagged_measured_ay(chi[i, VX], chi[i, YAW_RATE], front, rear, angle, p)
-        zeta[i, Z_YAW_RATE] = chi[i, YAW_RATE]
-        zeta[i, Z_SPEED] = chi[i, VX]
+        zeta[i, shell.Z_AY] = lagged_measured_ay(chi[i, shell.VX], chi[i, shell.YAW_RATE], front, rear, angle, p)
+        zeta[i, shell.Z_YAW_RATE] = chi[i, shell.YAW_RATE]
+        zeta[i, shell.Z_SPEED] = chi[i, shell.VX]
         if biased:
-            zeta[i, Z_AY] += chi[i, AY_BIAS]
-            zeta[i, Z_YAW_RATE] += chi[i, YAW_RATE_BIAS]
+            zeta[i, shell.Z_AY] += chi[i, AY_BIAS]
+            zeta[i, shell.Z_YAW_RATE] += chi[i, YAW_RATE_BIAS]
 
 
 @njit(cache=True)
@@ -156,53 +114,55 @@ def _filter(window, tuning, p, f, belief, out):  # type: ignore[no-untyped-def]
     x, P, memory = belief
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     n = x.shape[0]
-    chi, L, zeta, z_hat, S, Pxz, nu, at_gate, given, use = make_work(n)
+    chi, L, zeta, z_hat, S, Pxz, nu, at_gate, given, use = shell.make_work(n)
     for k in range(dt.shape[0]):
-        sample = Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
-        now = begin_step(sample, rules, memory)
-        if memory[M_INITIALISED] == 0.0:
-            out_valid[k] = starts(now, p.rear_m, initial_std, x, P, memory)
+        sample = shell.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
+        now = shell.begin_step(sample, rules, memory)
+        if memory[shell.M_INITIALISED] == 0.0:
+            out_valid[k] = shell.starts(now, p.rear_m, initial_std, x, P, memory)
             if out_valid[k]:  # the forces are the tyres' steady ones
-                x[FRONT_FORCE], x[REAR_FORCE] = settled_forces(x[VX], x[VY], x[YAW_RATE], now.steer, now.friction, p, f)
+                x[FRONT_FORCE], x[REAR_FORCE] = settled_forces(
+                    x[shell.VX], x[shell.VY], x[shell.YAW_RATE], now.steer, now.friction, p, f
+                )
         else:
-            over = meanwhile(now, memory)
+            over = shell.meanwhile(now, memory)
             draw_sigma_points(x, P, scale, L, chi)
             _propagate(chi, over, now.dt, p, f)
             mean_and_covariance(chi, wm, wc, x, P)
-            add_process_noise(P, q_std, over.ax_known, now.dt)
-            alive = all_finite(x, P)
+            shell.add_process_noise(P, q_std, over.ax_known, now.dt)
+            alive = shell.all_finite(x, P)
             out_prior[k] = x
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
                 _measure(chi, now.steer, now.friction, p, f, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                verdict = gate(now, memory, nu, S, at_gate, given, use)
-                for i in range(MEASUREMENTS):
+                shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                verdict = shell.gate(now, memory, nu, S, at_gate, given, use)
+                for i in range(shell.MEASUREMENTS):
                     if given[i]:
                         out_nu[k, i] = nu[i]
                 if verdict.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
                     _, _, out_likelihood[k] = kalman_update(x.copy(), P.copy(), at_gate, S, Pxz, given)
                 if verdict.opens:
-                    P *= GATE_INFLATION
+                    P *= shell.GATE_INFLATION
                     draw_sigma_points(x, P, scale, L, chi)
                     _measure(chi, now.steer, now.friction, p, f, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
-                    innovate(k, now, r_std, extra_r, z_hat, S, nu)
-                    open_gate(use, memory)
+                    shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
+                    shell.open_gate(use, memory)
                 nis, dof, likelihood = kalman_update(x, P, nu, S, Pxz, use)
                 if dof > 0:
                     out_nis[k] = nis
                     out_dof[k] = dof
                     if not verdict.outside:
                         out_likelihood[k] = likelihood
-                settle(now, verdict, rules, standstill_std, x, P, memory)
-                alive = all_finite(x, P)
+                shell.settle(now, verdict, rules, standstill_std, x, P, memory)
+                alive = shell.all_finite(x, P)
             out_valid[k] = alive and now.steer_ok
-            out_diverged[k] = not alive or diverges(rules, x, memory)
+            out_diverged[k] = not alive or shell.diverges(rules, x, memory)
             if not alive:
-                memory[M_INITIALISED] = 0.0
-        finish_step(k, now, residual_rate, rules, memory, out_inputs)
+                memory[shell.M_INITIALISED] = 0.0
+        shell.finish_step(k, now, residual_rate, rules, memory, out_inputs)
         out_x[k] = x
         out_P[k] = P
 
@@ -228,20 +188,25 @@ def _predict_outputs(due, held, tuning, p, f, predicted):  # type: ignore[no-unt
             continue
         x[:] = held_x[k]
         P[:, :] = held_P[k]
-        over = Meanwhile(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+        over = shell.Meanwhile(
+            inputs[k, shell.U_STEER],
+            inputs[k, shell.U_AX],
+            inputs[k, shell.U_AX_KNOWN] > 0.0,
+            inputs[k, shell.U_FRICTION],
+        )
         if horizon_s[m] > 0.0:
             draw_sigma_points(x, P, scale, L, chi)
             _propagate(chi, over, horizon_s[m], p, f)
             mean_and_covariance(chi, wm, wc, x, P)
-            add_process_noise(P, q_std, over.ax_known, horizon_s[m])
-            if not all_finite(x, P):
+            shell.add_process_noise(P, q_std, over.ax_known, horizon_s[m])
+            if not shell.all_finite(x, P):
                 x[:] = math.nan
                 P[:, :] = math.nan
         out_x[m] = x
         out_P[m] = P
         angle = over.steer - x[STEER_BIAS] if n > STATES else over.steer
         front, rear = _axle_forces(x, angle, over.friction, p, f)
-        out_ay[m] = lagged_planar_ay(x[VX], x[YAW_RATE], front, rear, angle, p)
+        out_ay[m] = lagged_planar_ay(x[shell.VX], x[shell.YAW_RATE], front, rear, angle, p)
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,40 +251,43 @@ class PhysicsPlusUkf:
         return model_parameters(self.vehicle, roll_correction=self.roll_correction), force_parameters(self.vehicle)
 
     @property
-    def _tuning(self) -> Tuning:
+    def _tuning(self) -> shell.Tuning:
         s = self.vehicle.sensors
         biases = (s.steer_bias_std_rad, s.ay_bias_std_m_s2, s.yaw_rate_bias_std_rad_s)
-        return make_tuning(
+        return shell.make_tuning(
             self.vehicle,
             (*self.q_std, *(_WALK_STD if self.bias_states else ())),
             self.measurement_std,
             (*INITIAL_STD, *(biases if self.bias_states else ())),
-            (*STANDSTILL_STD, STANDSTILL_FORCE_STD, STANDSTILL_FORCE_STD),
+            (*shell.STANDSTILL_STD, STANDSTILL_FORCE_STD, STANDSTILL_FORCE_STD),
             use_speed=self.use_speed,
             standstill=self.standstill,
         )
 
-    def filter_steps(self, signals: Signals, carry: FilterCarry | None) -> tuple[PosteriorSteps, FilterCarry]:
+    def filter_steps(self, signals: Signals, carry: FilterCarry | None) -> tuple[shell.PosteriorSteps, FilterCarry]:
         """Run the filter on measurement time only; the steps and the carry with no pending steps in it."""
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
-        window, tuning = make_window(signals, carry), self._tuning
-        belief, out = resume(carry, len(tuning.initial_std)), no_posterior(len(signals), len(tuning.initial_std))
+        window, tuning = shell.make_window(signals, carry), self._tuning
+        belief, out = (
+            shell.resume(carry, len(tuning.initial_std)),
+            shell.no_posterior(len(signals), len(tuning.initial_std)),
+        )
         _filter(window, tuning, *self._parameters, belief, out)
-        steps = PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
-        return steps, carry_on(belief, steps, carry, slip)
+        steps = shell.PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
+        return steps, shell.carry_on(belief, steps, carry, slip)
 
     def run(self, signals: Signals, carry: FilterCarry | None) -> tuple[StateTrack, FilterCarry]:
         """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
         steps, after = self.filter_steps(signals, carry)
         if carry is not None:
             steps = carry.steps.joined(steps)
-        held = Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
+        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
 
-        def predict(due: Due, predicted: Predicted) -> None:
+        def predict(due: shell.Due, predicted: shell.Predicted) -> None:
             _predict_outputs(due, held, self._tuning, *self._parameters, predicted)
 
-        track, released = released_track(self.name, signals.stamps_ns, steps, predict)
+        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict)
         return track, replace(after, steps=steps.since(released.needed))
 
 

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -70,31 +69,6 @@ class DivergenceCarry:
     waiting: FlagSteps
 
 
-class Motion(NamedTuple):
-    """What the watch compares at each step, [K]: sensors, friction, and the estimate with where it is valid."""
-
-    dt_s: FloatArray
-    ay: FloatArray
-    gyro: FloatArray
-    friction: FloatArray
-    vx: FloatArray
-    vy: FloatArray
-    yaw_rate: FloatArray
-    valid: BoolArray
-
-
-class Car(NamedTuple):
-    """What the watch must know of a car and its sensors; ``tilt`` is what the accelerometer reads over a_y."""
-
-    default_friction: float
-    tilt: float
-    ay_std: float
-    gyro_std: float
-    imu_x: float
-    imu_y: float
-    least_speed: float
-
-
 @dataclass(slots=True)
 class DivergenceWatch:
     """Watches the tracks of a drive window by window, each by its name.
@@ -131,12 +105,12 @@ def wrong_branch(
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     steps = FlagSteps(signals.ready_ns, np.empty(count, dtype=np.bool_))
     dt_s = step_durations_s(signals.stamps_ns, before_ns)
-    motion = Motion(
+    motion = (
         dt_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
         track.valid,
     )  # fmt: skip
     sensors = vehicle.sensors
-    car = Car(
+    car = (
         vehicle.assumed_friction, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2, sensors.ay_std_m_s2,
         sensors.yaw_rate_std_rad_s, *vehicle.imu_position_m[:2], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
     )  # fmt: skip

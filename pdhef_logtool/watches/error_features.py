@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -75,18 +74,6 @@ class FeatureCarry:
     waiting: TermSteps
 
 
-class Motion(NamedTuple):
-    """What the terms are made of, by step, [K]: believed sensors, friction and the estimate."""
-
-    dt_s: FloatArray
-    ay: FloatArray
-    rate: FloatArray
-    friction: FloatArray
-    vx: FloatArray
-    vy: FloatArray
-    yaw_rate: FloatArray
-
-
 def error_terms(
     track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float, carry: FeatureCarry | None
 ) -> tuple[FloatArray, FeatureCarry]:
@@ -106,7 +93,7 @@ def error_terms(
     memory = np.zeros(MEMORY_SIZE) if carry is None else carry.memory.copy()
     steps = TermSteps(signals.ready_ns, np.empty((count, STEP_SIZE)))
     dt_s = step_durations_s(signals.stamps_ns, before_ns)
-    motion = Motion(
+    motion = (
         dt_s, *believed(track, signals), friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
     )  # fmt: skip
     _advance(motion, 1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2, memory, steps.terms)

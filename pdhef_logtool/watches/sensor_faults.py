@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -133,27 +133,6 @@ class SensorFaults:
     reason: IntArray
     filtered: Signals
     network: Signals
-
-
-class Window(NamedTuple):
-    """What the sensors say at the steps of a window, [K]."""
-
-    dt_s: FloatArray
-    steer: FloatArray
-    ay: FloatArray
-    yaw_rate: FloatArray
-    speed: FloatArray
-    friction: FloatArray
-
-
-class Found(NamedTuple):
-    """What the detector writes by step: as :class:`SensorFaults`, and the samples that are left, [K, 2]."""
-
-    extra_r: FloatArray
-    noise_std: FloatArray
-    usual_std: FloatArray
-    reason: IntArray
-    usable: FloatArray
 
 
 @njit(cache=True)
@@ -420,15 +399,22 @@ def find_faults(
     if carry is None:
         witness[W_SPEED_AGE] = np.inf
     before_ns = carry.last_stamp_ns if carry else None
-    window = Window(
+    window = (
         step_durations_s(signals.stamps_ns, before_ns), signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s,
         signals.speed_m_s, signals.friction,
     )  # fmt: skip
     extra, noise, usual, usable = (np.empty((count, 2)) for _ in range(4))
-    found = Found(extra, noise, usual, np.empty(count, dtype=np.int64), usable)
+    reason = np.empty(count, dtype=np.int64)
     s0 = np.array([vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s])
-    _detect(window, vehicle.assumed_friction, s0, model_parameters(vehicle), channels, witness, found)
-    reason = found.reason
+    _detect(
+        window,
+        vehicle.assumed_friction,
+        s0,
+        model_parameters(vehicle),
+        channels,
+        witness,
+        (extra, noise, usual, reason, usable),
+    )
     last = last_stamp_ns(signals.stamps_ns, before_ns)
     filtered: dict[str, Any] = {"ay_m_s2": usable[:, AY].copy(), "yaw_rate_rad_s": usable[:, YAW_RATE].copy()}
     seen: dict[str, Any] = {

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -80,16 +79,6 @@ class SlipCarry:
 
     memory: FloatArray
     last_stamp_ns: int | None
-
-
-class Window(NamedTuple):
-    """What the sensors say at the steps of a window, [K], and the wheel speeds [K, 4]."""
-
-    dt_s: FloatArray
-    ax: FloatArray
-    yaw_rate: FloatArray
-    speed: FloatArray
-    wheels: FloatArray
 
 
 @njit(cache=True)
@@ -288,7 +277,7 @@ def _run(
     memory = np.zeros(_MEMORY) if carry is None else carry.memory.copy()
     believed, reckoned = np.empty(count), np.empty(count)
     dt_s = step_durations_s(signals.stamps_ns, before_ns)
-    window = Window(dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
+    window = (dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
     bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * speed_std_m_s)
     changed = _gate(window, bound, memory, believed, reckoned)
     last = last_stamp_ns(signals.stamps_ns, before_ns)
