@@ -6,7 +6,6 @@ settings, and the sources of what computes. A row whose key is as it was is not 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sys
@@ -14,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -40,25 +39,8 @@ from truthsim.vehicle_choice import choose_vehicle
 FORMAT = 1
 COLUMNS = ("row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 _KEY, _NOTES = b"key", b"notes"
-#: What decides the figures, beside the drives: sources by folder or file.
-_SOURCES = (
-    "pdhef_logtool/estimators",
-    "pdhef_logtool/residual_model",
-    "pdhef_logtool/evaluation",
-    "pdhef_logtool/mapping",
-    "pdhef_logtool/drive",
-    "pdhef_logtool/car",
-    "pdhef_logtool/watches",
-    "pdhef_logtool/records",
-    "studies/condition_drives.py",
-    "studies/condition_runs.py",
-    "studies/fixed_grid.py",
-    "studies/independent_sim_logs.py",
-    "studies/table_maths.py",
-)
-_BUDGET_SOURCES = ("truthsim", "studies/error_budget.py", "studies/defaults/fit_nominal_tyres.py")
-
-Say = Callable[[str], None]
+#: What decides the figures, beside the drives: all sources of these folders.
+_SOURCES = ("pdhef_logtool", "truthsim", "studies")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,34 +101,26 @@ _Done = tuple[Task, list[tuple[Any, ...]], list[str]]
 
 
 @cache
-def source_digest(*places: str) -> str:
-    """Return the hash of the Python sources under folders or files of the repository."""
-    digest = hashlib.sha256()
-    for place in places:
-        path = ROOT / place
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-            digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+def source_digest() -> str:
+    """Return the hash of the sources that decide the figures."""
+    files = sorted(file for place in _SOURCES for file in (ROOT / place).rglob("*.py"))
+    return digest([[f.relative_to(ROOT).as_posix(), f.read_text(encoding="utf-8")] for f in files])
 
 
 def row_key(setup: Setup, tasks: Sequence[Task]) -> str:
     """Return the hash of all that the row's figures depend on."""
-    kind = tasks[0].kind
     document = {
         "format": FORMAT,
-        "kind": kind,
+        "kind": tasks[0].kind,
         "setup": setup.identity,
         "assume": tasks[0].assume,
         "drives": [[t.log.name, t.sha256, t.friction] for t in tasks],
-        "grid": [asdict(s) for s in fixed_grid.GRID],
-        "sources": source_digest(*_SOURCES, *(_BUDGET_SOURCES if kind == "budget" else ())),
+        "sources": source_digest(),
     }
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    return digest(document)
 
 
-def run_rows(
-    setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: int, title: str, say: Say
-) -> dict[str, RowResult]:
+def run_rows(setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: int, title: str) -> dict[str, RowResult]:
     """Run the tasks of every row, keep what is there already, write each row's Parquet as soon as it is whole."""
     folder.mkdir(parents=True, exist_ok=True)
     done: dict[str, RowResult] = {}
@@ -160,7 +134,7 @@ def run_rows(
         else:
             done[name] = kept
     if done:
-        say(f"{title}: {len(done)} rows kept")
+        progress(f"{title}: {len(done)} rows kept")
     open_rows: dict[str, list[_Done]] = {}
     began = time.monotonic()
     with _workers(setup, jobs) as work:
@@ -169,12 +143,12 @@ def run_rows(
             so_far = open_rows.setdefault(task.row, [])
             so_far.append(done_now)
             left = (time.monotonic() - began) / count * (len(todo) - count)
-            say(f"\r{title}: {count} of {len(todo)} drives, {left:.0f} s left   ")
+            progress(f"\r{title}: {count} of {len(todo)} drives, {left:.0f} s left   ")
             if len(so_far) == len(rows[task.row]):
                 done[task.row] = _write(folder / f"{task.row}.parquet", so_far, keys[task.row])
                 del open_rows[task.row]
     if todo:
-        say(f"\n{title}: {len(todo)} drives in {time.monotonic() - began:.0f} s\n")
+        progress(f"\n{title}: {len(todo)} drives in {time.monotonic() - began:.0f} s\n")
     return {name: done[name] for name in rows if name in done}
 
 

@@ -105,14 +105,14 @@ def run(given: argparse.Namespace) -> None:
         if not tasks[INDEPENDENT_ROW]:
             absent = f"{INDEPENDENT_ROW} is left out: it needs ../shared beside the repository"
             progress(absent)
-    scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators", say=progress)
+    scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators")
     if not scored:
         raise SystemExit("no drives to score")
     calibration = {}
     if setup.loaded.network is not None and given.calibration_drives > 0:
         grid = simulated(given, "grid", given.calibration_drives, given.seed + CALIBRATION_SEED_OFFSET)
         folder = given.work / "calibration"
-        calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings", say=progress)
+        calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings")
     metrics = as_frame(scored)
     ran = set(metrics["estimator"].unique())
     budget = {}

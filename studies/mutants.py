@@ -11,7 +11,6 @@ died.
 
 from __future__ import annotations
 
-import argparse
 import ast
 import copy
 import json
@@ -29,7 +28,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
+from studies.pages import ROOT, options
+
 SOURCES = "pdhef_logtool"
 #: By package that is mutated, the folders of the tests that know it best.
 FOLDERS = {
@@ -338,7 +338,7 @@ def _line(mutant: Mutant) -> str:
 
 def main() -> int:
     """Draw, judge and report."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options("mutants", __doc__)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=30)
     parser.add_argument("--only", choices=FOLDERS, action="append", help="one package; may be given again")
@@ -346,21 +346,21 @@ def main() -> int:
     parser.add_argument("--list", action="store_true", help="draw only")
     parser.add_argument("--focused", action="store_true", help="only the tests of the mutants' packages")
     parser.add_argument("--json", type=Path, help="write the verdicts here as well")
-    options = parser.parse_args()
-    packages = options.only or list(FOLDERS)
-    mutants = draw(packages, options.count, options.seed)
-    if options.list:
+    given = parser.parse_args()
+    packages = given.only or list(FOLDERS)
+    mutants = draw(packages, given.count, given.seed)
+    if given.list:
         print(*map(_line, mutants), sep="\n")
         return 0
-    with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(options.jobs) as pool:
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(given.jobs) as pool:
         clean = copy_tree(ROOT, Path(folder))
-        chosen = sorted({f"tests/{f}" for p in packages for f in FOLDERS[p]}) if options.focused else ["tests"]
-        failed = run_tests(clean, [*chosen, "-n", str(options.jobs), "--dist", "loadfile"])
+        chosen = sorted({f"tests/{f}" for p in packages for f in FOLDERS[p]}) if given.focused else ["tests"]
+        failed = run_tests(clean, [*chosen, "-n", str(given.jobs), "--dist", "loadfile"])
         if failed:
             print(f"the tests do not pass without a mutant: {failed}", file=sys.stderr)
             return 2
         verdicts = []
-        for verdict in pool.map(lambda m: judge(m, clean, options.focused), mutants):
+        for verdict in pool.map(lambda m: judge(m, clean, given.focused), mutants):
             verdicts.append(verdict)
             print(f"{f'killed by {verdict.by}' if verdict.killed else 'SURVIVED'} in {verdict.wall_s:.0f} s")
             print(f"    {_line(verdict.mutant)}", flush=True)
@@ -368,10 +368,10 @@ def main() -> int:
         own = [v.killed for v in verdicts if v.mutant.package == package]
         print(f"{package}: {sum(own)} of {len(own)} died")
     died = sum(v.killed for v in verdicts)
-    print(f"seed {options.seed}: {died} of {len(verdicts)} died")
-    if options.json:
-        document = {"seed": options.seed, "died": died, "verdicts": [asdict(v) for v in verdicts]}
-        options.json.write_text(json.dumps(document, indent=2) + "\n")
+    print(f"seed {given.seed}: {died} of {len(verdicts)} died")
+    if given.json:
+        document = {"seed": given.seed, "died": died, "verdicts": [asdict(v) for v in verdicts]}
+        given.json.write_text(json.dumps(document, indent=2) + "\n")
     return 0 if died >= ENOUGH * len(verdicts) else 1
 
 
