@@ -20,7 +20,7 @@ from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error, summarise_errors
+from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
@@ -76,9 +76,7 @@ def read_drive(path: Path, car: Car, *, friction: float | None = None) -> Condit
 
     def with_true_friction(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
         return replace(
-            mapping,
-            signals={**mapping.signals, "friction": _FRICTION},
-            truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y},
+            mapping, signals={**mapping.signals, "friction": _FRICTION}, truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y}
         )
 
     adjust = with_true_friction if friction is None else None
@@ -161,11 +159,8 @@ def root_mean_square(error: FloatArray) -> float:
 
 def rmse_row(drive: str, estimator: str, segment: str, error: FloatArray) -> list[MetricRow]:
     """Return the sideslip RMSE over an error [N] in rad as a row; none where nothing is known."""
-    known = error[np.isfinite(error)]
-    if not known.size:
-        return []
-    rmse = summarise_errors(known)["rmse"]
-    return [MetricRow(drive, estimator, SIDESLIP, segment, "rmse", rmse, "rad", int(known.size))]
+    n = int(np.count_nonzero(np.isfinite(error)))
+    return [MetricRow(drive, estimator, SIDESLIP, segment, "rmse", root_mean_square(error), "rad", n)] if n else []
 
 
 def independent_runs(folder: Path) -> Iterable[tuple[Path, Path, float]]:

@@ -68,13 +68,8 @@ def simulated(given: argparse.Namespace, kind: str, drives: int, seed: int) -> d
     # A manifest holds what was asked for: one of some rows must not take the place of that of all.
     part = "" if set(rows) == set(ROW_NAMES) else "-" + hashlib.sha256(",".join(rows).encode()).hexdigest()[:8]
     folder = given.work / f"drives-{seed}-{drives}{part}"
-
-    def say(text: str, _share: float) -> None:
-        progress(f"\rsimulating (seed {seed}): {text}   ")
-
-    manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs, progress=say)
-    progress(f"\rsimulated (seed {seed}): {len(manifest['drives'])} drives        ")
-    progress("\n")
+    manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs)
+    progress(f"simulated (seed {seed}): {len(manifest['drives'])} drives")
     entries = {e["file"]: e for e in manifest["drives"]}
     return {
         row["name"]: [
@@ -124,9 +119,7 @@ def run(given: argparse.Namespace) -> None:
             if name != INDEPENDENT_ROW
         }
         folder = given.work / "budget"
-        budget = run_rows(
-            replace(setup, estimators=names), some, folder, jobs=given.jobs, title="error budget", say=progress
-        )
+        budget = run_rows(replace(setup, estimators=names), some, folder, jobs=given.jobs, title="error budget")
     facts = Facts(
         command=_command(given),
         car=setup.loaded.vehicle.name,

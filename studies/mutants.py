@@ -1,6 +1,6 @@
 """Mutants: small faults put into the code one at a time, to see whether the tests notice.
 
-    python -m studies.mutants [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused] [--json FILE]
+    python -m studies.mutants [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused]
 
 A seeded draw spreads the faults over five packages, over kinds of faults and over functions: no function gets two.
 What only words a message is left alone, and so is what no test can tell apart by construction. Each mutant lives in a
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import ast
 import copy
-import json
 import os
 import random
 import re
@@ -21,10 +20,9 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -69,16 +67,6 @@ class Mutant:
     old: str
     new: str
     compiled: bool
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """What became of a mutant; ``by`` is the first test that failed, empty for a survivor."""
-
-    mutant: Mutant
-    killed: bool
-    by: str
-    wall_s: float
 
 
 class _Finder(ast.NodeVisitor):
@@ -318,17 +306,15 @@ def run_tests(tree: Path, arguments: Sequence[str]) -> str | None:
     return failed[1] if failed else f"pytest ended with {done.returncode}"
 
 
-def judge(mutant: Mutant, clean: Path, focused: bool) -> Verdict:
-    """Run the tests on one mutant until one fails."""
-    begin = time.monotonic()
+def judge(mutant: Mutant, clean: Path, focused: bool) -> str:
+    """Run the tests on one mutant until one fails; return which, empty for a survivor."""
     known = [f"tests/{f}" for f in FOLDERS[mutant.package]]
     others = sorted({p.parent.relative_to(clean).as_posix() for p in clean.glob("tests/*/test_*.py")} - set(known))
     stages = [[*known, "-m", "not slow"], [*known, "-m", "slow"], *([] if focused else [others])]
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         tree = copy_tree(clean, Path(folder))
         apply(mutant, tree)
-        by = next((failed for stage in stages if (failed := run_tests(tree, stage))), "")
-    return Verdict(mutant, bool(by), by, time.monotonic() - begin)
+        return next((failed for stage in stages if (failed := run_tests(tree, stage))), "")
 
 
 def _line(mutant: Mutant) -> str:
@@ -345,7 +331,6 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time")
     parser.add_argument("--list", action="store_true", help="draw only")
     parser.add_argument("--focused", action="store_true", help="only the tests of the mutants' packages")
-    parser.add_argument("--json", type=Path, help="write the verdicts here as well")
     given = parser.parse_args()
     packages = given.only or list(FOLDERS)
     mutants = draw(packages, given.count, given.seed)
@@ -359,20 +344,16 @@ def main() -> int:
         if failed:
             print(f"the tests do not pass without a mutant: {failed}", file=sys.stderr)
             return 2
-        verdicts = []
-        for verdict in pool.map(lambda m: judge(m, clean, given.focused), mutants):
-            verdicts.append(verdict)
-            print(f"{f'killed by {verdict.by}' if verdict.killed else 'SURVIVED'} in {verdict.wall_s:.0f} s")
-            print(f"    {_line(verdict.mutant)}", flush=True)
+        killers = []
+        for mutant, by in zip(mutants, pool.map(lambda m: judge(m, clean, given.focused), mutants), strict=True):
+            killers.append(by)
+            print(f"{f'killed by {by}' if by else 'SURVIVED'}\n    {_line(mutant)}", flush=True)
     for package in packages:
-        own = [v.killed for v in verdicts if v.mutant.package == package]
+        own = [bool(by) for mutant, by in zip(mutants, killers, strict=True) if mutant.package == package]
         print(f"{package}: {sum(own)} of {len(own)} died")
-    died = sum(v.killed for v in verdicts)
-    print(f"seed {given.seed}: {died} of {len(verdicts)} died")
-    if given.json:
-        document = {"seed": given.seed, "died": died, "verdicts": [asdict(v) for v in verdicts]}
-        given.json.write_text(json.dumps(document, indent=2) + "\n")
-    return 0 if died >= ENOUGH * len(verdicts) else 1
+    died = sum(map(bool, killers))
+    print(f"seed {given.seed}: {died} of {len(mutants)} died")
+    return 0 if died >= ENOUGH * len(mutants) else 1
 
 
 if __name__ == "__main__":

@@ -50,10 +50,7 @@ def cases(shipped: str) -> tuple[Case, ...]:
     return (
         Case("samples", ("run", *samples, "--vehicle", shipped)),
         Case("low-friction", ("run", "sample_logs/sweep.mcap", "--vehicle", shipped, "--friction", "0.3")),
-        Case(
-            "untuned",
-            ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--sensors", "esp"),
-        ),
+        Case("untuned", ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--sensors", "esp")),
         Case(
             "default-car",
             ("run", "sample_logs/dlc.mcap", "--model", "many-cars", "--friction", "estimate", "--annotate", "sidecar"),

@@ -11,11 +11,7 @@ RMSE = {
     ("B", "ay_g"): 0.025,
 }
 #: RMSE of the paper's Phy-UKF (section 5.5.1).
-PHY_RMSE = {
-    ("A", "yaw_rate_rad_s"): 0.068,
-    ("A", "position_m"): 0.025,
-    ("B", "sideslip_deg"): 0.26,
-}
+PHY_RMSE = {("A", "yaw_rate_rad_s"): 0.068, ("A", "position_m"): 0.025, ("B", "sideslip_deg"): 0.26}
 #: "reduces the root mean square error by over 60 % compared to traditional observers" (abstract).
 IMPROVEMENT = 0.60
 #: "position ... 0.008 m (reduced by 60 %)" (section 5.5.1).
