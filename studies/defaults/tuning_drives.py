@@ -7,7 +7,6 @@ evaluation drive. Results are written to ``studies/defaults/results``.
 from __future__ import annotations
 
 import json
-import tempfile
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
@@ -18,12 +17,11 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.records.signals import FloatArray, Signals
+from studies.condition_drives import as_logged
 from studies.pages import ROOT
-from truthsim.drive import Drive, simulate_drive, write_drive
+from truthsim.drive import simulate_drive
 
 FIRST_SEED = 1000
 VEHICLE_FILE = "sample_logs/vehicle.toml"
@@ -51,37 +49,24 @@ class TuningDrive:
     sideslip_rad: FloatArray
 
 
-def signals_of(drive: Drive, vehicle: VehicleParameters, folder: Path) -> Signals:
-    """Take a drive the way of every log: written as MCAP, mapped by recognition, aligned."""
-    path = folder / f"{drive.manoeuvre}-{drive.seed}.mcap"
-    write_drive(drive, path)
-    with read_drive(path, Car.of(vehicle), options=ReadOptions(friction=None)) as log:
-        signals = log.whole().signals
-    path.unlink()
-    return signals
-
-
 def tuning_drives() -> list[TuningDrive]:
     """Simulate the drives of ``PLAN``; a drive that spins is left out."""
     nominal = load_vehicle(ROOT / VEHICLE_FILE)
     plan = [(name, *point) for name, (speeds, frictions) in PLAN.items() for point in product(speeds, frictions)]
     drives: list[TuningDrive] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for seed, (manoeuvre, speed, friction) in enumerate(plan, start=FIRST_SEED):
-            duration_s = ROAD_DURATION_S if manoeuvre == "road" else None
-            drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
-            if drive.spun:
-                print(f"left out, it spun: {drive.command}")
-                continue
-            vehicle = nominal.model_copy(update={"friction": friction})
-            signals = signals_of(drive, vehicle, Path(folder))
-            at = (signals.stamps_ns - drive.start_ns) * 1e-9
-            vx, vy = (
-                np.interp(at, drive.times_s, drive.truth[k], left=np.nan, right=np.nan) for k in ("vx_m_s", "vy_m_s")
-            )
-            moving = np.hypot(vx, vy) > vehicle.low_speed_blend_m_s
-            sideslip = np.where(moving, np.arctan2(vy, vx), np.nan)
-            drives.append(TuningDrive(manoeuvre, drive.command, vehicle, signals, sideslip))
+    for seed, (manoeuvre, speed, friction) in enumerate(plan, start=FIRST_SEED):
+        duration_s = ROAD_DURATION_S if manoeuvre == "road" else None
+        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
+        if drive.spun:
+            print(f"left out, it spun: {drive.command}")
+            continue
+        vehicle = nominal.model_copy(update={"friction": friction})
+        signals = as_logged(drive, Car.of(vehicle)).signals
+        at = (signals.stamps_ns - drive.start_ns) * 1e-9
+        vx, vy = (np.interp(at, drive.times_s, drive.truth[k], left=np.nan, right=np.nan) for k in ("vx_m_s", "vy_m_s"))
+        moving = np.hypot(vx, vy) > vehicle.low_speed_blend_m_s
+        sideslip = np.where(moving, np.arctan2(vy, vx), np.nan)
+        drives.append(TuningDrive(manoeuvre, drive.command, vehicle, signals, sideslip))
     return drives
 
 

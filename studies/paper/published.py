@@ -33,5 +33,3 @@ TRAIN_LOSS, TRAIN_LOSS_EPOCHS, VALIDATION_LOSS = 1e-3, 150, 0.05
 OPEN_LOOP_AY_OFFSET = 0.80
 #: Peak |a_y| of the double lane change (section 5.3.1), and its speed.
 DLC_PEAK_G, DLC_SPEED_KM_H = 0.7, 100.0
-#: Network training (Table 1, section 3.1.3).
-TRAINING_SAMPLES, TRAINING_EPOCHS = 250_000, 200
