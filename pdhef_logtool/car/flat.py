@@ -18,6 +18,8 @@ from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
 
+#: What a file holds beside physics and sensors.
+_TABLES = ("filter", "network", "identification")
 #: A drive and a score, as older versions wrote them for people.
 _SPAN = re.compile(r"(?P<name>.+): (?P<start_s>-?[\d.]+) to (?P<end_s>-?[\d.]+) s")
 _SCORE = re.compile(r"(?P<name>[a-z-]+): (?P<score_deg>[\d.]+) deg at trial (?P<trial>\d+)")
@@ -126,8 +128,10 @@ def flat_toml(
     if trust is not None:
         found = {"trust_cap": trust.trust_cap, "evidence": trust.evidence, "model_sha256": trust.network_sha256}
         tables["network"] = {k: v for k, v in found.items() if v is not None}
-    known = document.unwrap().get("identification", {})
-    if provenance := {k: v for k, v in {**known, **identification}.items() if k != "tuning_scores"}:
+    given = {name: table for name, table in document.unwrap().items() if name in _TABLES}
+    provenance = {**given.get("identification", {}), **identification}
+    provenance.pop("tuning_scores", None)
+    if provenance:
         tables["identification"] = provenance
     for name in {"filter", "network", "identification"} - tables.keys():
         document.pop(name, None)
