@@ -133,9 +133,10 @@ def flat_toml(
     provenance.pop("tuning_scores", None)
     if provenance:
         tables["identification"] = provenance
-    for name in ("filter", "network", "identification"):
+    for name in {"filter", "network", "identification"} - tables.keys():
         document.pop(name, None)
-    _merge(document, {}, tables)
+    stand = {name: document[name].unwrap() for name in tables if name in document}
+    _merge(document, stand, tables)
     _comment(document, comments or {})
     return tomlkit.dumps(document)
 

@@ -185,10 +185,14 @@ def _take_place(fresh: Path, target: Path) -> None:
         fresh.rename(target)
         return
     if not _exchanged(fresh, target):
-        # A file system without exchange: for a moment the car stands under its old name alone.
+        # A file system without exchange: for a moment nothing stands under the car's name.
         old = fresh.with_suffix(".old")
         target.rename(old)
-        fresh.rename(target)
+        try:
+            fresh.rename(target)
+        except BaseException:
+            old.rename(target)
+            raise
         old.rename(fresh)
 
 

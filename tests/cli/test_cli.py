@@ -219,6 +219,25 @@ def test_options_of_old_mean_what_they_meant(capsys: pytest.CaptureFixture[str])
 
 
 @pytest.mark.slow
+def test_a_run_with_options_of_old_is_the_same_run(sample_logs_dir: Path, tmp_path: Path) -> None:
+    car = str(sample_logs_dir / "vehicle.toml")
+    shipped = ROOT / "pdhef_logtool" / "models" / "default"
+    given = {
+        "new": ("--car", car, "--network", "many-cars", "--intervals", str(shipped / "intervals.json")),
+        "old": ("--vehicle", car, "--model", "many-cars", "--calibration", str(shipped / "intervals.json")),
+    }
+    for name, options in given.items():
+        result = _pdhef(
+            *("run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path / name), "--annotate", "none"),
+            *("-e", "phy-ukf,pd-hef", "--end", "4", *options),
+        )
+        assert result.returncode == 0, result.stderr
+        assert result.stderr.count("notice: ") == (3 if name == "old" else 0)
+    for file in ("run.json", "metrics.parquet", "logs/dlc/estimates.parquet", "logs/dlc/report.json"):
+        assert (tmp_path / "old" / file).read_bytes() == (tmp_path / "new" / file).read_bytes(), file
+
+
+@pytest.mark.slow
 def test_unknown_manoeuvre_names_those_that_there_are(tmp_path: Path) -> None:
     result = _pdhef("simulate", "moose", "-o", str(tmp_path / "x.mcap"))
     assert result.returncode == 2

@@ -267,3 +267,43 @@ def test_impossible_readings_are_told(sample_logs_dir: Path, tmp_path: Path) -> 
     told = [x for x in report["losses"] if x["kind"] == "impossible"]
     assert [x["where"] for x in told] == ["ay_m_s2"]
     assert told[0]["count"] > 10
+
+
+def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
+    from mcap.reader import make_reader
+
+    folder = dlc_run / "logs" / "dlc"
+    told = {e["name"]: e["algorithm"] for e in json.loads((folder / "report.json").read_text())["estimators"]}
+    assert None not in told.values()
+    assert told["phy-ukf"]["algorithm"] == "physics-ukf"
+    for metrics in (dlc_run / "metrics.parquet", folder / "metrics.parquet"):
+        rows = pl.read_parquet(metrics).select("estimator", "algorithm").unique()
+        of = {name: digest for name, digest in rows.iter_rows() if name in told}
+        assert of == {name: told[name]["sha256"][:12] for name in of}
+        assert {"phy-ukf", "pd-hef"} <= of.keys()
+    with (folder / "annotated.mcap").open("rb") as stream:
+        (record,) = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == "pdhef.metrics"]
+    assert {n: json.loads(record[f"{n}/algorithm"]) for n in told} == told
+
+
+def test_a_part_that_is_not_used_is_told(sample_logs_dir: Path, tmp_path: Path) -> None:
+    car = tmp_path / "car"
+    car.mkdir()
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    (car / "vehicle.toml").write_text(text)
+    (car / "fit.toml").write_text(
+        'format = "pdhef-fit"\nversion = 1\n'
+        f'physics_sha256 = "{Car.load(car).physics_sha256}"\n[values]\nsteer_offset_rad = 0.02\n'
+    )
+    offset = {}
+    for name, changed in (("same", text), ("other", text.replace("1440.0", "1450.0"))):
+        (car / "vehicle.toml").write_text(changed)
+        said: list[str] = []
+        config = _config(sample_logs_dir, car=car, estimators=("open-loop",), end="3")
+        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, warn=said.append)
+        assert ("fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew" in said) == (
+            name == "other"
+        )
+        estimates = pl.read_parquet(tmp_path / name / "logs/dlc/estimates.parquet")
+        offset[name] = float(estimates.filter(pl.col("estimator") == "open-loop")["sideslip_rad"].abs().mean())
+    assert offset["same"] > 1.5 * offset["other"]
