@@ -128,8 +128,8 @@ def tune(
         Option(
             "--estimators",
             "-e",
-            help="Out of phy-ukf-tuned, physics-plus, pd-hef, pd-hef-smoothed. Default: the first two, and pd-hef where "
-            "the car has a network of its own or --network names one.",
+            help="Out of phy-ukf-tuned, physics-plus, pd-hef, pd-hef-smoothed. Default: the first two, and pd-hef "
+            "where the car has a network of its own or --network names one.",
         ),
     ] = None,
     trials: Annotated[int, Option(help="Of each estimator.")] = 128,
