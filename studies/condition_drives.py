@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell
@@ -52,15 +53,22 @@ _KEPT = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConditionDrive:
-    """Signals [N] as an estimator would get them with the true friction, and the perfect truth [N] at their stamps."""
+    """Signals [N] as an estimator would get them with the true friction, and the perfect truth [N] at their stamps.
+
+    Slower than ``low_speed_m_s`` nothing is scored.
+    """
 
     name: str
     signals: Signals
     truth: StateTrack
-    friction: FloatArray
+    low_speed_m_s: float
+
+    def error(self, track: StateTrack) -> FloatArray:
+        """Return the sideslip error of a track [N] in rad, NaN where it is not scored."""
+        return signal_error(track, self.truth, SIDESLIP, self.low_speed_m_s)
 
 
-def read_drive(path: Path, vehicle: VehicleParameters, name: str, *, friction: float | None = None) -> ConditionDrive:
+def read_drive(path: Path, car: Car, *, friction: float | None = None) -> ConditionDrive:
     """Read a simulated log; ``friction`` where the log has none of its own.
 
     The perfect truth stands on the sensors' clock, so that no latency is looked for: a stuck gyro would bend it.
@@ -74,7 +82,7 @@ def read_drive(path: Path, vehicle: VehicleParameters, name: str, *, friction: f
         )
 
     adjust = with_true_friction if friction is None else None
-    with reading.read_drive(path, vehicle, options=ReadOptions(friction=None), adjust=adjust) as drive:
+    with reading.read_drive(path, car, options=ReadOptions(friction=None), adjust=adjust) as drive:
         drive.plan = replace(drive.plan, latency=None)
         whole = drive.whole()
     signals, truth = whole.signals, whole.truth
@@ -82,7 +90,7 @@ def read_drive(path: Path, vehicle: VehicleParameters, name: str, *, friction: f
     if friction is not None:
         constant = np.full(len(signals), friction)
         signals = replace(signals, friction=constant, available=signals.available | {"friction"})
-    return ConditionDrive(name, signals, truth, signals.friction)
+    return ConditionDrive(whole.name, signals, truth, car.vehicle.low_speed_blend_m_s)
 
 
 def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:
@@ -105,20 +113,20 @@ def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:
 def bin_masks(drive: ConditionDrive) -> dict[str, BoolArray]:
     """Return the segments: everything, the bins, and the nonlinear range; by true friction and lateral acceleration."""
     share = np.abs(smooth(drive.truth.stamps_ns, drive.truth.ay_m_s2, GRIP_SMOOTHING_HZ))
-    share = share / (drive.friction * GRAVITY_M_S2)
+    share = share / (drive.signals.friction * GRAVITY_M_S2)
     masks = {name: (share >= low) & (share < high) for name, (low, high) in BINS.items()}
     return {ALL: np.ones(len(share), dtype=np.bool_), **masks, NONLINEAR: share > NONLINEAR_SHARE}
 
 
-def score(track: StateTrack, drive: ConditionDrive, low_speed_m_s: float) -> list[MetricRow]:
+def score(track: StateTrack, drive: ConditionDrive) -> list[MetricRow]:
     """Return the metrics that the table needs: of :mod:`pdhef_logtool.evaluation.metrics`, and of the interval."""
     masks = bin_masks(drive)
     rows = [
         row
-        for row in score_track(track, drive.truth, masks, log=drive.name, low_speed_m_s=low_speed_m_s)
+        for row in score_track(track, drive.truth, masks, log=drive.name, low_speed_m_s=drive.low_speed_m_s)
         if row.signal in (SIDESLIP, "state") or (row.segment == ALL and row.metric in _KEPT.get(row.signal, ()))
     ]
-    error = signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
+    error = drive.error(track)
     sigma = np.hypot(track.sideslip_std_rad, np.nan_to_num(drive.truth.sideslip_std_rad, nan=0.0))
     return rows + interval_rows(error, sigma, masks, log=drive.name, estimator=track.name)
 
@@ -140,10 +148,9 @@ def interval_rows(
     return rows
 
 
-def sideslip_error(estimator: Estimator, signals: Signals, drive: ConditionDrive, low_speed_m_s: float) -> FloatArray:
-    """Run an estimator on signals; returns its sideslip error [N] in rad, NaN where it is not scored."""
-    track, _ = estimator.run(signals, None)
-    return signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
+def sideslip_error(estimator: Estimator, drive: ConditionDrive, signals: Signals | None = None) -> FloatArray:
+    """Run an estimator on signals, None: the drive's; returns its sideslip error [N] in rad, NaN where not scored."""
+    return drive.error(estimator.run(drive.signals if signals is None else signals, None)[0])
 
 
 def root_mean_square(error: FloatArray) -> float:

@@ -22,15 +22,16 @@ from typing import Any
 
 import polars as pl
 import pyarrow.parquet as pq
-from pdhef_logtool.estimators.registry import make_estimator, runnable
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import digest
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.estimators.table import Options, make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.files import PendingFile
-from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
-from pdhef_logtool.watches.intervals import Calibration, calibrated, find_calibration
+from pdhef_logtool.run.estimating import calibrator
 from studies import error_budget, fixed_grid
 from studies.condition_drives import read_drive, rmse_row, score, sideslip_error, told
 from studies.pages import ROOT
@@ -62,21 +63,27 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What every drive is run with; ``model`` None leaves out what needs a network."""
+    """What every drive is run with: a car as ``--car`` takes it, and a network instead of its own."""
 
-    vehicle: Path
-    model: Path | None
+    car: Path
+    network: Path | None
     estimators: tuple[str, ...]
+
+    @property
+    def loaded(self) -> Car:
+        """The car, read once a process."""
+        return _loaded(self.car, self.network)
 
     @property
     def identity(self) -> dict[str, Any]:
         """What the setup is, by content."""
-        _, model = _loaded(self.vehicle, self.model)
-        calibration = _calibration(self.model)
+        car = self.loaded
+        parts = {"trust": car.trust, "intervals": car.intervals}
         return {
-            "vehicle": hashlib.sha256(self.vehicle.read_bytes()).hexdigest(),
-            "model": None if model is None else model.sha256,
-            "calibration": None if calibration is None else calibration.sha256,
+            "physics": car.physics_sha256,
+            "noise": car.noise_sha256,
+            "network": None if car.network is None else car.network.sha256,
+            **{name: None if part is None else digest(part.model_dump(mode="json")) for name, part in parts.items()},
             "estimators": list(self.estimators),
         }
 
@@ -220,72 +227,60 @@ def _run(setup: Setup, task: Task) -> _Done:
 
 
 @cache
-def _loaded(vehicle: Path, model: Path | None) -> tuple[VehicleParameters, ModelBundle | None]:
-    return load_vehicle(vehicle), None if model is None else load_bundle(model)
-
-
-@cache
-def _calibration(model: Path | None) -> Calibration | None:
-    """Return the calibration in the model's folder, as ``pdhef run`` takes it."""
-    return None if model is None else find_calibration(None, model)
+def _loaded(car: Path, network: Path | None) -> Car:
+    return Car.load(car, network=network)
 
 
 @cache
 def _estimators(setup: Setup, available: frozenset[str], use_speed: bool) -> tuple[tuple[Estimator, ...], list[str]]:
     """Build estimators once a process: they are immutable, and the network takes longer to build than to run."""
-    vehicle, model = _loaded(setup.vehicle, setup.model)
-    ready, skipped = runnable(setup.estimators, vehicle, available, use_speed=use_speed, model=model)
+    ready, skipped = runnable(setup.estimators, setup.loaded, available, Options(use_speed))
     return tuple(ready), [f"{s.name} does not run: {s.reason}" for s in skipped]
 
 
 @cache
 def _grid_base(setup: Setup, use_speed: bool) -> HybridUkf | None:
-    vehicle, model = _loaded(setup.vehicle, setup.model)
-    if model is None:
+    if setup.loaded.network is None:
         return None
-    base = make_estimator(fixed_grid.BASE, vehicle, use_speed=use_speed, model=model)
+    base = make_estimator(fixed_grid.BASE, setup.loaded, Options(use_speed))
     return base if isinstance(base, HybridUkf) else None
 
 
 def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
-    vehicle, _ = _loaded(setup.vehicle, setup.model)
-    drive = read_drive(task.log, vehicle, task.log.stem, friction=task.friction)
+    drive = read_drive(task.log, setup.loaded, friction=task.friction)
     signals = told(drive, task.assume)
     estimators, skipped = _estimators(setup, signals.available, task.use_speed)
-    notes, calibration = list(skipped), _calibration(setup.model)
+    notes, intervals = list(skipped), calibrator(setup.loaded, estimators)
     rows: list[MetricRow] = []
     for estimator in estimators if task.kind == "score" else ():
         try:
             track, _ = estimator.run(signals, None)
-            if calibration is not None and track.name in calibration.inflations:
-                track, _ = calibrated(track, signals, calibration)
-            rows += score(track, drive, vehicle.low_speed_blend_m_s)
+            rows += score(intervals.add(track, signals), drive)
         except Exception as error:  # noqa: BLE001 (one estimator's failure on one drive is a result, not an end)
             notes.append(f"{estimator.name} failed on {task.row}/{drive.name}: {type(error).__name__}: {error}")
     base = _grid_base(setup, task.use_speed)
     if base is not None:
-        rows += fixed_grid.run_grid(base, signals, drive, vehicle.low_speed_blend_m_s)
+        rows += fixed_grid.run_grid(base, signals, drive)
     return rows, notes
 
 
 @lru_cache(maxsize=256)
-def _fitted(car: str, friction: float, file: Path) -> VehicleParameters:
-    return error_budget.fit_vehicle(choose_vehicle(car), friction, load_vehicle(file))
+def _fitted(car: str, friction: float, setup: Setup) -> VehicleParameters:
+    return error_budget.fit_vehicle(choose_vehicle(car), friction, setup.loaded.vehicle)
 
 
 def _budget(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     """Sideslip RMSE with nothing and with each cause taken away; the cause stands in ``segment``."""
-    vehicle, model = _loaded(setup.vehicle, setup.model)
+    car = setup.loaded
     run = error_budget.drive_again(task.entry)
-    fitted = _fitted(run.spec.vehicle, run.spec.friction, setup.vehicle)
+    fitted = _fitted(run.spec.vehicle, run.spec.friction, setup)
     rows: list[MetricRow] = []
     for cause in (None, *error_budget.causes_of(run.spec, task.assume)):
-        case = error_budget.without(run, cause, vehicle, task.assume, fitted)
-        ready, _ = runnable(
-            setup.estimators, case.vehicle, case.signals.available, use_speed=case.use_speed, model=model
-        )
+        case = error_budget.without(run, cause, car.vehicle, task.assume, fitted)
+        options = Options(case.use_speed)
+        ready, _ = runnable(setup.estimators, car.with_vehicle(case.vehicle), case.signals.available, options)
         for estimator in ready:
-            error = sideslip_error(estimator, case.signals, case.drive, vehicle.low_speed_blend_m_s)
+            error = sideslip_error(estimator, case.drive, case.signals)
             rows += rmse_row(task.log.stem, estimator.name, cause or "base", error)
     return rows, []
 

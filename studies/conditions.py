@@ -1,10 +1,10 @@
 """The condition table (METHOD §10): every estimator on the same drives with one thing wrong in each row.
 
-    python -m studies.conditions --vehicle car.toml --model model/ [--drives 30] [--jobs 2] [--rows NAME,...]
+    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...]
 
 Simulates the drives (``pdhef simulate conditions``; kept once made), runs all registered estimators that can run, and
 writes ``conditions.md`` with ``conditions/`` (tables as Parquet, plots) to ``--out``. Logs and the rows' results lie in
-``--work`` and are kept: a repeated call computes only rows whose drives, vehicle, model, settings or sources changed.
+``--work`` and are kept: a repeated call computes only rows whose drives, car, network, settings or sources changed.
 The independent simulator's runs join as a row where ``../shared`` lies beside the repository.
 """
 
@@ -17,15 +17,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, check_names
-
+from pdhef_logtool.estimators.table import SPECS, check_names
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.sinks.report import tool_versions
 from studies import fixed_grid
 from studies.condition_drives import independent_runs
 from studies.condition_runs import Setup, Task, as_frame, progress, run_rows
 from studies.conditions_page import Facts, Tables, write_page
-from studies.pages import DOCS, ROOT, SAMPLE_VEHICLE, options
+from studies.pages import DOCS, ROOT, options
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
 INDEPENDENT_ROW = "independent-simulator"
@@ -40,9 +39,9 @@ BUDGET = ("phy-ukf-tuned", "phy-ukf")
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the command line's options."""
     parser = options("conditions", __doc__)
-    parser.add_argument("--vehicle", type=Path, default=SAMPLE_VEHICLE)
-    parser.add_argument("--model", type=Path, help="model bundle; without one no hybrid filter runs")
-    parser.add_argument("--estimators", default=",".join(DESCRIPTIONS), help="names, default all")
+    parser.add_argument("--car", type=Path, default=Path("saloon"), help="default: the shipped one")
+    parser.add_argument("--network", type=Path, help="instead of the car's; none: no hybrid filter runs")
+    parser.add_argument("--estimators", default=",".join(s.name for s in SPECS), help="names, default all")
     parser.add_argument("--rows", default=",".join((*ROW_NAMES, INDEPENDENT_ROW)))
     parser.add_argument("--drives", type=int, default=30, help="drives a row")
     parser.add_argument("--calibration-drives", type=int, default=10, help="drives a row for the best fixed setting")
@@ -98,7 +97,7 @@ def independent(work: Path) -> list[Task]:
 
 def run(given: argparse.Namespace) -> None:
     """Do everything."""
-    setup = Setup(given.vehicle, given.model, given.estimators)
+    setup = Setup(given.car, given.network, given.estimators)
     tasks = simulated(given, "score", given.drives, given.seed)
     absent = ""
     if INDEPENDENT_ROW in given.rows:
@@ -110,7 +109,7 @@ def run(given: argparse.Namespace) -> None:
     if not scored:
         raise SystemExit("no drives to score")
     calibration = {}
-    if given.model is not None and given.calibration_drives > 0:
+    if setup.loaded.network is not None and given.calibration_drives > 0:
         grid = simulated(given, "grid", given.calibration_drives, given.seed + CALIBRATION_SEED_OFFSET)
         folder = given.work / "calibration"
         calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings", say=progress)
@@ -124,12 +123,14 @@ def run(given: argparse.Namespace) -> None:
             for name, row in tasks.items()
             if name != INDEPENDENT_ROW
         }
-        narrow = Setup(given.vehicle, given.model, names)
         folder = given.work / "budget"
-        budget = run_rows(narrow, some, folder, jobs=given.jobs, title="error budget", say=progress)
+        budget = run_rows(
+            replace(setup, estimators=names), some, folder, jobs=given.jobs, title="error budget", say=progress
+        )
     facts = Facts(
         command=_command(given),
-        setup={**setup.identity, "vehicle_file": given.vehicle.name},
+        car=setup.loaded.vehicle.name,
+        setup=setup.identity,
         rows={r.name: r.description for r in ROWS}
         | {INDEPENDENT_ROW: "runs of another simulator, friction as it says"},
         subject=next((n for n in SUBJECTS if n in ran), None),
@@ -144,9 +145,9 @@ def run(given: argparse.Namespace) -> None:
 
 def _command(given: argparse.Namespace) -> str:
     """Return the command line that makes the page again; files by name only."""
-    model = "" if given.model is None else f" --model {given.model.name}"
+    network = "" if given.network is None else f" --network {given.network.name}"
     return (
-        f"python -m studies.conditions --vehicle {given.vehicle.name}{model} --drives {given.drives}"
+        f"python -m studies.conditions --car {given.car.name}{network} --drives {given.drives}"
         f" --seed {given.seed} --calibration-drives {given.calibration_drives} --budget-drives {given.budget_drives}"
     )
 

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import polars as pl
-from pdhef_logtool.estimators.registry import NOT_CAUSAL
 
+from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.signals import FloatArray
 from studies import fixed_grid
@@ -35,6 +34,7 @@ from studies.table_maths import (
 )
 
 ALL = "all"
+NOT_CAUSAL = {s.name for s in SPECS if not s.causal}
 #: Below this share of the scorable stamps an RMSE is marked: it leaves out what the estimator gave up on.
 AVAILABLE = 0.99
 #: A bin with fewer drives is marked.
@@ -50,7 +50,8 @@ class Facts:
     """What the page says besides the figures. ``rows``: description by name, in order; ``order``: of the estimators."""
 
     command: str
-    setup: Mapping[str, Any]
+    car: str
+    setup: Mapping[str, str | None]
     rows: Mapping[str, str]
     subject: str | None
     references: Sequence[str]
@@ -183,18 +184,18 @@ def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
 
 
 def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Sequence[str]) -> str:
-    model = facts.setup["model"]
-    used = f"`{facts.setup['vehicle_file']}` (sha256 {facts.setup['vehicle'][:12]})"
-    network = "none: no hybrid filter ran" if model is None else f"sha256 {model[:12]}"
-    calibration = facts.setup.get("calibration")
-    intervals = "as the estimators give them" if calibration is None else f"calibrated, sha256 {calibration[:12]}"
+    network, calibrated = facts.setup["network"], facts.setup["intervals"]
+    physics, noise = (str(facts.setup[k])[:12] for k in ("physics", "noise"))
+    used = f"{facts.car} (physics {physics}, noise {noise})"
+    ran = "none: no hybrid filter ran" if network is None else f"sha256 {network[:12]}"
+    intervals = "as the estimators give them" if calibrated is None else f"calibrated, sha256 {calibrated[:12]}"
     drives = {r: max(figures.get(r, n)[0].size for n in figures.estimators(r)) for r in rows}
     lines = [
         "# Condition table",
         "",
         f"Written by `{facts.command}`; every figure comes from that command.",
         "",
-        f"Vehicle file {used}; network {network}; pdhef-logtool {facts.versions.get('pdhef-logtool', '?')}.",
+        f"Car: {used}; network {ran}; pdhef-logtool {facts.versions.get('pdhef-logtool', '?')}.",
         f"95 % intervals {intervals}.",
         "The vehicle file stays the same in all rows, whatever car is driven. Friction is told to every estimator from",
         "the drive, times the factor of the row, or not at all where the row says so. Truth is the simulator's state.",

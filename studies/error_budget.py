@@ -189,7 +189,7 @@ def as_read(channels: Mapping[str, SensorChannel], run: Rerun, vehicle: VehicleP
             for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
         },
     )
-    return ConditionDrive(run.name, signals, truth, signals.friction)
+    return ConditionDrive(run.name, signals, truth, vehicle.low_speed_blend_m_s)
 
 
 def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> VehicleParameters:

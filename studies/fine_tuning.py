@@ -18,11 +18,11 @@ def train_on_parts(
 ) -> ModelBundle:
     """Extract the logs of the parts ``train`` and ``validation`` into a folder and train; ``init`` is the start."""
     from pdhef_logtool.learning.network.dataset import read_dataset
-    from pdhef_logtool.learning.network.extract_command import ExtractSettings, run_extraction
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
     from pdhef_logtool.learning.network.train_command import make_recipe, train_on
 
     for split, (logs, config) in parts.items():
-        run_extraction([str(log) for log in logs], folder / split, ExtractSettings(config, split=split))
+        extract([str(log) for log in logs], folder / split, ExtractSettings(config, split=split))
     sets = [read_dataset(folder / split) for split in parts]
     both = replace(sets[0], drives=tuple(d for s in sets for d in s.drives))
     recipe = replace(make_recipe(paper=False, seed=0, epochs=None, device="cpu"), **(SMALL if init is None else GENTLY))

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.evaluation.metrics import ALL, MetricRow, signal_error
+from pdhef_logtool.evaluation.metrics import ALL, MetricRow
 from pdhef_logtool.records.signals import Signals
-from studies.condition_drives import SIDESLIP, ConditionDrive, bin_masks, rmse_row
+from studies.condition_drives import ConditionDrive, bin_masks, rmse_row
 
 TRUSTS = (0.0, 0.5, 1.0)
 #: Factors on the 1-sigma of a_y and on all of the process noise, from those of the hybrid filter with fixed noise.
@@ -62,14 +62,12 @@ def at(base: HybridUkf, setting: Setting) -> HybridUkf:
     )
 
 
-def run_grid(
-    base: HybridUkf, signals: Signals, drive: ConditionDrive, low_speed_m_s: float, grid: tuple[Setting, ...] = GRID
-) -> Iterator[MetricRow]:
+def run_grid(base: HybridUkf, signals: Signals, drive: ConditionDrive) -> Iterator[MetricRow]:
     """Yield the sideslip RMSE and availability of every setting, over everything and in the nonlinear range."""
     rate, _, _ = base.residual_rate(signals, None)
     masks = {name: m for name, m in bin_masks(drive).items() if name in (ALL, "nonlinear")}
-    for setting in grid:
+    for setting in GRID:
         track, _ = at(base, setting).filter.run(signals, None, setting.trust * rate)
-        error = signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
+        error = drive.error(track)
         for segment, mask in masks.items():
             yield from rmse_row(drive.name, setting.name, segment, error[mask])

@@ -16,13 +16,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from pdhef_logtool.estimators.registry import make_estimator
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION, FrictionBank
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
 from studies.condition_drives import ConditionDrive, read_drive, root_mean_square, sideslip_error
 from studies.pages import DOCS, SAMPLE_VEHICLE, fill, options, table, write
 from truthsim.drive import simulate_drive, write_drive
@@ -60,13 +59,11 @@ class Outcome:
     rmse_seen_deg: Mapping[tuple[str, str], float]
 
 
-def measure(
-    drive: ConditionDrive, manoeuvre: str, friction: float, vehicle: VehicleParameters, model: ModelBundle
-) -> Outcome:
+def measure(drive: ConditionDrive, manoeuvre: str, friction: float, car: Car) -> Outcome:
     """Estimate the friction of a drive, and run every estimator with every friction that it may be told."""
-    found, _ = FrictionBank(vehicle).run(drive.signals, None)
+    found, _ = FrictionBank(car.vehicle).run(drive.signals, None)
     told = {
-        "true": drive.friction,
+        "true": drive.signals.friction,
         "1": np.ones(len(drive.signals)),
         "0.85": np.full(len(drive.signals), 0.85),
         "estimated": found.friction,
@@ -74,20 +71,18 @@ def measure(
     rmse, rmse_seen = {}, {}
     for name in ESTIMATORS:
         for how in TOLD:
-            estimator = make_estimator(name, vehicle, use_speed=True, model=model)
             given = replace(drive.signals, friction=told[how])
-            error = np.degrees(sideslip_error(estimator, given, drive, vehicle.low_speed_blend_m_s))
+            error = np.degrees(sideslip_error(make_estimator(name, car), drive, given))
             rmse[name, how] = root_mean_square(error)
             rmse_seen[name, how] = root_mean_square(error[found.observable])
-    return Outcome(manoeuvre, friction, np.abs(found.friction - drive.friction), found.observable, rmse, rmse_seen)
+    return Outcome(
+        manoeuvre, friction, np.abs(found.friction - drive.signals.friction), found.observable, rmse, rmse_seen
+    )
 
 
 def measure_all(folder: Path) -> list[Outcome]:
     """Simulate and measure every drive; one that spins is left out, with a line on stderr."""
-    vehicle = load_vehicle(SAMPLE_VEHICLE)
-    model = open_model(None)
-    if model is None:
-        raise SystemExit("no shipped model: pdhef train writes one")
+    car = Car.load(SAMPLE_VEHICLE)
     outcomes = []
     seed = FIRST_SEED
     for manoeuvre, (speed, duration) in PLAN.items():
@@ -101,7 +96,7 @@ def measure_all(folder: Path) -> list[Outcome]:
                 print(f"left out: {error}", file=sys.stderr)
                 continue
             write_drive(made, path)
-            outcomes.append(measure(read_drive(path, vehicle, path.stem), manoeuvre, friction, vehicle, model))
+            outcomes.append(measure(read_drive(path, car), manoeuvre, friction, car))
             path.unlink()
     return outcomes
 

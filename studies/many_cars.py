@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_to_toml
+from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import SimulationError
 from studies.error_budget import fit_vehicle
 from studies.pages import options
@@ -24,7 +25,7 @@ from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
 from truthsim.suite import draw_spec
-from truthsim.vehicle import GRAVITY_M_S2, Vehicle
+from truthsim.vehicle import GRAVITY_M_S2
 from truthsim.vehicle_choice import choose_vehicle
 
 SEED = 4000
@@ -58,7 +59,7 @@ _ATTEMPTS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Car:
+class DrawnCar:
     """One car: its name as ``--vehicle`` takes it, its file, and the sensors that it has."""
 
     text: str
@@ -66,7 +67,7 @@ class Car:
     sensors: tuple[tuple[str, float], ...]
 
 
-def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str, ...] = KINDS) -> Car:
+def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str, ...] = KINDS) -> DrawnCar:
     """Draw a car that understeers and can be driven through a ramp steer, with its vehicle file."""
     while True:
         kind = str(rng.choice(kinds))
@@ -82,18 +83,8 @@ def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str
             fitted = fit_vehicle(car, FIT_FRICTION, base)
         except (SimulationError, ValueError):
             continue  # rolls over or spins in the ramp
-        return Car(text, _file_of(car, fitted, text), _sensors(rng))
-
-
-def _file_of(car: Vehicle, fitted: VehicleParameters, name: str) -> VehicleParameters:
-    return fitted.model_copy(
-        update={
-            "name": name,
-            "wheel_radius_m": car.wheel_radius_m,
-            "steering_ratio": car.steering_ratio,
-            "network": Network(),  # the base file's is about another car
-        }
-    )
+        own = {"name": text, "wheel_radius_m": car.wheel_radius_m, "steering_ratio": car.steering_ratio}
+        return DrawnCar(text, fitted.model_copy(update=own), _sensors(rng))
 
 
 def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
@@ -117,7 +108,7 @@ def plan_cars(
         rng = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(500, index)))
         car = draw_car(rng, base, kinds)
         file = f"cars/car_{index:04d}.toml"
-        (folder / file).write_text(vehicle_to_toml(car.vehicle), encoding="utf-8")
+        (folder / file).write_text(vehicle_toml(car.vehicle), encoding="utf-8")
         place = (index + 0.5) / cars
         facts: list[tuple[str, Any]] = [
             ("vehicle_file", file),
@@ -129,7 +120,7 @@ def plan_cars(
     return jobs
 
 
-def _spec(rng: np.random.Generator, car: Car) -> DriveSpec:
+def _spec(rng: np.random.Generator, car: DrawnCar) -> DriveSpec:
     return replace(draw_spec(rng, duration_s=DRIVE_S, vehicle=car.text), sensors=car.sensors)
 
 

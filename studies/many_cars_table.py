@@ -1,10 +1,10 @@
 """docs/many_cars.md: one network for many cars against the network of one car, on cars that neither ever saw.
 
-    python -m studies.many_cars_table [--train] [--one MODEL] [--many MODEL] [--out docs]
+    python -m studies.many_cars_table [--train] [--one NETWORK] [--many NETWORK] [--out docs]
 
 ``--train`` first simulates the cars (``studies.many_cars``), extracts and trains the network for many cars, which
 takes about 25 minutes on two cores. Each car has a vehicle file of its own (fitted to a ramp steer of it, or identified
-on runs that are not scored); filter noise is that of the shipped model's vehicle file for all estimators alike.
+on runs that are not scored); filter noise is that of the shipped car for all estimators alike.
 """
 
 from __future__ import annotations
@@ -12,14 +12,17 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pdhef_logtool.estimators.registry import make_estimator
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle, vehicle_to_toml
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.learning.car.identify_command import identify
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import train_on
@@ -28,7 +31,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.run.config import RunConfig
 from studies import many_cars
 from studies.condition_drives import independent_runs, read_drive, root_mean_square, sideslip_error
-from studies.defaults.train_default import HOME, MAPPING, pdhef
+from studies.defaults.train_default import MAPPING, pdhef
 from studies.fine_tuning import train_on_parts
 from studies.pages import DOCS, INDEPENDENT, ROOT, options, table, write
 from studies.table_maths import median_ratio, pooled_rmse
@@ -58,10 +61,10 @@ Errors = list[tuple[float, float]]
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One log with the vehicle file of its car; ``friction`` where the log has none of its own."""
+    """One log with its car; ``friction`` where the log has none of its own."""
 
     log: Path
-    vehicle: VehicleParameters
+    car: Car
     friction: float | None = None
 
 
@@ -75,9 +78,9 @@ def train_networks() -> None:
     train_on(read_dataset(DATA), MODEL, recipe, progress=lambda text, _share: print(text, flush=True))
 
 
-def noise_of_the_shipped(vehicle: VehicleParameters) -> VehicleParameters:
-    """Return a vehicle file with the filter noise of the shipped model's."""
-    return vehicle.model_copy(update={"filter": load_vehicle(HOME / "vehicle.toml").filter})
+def with_shipped_noise(vehicle: VehicleParameters) -> Car:
+    """Return a car of a vehicle with the filter noise of the shipped one."""
+    return Car.of(vehicle, noise=Car.load("saloon", network="none").noise)
 
 
 def drives_of(folder: Path) -> list[dict[str, Any]]:
@@ -90,8 +93,7 @@ def cars_of(folder: Path, split: str | None) -> Iterator[Case]:
     """Yield the drives of a set of many cars."""
     for entry in drives_of(folder):
         if split in (None, entry["split"]):
-            own = load_vehicle(folder / entry["vehicle_file"])
-            yield Case(folder / entry["file"], noise_of_the_shipped(own))
+            yield Case(folder / entry["file"], with_shipped_noise(load_vehicle(folder / entry["vehicle_file"])))
 
 
 def independent_cases(work: Path) -> Iterator[Case]:
@@ -99,11 +101,11 @@ def independent_cases(work: Path) -> Iterator[Case]:
     start = load_vehicle(many_cars.BASE).model_copy(update={"friction": 1.0})
     runs = [(log, friction) for _, log, friction in independent_runs(work)]
     fit = [log for log, _ in runs if log.stem.endswith(IDENTIFY_ON)]
-    guess, found = work / "guess.toml", work / "identified.toml"
-    guess.write_text(vehicle_to_toml(start), encoding="utf-8")
-    pdhef("identify", *fit, "-o", found, "--vehicle", guess, "--holdout", 0)
-    vehicle = noise_of_the_shipped(load_vehicle(found))
-    yield from (Case(log, vehicle, friction) for log, friction in runs if log not in fit)
+    guess, found = work / "guess.toml", work / "identified"
+    guess.write_text(vehicle_toml(start), encoding="utf-8")
+    identify([str(log) for log in fit], found, RunConfig(car=guess), holdout=0.0)
+    car = with_shipped_noise(Car.load(found, network="none").vehicle)
+    yield from (Case(log, car, friction) for log, friction in runs if log not in fit)
 
 
 def fine_tuned(network: ModelBundle, work: Path) -> dict[str, Errors]:
@@ -117,18 +119,18 @@ def fine_tuned(network: ModelBundle, work: Path) -> dict[str, Errors]:
     found: dict[str, Errors] = {}
     for car, entries in by_car.items():
         vehicle_file = TUNED_SET / entries[0]["vehicle_file"]
-        config = RunConfig(vehicle=vehicle_file, mapping=mapping)
+        config = RunConfig(car=vehicle_file, mapping=mapping)
         logs = [TUNED_SET / e["file"] for e in entries]
         parts = {"train": logs[: FIT_DRIVES - STOP_DRIVES], "validation": logs[FIT_DRIVES - STOP_DRIVES : FIT_DRIVES]}
         own = train_on_parts({s: (logs, config) for s, logs in parts.items()}, work / str(car), network)
-        vehicle = noise_of_the_shipped(load_vehicle(vehicle_file))
+        drawn = with_shipped_noise(load_vehicle(vehicle_file))
         columns = {
             "phy-ukf-tuned": ("phy-ukf-tuned", network),
             "physics-plus": ("physics-plus", network),
             "many cars": ("pd-hef-trust1", network),
             "many cars, fine-tuned": ("pd-hef-trust1", own),
         }
-        for column, errors in score([Case(log, vehicle) for log in logs[FIT_DRIVES:]], columns).items():
+        for column, errors in score([Case(log, drawn) for log in logs[FIT_DRIVES:]], columns).items():
             found.setdefault(column, []).extend(errors)
     return found
 
@@ -137,10 +139,9 @@ def score(cases: Iterable[Case], columns: Mapping[str, tuple[str, ModelBundle]])
     """Run the columns' estimators with their networks on every drive; an RMSE is NaN below some samples."""
     found: dict[str, Errors] = {column: [] for column in columns}
     for case in cases:
-        drive = read_drive(case.log, case.vehicle, case.log.name, friction=case.friction)
-        for column, (name, model) in columns.items():
-            estimator = make_estimator(name, case.vehicle, model=model)
-            error = np.degrees(sideslip_error(estimator, drive.signals, drive, case.vehicle.low_speed_blend_m_s))
+        drive = read_drive(case.log, case.car, friction=case.friction)
+        for column, (name, network) in columns.items():
+            error = np.degrees(sideslip_error(make_estimator(name, replace(case.car, network=network)), drive))
             n = np.count_nonzero(np.isfinite(error))
             found[column].append((root_mean_square(error) if n >= LEAST_SAMPLES else float("nan"), float(n)))
     return found
@@ -162,8 +163,8 @@ def main() -> None:
     """Write the page."""
     parser = options("many_cars_table", __doc__)
     parser.add_argument("--train", action="store_true", help="simulate, extract and train first")
-    parser.add_argument("--one", type=Path, default=HOME, help="model of one car")
-    parser.add_argument("--many", type=Path, default=MODEL, help="model of many cars")
+    parser.add_argument("--one", type=Path, default=SHIPPED_FOLDERS["default"], help="network of one car")
+    parser.add_argument("--many", type=Path, default=MODEL, help="network of many cars")
     parser.add_argument("--out", type=Path, default=DOCS)
     given = parser.parse_args()
     if given.train:
@@ -206,7 +207,7 @@ Written by `python -m studies.many_cars_table`; networks by `make train-default`
 The network for many cars knows mass, geometry, stiffness and peak force of the vehicle file as inputs. It learns from
 {many_cars.CARS} simulated saloons and SUVs with {many_cars.DRIVES_PER_CAR} drives of {many_cars.DRIVE_S:g} s each, all
 with vehicle files and sensors of their own; {VARY:g} is the spread by which files and friction are made wrong on top.
-Friction is told. Filter noise of all estimators is the shipped vehicle file's.
+Friction is told. Filter noise of all estimators is the shipped car's.
 
 {chr(10).join(parts)}"""
 

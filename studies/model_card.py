@@ -1,6 +1,6 @@
 """docs/model_card.md: what the shipped model was made of, how good it is on drives that it never saw, and its limits.
 
-    python -m studies.model_card [--work out/train-default] [--model pdhef_logtool/models/default] [--out docs]
+    python -m studies.model_card [--work out/train-default] [--car saloon] [--out docs]
 
 Every figure is computed here from the logs that ``studies.defaults.train_default`` simulated and the model that it
 wrote.
@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pdhef_logtool.estimators.registry import runnable
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
-from pdhef_logtool.residual_model.bundle import PAPER_FOLDER, PURE_LSTM_FOLDER, ModelBundle, load_bundle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.table import runnable
+from pdhef_logtool.residual_model.bundle import PAPER_FOLDER, PURE_LSTM_FOLDER, ModelBundle
 from studies.condition_drives import read_drive, root_mean_square, sideslip_error
-from studies.defaults.train_default import DRIVES, HOME, SETS
+from studies.defaults.train_default import DRIVES, SETS
 from studies.pages import options, table, write
 
 ESTIMATORS = ("zero", "linear-regression", "phy-ukf", "phy-ukf-tuned", "physics-plus", "pure-lstm", "pd-hef-paper",
@@ -32,17 +32,17 @@ PARTS = (
 LEAST_SAMPLES = 100
 
 
-def errors_deg(folder: Path, split: str, vehicle: VehicleParameters, model: ModelBundle) -> dict[str, list[float]]:
+def errors_deg(folder: Path, split: str, car: Car) -> dict[str, list[float]]:
     """Return the sideslip RMSE in degrees of every estimator on every drive of a split."""
     entries = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["drives"]
     found: dict[str, list[float]] = {}
     for entry in entries:
         if entry.get("split") != split or "sha256" not in entry:
             continue
-        drive = read_drive(folder / entry["file"], vehicle, entry["file"])
-        ready, _ = runnable(ESTIMATORS, vehicle, drive.signals.available, model=model)
+        drive = read_drive(folder / entry["file"], car)
+        ready, _ = runnable(ESTIMATORS, car, drive.signals.available)
         for estimator in ready:
-            error = np.degrees(sideslip_error(estimator, drive.signals, drive, vehicle.low_speed_blend_m_s))
+            error = np.degrees(sideslip_error(estimator, drive))
             if np.count_nonzero(np.isfinite(error)) >= LEAST_SAMPLES:
                 found.setdefault(estimator.name, []).append(root_mean_square(error))
     return found
@@ -72,9 +72,10 @@ def network_line(name: str, network: ModelBundle) -> list[str]:
     return [name, *shape, weights, f"{p['epochs']} (best {p['best_epoch']})", *losses]
 
 
-def page(work: Path, folder: Path) -> str:
+def page(work: Path, car: Car) -> str:
     """Return the card."""
-    model, vehicle = load_bundle(folder), load_vehicle(folder / "vehicle.toml")
+    model, folder = car.network, car.source
+    assert model is not None and folder is not None
     manifest = json.loads((work / "dataset" / "manifest.json").read_text(encoding="utf-8"))
     recipe = model.provenance["recipe"]
     splits = ", ".join(f"{n} {s['drives']} drives" for n, s in manifest["splits"].items())
@@ -86,7 +87,7 @@ def page(work: Path, folder: Path) -> str:
         if bundle is not None:
             networks.append(network_line(f"{name} (`{place}`)", bundle))
     parts = [
-        f"### {words[0].upper()}{words[1:]}\n\n{error_table(errors_deg(work / place, split, vehicle, model))}\n"
+        f"### {words[0].upper()}{words[1:]}\n\n{error_table(errors_deg(work / place, split, car))}\n"
         for place, split, words in PARTS
     ]
     return f"""# Model card of the shipped model
@@ -95,7 +96,7 @@ Written by `python -m studies.model_card`; the model by `make train-default`.
 
 - Place: `pdhef_logtool/models/default`, {size_kb(folder) / 1024.0:.2f} MB, sha256 `{model.sha256[:16]}…`.
 - What it is for: the residual of the nominal single-track model of the simulated saloon (`vehicle.toml` beside it,
-  with the filter noise that belongs to it). On another car its trust is capped by that car's vehicle file.
+  with the filter noise that belongs to it). On another car its trust is capped by that car's own evidence.
 - Data: simulated, {DRIVES} drives of 12.5 s of that car (seed {SETS["one_car"][0]}), friction 0.3 to 1.0, 40 to
   120 km/h, sensors with METHOD's noise, biases and delays; friction is told by the simulator. {splits}; split by drive.
 - Training: seed {recipe["seed"]}, one cycle up to a learning rate of {recipe["learning_rate"]:g}, on
@@ -123,10 +124,10 @@ def main(arguments: list[str] | None = None) -> None:
     """Write the card."""
     parser = options("model_card", __doc__)
     parser.add_argument("--work", type=Path, default=Path("out/train-default"))
-    parser.add_argument("--model", type=Path, default=HOME)
+    parser.add_argument("--car", default="saloon")
     parser.add_argument("--out", type=Path, default=Path("docs"))
     given = parser.parse_args(arguments)
-    write(given.out / "model_card.md", page(given.work, given.model))
+    write(given.out / "model_card.md", page(given.work, Car.load(given.car)))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m studies.switches [--drives 12] [--work out/switches] [--out docs/switches.md]
 
 Simulates the drives (kept once made; seeds from ``FIRST_SEED`` on, which nothing was fitted, tuned or trained on), runs
-the shipped vehicle file and network, and writes the page. Both sides of a switch see the same samples and are scored at
+the shipped car with its network, and writes the page. Both sides of a switch see the same samples and are scored at
 the stamps where both give an estimate; drives are the unit of the paired bootstrap.
 """
 
@@ -18,26 +18,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pdhef_logtool.estimators.registry import make_estimator
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.release import released_steps
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import open_model
-from studies.condition_drives import SIDESLIP, ConditionDrive, read_drive, root_mean_square
+from studies.condition_drives import ConditionDrive, read_drive, root_mean_square
 from studies.pages import DOCS, ROOT, number, options, table, write
 from studies.table_maths import Bound, median, median_ratio, pooled_ratio, pooled_rmse
 from truthsim.conditions import write_conditions
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
-VEHICLE = ROOT / "pdhef_logtool" / "models" / "default" / "vehicle.toml"
 FIRST_SEED = 11000
 ESTIMATORS = ("phy-ukf-tuned", "physics-plus", "pd-hef")
 #: Ratios nearer to 1 than this are no difference that matters.
@@ -219,25 +216,21 @@ def simulate(folder: Path, count: int) -> dict[str, list[Path]]:
     return found
 
 
-def measure(
-    drives: dict[str, list[Path]], vehicle: VehicleParameters, estimators: Sequence[Estimator]
-) -> Iterator[Line]:
+def measure(drives: dict[str, list[Path]], car: Car) -> Iterator[Line]:
     """Run both sides of every switch on its drives, kind by kind."""
+    estimators = [make_estimator(name, car) for name in ESTIMATORS]
     for kind, paths in drives.items():
-        read = [read_drive(p, vehicle, p.stem) for p in paths]
+        read = [read_drive(p, car) for p in paths]
         for switch in (s for s in SWITCHES if s.drives == kind):
             for e in estimators:
                 if e.name in switch.default:
-                    sides = np.array([compare(switch, e, d, vehicle.low_speed_blend_m_s) for d in read]).reshape(-1, 3)
+                    sides = np.array([compare(switch, e, d) for d in read]).reshape(-1, 3)
                     yield Line(switch, e.name, sides[:, 0], sides[:, 1], sides[:, 2])
 
 
-def compare(switch: Switch, estimator: Estimator, drive: ConditionDrive, low_speed_m_s: float) -> list[float]:
+def compare(switch: Switch, estimator: Estimator, drive: ConditionDrive) -> list[float]:
     """Return the sideslip RMSE in degrees on and off, and the number of stamps that both are scored at."""
-    on, off = (
-        np.degrees(signal_error(run(estimator, drive), drive.truth, SIDESLIP, low_speed_m_s))
-        for run in (switch.on, switch.off)
-    )
+    on, off = (np.degrees(drive.error(run(estimator, drive))) for run in (switch.on, switch.off))
     both = np.isfinite(on) & np.isfinite(off)
     if not both.any():
         return [float("nan"), float("nan"), 0.0]
@@ -332,16 +325,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=DOCS / "switches.md")
     given = parser.parse_args(arguments)
     began = time.monotonic()
-    vehicle, model = load_vehicle(VEHICLE), open_model(None)
-    if model is None:
-        raise SystemExit("no shipped model: make train-default makes one")
-    estimators = [make_estimator(name, vehicle, model=model) for name in ESTIMATORS]
+    car = Car.load("saloon")
     lines = []
-    for line in measure(simulate(given.work, given.drives), vehicle, estimators):
+    for line in measure(simulate(given.work, given.drives), car):
         print(f"{line.switch.name}, {line.switch.drives}, {line.estimator}: {line.says}", file=sys.stderr)
         lines.append(line)
     command = f"python -m studies.switches --drives {given.drives}"
-    write(given.out, page(lines, command, model.sha256, vehicle.name))
+    assert car.network is not None
+    write(given.out, page(lines, command, car.network.sha256, car.vehicle.name))
     print(f"{time.monotonic() - began:.0f} s", file=sys.stderr)
 
 

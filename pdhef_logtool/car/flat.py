@@ -18,6 +18,8 @@ from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
 
+#: What a file holds beside physics and sensors.
+_TABLES = ("filter", "network", "identification")
 #: A drive and a score, as older versions wrote them for people.
 _SPAN = re.compile(r"(?P<name>.+): (?P<start_s>-?[\d.]+) to (?P<end_s>-?[\d.]+) s")
 _SCORE = re.compile(r"(?P<name>[a-z-]+): (?P<score_deg>[\d.]+) deg at trial (?P<trial>\d+)")
@@ -45,7 +47,7 @@ class _FlatFile(VehicleParameters):
 
 @dataclass(frozen=True, slots=True)
 class FlatCar:
-    """What one file says of a car; ``provenance`` is its ``[identification]`` as it stands."""
+    """What one file says of a car."""
 
     vehicle: VehicleParameters
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
@@ -126,15 +128,12 @@ def flat_toml(
     if trust is not None:
         found = {"trust_cap": trust.trust_cap, "evidence": trust.evidence, "model_sha256": trust.network_sha256}
         tables["network"] = {k: v for k, v in found.items() if v is not None}
-    known = (
-        {k: v for k, v in document.get("identification", {}).unwrap().items() if k != "tuning_scores"}
-        if ("identification" in document)
-        else {}
-    )
-    if known or identification:
-        tables["identification"] = {**known, **identification}
-    stand = {name: document[name].unwrap() for name in tables if name in document}
-    _merge(document, stand, tables)
+    given = {name: table for name, table in document.unwrap().items() if name in _TABLES}
+    provenance = {**given.get("identification", {}), **identification}
+    provenance.pop("tuning_scores", None)
+    if provenance:
+        tables["identification"] = provenance
+    _merge(document, given, tables)
     _comment(document, comments or {})
     return tomlkit.dumps(document)
 
@@ -162,17 +161,45 @@ def _plain(part: Record) -> dict[str, Any]:
 
 
 def _merge(table: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-    """Change a TOML table in place where ``after`` differs from ``before``; plain entries before tables."""
+    """Change a TOML table in place where ``after`` differs from ``before``; plain entries before tables and lists."""
+    import tomlkit
+
     for key in before.keys() - after.keys():
         table.pop(key, None)
-    for key, value in sorted(after.items(), key=lambda item: isinstance(item[1], Mapping)):
+    for key, value in sorted(after.items(), key=lambda item: _rank(item[1])):
         if key in before and before[key] == value:
             continue
         if isinstance(value, Mapping) and isinstance(table.get(key), Mapping):
             old = before.get(key)
             _merge(table[key], old if isinstance(old, Mapping) else {}, value)
+        elif isinstance(value, Mapping) and any(map(_rank, value.values())):
+            table[key] = tomlkit.table()
+            _merge(table[key], {}, value)
+        elif isinstance(value, list) and _rank(value):
+            table[key] = _lines(value)
         else:
             table[key] = value
+
+
+def _rank(value: Any) -> int:
+    """Return where an entry stands in a table: plain ones first, then lists a line an item, which may be long."""
+    if isinstance(value, Mapping):
+        return 2
+    return int(isinstance(value, list) and any(isinstance(item, Mapping | str) for item in value))
+
+
+def _lines(items: Sequence[Any]) -> Any:
+    """Return a list with an item a line."""
+    import tomlkit
+
+    array = tomlkit.array().multiline(True)
+    for item in items:
+        if isinstance(item, Mapping):
+            inline = tomlkit.inline_table()
+            inline.update(item)
+            item = inline
+        array.append(item)
+    return array
 
 
 def _comment(document: Any, comments: Mapping[str, str]) -> None:
@@ -183,4 +210,4 @@ def _comment(document: Any, comments: Mapping[str, str]) -> None:
         for table in tables:
             place = place.get(table, {})
         if entry in place:
-            place[entry].comment(text)
+            place[entry].comment(text).trivia.comment_ws = "  "

@@ -36,12 +36,12 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from pdhef_logtool import __version__
 from pdhef_logtool.logs.container import RawChunk
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.version import __version__
 
 LIBRARY = f"pdhef-logtool {__version__}"
 _MAGIC = b"\x89MCAP0\r\n"

@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,14 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
-from pdhef_logtool.drive.alignment import align, plan_alignment
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import auto_map, fit_clocks, read_signals
 from pdhef_logtool.records.signals import FloatArray, Signals
 from studies.pages import ROOT
 from truthsim.drive import Drive, simulate_drive, write_drive
@@ -62,12 +62,8 @@ def signals_of(drive: Drive, vehicle: VehicleParameters, folder: Path) -> Signal
     """Take a drive the way of every log: written as MCAP, mapped by recognition, aligned."""
     path = folder / f"{drive.manoeuvre}-{drive.seed}.mcap"
     write_drive(drive, path)
-    with closing(open_log(path)) as log:
-        mapping = auto_map(log).mapping
-        clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-        channels = read_signals(log, mapping, clocks, log.start_ns, log.end_ns).signals
-        plan = plan_alignment(channels, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m)
-        signals = align(channels, plan, log.start_ns, log.end_ns)
+    with read_drive(path, Car.of(vehicle), options=ReadOptions(friction=None)) as log:
+        signals = log.whole().signals
     path.unlink()
     return signals
 

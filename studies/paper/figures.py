@@ -260,7 +260,7 @@ def draw(r: Results, folder: Path) -> None:
     schemes = [n for n in DRAWN if n in r.ran]
     if r.histories:
         convergence(folder, r.histories)
-    seed = r.models[0].seed
+    seed = r.first_seed
     residuals(folder, "figure10_residual_fit", r.fits[A.name][0], f"scenario A, training seed {seed}")
     residuals(folder, "figure19_residual_verification", r.fits[B.name][0], f"scenario B, training seed {seed}")
     for scenario, letter, first in ((A.name, "a", 11), (B.name, "b", 15)):

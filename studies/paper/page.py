@@ -169,7 +169,7 @@ def _figure_10(r: Results) -> str:
     fit = r.fits[A.name][0]
     (target_v, output_v), (target_r, output_r) = fit.noise(0), fit.noise(1)
     facts = (
-        f"Scenario A, training seed {r.models[0].seed}: the residual is what the nominal model misses at the true "
+        f"Scenario A, training seed {r.first_seed}: the residual is what the nominal model misses at the true "
         f"state with the measured steering, bias and noise included (Eq 10). The networks explain "
         f"{_explained(r, A.name)} (1 − error over residual, mean squares)."
     )
@@ -236,7 +236,7 @@ def _figure_state(
 ) -> str:  # fmt: skip
     lines = [f"`{n}` {ranged(s)} {unit}" for n in DRAWN if (s := r.spread(scenario, n, figure))]
     seed = r.experiment.drives[scenario].noise_seed
-    facts = f"RMSE: {'; '.join(lines)}. Drawn: noise seed {seed}, training seed {r.models[0].seed}."
+    facts = f"RMSE: {'; '.join(lines)}. Drawn: noise seed {seed}, training seed {r.first_seed}."
     found = Findings()
     found.gain(r.improvement(scenario, HYBRID, "phy-ukf", figure), f"`{HYBRID}` against `phy-ukf`")
     _against_paper(r, scenario, figure, unit, found)
@@ -315,7 +315,7 @@ def _figure_19(r: Results) -> str:
     largest = float(np.nanmax(np.abs(np.gradient(truth.yaw_rate_rad_s, truth.stamps_ns * 1e-9))))
     asked = max(abs(v) for v in published.NETWORK_OUTPUT_RAD_S) / step
     facts = (
-        f"Scenario B, training seed {r.models[0].seed}; the networks explain {_explained(r, B.name)}, and in A "
+        f"Scenario B, training seed {r.first_seed}; the networks explain {_explained(r, B.name)}, and in A "
         f"{_explained(r, A.name)}. Increments of yaw rate over a {1e3 * step:.0f} ms step: {signed(low)} … "
         f"{signed(high)} rad/s in B, {signed(low_a)} … {signed(high_a)} rad/s in A; as rates "
         f"{signed(low_a / step)} … {signed(high_a / step)} rad/s² in A."
@@ -519,9 +519,8 @@ def write_page(r: Results) -> str:
     latency = max(abs(float(str(f["truth_latency_ms"]))) for f in r.experiment.facts)
     missing = [f"- `{name}`: {reason}." for name, reason in r.experiment.missing.items()]
     networks = "; ".join(
-        f"seed {m.seed} `{m.bundle.sha256[:12]}` ({len(m.bundle.feature_names)} features, {m.bundle.layers} × "
-        f"{m.bundle.hidden})"
-        for m in r.models
+        f"seed {seed} `{n.sha256[:12]}` ({len(n.feature_names)} features, {n.layers} × {n.hidden})"
+        for seed, n in r.networks.items()
     )
     figures = [_figure_9(r), _figure_10(r)]
     for scenario, letter, first, words in ((A.name, "a", 11, "double lane change"), (B.name, "b", 15, "sine sweep")):
@@ -549,10 +548,10 @@ through the lanes asks for {_impossible_course()} g, so A is the ISO 3888-1 cour
 {published.DLC_PEAK_G:g} g.
 
 Sensors: {_sensors()} {len(seeds)} noise {"seed" if len(seeds) == 1 else "seeds"} ({seeds[0]} to {seeds[-1]}),
-{len(r.models)} training {"seed" if len(r.models) == 1 else "seeds"}. The latency taken off the truth is what the gyro
+{len(r.cars)} training {"seed" if len(r.cars) == 1 else "seeds"}. The latency taken off the truth is what the gyro
 says: at most {number(latency)} ms.
 
-**Friction is known**: each scheme gets the friction of the drive through the vehicle file. Vehicle: {r.vehicle.name}.
+**Friction is known**: each scheme gets the friction of the drive through the car's file. Vehicle: {r.car.vehicle.name}.
 Networks: {networks}.
 
 Schemes:

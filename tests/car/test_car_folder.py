@@ -213,6 +213,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert car.notes == (
         "fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew",
         "noise of physics-plus is not used: it belongs to other physics; pdhef tune makes it anew",
+        "network.toml allows no trust: it was found with other physics; pdhef trust makes it anew",
     )
     assert car.allowed_trust.cap == 0.0
     assert "other physics; pdhef trust gives it anew" in car.allowed_trust.note
@@ -250,7 +251,10 @@ def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     car = load(folder, "default")
     assert car.vehicle.friction == 0.7
     assert dict(car.noise) == fit.filter
-    assert len(car.notes) == 1 and "noise of physics-plus is not used" in car.notes[0]
+    assert [note.split(":")[0] for note in car.notes] == [
+        "noise of physics-plus is not used",
+        "network.toml allows no trust",
+    ]
     assert car.allowed_trust.cap == 0.0
 
 
@@ -259,7 +263,7 @@ def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
     add_trust(folder)
     add_noise(folder)
     car = load(folder, "default")
-    assert car.notes == ()
+    assert car.notes == ("network.toml allows no trust: it was found with other noise; pdhef trust makes it anew",)
     assert car.allowed_trust.cap == 0.0
     assert "other noise" in car.allowed_trust.reason
 
@@ -274,6 +278,10 @@ def test_noise_of_a_filter_with_another_network_is_left_out(folder: Path) -> Non
     assert dict(other.noise) == {}
     assert other.notes == ("noise of pd-hef is not used: it belongs to another network; pdhef tune makes it anew",)
     assert dict(load(folder, "none").noise) == {"pd-hef": noise}  # no filter that could take it
+    add_noise(folder)
+    add_trust(folder, "many-cars")
+    assert load(folder, "default").notes == ()  # noise of physics alone, and evidence about another network
+    assert "the car's evidence is about network" in load(folder, "default").allowed_trust.reason
 
 
 def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder: Path) -> None:
@@ -286,6 +294,10 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
     assert after.physics_sha256 == before.physics_sha256
     assert after.intervals == before.intervals
     assert after.intervals is not None and after.intervals.physics_sha256 == after.physics_sha256
+    assert after.notes == ()
+    edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
+    assert "intervals.json was made with other physics; pdhef calibrate makes it anew" in Car.load(folder).notes
+    assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
 
 
 # --- what is refused -------------------------------------------------------------------------------------------------

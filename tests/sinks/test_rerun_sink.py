@@ -397,3 +397,16 @@ def test_a_trajectory_stays_small_and_evenly_spaced(lengths):
         assert strip[0, 0] == 0
         assert len(set(np.diff(strip[:, 0]))) == 1
         assert total - strip[-1, 0] <= np.diff(strip[:, 0])[0]
+
+
+def test_the_truth_stands_out_and_bands_stay_behind_the_lines(recording: Path) -> None:
+    _, static = tables(recording)
+
+    def widths(entity: str) -> list[float]:
+        (batch,) = static[entity]
+        (column,) = [n for n in batch.schema.names if n.endswith("widths")]
+        return list(batch.column(column).to_pylist()[0])
+
+    assert widths("/sideslip_deg/truth") == [2.0]
+    assert widths("/sideslip_deg/phy-ukf") == [1.5]
+    assert widths("/sideslip_deg/phy-ukf/band95") == [0.75, 0.75]

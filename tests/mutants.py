@@ -1,6 +1,6 @@
 """Mutants: small faults put into the code one at a time, to see whether the tests notice.
 
-    python -m studies.mutants [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused] [--json FILE]
+    python tests/mutants.py [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused] [--json FILE]
 
 A seeded draw spreads the faults over five packages, over kinds of faults and over functions: no function gets two.
 What only words a message is left alone, and so is what no test can tell apart by construction. Each mutant lives in a
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import functools
 import json
 import os
 import random
@@ -27,6 +28,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = "pdhef_logtool"
@@ -201,11 +203,12 @@ class _Finder(ast.NodeVisitor):
         """Leave what only narrows types alone."""
 
 
-def _flip(operator: ast.AST) -> ast.AST:
+def _flip(operator: ast.AST) -> Any:
     return _OPPOSITE[type(operator)]()
 
 
-def possible(package: str, root: Path = ROOT) -> list[Mutant]:
+@functools.cache
+def possible(package: str, root: Path = ROOT) -> tuple[Mutant, ...]:
     """Return every fault that can be put into a package, in order of files and lines."""
     trees = {p: ast.parse(p.read_bytes()) for p in sorted((root / SOURCES).rglob("*.py"))}
     at_import = {name for tree in trees.values() for name in _called_at_import(tree)}
@@ -215,7 +218,7 @@ def possible(package: str, root: Path = ROOT) -> list[Mutant]:
             finder = _Finder(package, path.relative_to(root).as_posix(), path.read_bytes(), at_import)
             finder.visit(tree)
             found += finder.found
-    return found
+    return tuple(found)
 
 
 def _called_at_import(tree: ast.Module) -> Iterator[str]:
@@ -231,7 +234,7 @@ def draw(packages: Sequence[str], count: int, seed: int, root: Path = ROOT) -> l
     drawn: list[Mutant] = []
     for n, package in enumerate(packages):
         rng = random.Random(f"{seed} {package}")
-        left = possible(package, root)
+        left = list(possible(package, root))
         kinds = sorted({m.kind for m in left})
         rng.shuffle(kinds)
         for i in range(count // len(packages) + (n < count % len(packages))):
