@@ -243,6 +243,13 @@ def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str
     assert (car.physics_sha256, car.noise_sha256) == (before.physics_sha256, before.noise_sha256)
 
 
+def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -> None:
+    """What stands at its default is as if it were absent."""
+    (tmp_path / "mine.toml").write_text(PERSONS)
+    said = {k: v for k, v in tomllib.loads(PERSONS).items() if k not in ("name", "truth_position_m")}
+    assert load(tmp_path / "mine.toml").physics_sha256 == digest(said)
+
+
 def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     add_fit(folder)
     add_noise(folder)
@@ -421,17 +428,26 @@ def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder: 
     assert load(written.parent).noise[PLUS] == NEW[PLUS]
     assert {p.name for p in folder.iterdir()} == {VEHICLE_FILE, FIT_FILE}
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["new"]
-    mask = os.umask(0)
-    os.umask(mask)
-    assert written.parent.stat().st_mode & 0o777 == 0o777 & ~mask
 
 
 def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(PERSONS)
     update_car(load(tmp_path / "mine.toml"), tmp_path / "mine", noise_change(NEW))
     assert (tmp_path / "mine" / VEHICLE_FILE).read_text() == PERSONS
+    mask = os.umask(0)
+    os.umask(mask)
+    assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o777 & ~mask
     update_car(Car.load(None, network="none"), tmp_path / "sedan", noise_change(NEW))
     assert load(tmp_path / "sedan").own == default_vehicle()
+
+
+def test_what_the_output_knows_of_the_car_stays(folder: Path, tmp_path: Path) -> None:
+    """The bare file of the same car is named: its folder keeps what other commands found."""
+    fit = add_fit(folder)
+    shutil.copy(folder / VEHICLE_FILE, tmp_path / "mine.toml")
+    update_car(load(tmp_path / "mine.toml"), folder, noise_change(NEW))
+    assert dict(load(folder).noise) == {**fit.filter, **NEW}
+    assert load(folder).learnt_on == DRIVES
 
 
 def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path) -> None:
