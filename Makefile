@@ -21,8 +21,8 @@ help:
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
-	@echo "make conditions VEHICLE=car.toml MODEL=model  docs/conditions.md: every estimator on the condition table"
-	@echo "make real MODEL=model  docs/real.md: every estimator on the recorded drives in ../shared"
+	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
+	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
 	@echo "make switches  docs/switches.md: bias states, roll, standstill, slip gate, latency of the filters, on and off"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
@@ -98,14 +98,14 @@ docs-truthsim: $(VENV)/installed
 paper: $(VENV)/installed $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.paper
 
-# Every estimator on the condition table; MODEL is the bundle of the network, VEHICLE the file that it belongs to.
+# Every estimator on the condition table, with the car's own network or another.
 DRIVES ?= 30
 conditions: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.conditions --drives $(DRIVES) --jobs $(JOBS) \
-	  $(if $(VEHICLE),--vehicle $(VEHICLE)) $(if $(MODEL),--model $(MODEL))
+	  --car $(CAR) $(if $(NETWORK),--network $(NETWORK))
 
 real: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.real $(if $(MODEL),--model $(MODEL))
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.real $(if $(NETWORK),--network $(NETWORK))
 
 switches: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches

@@ -1,6 +1,6 @@
 """Run the speed benchmarks and print one table.
 
-    python -m benchmarks [NAME ...] [--json] [--list] [--write-docs] [--gate]
+    python -m benchmarks [NAME ...] [--write-docs] [--gate]
 
 With ``--gate`` it ends with 4 if a target is missed.
 """
@@ -11,7 +11,7 @@ import argparse
 import sys
 from importlib import import_module
 
-from benchmarks.measuring import ROOT, Figure, as_json, machine_facts
+from benchmarks.measuring import ROOT, Figure, machine_facts
 
 NAMES = ("reading", "writing", "copying", "filtering")
 DOCUMENT = ROOT / "docs" / "benchmarks.md"
@@ -52,27 +52,18 @@ def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Speed against peers in the same run.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; all when none is given")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
-    parser.add_argument("--list", action="store_true", help="print the names")
     parser.add_argument("--write-docs", action="store_true", help="write docs/benchmarks.md (needs all benchmarks)")
     parser.add_argument("--gate", action="store_true", help="end with 4 if a target is missed")
     arguments = parser.parse_args()
-    unknown = sorted(set(arguments.names) - set(NAMES))
-    if unknown:
-        parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(NAMES)}")
+    if set(arguments.names) - set(NAMES):
+        parser.error(f"expected names out of {', '.join(NAMES)}, got {', '.join(arguments.names)}")
     if arguments.write_docs and arguments.names:
         parser.error("--write-docs needs all benchmarks: give no names")
-    if arguments.list:
-        print("\n".join(NAMES))
-        return 0
     figures: list[Figure] = []
     for name in arguments.names or NAMES:
         print(f"{name} ...", file=sys.stderr)
         figures += import_module(f"benchmarks.{name}").run()
-    if arguments.json:
-        print(as_json(figures))
-    else:
-        print_table(figures)
+    print_table(figures)
     if arguments.write_docs:
         write_document(figures)
     return 4 if arguments.gate and any(f.passed is False for f in figures) else 0

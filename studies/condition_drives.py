@@ -7,6 +7,7 @@ only through the factor of the row: 1.2 times it, or nothing at all. The bins ar
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error, summarise_errors
+from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
@@ -30,6 +31,7 @@ from pdhef_logtool.records.tracks import StateTrack
 from studies.independent_sim_logs import write_run
 from studies.pages import INDEPENDENT
 from studies.table_maths import interval_score
+from truthsim.drive import Drive, write_drive
 
 SIDESLIP = "sideslip_rad"
 #: Bins of true |a_y| over μ g (METHOD §10), by name: lower and upper limit.
@@ -76,9 +78,7 @@ def read_drive(path: Path, car: Car, *, friction: float | None = None) -> Condit
 
     def with_true_friction(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
         return replace(
-            mapping,
-            signals={**mapping.signals, "friction": _FRICTION},
-            truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y},
+            mapping, signals={**mapping.signals, "friction": _FRICTION}, truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y}
         )
 
     adjust = with_true_friction if friction is None else None
@@ -91,6 +91,15 @@ def read_drive(path: Path, car: Car, *, friction: float | None = None) -> Condit
         constant = np.full(len(signals), friction)
         signals = replace(signals, friction=constant, available=signals.available | {"friction"})
     return ConditionDrive(whole.name, signals, truth, car.vehicle.low_speed_blend_m_s)
+
+
+def as_logged(drive: Drive, car: Car) -> reading.WholeDrive:
+    """Return a simulated drive the way of every log: written as MCAP, mapped by recognition, read; no friction told."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.mcap"
+        write_drive(drive, path)
+        with reading.read_drive(path, car, options=ReadOptions(friction=None)) as read:
+            return read.whole()
 
 
 def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:
@@ -161,11 +170,14 @@ def root_mean_square(error: FloatArray) -> float:
 
 def rmse_row(drive: str, estimator: str, segment: str, error: FloatArray) -> list[MetricRow]:
     """Return the sideslip RMSE over an error [N] in rad as a row; none where nothing is known."""
-    known = error[np.isfinite(error)]
-    if not known.size:
-        return []
-    rmse = summarise_errors(known)["rmse"]
-    return [MetricRow(drive, estimator, SIDESLIP, segment, "rmse", rmse, "rad", int(known.size))]
+    n = int(np.count_nonzero(np.isfinite(error)))
+    return [MetricRow(drive, estimator, SIDESLIP, segment, "rmse", root_mean_square(error), "rad", n)] if n else []
+
+
+def drives_of(folder: Path, split: str | None = None) -> list[dict[str, Any]]:
+    """Return the entries of a set's manifest, of one split or all, whose drives could be made."""
+    entries = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["drives"]
+    return [e for e in entries if "sha256" in e and split in (None, e.get("split"))]
 
 
 def independent_runs(folder: Path) -> Iterable[tuple[Path, Path, float]]:

@@ -6,16 +6,14 @@ settings, and the sources of what computes. A row whose key is as it was is not 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from functools import cache, lru_cache
+from dataclasses import dataclass, field
+from functools import cache, lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -37,28 +35,10 @@ from studies.condition_drives import read_drive, rmse_row, score, sideslip_error
 from studies.pages import ROOT
 from truthsim.vehicle_choice import choose_vehicle
 
-FORMAT = 1
 COLUMNS = ("row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 _KEY, _NOTES = b"key", b"notes"
-#: What decides the figures, beside the drives: sources by folder or file.
-_SOURCES = (
-    "pdhef_logtool/estimators",
-    "pdhef_logtool/residual_model",
-    "pdhef_logtool/evaluation",
-    "pdhef_logtool/mapping",
-    "pdhef_logtool/drive",
-    "pdhef_logtool/car",
-    "pdhef_logtool/watches",
-    "pdhef_logtool/records",
-    "studies/condition_drives.py",
-    "studies/condition_runs.py",
-    "studies/fixed_grid.py",
-    "studies/independent_sim_logs.py",
-    "studies/table_maths.py",
-)
-_BUDGET_SOURCES = ("truthsim", "studies/error_budget.py", "studies/defaults/fit_nominal_tyres.py")
-
-Say = Callable[[str], None]
+#: What decides the figures, beside the drives: all sources of these folders.
+_SOURCES = ("pdhef_logtool", "truthsim", "studies")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,63 +99,36 @@ _Done = tuple[Task, list[tuple[Any, ...]], list[str]]
 
 
 @cache
-def source_digest(*places: str) -> str:
-    """Return the hash of the Python sources under folders or files of the repository."""
-    digest = hashlib.sha256()
-    for place in places:
-        path = ROOT / place
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-            digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+def source_digest() -> str:
+    """Return the hash of the sources that decide the figures."""
+    files = sorted(file for place in _SOURCES for file in (ROOT / place).rglob("*.py"))
+    return digest([[f.relative_to(ROOT).as_posix(), f.read_text(encoding="utf-8")] for f in files])
 
 
 def row_key(setup: Setup, tasks: Sequence[Task]) -> str:
     """Return the hash of all that the row's figures depend on."""
-    kind = tasks[0].kind
     document = {
-        "format": FORMAT,
-        "kind": kind,
+        "kind": tasks[0].kind,
         "setup": setup.identity,
         "assume": tasks[0].assume,
         "drives": [[t.log.name, t.sha256, t.friction] for t in tasks],
-        "grid": [asdict(s) for s in fixed_grid.GRID],
-        "sources": source_digest(*_SOURCES, *(_BUDGET_SOURCES if kind == "budget" else ())),
+        "sources": source_digest(),
     }
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    return digest(document)
 
 
-def run_rows(
-    setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: int, title: str, say: Say
-) -> dict[str, RowResult]:
+def run_rows(setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: int, title: str) -> dict[str, RowResult]:
     """Run the tasks of every row, keep what is there already, write each row's Parquet as soon as it is whole."""
     folder.mkdir(parents=True, exist_ok=True)
     done: dict[str, RowResult] = {}
-    todo: list[Task] = []
     rows = {name: tasks for name, tasks in rows.items() if tasks}
-    keys = {name: row_key(setup, tasks) for name, tasks in rows.items()}
-    for name, tasks in rows.items():
-        kept = _read(folder / f"{name}.parquet", keys[name])
-        if kept is None:
-            todo += tasks
-        else:
-            done[name] = kept
-    if done:
-        say(f"{title}: {len(done)} rows kept")
-    open_rows: dict[str, list[_Done]] = {}
-    began = time.monotonic()
-    with _workers(setup, jobs) as work:
-        for count, done_now in enumerate(work(todo), start=1):
-            task = done_now[0]
-            so_far = open_rows.setdefault(task.row, [])
-            so_far.append(done_now)
-            left = (time.monotonic() - began) / count * (len(todo) - count)
-            say(f"\r{title}: {count} of {len(todo)} drives, {left:.0f} s left   ")
-            if len(so_far) == len(rows[task.row]):
-                done[task.row] = _write(folder / f"{task.row}.parquet", so_far, keys[task.row])
-                del open_rows[task.row]
-    if todo:
-        say(f"\n{title}: {len(todo)} drives in {time.monotonic() - began:.0f} s\n")
-    return {name: done[name] for name in rows if name in done}
+    with _workers(jobs) as work:
+        for name, tasks in rows.items():
+            path, key = folder / f"{name}.parquet", row_key(setup, tasks)
+            done[name] = _read(path, key) or _write(path, list(work(partial(_run, setup), tasks)), key)
+            progress(f"\r{title}: {len(done)} of {len(rows)} rows   ")
+    progress("\n")
+    return done
 
 
 def _read(path: Path, key: str) -> RowResult | None:
@@ -189,7 +142,6 @@ def _read(path: Path, key: str) -> RowResult | None:
 
 
 def _write(path: Path, parts: list[_Done], key: str) -> RowResult:
-    # Processes finish in any order; the file does not show it.
     parts = sorted(parts, key=lambda p: p[0].log.as_posix())
     schema = dict.fromkeys(COLUMNS, pl.String) | {"value": pl.Float64, "n": pl.Int64}
     table = pl.DataFrame([(task.row, *r) for task, rows, _ in parts for r in rows], schema=schema, orient="row")
@@ -201,24 +153,15 @@ def _write(path: Path, parts: list[_Done], key: str) -> RowResult:
 
 
 @contextmanager
-def _workers(setup: Setup, jobs: int) -> Iterator[Callable[[list[Task]], Iterator[_Done]]]:
-    """Yield a function that runs tasks, here or in processes, and yields what they give in any order."""
+def _workers(jobs: int) -> Iterator[Callable[..., Iterator[_Done]]]:
+    """Yield what maps a function over tasks, here or in processes."""
     if jobs == 1:
-        yield lambda todo: (_run(setup, task) for task in todo)
+        yield map
         return
     # Read by the fresh interpreters when they load the libraries: one thread each, parallel over drives.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-
-        def work(todo: list[Task]) -> Iterator[_Done]:
-            futures = [pool.submit(_run, setup, task) for task in todo]
-            try:
-                for future in as_completed(futures):
-                    yield future.result()
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
-
-        yield work
+        yield pool.map
 
 
 def _run(setup: Setup, task: Task) -> _Done:

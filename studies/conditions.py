@@ -68,13 +68,8 @@ def simulated(given: argparse.Namespace, kind: str, drives: int, seed: int) -> d
     # A manifest holds what was asked for: one of some rows must not take the place of that of all.
     part = "" if set(rows) == set(ROW_NAMES) else "-" + hashlib.sha256(",".join(rows).encode()).hexdigest()[:8]
     folder = given.work / f"drives-{seed}-{drives}{part}"
-
-    def say(text: str, _share: float) -> None:
-        progress(f"\rsimulating (seed {seed}): {text}   ")
-
-    manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs, progress=say)
-    progress(f"\rsimulated (seed {seed}): {len(manifest['drives'])} drives        ")
-    progress("\n")
+    manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs)
+    progress(f"simulated (seed {seed}): {len(manifest['drives'])} drives")
     entries = {e["file"]: e for e in manifest["drives"]}
     return {
         row["name"]: [
@@ -105,14 +100,14 @@ def run(given: argparse.Namespace) -> None:
         if not tasks[INDEPENDENT_ROW]:
             absent = f"{INDEPENDENT_ROW} is left out: it needs ../shared beside the repository"
             progress(absent)
-    scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators", say=progress)
+    scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators")
     if not scored:
         raise SystemExit("no drives to score")
     calibration = {}
     if setup.loaded.network is not None and given.calibration_drives > 0:
         grid = simulated(given, "grid", given.calibration_drives, given.seed + CALIBRATION_SEED_OFFSET)
         folder = given.work / "calibration"
-        calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings", say=progress)
+        calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings")
     metrics = as_frame(scored)
     ran = set(metrics["estimator"].unique())
     budget = {}
@@ -124,9 +119,7 @@ def run(given: argparse.Namespace) -> None:
             if name != INDEPENDENT_ROW
         }
         folder = given.work / "budget"
-        budget = run_rows(
-            replace(setup, estimators=names), some, folder, jobs=given.jobs, title="error budget", say=progress
-        )
+        budget = run_rows(replace(setup, estimators=names), some, folder, jobs=given.jobs, title="error budget")
     facts = Facts(
         command=_command(given),
         car=setup.loaded.vehicle.name,

@@ -210,14 +210,9 @@ def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Seque
     return "\n".join(lines)
 
 
-def _availability(figures: Figures, row: str, name: str) -> float:
-    values, samples = figures.get(row, name, "availability")
-    return pooled_mean(values, samples) if values.size else float("nan")
-
-
 def _sideslip(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
     def mark(row: str, name: str) -> str:
-        return "†" if _availability(figures, row, name) < AVAILABLE else ""
+        return "†" if pooled_mean(*figures.get(row, name, "availability")) < AVAILABLE else ""
 
     def middle(row: str, name: str) -> str:
         return _deg(median(figures.get(row, name)[0])) + mark(row, name)
@@ -345,11 +340,8 @@ def _fixed(figures: Figures, rows: Sequence[str], chosen: Chosen | None, facts: 
 
 
 def _nonlinear(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
-    def cell(row: str, name: str) -> str:
-        return _deg(median(figures.get(row, name, segment=NONLINEAR)[0]))
-
     title = "## Sideslip RMSE in the nonlinear range (|a_y| > 0.5 μ g), in degrees: median over drives\n\n"
-    return title + _grid(rows, names, cell)
+    return title + _grid(rows, names, lambda row, name: _deg(median(figures.get(row, name, segment=NONLINEAR)[0])))
 
 
 def _consistency(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:

@@ -6,7 +6,6 @@ row, the one that nobody could have known beforehand. All settings share one pas
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
@@ -46,7 +45,7 @@ GRID = tuple(Setting(*point) for point in product(TRUSTS, AY_FACTORS, Q_FACTORS)
 
 def is_setting(name: str) -> bool:
     """Tell whether an estimator's name is one of the grid."""
-    return re.match(rf"{PREFIX}\(", name) is not None
+    return name.startswith(f"{PREFIX}(")
 
 
 def at(base: HybridUkf, setting: Setting) -> HybridUkf:

@@ -1,10 +1,8 @@
 """Turn the independent simulator's runs (Parquet) into logs as a recorder would leave them.
 
-    python -m studies.independent_sim_logs [../shared/data/independent_sim] [out/independent_sim]
-
 Topics and types are those of the simulated sample logs, so that the same mapping reads both: IMU, steering and wheel
 speeds from the runs' sensor columns, ``/truth/perfect/odometry`` from their states. The runs' licence keeps them out of
-the repository: ``out/`` is ignored by git.
+the repository.
 """
 
 from __future__ import annotations
@@ -18,15 +16,14 @@ import polars as pl
 
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.signals import WHEELS
-from studies.pages import INDEPENDENT, ROOT, options
 from truthsim.recording import STEERING_REPORT, quaternion
 
 START_NS = 1_767_225_600_000_000_000
 RADIUS_M = 0.30
 
 
-def write_run(source: Path, target: Path) -> int:
-    """Write one run as MCAP and return the number of samples."""
+def write_run(source: Path, target: Path) -> None:
+    """Write one run as MCAP."""
     run = pl.read_parquet(source)
     facts = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
     column = {name: run[name].to_numpy().astype(np.float64) for name in run.columns}
@@ -78,23 +75,3 @@ def write_run(source: Path, target: Path) -> int:
             writer.add_topic(topic, type_name, constants=constants, definition=definition)
         writer.metadata("independent_sim", {"run": str(facts["run"]), "friction": repr(facts["mu"])})
         writer.write([TopicBatch(topic, stamps, stamps, fields) for topic, (_, _, fields, _) in topics.items()])
-    return int(stamps.shape[0])
-
-
-def main(source: Path, target: Path) -> None:
-    """Convert every run of a folder."""
-    runs = sorted(source.glob("*.parquet"))
-    if not runs:
-        raise SystemExit(f"{source}: expected Parquet runs, got none")
-    target.mkdir(parents=True, exist_ok=True)
-    for path in runs:
-        log = target / f"{path.stem}.mcap"
-        print(f"{log}: {write_run(path, log)} samples")
-
-
-if __name__ == "__main__":
-    parser = options("independent_sim_logs", __doc__)
-    parser.add_argument("source", type=Path, nargs="?", default=INDEPENDENT)
-    parser.add_argument("target", type=Path, nargs="?", default=ROOT / "out" / "independent_sim")
-    given = parser.parse_args()
-    main(given.source, given.target)

@@ -1,7 +1,5 @@
 """Short drives of many simulated cars, each with a vehicle file of its own: what one network for many cars learns from.
 
-    python -m studies.many_cars [-o out/many-cars] [--cars 300] [--jobs 2]
-
 Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
 that no network ever saw. A car's file is fitted to a ramp steer of it (``error_budget.fit_vehicle``), as somebody who
 has measured his car would have it. Drives are split by car.
@@ -9,7 +7,6 @@ has measured his car would have it. Drives are split by car.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +17,6 @@ from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import SimulationError
 from studies.error_budget import fit_vehicle
-from studies.pages import options
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
@@ -129,25 +125,5 @@ def write_cars(
 ) -> dict[str, Any]:
     """Write a set of many cars and its manifest; drives that are there as they should be are kept."""
     planned = plan_cars(cars, drives, seed, folder, load_vehicle(BASE), kinds)
-    head = {"command": "python -m studies.many_cars", "seed": seed, "cars": cars, "drives_per_car": drives}
+    head = {"command": "python -m studies.many_cars_table", "seed": seed, "cars": cars, "drives_per_car": drives}
     return run_jobs(planned, folder, head, processes=jobs)
-
-
-def main() -> None:
-    """Write the set."""
-    parser = options("many_cars", __doc__)
-    parser.add_argument("-o", "--output", type=Path, default=Path("out/many-cars"))
-    parser.add_argument("--cars", type=int, default=CARS)
-    parser.add_argument("--drives", type=int, default=DRIVES_PER_CAR, help="of each car")
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), help="sedan, suv, hatchback")
-    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    given = parser.parse_args()
-    how = {"cars": given.cars, "drives": given.drives, "seed": given.seed, "jobs": given.jobs}
-    manifest = write_cars(given.output, **how, kinds=tuple(given.kinds))
-    made = sum("sha256" in e for e in manifest["drives"])
-    print(f"{made} drives of {given.cars} cars in {given.output}")
-
-
-if __name__ == "__main__":
-    main()

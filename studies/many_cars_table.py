@@ -9,7 +9,6 @@ on runs that are not scored); filter noise is that of the shipped car for all es
 
 from __future__ import annotations
 
-import json
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -30,7 +29,7 @@ from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, ModelBundle, lo
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.run.config import RunConfig
 from studies import many_cars
-from studies.condition_drives import independent_runs, read_drive, root_mean_square, sideslip_error
+from studies.condition_drives import drives_of, independent_runs, read_drive, root_mean_square, sideslip_error
 from studies.defaults.train_default import MAPPING, pdhef
 from studies.fine_tuning import train_on_parts
 from studies.pages import DOCS, INDEPENDENT, ROOT, options, table, write
@@ -83,17 +82,10 @@ def with_shipped_noise(vehicle: VehicleParameters) -> Car:
     return Car.of(vehicle, noise=Car.load("saloon", network="none").noise)
 
 
-def drives_of(folder: Path) -> list[dict[str, Any]]:
-    """Return the manifest's entries of the drives that could be made."""
-    entries = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["drives"]
-    return [e for e in entries if "sha256" in e]
-
-
 def cars_of(folder: Path, split: str | None) -> Iterator[Case]:
     """Yield the drives of a set of many cars."""
-    for entry in drives_of(folder):
-        if split in (None, entry["split"]):
-            yield Case(folder / entry["file"], with_shipped_noise(load_vehicle(folder / entry["vehicle_file"])))
+    for entry in drives_of(folder, split):
+        yield Case(folder / entry["file"], with_shipped_noise(load_vehicle(folder / entry["vehicle_file"])))
 
 
 def independent_cases(work: Path) -> Iterator[Case]:

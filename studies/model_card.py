@@ -17,7 +17,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.table import runnable
 from pdhef_logtool.residual_model.bundle import PAPER_FOLDER, PURE_LSTM_FOLDER, ModelBundle
-from studies.condition_drives import read_drive, root_mean_square, sideslip_error
+from studies.condition_drives import drives_of, read_drive, root_mean_square, sideslip_error
 from studies.defaults.train_default import DRIVES, SETS
 from studies.pages import options, table, write
 
@@ -34,11 +34,8 @@ LEAST_SAMPLES = 100
 
 def errors_deg(folder: Path, split: str, car: Car) -> dict[str, list[float]]:
     """Return the sideslip RMSE in degrees of every estimator on every drive of a split."""
-    entries = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["drives"]
     found: dict[str, list[float]] = {}
-    for entry in entries:
-        if entry.get("split") != split or "sha256" not in entry:
-            continue
+    for entry in drives_of(folder, split):
         drive = read_drive(folder / entry["file"], car)
         ready, _ = runnable(ESTIMATORS, car, drive.signals.available)
         for estimator in ready:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -52,7 +52,10 @@ TRAIN_SHARE, GUARD_S = 0.8, 5.0
 #: Against which all others are judged, the first that ran.
 YARDSTICKS = ("phy-ukf-tuned, identified", "phy-ukf, catalogue")
 
-Say = Callable[[str], None]
+
+def say(text: str) -> None:
+    """Tell who waits."""
+    print(text, file=sys.stderr)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +160,7 @@ def read_part(part: Part, mapping_file: Path, car: Car) -> WholeDrive:
         return drive.whole()
 
 
-def run_case(case: Case, network: Path, trials: int, say: Say) -> list[Result]:
+def run_case(case: Case, network: Path, trials: int) -> list[Result]:
     """Fit what is to be fitted and return the errors of everything on the scored part."""
     mapping_file, catalogue_file = files(case)
     results: list[Result] = []
@@ -197,9 +200,9 @@ def run_case(case: Case, network: Path, trials: int, say: Say) -> list[Result]:
         results += regressions(case, case.fit, mapping_file, catalogue)
         add("identified", identified, physics)
         hybrids = [n for n in networks if n.startswith("pd-hef")]
-        tried = {"network of this part": train(case, config, folder / "alone", None, say)}
+        tried = {"network of this part": train(case, config, folder / "alone", None)}
         if catalogue.network is not None:
-            own = train(case, config, folder / "fine-tuned", catalogue.network, say)
+            own = train(case, config, folder / "fine-tuned", catalogue.network)
             tried = {"given network": catalogue.network, **tried, "network fine-tuned": own}
         for label, bundle in tried.items():
             say(f"{case.name}: trust in the {label}")
@@ -245,7 +248,7 @@ def half_trust(ready: Sequence[Estimator]) -> list[Estimator]:
     return [replace(e, trust=0.5, name=f"{name} at trust 0.5") for e in fixed]
 
 
-def train(case: Case, config: RunConfig, folder: Path, init: ModelBundle | None, say: Say) -> ModelBundle:
+def train(case: Case, config: RunConfig, folder: Path, init: ModelBundle | None) -> ModelBundle:
     """Train a network on the first share of the fit part, stopped by the rest of it; ``init`` is its start."""
     say(f"{case.name}: training {folder.name}")
     slices = {
@@ -331,12 +334,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not DRIVES.is_dir():
         print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
         return 0
-    unknown = sorted(set(given.cases.split(",")) - {c.name for c in CASES})
-    if unknown:
-        parser.error(f"--cases: expected names out of {', '.join(c.name for c in CASES)}, got {', '.join(unknown)}")
-
-    def say(text: str) -> None:
-        sys.stderr.write(text + "\n")
+    wanted, known = given.cases.split(","), [c.name for c in CASES]
+    if set(wanted) - set(known):
+        parser.error(f"--cases: expected names out of {', '.join(known)}, got {given.cases}")
 
     network = Car.load(network=given.network).network
     used = "none" if network is None else f"sha256 {network.sha256[:12]}"
@@ -348,12 +348,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "Sideslip RMSE with the 95 % interval of a bootstrap of 10 s blocks. The drives may not be redistributed.",
         "",
     ]
-    for case in CASES:
-        if case.name not in given.cases.split(","):
-            continue
+    for case in (c for c in CASES if c.name in wanted):
         lines += [f"## {case.title}", "", f"Scored above {case.min_speed_m_s:g} m/s. {case.remark}", ""]
         try:
-            lines += [case_table(run_case(case, given.network, given.trials, say)), ""]
+            lines += [case_table(run_case(case, given.network, given.trials)), ""]
         except PdhefError as error:
             say(str(error))
             lines += [f"Not done: {error}", ""]

@@ -10,7 +10,6 @@ of metrics.parquet, and payloads and stamps of every topic below ``/pdhef``. A d
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -21,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-ROOT = Path(__file__).resolve().parents[1]
-DRIVES = ROOT.parent / "shared" / "data" / "drives"
+from studies.pages import DRIVES, ROOT, options
+
 _REFERENCE = ["--vehicle", "tests/reference/vehicles/revs_250lm.toml"]
 _MAPPING = ["--mapping", "tests/reference/mappings/revs_250lm.toml"]
 _SAMPLES = ("dlc.mcap", "road.mcap", "step.mcap", "step_rosbag2", "fishhook.mcap", "faults.mcap", "no_truth.mcap")
@@ -51,10 +50,7 @@ def cases(shipped: str) -> tuple[Case, ...]:
     return (
         Case("samples", ("run", *samples, "--vehicle", shipped)),
         Case("low-friction", ("run", "sample_logs/sweep.mcap", "--vehicle", shipped, "--friction", "0.3")),
-        Case(
-            "untuned",
-            ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--sensors", "esp"),
-        ),
+        Case("untuned", ("run", *samples[:1], "sample_logs/faults.mcap", *samples_car, "--sensors", "esp")),
         Case(
             "default-car",
             ("run", "sample_logs/dlc.mcap", "--model", "many-cars", "--friction", "estimate", "--annotate", "sidecar"),
@@ -77,7 +73,7 @@ MENDED: dict[tuple[str, str, str], str] = {}
 
 def main(arguments: list[str] | None = None) -> int:
     """Run both trees and compare; 0 if nothing differs but what is mended."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options("same_as_before", __doc__)
     parser.add_argument("commit", help="to compare with")
     parser.add_argument("--work", type=Path, default=Path("out/same"), help="both trees' outputs")
     parser.add_argument("--keep", action="store_true", help="take the older tree's outputs as they are there")

@@ -31,10 +31,7 @@ class Bound:
 
 def pooled_rmse(rmse: FloatArray, samples: FloatArray) -> float:
     """Return the RMSE over all samples of all drives from each drive's RMSE [N] and number of samples [N]."""
-    known = np.isfinite(rmse) & (samples > 0)
-    if not known.any():
-        return float("nan")
-    return float(np.sqrt(np.sum(samples[known] * rmse[known] ** 2) / np.sum(samples[known])))
+    return float(np.sqrt(pooled_mean(rmse**2, samples)))
 
 
 def pooled_mean(mean: FloatArray, samples: FloatArray) -> float:

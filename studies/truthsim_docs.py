@@ -39,11 +39,6 @@ COLOURS = {"sedan": "#1f5fa8", "suv": "#b5482a", "hatchback": "#3b8550"}
 _SAVED_DPI = 80
 
 
-def degrees(radians: FloatArray | float) -> Any:
-    """Radians in degrees."""
-    return np.degrees(radians)
-
-
 def open_loop(speed_m_s: float, steer_rad: FloatArray) -> Plan:
     """Return the plan of a steering table."""
     return Plan(speed_m_s, (steer_rad.shape[0] - 1) * 1e-3, steer_rad=steer_rad)
@@ -88,13 +83,13 @@ def steady_state(folder: Path) -> dict[str, str]:
         rear = slope(motion, 0.5 * (motion.column("fz_rr_n") - motion.column("fz_rl_n")))
         front_theory, rear_theory = steady_roll(car)[1]
         a_y = motion.column("ay_m_s2") / G
-        angles = ((degrees(understeer), degrees(theory)), (degrees(roll), degrees(roll_theory)))
+        angles = ((np.degrees(understeer), np.degrees(theory)), (np.degrees(roll), np.degrees(roll_theory)))
         loads = ((front, front_theory), (rear, rear_theory))
         cells = [f"{own * G:.2f} / {said * G:.2f}" for own, said in angles]
         rows.append([name, *cells, *(f"{own * G:.0f} / {said * G:.0f}" for own, said in loads), f"{a_y.max():.2f}"])
-        ax.plot(a_y, degrees(beyond), color=COLOURS[name], label=f"{name}, simulated")
+        ax.plot(a_y, np.degrees(beyond), color=COLOURS[name], label=f"{name}, simulated")
         line = np.array([0.0, 0.5])
-        ax.plot(line, degrees(theory) * G * line, "--", color=COLOURS[name], linewidth=1.0)
+        ax.plot(line, np.degrees(theory) * G * line, "--", color=COLOURS[name], linewidth=1.0)
     ax.set(
         xlabel="lateral acceleration, g",
         ylabel="road-wheel angle beyond L/R, deg",
@@ -155,15 +150,15 @@ def responses(folder: Path) -> dict[str, str]:
         for k, name in enumerate(worst):
             ratios = np.array([m[k] for m, _ in found]) / np.array([h[k] for h in theory_here])
             worst[name][0] = max(worst[name][0], float(np.abs(np.abs(ratios) - 1.0).max()))
-            worst[name][1] = max(worst[name][1], float(np.abs(degrees(np.angle(ratios))).max()))
+            worst[name][1] = max(worst[name][1], float(np.abs(np.degrees(np.angle(ratios))).max()))
         theory = np.array([frequency_response(free_rolling(car), float(f), speed, DRY) for f in fine])
         for k, scale in ((0, 1.0), (1, np.radians(1.0) / G)):
             measured = np.array([m[k] for m, _ in found])
             label = f"{speed * 3.6:.0f} km/h"
             axes[0, k].plot(fine, scale * np.abs(theory[:, k]), color=colour, label=f"{label}, linear theory")
             axes[0, k].plot(points, scale * np.abs(measured), "o", color=colour, markersize=4, label="simulated")
-            axes[1, k].plot(fine, degrees(np.unwrap(np.angle(theory[:, k]))), color=colour)
-            axes[1, k].plot(points, degrees(np.unwrap(np.angle(measured))), "o", color=colour, markersize=4)
+            axes[1, k].plot(fine, np.degrees(np.unwrap(np.angle(theory[:, k]))), color=colour)
+            axes[1, k].plot(points, np.degrees(np.unwrap(np.angle(measured))), "o", color=colour, markersize=4)
     for k, title in ((0, "yaw rate over road-wheel angle, 1/s"), (1, "a_y over road-wheel angle, g/deg")):
         axes[0, k].set(title=title, ylim=(0.0, None))
         axes[1, k].set(xlabel="frequency, Hz", ylabel="phase, deg" if k == 0 else "")
@@ -231,11 +226,11 @@ def traces(folder: Path) -> dict[str, str]:
         fig, axes = figure(3, 2, 8.4, 6.4)
         felt = [("ay_m_s2", "a_y", 1 / G), ("specific_force_y_m_s2", "felt by the leaning IMU", 1 / G)]
         panels = (
-            ("road-wheel angle, deg", [("steer_rad", "", degrees(1.0))]),
-            ("yaw rate, deg/s", [("yaw_rate_rad_s", "", degrees(1.0))]),
+            ("road-wheel angle, deg", [("steer_rad", "", np.degrees(1.0))]),
+            ("yaw rate, deg/s", [("yaw_rate_rad_s", "", np.degrees(1.0))]),
             ("acceleration, g", felt),
-            ("sideslip, deg", [("sideslip_rad", "", degrees(1.0))]),
-            ("roll, deg", [("roll_rad", "", degrees(1.0))]),
+            ("sideslip, deg", [("sideslip_rad", "", np.degrees(1.0))]),
+            ("roll, deg", [("roll_rad", "", np.degrees(1.0))]),
             ("wheel load, kN", [(f"fz_{w}_n", w, 1e-3) for w in WHEELS]),
         )
         for ax, (label, lines) in zip(axes.ravel(), panels, strict=True):
@@ -251,9 +246,9 @@ def traces(folder: Path) -> dict[str, str]:
         fig.suptitle(title)
         save(fig, folder / f"{name}.png", _SAVED_DPI)
         unit = drive.friction * G
-        yaw_rate, roll = (degrees(float(np.abs(truth[c]).max())) for c in ("yaw_rate_rad_s", "roll_rad"))
+        yaw_rate, roll = (np.degrees(float(np.abs(truth[c]).max())) for c in ("yaw_rate_rad_s", "roll_rad"))
         largest = f"{drive.peak_ay_m_s2 / G:.2f} g = {drive.peak_ay_m_s2 / unit:.2f} mu g"
-        angles = [f"{yaw_rate:.1f}", f"{degrees(drive.peak_sideslip_rad):.2f}", f"{roll:.2f}"]
+        angles = [f"{yaw_rate:.1f}", f"{np.degrees(drive.peak_sideslip_rad):.2f}", f"{roll:.2f}"]
         lightest = min(float(truth[f"fz_{w}_n"].min()) for w in WHEELS)
         rows.append([title.split(",")[0], largest, *angles, f"{lightest:.0f}"])
     head = "manoeuvre | largest a_y | yaw rate, deg/s | sideslip, deg | roll, deg | lightest wheel, N"
@@ -278,8 +273,8 @@ def speed() -> dict[str, str]:
 #: parallel steering, pitch centre at 0.05 m.
 _OTHER_RELAXATION_M = 0.2
 _QUANTITIES = {"a_y": "ay", "yaw rate": "yaw_rate", "sideslip": "beta", "roll": "roll"}
-_UNITS = {"a_y": (1.0, "m/s²"), "yaw rate": (degrees(1.0), "°/s"), "sideslip": (degrees(1.0), "°")}
-_UNITS["roll"] = (degrees(1.0), "°")
+_UNITS = {"a_y": (1.0, "m/s²"), "yaw rate": (np.degrees(1.0), "°/s"), "sideslip": (np.degrees(1.0), "°")}
+_UNITS["roll"] = (np.degrees(1.0), "°")
 
 
 def other_stiffness_n_per_rad(ramp_run: Any) -> tuple[float, float]:

@@ -6,10 +6,9 @@ import ast
 from collections import Counter
 from pathlib import Path
 
+import mutants
 import pytest
 from mutants import FOLDERS, ROOT, Mutant
-
-from studies import mutants
 
 pytestmark = pytest.mark.slow
 

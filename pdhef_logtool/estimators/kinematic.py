@@ -32,7 +32,8 @@ STANDSTILL_SPEED_M_S = 0.05
 
 
 @njit(cache=True)
-def _kinematic(dt, ax, ay, yaw_rate, speed, leak_s, state, values, rates, valid):  # type: ignore[no-untyped-def]
+def _kinematic(sensors, leak_s, state, values, rates, valid):  # type: ignore[no-untyped-def]
+    dt, ax, ay, yaw_rate, speed = sensors
     # state: v_x, age of the speed sample, v_y, v̇_y of the step before
     for k in range(dt.shape[0]):
         advance_speed(state, dt[k], ax[k], speed[k])
@@ -72,9 +73,8 @@ class Kinematic:
         def step(
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
         ) -> None:
-            _kinematic(
-                dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, self.leak_s, state, values, rates, valid
-            )
+            sensors = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
+            _kinematic(sensors, self.leak_s, state, values, rates, valid)
 
         return run_stepwise(self.name, signals, carry, 4, step, slip_gate=self.slip_gate)
 

@@ -100,6 +100,7 @@ def relaxation_rate(vx, p, f):  # type: ignore[no-untyped-def]
     return max(vx, p.blend_low_m_s) / f.relaxation_length_m
 
 
+# positional: scalars throughout; called four times a step, on sums of them.
 @njit(cache=True)
 def lagged_derivative(vx, vy, r, ff, fr, steer, cos_steer, ax, friction, max_rate, p, f):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r, f_f, f_r], blended to the kinematic model at low speed.
@@ -136,6 +137,7 @@ def lagged_substeps(vx, dt, friction, p, f):  # type: ignore[no-untyped-def]
     return min(n, MAX_SUBSTEPS)
 
 
+# positional: scalars throughout, as ``rk4_step`` of the nominal model with two states more.
 @njit(cache=True)
 def lagged_rk4_step(vx, vy, r, ff, fr, steer, ax, friction, dt, n, p, f):  # type: ignore[no-untyped-def]
     """Advance [v_x, v_y, r, f_f, f_r] by ``dt`` s in ``n`` RK4 steps with constant inputs.

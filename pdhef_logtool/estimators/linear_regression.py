@@ -9,8 +9,9 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.direct_network import write_direct_steps
+from pdhef_logtool.estimators.filter_shell import VX
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import VX, FilterCarry
+from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.estimators.stepwise import StepCarry, run_stepwise
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack

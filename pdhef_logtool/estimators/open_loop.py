@@ -38,7 +38,8 @@ AY_RATE_STEP_S = 0.001
 
 
 @njit(cache=True)
-def _open_loop(dt, steer, ax, speed, friction, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
+def _open_loop(inputs, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
+    dt, steer, ax, speed, friction = inputs
     # state: v_x, age of the speed sample, v_y, r, steering and friction of the step before
     for k in range(dt.shape[0]):
         before = state[0]
@@ -99,9 +100,8 @@ class OpenLoop:
         def step(
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
         ) -> None:
-            _open_loop(
-                dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction, mu, p, state, values, rates, valid
-            )  # fmt: skip
+            inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
+            _open_loop(inputs, mu, p, state, values, rates, valid)
 
         std = self.vehicle.sensors.speed_std_m_s
         return run_stepwise(self.name, signals, carry, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 
 @njit(cache=True)
-def _pass_through(dt, ax, ay, yaw_rate, speed, vy, state, values, valid):  # type: ignore[no-untyped-def]
+def _pass_through(sensors, vy, state, values, valid):  # type: ignore[no-untyped-def]
+    dt, ax, ay, yaw_rate, speed = sensors
     for k in range(dt.shape[0]):
         advance_speed(state, dt[k], ax[k], speed[k])
         values[k, 0] = state[0]
@@ -51,7 +52,7 @@ class PassThrough:
         def step(
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, _: FloatArray, valid: BoolArray
         ) -> None:
-            _pass_through(dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, vy, state, values, valid)
+            _pass_through((dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s), vy, state, values, valid)
 
         return run_stepwise(self.name, signals, carry, 2, step)
 

@@ -30,17 +30,11 @@ from numba import njit
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale
+from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
-from pdhef_logtool.estimators.physics import (
-    AX_BIAS,
-    LINK_BIASES,
-    LINK_NONE,
-    FilterCarry,
-    PhysicsUkf,
-    PosteriorSteps,
-    StepLinks,
-)
+from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, PhysicsUkf, StepLinks
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
+from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, cut_signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.service import NetworkService
@@ -90,8 +84,16 @@ def _smoother_gain(cross, predicted, first, L, gain):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _smooth(x, P, prior, kind, predicted_P, cross, first, last, end, out_x, out_P):  # type: ignore[no-untyped-def]
-    """Smooth steps ``first`` to ``last`` with all up to ``end`` (inclusive); writes out_x [K, n], out_P [K, n, n]."""
+def _smooth(forward, links, span, smoothed):  # type: ignore[no-untyped-def]
+    """Smooth the first steps of a span with all of it; writes state [K, n] and covariance [K, n, n].
+
+    ``forward`` are posterior state, covariance and prior state, ``links`` the columns of :class:`~.physics.StepLinks`,
+    ``span`` the first step, the last one that is written and the last one, inclusive.
+    """
+    x, P, prior = forward
+    kind, predicted_P, cross = links
+    first, last, end = span
+    out_x, out_P = smoothed
     n = x.shape[1]
     xs, Ps = x[end].copy(), P[end].copy()
     L, gain, change = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
@@ -140,19 +142,17 @@ def smooth_steps(
     """
     n = steps.x.shape[1]
     x, P = np.empty((count, n)), np.empty((count, n, n))
+    forward, tied = (steps.x, steps.P, steps.prior), (links.kind, links.predicted_P, links.cross)
     block = (steps.stamps_ns - origin_ns) // block_ns
     for b in np.unique(block[:count]).tolist():
         first, behind = (int(i) for i in np.searchsorted(block, (b, b + 1)))
         end = int(np.searchsorted(block, b + 2)) - 1
-        _smooth(
-            steps.x, steps.P, steps.prior, links.kind, links.predicted_P, links.cross, first,
-            min(behind, count) - 1, end, x, P,
-        )  # fmt: skip
+        _smooth(forward, tied, (first, min(behind, count) - 1, end), (x, P))
     return x, P
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ForwardSteps:
+class ForwardSteps(StepColumns):
     """Steps of the forward pass: posteriors, what ties them, and what was wrong with their samples.
 
     ``extra_r`` [K, 2] and ``reason`` [K] are those of :class:`~.sensor_faults.SensorFaults`.
@@ -166,21 +166,6 @@ class ForwardSteps:
     def __len__(self) -> int:
         """Return the number of steps."""
         return len(self.reason)
-
-    def joined(self, other: ForwardSteps) -> ForwardSteps:
-        """Append the steps that follow."""
-        return ForwardSteps(
-            self.posterior.joined(other.posterior),
-            self.links.joined(other.links),
-            np.concatenate([self.extra_r, other.extra_r]),
-            np.concatenate([self.reason, other.reason]),
-        )
-
-    def since(self, index: int) -> ForwardSteps:
-        """Keep the steps from ``index`` on."""
-        return ForwardSteps(
-            self.posterior.since(index), self.links.since(index), self.extra_r[index:], self.reason[index:]
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

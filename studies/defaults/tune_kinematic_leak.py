@@ -44,7 +44,8 @@ def main() -> None:
     best = min(means, key=means.__getitem__)
     print(f"chosen: {best} s")
     criterion = "mean over manoeuvres of the median sideslip RMSE of the drives, degrees"
-    write_result("kinematic_leak", drives, criterion=criterion, leak_s=best, grid=rows)
+    made_by = "python -m studies.defaults.tune_kinematic_leak"
+    write_result("kinematic_leak", drives, made_by=made_by, criterion=criterion, leak_s=best, grid=rows)
 
 
 if __name__ == "__main__":

@@ -8,16 +8,13 @@ car is told that of the drive. Noise seeds change the sensors alone; training se
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.drive.reading import WholeDrive, read_drive
+from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import runnable, spec_of
 from pdhef_logtool.evaluation.metrics import MetricRow, score_track
@@ -25,8 +22,9 @@ from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.run.estimating import estimate_windows
+from studies.condition_drives import as_logged
 from studies.paper.schemes import SCHEMES
-from truthsim.drive import simulate_drive, write_drive
+from truthsim.drive import simulate_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import MANOEUVRES
 
@@ -151,12 +149,7 @@ def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:
     """Simulate a drive, write it as a log and read it as ``pdhef run`` does."""
     faults = [parse_fault(f) for f in scenario.faults]
     drive = simulate_drive(scenario.manoeuvre, seed=noise_seed, faults=faults)
-    options = ReadOptions(friction=None)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "drive.mcap"
-        write_drive(drive, path)
-        with read_drive(path, on_the_road(car, drive.friction), options=options) as read:
-            whole = read.whole()
+    whole = as_logged(drive, on_the_road(car, drive.friction))
     facts = {
         "scenario": scenario.name,
         "noise_seed": noise_seed,

@@ -1,4 +1,4 @@
-"""The pictures of Figures 9 to 23 with our data, in colours that colour-blind readers can tell apart (Okabe-Ito)."""
+"""The pictures of Figures 9 to 23 with our data, in the colours that estimators have everywhere."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.evaluation.metrics import position_error
 from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
@@ -22,19 +23,8 @@ from studies.paper.schemes import DRAWN
 from studies.paper.step_time import StepTime
 from studies.pictures import STYLE, save, subplots
 
-COLOURS = {
-    "truth": "#8c8c8c",
-    "phy-ukf": "#0072B2",
-    "phy-ukf-tuned": "#56B4E9",
-    "physics-plus": "#CC79A7",
-    "pure-lstm": "#D55E00",
-    "pd-hef-paper": "#E69F00",
-    "pd-hef-fixed-r": "#000000",
-    "pd-hef-trust0": "#666666",
-    "pd-hef": "#009E73",
-}
+COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
 DASHES = {"phy-ukf": (0, (4, 1.5)), "pure-lstm": (0, (1.5, 1)), "pd-hef-paper": (0, (5, 1, 1, 1))}
-OTHERS = "#999999"
 BARS = ("phy-ukf", "phy-ukf-tuned", "physics-plus", "pure-lstm", "pd-hef-paper", "pd-hef-fixed-r", "pd-hef")
 
 #: Signal, factor to the unit drawn, label.
@@ -50,12 +40,12 @@ _STYLE = {**STYLE, "axes.spines.top": False, "axes.spines.right": False, "lines.
 
 
 def _style(name: str) -> dict[str, Any]:
-    return {"color": COLOURS.get(name, OTHERS), "linestyle": DASHES.get(name, "-"), "label": name}
+    return {"color": COLOURS[name], "linestyle": DASHES.get(name, "-"), "label": name}
 
 
 def _thin(name: str) -> dict[str, Any]:
     """Style of errors: noise in dashes cannot be read."""
-    return {"color": COLOURS.get(name, OTHERS), "linewidth": 0.9, "label": name}
+    return {"color": COLOURS[name], "linewidth": 0.9, "label": name}
 
 
 def _time_s(track: StateTrack) -> FloatArray:
@@ -70,15 +60,8 @@ def convergence(folder: Path, histories: Mapping[int, History]) -> None:
         shade = {"alpha": 1.0 if number == 0 else 0.45}
         mark = {} if len(history.epoch) > 1 else {"marker": "o"}
         ax.plot(history.epoch, history.train_loss, color="#0072B2", **shade, **mark, label=f"training, seed {seed}")
-        ax.plot(
-            history.epoch,
-            history.validation_loss,
-            color="#D55E00",
-            linestyle=DASHES["phy-ukf"],
-            **shade,
-            **mark,
-            label=f"validation, seed {seed}",
-        )
+        second = {"color": "#D55E00", "linestyle": DASHES["phy-ukf"], "label": f"validation, seed {seed}"}
+        ax.plot(history.epoch, history.validation_loss, **shade, **mark, **second)
     ax.set(yscale="log", xlabel="epoch", ylabel="mean square error,\nshare of the residual's mean square")
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     save(fig, folder / "figure09_convergence.png")
@@ -183,7 +166,7 @@ def trust(folder: Path, curves: Mapping[str, Mapping[str, TrustCurve]]) -> None:
     fig, axes = subplots(1, len(curves), 7.4, 3.3, _STYLE, sharey=True)
     for ax, (scenario, by_scheme) in zip(axes[0], curves.items(), strict=True):
         for scheme, curve in by_scheme.items():
-            colour = COLOURS.get(scheme, OTHERS)
+            colour = COLOURS[scheme]
             ax.plot(curve.ay_g, curve.trust, ".", markersize=2.0, alpha=0.35, color=colour)
             ax.fill_between(curve.centre_g, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
             ax.plot(curve.centre_g, curve.median, "o-", markersize=4, color=colour, label=f"{scheme}, median of a bin")
@@ -216,10 +199,8 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
             for k, name, s in spreads:
                 if s is None:
                     continue
-                ax.barh(k, s.median, color=COLOURS.get(name, OTHERS), height=0.72)
-                ax.plot(
-                    [s.low, s.high], [k, k], color="#222222" if name != "pd-hef-fixed-r" else "#bbbbbb", linewidth=1.1
-                )
+                ax.barh(k, s.median, color=COLOURS[name], height=0.72)
+                ax.plot([s.low, s.high], [k, k], color="#222222", linewidth=1.1)
             theirs = published.RMSE.get((scenario, figure))
             if theirs is not None:
                 ax.axvline(theirs, color="#222222", linestyle=":", linewidth=1.4)
@@ -238,16 +219,11 @@ def step_time_bars(folder: Path, times: Mapping[str, StepTime]) -> None:
     fig, axes = subplots(1, 1, 7.0, 0.9 + 0.26 * len(names), _STYLE)
     ax = axes[0, 0]
     for k, name in enumerate(names):
-        ax.barh(k, times[name].median_us, color=COLOURS.get(name, OTHERS), height=0.72)
+        ax.barh(k, times[name].median_us, color=COLOURS[name], height=0.72)
     for scheme, value in published.STEP_MS.items():
         ax.axvline(1e3 * value, color=COLOURS[scheme], linestyle=":", linewidth=1.5, label=f"paper, {scheme}")
-    ax.axvline(
-        1e3 * published.CYCLE_MS,
-        color="#222222",
-        linestyle="--",
-        linewidth=1.2,
-        label=f"{published.CYCLE_MS:g} ms cycle",
-    )
+    cycle = {"color": "#222222", "linestyle": "--", "linewidth": 1.2, "label": f"{published.CYCLE_MS:g} ms cycle"}
+    ax.axvline(1e3 * published.CYCLE_MS, **cycle)
     ax.set(xscale="log", xlabel="processor time a step, µs (log scale)")
     ax.set_yticks(range(len(names)), names)
     ax.grid(axis="y", visible=False)

@@ -31,6 +31,7 @@ from pdhef_logtool.car.nominal_points import (
 )
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators import physics
+from pdhef_logtool.estimators.filter_shell import Meanwhile
 
 pytestmark = pytest.mark.slow
 
@@ -184,7 +185,8 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
             want[i, layout.force_scale] *= math.exp(-dt / physics.FORCE_SCALE_TIME_S)
     np.testing.assert_allclose(zeta, want_zeta, rtol=TOLERANCE, atol=TOLERANCE)
 
-    physics._propagate(chi, steer, ax, mu, rate_vy, rate_r, dt, layout, p, points)
+    over = Meanwhile(steer, ax, ax_known=True, friction=mu)
+    physics._propagate(chi, over, (rate_vy, rate_r), dt, layout, p, points)
     np.testing.assert_allclose(chi, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -29,17 +29,10 @@ from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of, run_window
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, check_inputs
+from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf
 from pdhef_logtool.estimators.pd_hef import build_smoothed
-from pdhef_logtool.estimators.physics import (
-    AX_BIAS,
-    LINK_BIASES,
-    LINK_NONE,
-    LINK_WHOLE,
-    PhysicsUkf,
-    PosteriorSteps,
-    StepLinks,
-)
+from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, LINK_WHOLE, PhysicsUkf, StepLinks
 from pdhef_logtool.estimators.smoothed import SMOOTHED_Q_STD, SmoothedHybrid, smooth_steps, smoothed_hybrid
 from pdhef_logtool.estimators.table import SPECS, Options, make_estimator
 from pdhef_logtool.records.reasons import (
@@ -496,9 +489,9 @@ def test_it_starts_from_what_the_adaptive_filter_starts_from(faulty):
 def test_links_cost_the_filter_no_bit(rough):
     plain, after = PhysicsUkf(VEHICLE).filter_steps(rough, None)
     steps, again, links = PhysicsUkf(VEHICLE).linked_steps(rough, None)
-    for name in PosteriorSteps.__slots__:
+    for name in (f.name for f in fields(PosteriorSteps)):
         np.testing.assert_array_equal(getattr(plain, name), getattr(steps, name))
-    np.testing.assert_array_equal(after.P, again.P)
+    np.testing.assert_array_equal(after.belief.P, again.belief.P)
     starts = ~np.isfinite(steps.prior[:, 0])
     np.testing.assert_array_equal(links.kind == LINK_NONE, starts)
     assert starts.sum() == 2

@@ -22,7 +22,7 @@ from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run
+from pdhef_logtool.run.pipeline import run_logs
 
 pytestmark = pytest.mark.slow
 
@@ -228,7 +228,7 @@ def test_250_lm_identified_on_its_first_half_is_good_on_its_second(shared_dir: P
     first = RunConfig(car=reference / "vehicles" / "revs_250lm.toml", mapping=mapping, end="150")
     identify(log, tmp_path / "car.toml", first, holdout=0.0)
     second = RunConfig(car=tmp_path / "car.toml", mapping=mapping, start="155", annotate="none")
-    result = run(log, tmp_path / "out", second)
+    result = run_logs(log, tmp_path / "out", second)
     rmse = {
         row.estimator: math.degrees(row.value)
         for row in result.results[0].rows

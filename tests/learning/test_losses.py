@@ -1,128 +1,90 @@
-"""What is gone of a log is told alike by every command that reads drives, and ends each of them with 3."""
+"""One damaged log is the same to every command: the same losses in the same words, and exit code 3."""
 
 from __future__ import annotations
 
-import json
-import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
-from typer.testing import CliRunner
+import pytest
 
-from pdhef_logtool.cli.app import app
-from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, tell_drive
-from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.learning.car.identify_command import identify
+from pdhef_logtool.learning.drives import LearnSettings
+from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
+from pdhef_logtool.learning.evidence.trust_command import trust
+from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
+from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
+from pdhef_logtool.records.errors import EXIT_PARTIAL
+from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.run.pipeline import run_logs
+
+pytestmark = pytest.mark.slow
 
 REFERENCE = Path(__file__).resolve().parents[1] / "reference"
-#: Calibration needs five drives.
-COPIES = ("cut", "cut2", "cut3", "cut4", "cut5")
 
 
-def _model(folder: Path) -> Path:
-    torch.manual_seed(0)
-    n = len(FEATURES)
-    network = ResidualNetwork(Architecture(n, 8, 1, (4,)))
-    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
-    ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights).save(folder)
-    return folder
+def _losses_by_command(
+    log: Path, others: list[Path], out: Path, config: RunConfig
+) -> dict[str, tuple[list[dict[str, Any]], list[str]]]:
+    """Run every command on a damaged log, calibrate with others beside it; return by command its losses and warnings.
 
+    Every one must end with exit code 3.
+    """
+    logs, found = [str(log)], {}
+    physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
 
-def _run(*arguments: object) -> tuple[dict[str, Any], list[str]]:
-    """Run a command that must end with 3; return its JSON and the lines of stderr."""
-    result = CliRunner().invoke(app, [str(a) for a in (*arguments, "--json")])
-    assert result.exit_code == 3, (arguments[0], result.exit_code, result.exception, result.stderr)
-    return json.loads(result.stdout), result.stderr.splitlines()
+    def learn(**settings: Any) -> dict[str, Any]:
+        return {"config": replace(physics, estimators=None), **settings}
 
-
-def _compare(folder: Path, common: tuple[object, ...], end_s: int, estimate: str) -> None:
-    log, out = folder / "cut.mcap", folder / "out"
-    for name in COPIES[1:]:
-        shutil.copy(log, folder / f"{name}.mcap")
-    logs = tuple(folder / f"{name}.mcap" for name in COPIES)
-    model = _model(folder / "model")
-    common = (*common, "--end", end_s)
-    ran, _ = _run("run", log, "-o", out, *common, "-e", "phy-ukf", "--annotate", "none", "--model", "none")
-    expected = ran["logs"][0]["report"]["losses"]
-    lost = [x for x in expected if x["severity"] == "lost"]
-    assert [x["kind"] for x in lost] == ["truncated"]
-    scored, _ = _run("metrics", log, *common, "--estimate", estimate)
-    assert scored["logs"][0]["report"]["losses"] == expected
-    warning = f"warning: cut: {lost[0]['what']} (cut.mcap)"
-    commands: dict[str, tuple[object, ...]] = {
-        "identify": (log, "-o", folder / "identified.toml", *common, "--holdout", 0),
-        "extract": (log, "-o", folder / "residuals", *common, "--split", "train"),
-        "tune": (log, "-o", folder / "tuned.toml", *common, "-e", "phy-ukf-tuned", "--trials", 4),
-        "trust": (log, "-o", folder / "trusted.toml", *common, "--model", model),
-        "calibrate": (*logs, "-o", folder / "c.json", *common, "-e", "phy-ukf", "--model", "none", "--vary", 0),
+    commands = {
+        "identify": lambda tell: identify(logs, out / "1", config, holdout=0.0, warn=tell),
+        "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), warn=tell),
+        "tune": lambda tell: tune(
+            logs, out / "3", TuneSettings(**learn(names=("phy-ukf-tuned",), trials=4)), warn=tell
+        ),
+        "trust": lambda tell: trust(logs, out / "4", LearnSettings(config=config), warn=tell),
+        "calibrate": lambda tell: calibrate(
+            [*logs, *map(str, others)], out / "5", CalibrateSettings(config=physics, spread=0.0), warn=tell
+        ),
+        "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), warn=tell),
     }
-    for command, arguments in commands.items():
-        document, said = _run(command, *arguments)
-        assert document["exit_code"] == 3
-        assert document["left_out"] == []
-        (drive,) = (d for d in document["drives"] if d["name"] == "cut")
-        assert drive["losses"] == expected, command
-        assert said.count(warning) == 1, (command, said)
+    for name, command in commands.items():
+        told: list[str] = []
+        result = command(told.append)
+        assert result.exit_code == EXIT_PARTIAL, name
+        document = result.to_dict()
+        if name == "run":
+            losses = document["logs"][0]["report"]["losses"]
+        else:
+            (losses,) = (d["losses"] for d in document["drives"] if d["name"] == log.stem)
+        found[name] = losses, [text for text in told if text.startswith(f"{log.stem}: ")]
+    return found
 
 
-def test_a_truncated_log_is_told_alike_by_all_commands(sample_logs_dir: Path, tmp_path: Path) -> None:
-    whole = (sample_logs_dir / "road.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 4])
-    _compare(
-        tmp_path, ("--vehicle", sample_logs_dir / "vehicle.toml"), 35, "sideslip_rad=/truth/perfect/state.sideslip_rad"
-    )
+def _check(found: dict[str, tuple[list[dict[str, Any]], list[str]]], name: str) -> None:
+    expected, _ = found["run"]
+    lost = [f"{name}: {x['what']} ({x['where']})" for x in expected if x["severity"] == "lost"]
+    assert lost
+    for command, (losses, told) in found.items():
+        assert losses == expected, command
+        if command != "run":
+            assert [text for text in told if text in lost] == lost, command
 
 
-def test_the_truncated_250_lm_is_told_alike_by_all_commands(shared_dir: Path, tmp_path: Path) -> None:
-    shutil.copyfile(shared_dir / "data/drives/faulty/revs_250lm_a_truncated60.mcap", tmp_path / "cut.mcap")
-    vehicle, mapping = REFERENCE / "vehicles" / "revs_250lm.toml", REFERENCE / "mappings" / "revs_250lm.toml"
-    _compare(
-        tmp_path,
-        ("--vehicle", vehicle, "--mapping", mapping),
-        60,
-        "vx_m_s=/vehicle/status/velocity_status.longitudinal_velocity",
-    )
+def test_a_truncated_simulated_log(sample_logs_dir: Path, tmp_path: Path) -> None:
+    data = (sample_logs_dir / "road.mcap").read_bytes()
+    log = tmp_path / "cut.mcap"
+    log.write_bytes(data[: len(data) * 6 // 10])
+    others = [sample_logs_dir / f"{n}.mcap" for n in ("dlc", "step", "fishhook", "sweep")]
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", end="30")
+    _check(_losses_by_command(log, others, tmp_path / "out", config), "cut")
 
 
-def _record(name: str, *, severity: str = "", left_out: str = "") -> DriveRecord:
-    losses = (Loss("gap", "something", "/imu", severity=severity),) if severity else ()  # type: ignore[arg-type]
-    return DriveRecord(name, f"{name}.mcap", losses=losses, notes=("a note",), left_out=left_out)
-
-
-def test_one_rule_for_exit_codes() -> None:
-    good, noted, lost = _record("good"), _record("noted", severity="note"), _record("lost", severity="lost")
-    out = _record("out", left_out="no truth")
-    assert exit_code([good, noted]) == 0
-    assert exit_code([good, lost]) == 3
-    assert exit_code([good, out]) == 3
-    assert exit_code([out, out]) == 1
-
-
-def test_one_wording_for_what_is_told() -> None:
-    said: list[str] = []
-    for record in (_record("noted", severity="note"), _record("lost", severity="lost"), _record("out", left_out="why")):
-        tell_drive(record, said.append)
-    assert said == [
-        "noted: a note",
-        "lost: a note",
-        "lost: something (/imu)",
-        "out: a note",
-        "out is left out: why",
-    ]
-    document = drives_document([_record("lost", severity="lost"), _record("out", left_out="why")])
-    assert [d["name"] for d in document["drives"]] == ["lost"]
-    assert document["drives"][0]["losses"][0]["severity"] == "lost"
-    assert document["left_out"][0]["reason"] == "why"
-    json.dumps(document, allow_nan=False)
-
-
-def test_a_damaged_chunk_is_counted_once(shared_dir: Path) -> None:
-    log = shared_dir / "data/drives/faulty/revs_250lm_a_flipped_byte.mcap"
-    mapping = REFERENCE / "mappings" / "revs_250lm.toml"
-    speed = "vx_m_s=/vehicle/status/velocity_status.longitudinal_velocity"
-    scored, _ = _run("metrics", log, "--mapping", mapping, "--estimate", speed)
-    (lost,) = (x for x in scored["logs"][0]["report"]["losses"] if x["severity"] == "lost")
-    assert lost["what"].startswith(f"{lost['count']} messages lost")
+def test_the_truncated_drive_of_the_250_lm(shared_dir: Path, tmp_path: Path) -> None:
+    log = shared_dir / "data/drives/faulty/revs_250lm_a_truncated60.mcap"
+    others = [tmp_path / f"again_{number}.mcap" for number in range(4)]
+    for other in others:
+        other.symlink_to(log)
+    vehicle, mapping = REFERENCE / "vehicles/revs_250lm.toml", REFERENCE / "mappings/revs_250lm.toml"
+    config = RunConfig(car=vehicle, mapping=mapping, end="40")
+    _check(_losses_by_command(log, others, tmp_path / "out", config), log.stem)

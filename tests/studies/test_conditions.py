@@ -172,7 +172,7 @@ def test_told_and_bins(made, car):
     folder, manifest = _drives(made)
     drive = read_drive(folder / manifest["drives"][0]["file"], car)
     assert np.isnan(told(drive, {"friction": "unknown"}).friction).all()
-    np.testing.assert_allclose(told(drive, {"friction_factor": 0.8}).friction, 0.8 * drive.friction)
+    np.testing.assert_allclose(told(drive, {"friction_factor": 0.8}).friction, 0.8 * drive.signals.friction)
     with pytest.raises(ValueError, match="expected"):
         told(drive, {"weather": "rain"})
     masks = bin_masks(drive)

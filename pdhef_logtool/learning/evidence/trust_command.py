@@ -58,6 +58,8 @@ FORMAT = "pdhef-trust"
 FORMAT_VERSION = 2
 #: Splits of a set that a network is trained on and chosen by: it looks better there than in service.
 SEEN = ("train", "validation")
+#: Two slices that meet share a sample or two.
+EDGE_S = 0.05
 
 Warn = Callable[[str], None]
 #: Drives that this command refuses.
@@ -204,7 +206,7 @@ def seen_by_identification(car: Car, drives: Sequence[DriveRecord]) -> list[str]
 
     def overlap(one: LearntOn, other: LearntOn) -> bool:
         same = one.sha256 == other.sha256 if one.sha256 and other.sha256 else one.name == other.name
-        return same and one.start_s < other.end_s and other.start_s < one.end_s
+        return same and min(one.end_s, other.end_s) - max(one.start_s, other.start_s) > EDGE_S
 
     return [
         f"the car was identified on {seen.name}, {seen.start_s:.2f} to {seen.end_s:.2f} s: score another part "

@@ -194,15 +194,16 @@ def tune(
         search={**_summary(settings), "drives_sha256": record["drives_sha256"]},
         drives=tuple(d.learnt_on for d in result.drives),
     )
+    comments = {f"filter.{n}.q_std": "v_x, v_y, yaw rate" for n in noise}
     head = "Written by pdhef tune. It belongs to the physics of this car: use it with no other."
     files: dict[str, Content] = {
-        NOISE_FILE: part_toml(part, head, {f"filter.{n}.q_std": "v_x, v_y, yaw rate" for n in noise}).encode(),
+        NOISE_FILE: part_toml(part, head, comments).encode(),
         "noise.record.json": json_bytes(record),
         "noise.png": lambda path: _plot(result, path),
     }
     in_words = {f"tuning_{k}": v for k, v in part.search.items()}
     change = Change("tune", NOISE_FILE, files, settings=settings.to_dict(), drives=part.drives, told=in_words)
-    write_change(car, replace(car, noise={**car.noise, **noise}), output, change)
+    write_change(car, replace(car, noise={**car.noise, **noise}), output, change, comments)
     return result
 
 
