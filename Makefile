@@ -67,7 +67,7 @@ quick: $(VENV)/installed-dev $(VENV)/compiled
 SEED ?= 1
 COUNT ?= 30
 mutants: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/python -m studies.mutants --seed $(SEED) --count $(COUNT) --jobs $(JOBS)
+	$(BIN)/python tests/mutants.py --seed $(SEED) --count $(COUNT) --jobs $(JOBS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .

@@ -129,9 +129,17 @@ class Car:
         car = _with_parts(cls(flat.vehicle, flat.vehicle, source=source), flat, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
-        return replace(
-            car, network=bundle, network_name=name, network_folder=home, intervals=_intervals_of(folder, intervals)
-        )
+        foreign = [n for n, one in car.noise.items() if bundle and one.network_sha256 not in (None, bundle.sha256)]
+        noise = {n: one for n, one in car.noise.items() if n not in foreign}
+        found = _intervals_of(folder, intervals)
+        car = replace(car, noise=noise, network=bundle, network_name=name, network_folder=home, intervals=found)
+        stale = [*car.notes, *(_stale(f"noise of {n}", "it belongs to another network", "pdhef tune") for n in foreign)]
+        if other := car._other_than_tried:
+            stale.append(f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef trust makes it anew")
+        own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
+        if own and found is not None and found.physics_sha256 != car.physics_sha256:
+            stale.append(f"{INTERVALS_FILE} was made with other physics; pdhef calibrate makes it anew")
+        return replace(car, notes=tuple(stale))
 
     @property
     def physics_sha256(self) -> str:
@@ -161,20 +169,25 @@ class Car:
                 f"the car's evidence is about network {found.network_sha256[:SHOWN_DIGITS]}, this one is "
                 f"{here[:SHOWN_DIGITS]}; pdhef trust tries it",
             )
-        for what, then, now in (
-            ("physics", found.physics_sha256, self.physics_sha256),
-            ("noise", found.noise_sha256, self.noise_sha256),
-        ):
-            if then is not None and then != now:
-                return AllowedTrust(0.0, f"the car's evidence was found with other {what}; pdhef trust gives it anew")
+        if other := self._other_than_tried:
+            return AllowedTrust(0.0, f"the car's evidence was found with {other}; pdhef trust gives it anew")
         return AllowedTrust(found.trust_cap, found.evidence)
+
+    @property
+    def _other_than_tried(self) -> str:
+        """What of the car is another than the network was tried with; empty if nothing is."""
+        found = self.trust
+        if found is not None and found.physics_sha256 not in (None, self.physics_sha256):
+            return "other physics"
+        return "other noise" if found is not None and found.noise_sha256 not in (None, self.noise_sha256) else ""
 
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
         vehicle = fit.values.applied_to(self.own)
         if not vehicle.name.endswith("(identified)"):
             vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
-        noise = {**self.noise, **fit.filter}
+        here = physics_sha256(vehicle)
+        noise = {n: one for n, one in self.noise.items() if one.physics_sha256 in (None, here)} | fit.filter
         return replace(self, vehicle=vehicle, noise=noise, trust=None, learnt_on=fit.drives)
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
@@ -202,13 +215,15 @@ def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
             vehicle, noise, learnt_on, trust = car.vehicle, dict(car.noise), car.learnt_on, None
         elif fit is not None:
             notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "pdhef identify"))
-        tuned = _part(folder / NOISE_FILE, Noise)
+        tuned, stale = _part(folder / NOISE_FILE, Noise), list[str]()
         here = physics_sha256(vehicle)
         for name, one in ({} if tuned is None else tuned.filter).items():
             if one.physics_sha256 in (None, here):
                 noise[name] = one
             else:
-                notes.append(_stale(f"noise of {name}", "it belongs to other physics", "pdhef tune"))
+                stale.append(name)
+        if stale:
+            notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "pdhef tune"))
         trust = _part(folder / NETWORK_FILE, Trust) or trust
     return replace(car, vehicle=vehicle, noise=noise, trust=trust, learnt_on=learnt_on, notes=tuple(notes))
 
@@ -219,7 +234,7 @@ def _stale(what: str, why: str, command: str) -> str:
 
 def _part(path: Path, kind: type[PartT]) -> PartT | None:
     """Return a part of a folder, None if there is none; raises VehicleError."""
-    if not path.is_file():
+    if not path.exists():
         return None
     what = f"a car's {path.name}"
     raw = read_json(path, what, VehicleError) if path.suffix == ".json" else read_toml(path, what, VehicleError)

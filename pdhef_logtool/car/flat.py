@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from pydantic import ConfigDict, Field
 
 from pdhef_logtool.car.parts import FilterNoise, FilterTables, LearntOn, Sha256, Trust
-from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters, vehicle_from_dict
+from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
 
@@ -35,8 +35,8 @@ class _Identification(Record):
     tuning_scores: Annotated[tuple[str, ...], Field(strict=False)] = ()
 
 
-class _Tables(Record):
-    """The tables that a vehicle.toml may hold beside physics and sensors."""
+class _FlatFile(VehicleParameters):
+    """A vehicle.toml with the tables that it may hold beside physics and sensors."""
 
     filter: FilterTables = Field(default_factory=dict)
     network: _Network | None = None
@@ -45,7 +45,7 @@ class _Tables(Record):
 
 @dataclass(frozen=True, slots=True)
 class FlatCar:
-    """What one file says of a car; ``provenance`` is its ``[identification]`` as it stands."""
+    """What one file says of a car."""
 
     vehicle: VehicleParameters
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
@@ -61,10 +61,11 @@ def read_flat(path: Path) -> FlatCar:
     VehicleError
         The file is missing, is no TOML, or holds wrong, unknown or missing entries; all of them are named at once.
     """
-    raw, where = dict(read_toml(path, "a vehicle TOML file", VehicleError)), str(path)
-    given = {name: raw.pop(name) for name in _Tables.model_fields if name in raw}
-    vehicle = vehicle_from_dict(raw, where=where)
-    tables = validated(_Tables, given, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
+    raw, where = read_toml(path, "a vehicle TOML file", VehicleError), str(path)
+    tables = validated(_FlatFile, raw, where, VehicleError, expected="the entries of vehicle.toml", remedy=REMEDY)
+    own = VehicleParameters.model_fields
+    given = tables.model_fields_set & own.keys()
+    vehicle = VehicleParameters.model_construct(given, **{name: getattr(tables, name) for name in own})
     noise: dict[str, FilterNoise] = dict(tables.filter)
     for score in _parsed(tables.identification.tuning_scores, _SCORE, f"{where}: identification.tuning_scores"):
         if score["name"] in noise:
@@ -125,16 +126,13 @@ def flat_toml(
     if trust is not None:
         found = {"trust_cap": trust.trust_cap, "evidence": trust.evidence, "model_sha256": trust.network_sha256}
         tables["network"] = {k: v for k, v in found.items() if v is not None}
-    known = (
-        {k: v for k, v in document.get("identification", {}).unwrap().items() if k != "tuning_scores"}
-        if ("identification" in document)
-        else {}
-    )
-    if known or identification:
-        tables["identification"] = {**known, **identification}
-    for name, table in tables.items():
+    known = document.unwrap().get("identification", {})
+    if provenance := {k: v for k, v in {**known, **identification}.items() if k != "tuning_scores"}:
+        tables["identification"] = provenance
+    for name in {"filter", "network", "identification"} - tables.keys():
         document.pop(name, None)
-        document[name] = table
+    stand = {name: document[name].unwrap() for name in tables if name in document}
+    _merge(document, stand, tables)
     _comment(document, comments or {})
     return tomlkit.dumps(document)
 
@@ -162,17 +160,45 @@ def _plain(part: Record) -> dict[str, Any]:
 
 
 def _merge(table: Any, before: Mapping[str, Any], after: Mapping[str, Any]) -> None:
-    """Change a TOML table in place where ``after`` differs from ``before``; plain entries before tables."""
+    """Change a TOML table in place where ``after`` differs from ``before``; plain entries before tables and lists."""
+    import tomlkit
+
     for key in before.keys() - after.keys():
         table.pop(key, None)
-    for key, value in sorted(after.items(), key=lambda item: isinstance(item[1], Mapping)):
+    for key, value in sorted(after.items(), key=lambda item: _rank(item[1])):
         if key in before and before[key] == value:
             continue
         if isinstance(value, Mapping) and isinstance(table.get(key), Mapping):
             old = before.get(key)
             _merge(table[key], old if isinstance(old, Mapping) else {}, value)
+        elif isinstance(value, Mapping) and any(map(_rank, value.values())):
+            table[key] = tomlkit.table()
+            _merge(table[key], {}, value)
+        elif isinstance(value, list) and _rank(value):
+            table[key] = _lines(value)
         else:
             table[key] = value
+
+
+def _rank(value: Any) -> int:
+    """Return where an entry stands in a table: plain ones first, then lists a line an item, which may be long."""
+    if isinstance(value, Mapping):
+        return 2
+    return int(isinstance(value, list) and any(isinstance(item, Mapping | str) for item in value))
+
+
+def _lines(items: Sequence[Any]) -> Any:
+    """Return a list with an item a line."""
+    import tomlkit
+
+    array = tomlkit.array().multiline(True)
+    for item in items:
+        if isinstance(item, Mapping):
+            inline = tomlkit.inline_table()
+            inline.update(item)
+            item = inline
+        array.append(item)
+    return array
 
 
 def _comment(document: Any, comments: Mapping[str, str]) -> None:
@@ -183,4 +209,4 @@ def _comment(document: Any, comments: Mapping[str, str]) -> None:
         for table in tables:
             place = place.get(table, {})
         if entry in place:
-            place[entry].comment(text)
+            place[entry].comment(text).trivia.comment_ws = "  "

@@ -96,7 +96,9 @@ class FilterNoise(Record):
     """
 
     q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
-    r_std: dict[Annotated[str, one_of(MEASUREMENTS)], Positive] = Field(default_factory=dict)
+    r_std: dict[Annotated[str, one_of(MEASUREMENTS), Field(json_schema_extra={"enum": [*MEASUREMENTS]})], Positive] = (
+        Field(default_factory=dict)
+    )
     physics_sha256: Sha256 | None = None
     network_sha256: Sha256 | None = None
     score_deg: Positive | None = None
@@ -118,7 +120,8 @@ def _axle_forces_belong_to_physics_plus(tables: dict[str, FilterNoise]) -> dict[
 
 #: Noise by filter.
 FilterTables = Annotated[
-    dict[Annotated[str, one_of(NOISY_FILTERS)], FilterNoise], AfterValidator(_axle_forces_belong_to_physics_plus)
+    dict[Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise],
+    AfterValidator(_axle_forces_belong_to_physics_plus),
 ]
 
 

@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool import __version__
 from pdhef_logtool.car.car import HISTORY_FILE, VEHICLE_FILE, Car
 from pdhef_logtool.car.flat import flat_toml, vehicle_toml
 from pdhef_logtool.car.parts import HistoryLine, LearntOn, digest
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.files import PendingFile, cannot_write, write_bytes
+from pdhef_logtool.records.version import __version__
 
 #: Writes one file at the path that it is given, or is its content.
 Content = bytes | Callable[[Path], object]
@@ -37,6 +37,7 @@ class Change:
     files : the part's file and what goes with it (records, plots), by name in the folder.
     folders : copied whole into the car's folder, by name.
     settings, drives : of the command, for the history.
+    told : of it in a flat file, under ``[identification]``.
     """
 
     command: str
@@ -45,6 +46,7 @@ class Change:
     folders: Mapping[str, Path] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     drives: Iterable[LearntOn] = ()
+    told: Mapping[str, Any] = field(default_factory=dict)
 
 
 def check_output(source: Car, output: Path) -> None:
@@ -135,7 +137,7 @@ def write_change(
     if output.suffix != ".toml":
         return update_car(source, output, change)
     text = vehicle_file(source).decode("utf-8")
-    provenance = {k: v for k, v in change.settings.items() if v not in (None, [], {})}
+    provenance = dict(change.told)
     if after.learnt_on:
         provenance["drives"] = [d.model_dump(mode="json") for d in after.learnt_on]
     flat = flat_toml(text, source.own, after.vehicle, after.noise, after.trust, provenance, comments)
@@ -183,10 +185,14 @@ def _take_place(fresh: Path, target: Path) -> None:
         fresh.rename(target)
         return
     if not _exchanged(fresh, target):
-        # A file system without exchange: for a moment the car stands under its old name alone.
+        # A file system without exchange: for a moment nothing stands under the car's name.
         old = fresh.with_suffix(".old")
         target.rename(old)
-        fresh.rename(target)
+        try:
+            fresh.rename(target)
+        except BaseException:
+            old.rename(target)
+            raise
         old.rename(fresh)
 
 

@@ -33,7 +33,7 @@ for _group in (inspecting, running, simulating, learning):
 
 def _version(show: bool) -> None:
     if show:
-        from pdhef_logtool import __version__
+        from pdhef_logtool.records.version import __version__
 
         print(f"pdhef {__version__}")  # noqa: T201
         raise typer.Exit

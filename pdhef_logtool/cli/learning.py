@@ -50,6 +50,7 @@ def identify(
     car="The nominal car (default: what a set's manifest names)",
 )
 def extract(
+    *,
     logs: options.TruthLogs,
     output: Annotated[Path, Option("--output", "-o", help="Folder of the dataset.")],
     config: RunConfig,
@@ -79,6 +80,7 @@ def extract(
     notes="An interrupted training goes on from its last whole epoch when the same command is given again.",
 )
 def train(
+    *,
     dataset: Annotated[Path, Argument(metavar="DATASET", help="Folder that pdhef extract wrote.")],
     output: Annotated[Path, Option("--output", "-o", help="Folder of the model bundle to write.")],
     init: Annotated[Path | None, Option(help="Model bundle to fine-tune, or many-cars, or default.")] = None,
@@ -117,6 +119,7 @@ def train(
     car="The car whose filter noise is tuned",
 )
 def tune(
+    *,
     logs: options.TruthLogs,
     output: options.CarOutput,
     config: RunConfig,

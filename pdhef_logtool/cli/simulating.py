@@ -53,6 +53,7 @@ Vehicles: sedan, suv, hatchback or a TOML file; NAME~SEED is another car of its 
 cg=0.1 (m to the rear), height=1.1, stiffness=0.85, tyres=suv.""",
 )
 def simulate(
+    *,
     manoeuvre: Annotated[str | None, Argument(metavar="MANOEUVRE", help="--list shows the names.")] = None,
     output: Annotated[Path | None, Option("--output", "-o", help="MCAP file to write.")] = None,
     speed_km_h: Annotated[float | None, Option("--speed", help="km/h; default: the manoeuvre's.")] = None,

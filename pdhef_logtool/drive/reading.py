@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from pdhef_logtool.car.car import Car
@@ -76,6 +75,7 @@ class Drive:
 
     name: str
     log: DriveLog
+    car: Car
     options: ReadOptions
     plan: DrivePlan
     missing: tuple[str, ...]
@@ -89,11 +89,6 @@ class Drive:
     def path(self) -> Path:
         """The file or folder."""
         return self.log.path
-
-    @property
-    def kind(self) -> str:
-        """Format of the log."""
-        return self.log.kind
 
     @property
     def mapping(self) -> Mapping:
@@ -113,13 +108,10 @@ class Drive:
 
     @property
     def losses(self) -> tuple[Loss, ...]:
-        """What could not be used; complete once all windows were read."""
-        return merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
-
-    @property
-    def lost_texts(self) -> tuple[str, ...]:
-        """What of the input is gone, in words."""
-        return lost_texts(self.losses)
+        """What could not be used; complete once all windows were read. Files are named without their folder."""
+        found = merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
+        folder = f"{self.path.parent}/"
+        return tuple(replace(x, where=x.where.removeprefix(folder)) for x in found)
 
     @property
     def samples(self) -> dict[str, int]:
@@ -179,9 +171,7 @@ class Drive:
         """Return itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the log."""
         self.close()
 
@@ -239,7 +229,7 @@ def read_drive(
     except BaseException:
         opened.close()
         raise
-    return Drive(log_input.stem, opened, options, plan, missing, notes, friction, tell)
+    return Drive(log_input.stem, opened, car, options, plan, missing, notes, friction, tell)
 
 
 def one_log(argument: str) -> LogInput:

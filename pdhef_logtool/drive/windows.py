@@ -192,8 +192,8 @@ class DriveReader:
                 continue
             yield self._window(signals, truth, done_ns, until, (b - plan.start_ns) / (plan.end_ns - plan.start_ns))
             done_ns = until
-            signals = {n: _since(c, until - margin) for n, c in signals.items()}
-            truth = {n: _since(c, until - margin) for n, c in truth.items()}
+            signals = {n: since(c, until - margin) for n, c in signals.items()}
+            truth = {n: since(c, until - margin) for n, c in truth.items()}
 
     def _window(
         self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int, share: float
@@ -241,7 +241,8 @@ def _with_following(held: deque[DriveWindow], look_ahead_ns: int) -> tuple[Drive
     return first, cut_signals(following, 0, until)
 
 
-def _since(channel: Channel, stamp_ns: int) -> Channel:
+def since(channel: Channel, stamp_ns: int) -> Channel:
+    """Return the samples of a channel from a stamp on."""
     first = int(np.searchsorted(channel.stamps_ns, stamp_ns))
     return replace(
         channel,

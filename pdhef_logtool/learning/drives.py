@@ -14,19 +14,21 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import LearntOn
+from pdhef_logtool.car.store import check_output
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts, read_drive
 from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.learning.noise.search import scorable_stamps
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, UsageError
+from pdhef_logtool.mapping import load_mapping
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
 
 #: What of the configuration decides what is learnt.
-_SETTINGS = ("car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth")
+_SETTINGS = ("car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "estimators")
 #: Drives that are named in an error.
 _NAMED = 3
 
@@ -64,18 +66,39 @@ class LearnSettings:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
-        config = self.config.to_dict()
         own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "config"}
-        return {**{k: config[k] for k in _SETTINGS}, **own}
+        return {**config_document(self.config), **own}
 
 
-def open_car(config: RunConfig) -> Car:
-    """Return the car of a command that learns of it; raises UsageError where none is named."""
+def config_document(config: RunConfig) -> dict[str, Any]:
+    """Return what of a configuration decides what is learnt, as JSON-able values; files by name only."""
+    document = config.to_dict()
+    return {k: document[k] for k in _SETTINGS if k != "estimators" or document[k] is not None}
+
+
+def open_car(config: RunConfig, output: Path | None, warn: Tell) -> Car:
+    """Return the car of a command that learns of it, after a look at where it is to be written (None: nowhere).
+
+    Raises
+    ------
+    UsageError
+        No car is named, or ``output`` is no place for it.
+    """
     if config.car is None:
         raise UsageError(
             expected="a car", got="none", where="--car", remedy="pdhef identify makes one from a vehicle.toml"
         )
-    return Car.load(config.car, network=config.network, intervals=config.intervals)
+    car = Car.load(config.car, network=config.network, intervals=config.intervals)
+    if output is not None:
+        check_output(car, output)
+    for note in car.notes:
+        warn(note)
+    return car
+
+
+def open_mapping(config: RunConfig) -> SignalMapping | None:
+    """Return the mapping that is configured, None without."""
+    return None if config.mapping is None else load_mapping(config.mapping)
 
 
 def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:
@@ -223,6 +246,43 @@ def exit_code(records: Sequence[DriveRecord]) -> int:
     if all(r.left_out for r in records):
         return EXIT_FAILURE
     return EXIT_PARTIAL if any(r.left_out or r.lost for r in records) else EXIT_OK
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LearnResult:
+    """What every command returns: the car that it wrote (a folder, or a flat file), and a record of every drive."""
+
+    car: Path
+    records: tuple[DriveRecord, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all drives took part whole, 3 if not."""
+        return exit_code(self.records)
+
+    @property
+    def drives(self) -> tuple[DriveRecord, ...]:
+        """Those that took part."""
+        return tuple(r for r in self.records if not r.left_out)
+
+    @property
+    def left_out(self) -> tuple[DriveRecord, ...]:
+        """The others."""
+        return tuple(r for r in self.records if r.left_out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {"car": str(self.car), "exit_code": self.exit_code, **drives_document(self.records)}
+
+
+def no_drive(expected: str, where: str) -> EstimatorError:
+    """Return the error for drives of which none can be learnt from."""
+    return EstimatorError(
+        expected=f"at least one drive with {expected}",
+        got="none",
+        where=where,
+        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
+    )
 
 
 def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, Any]]]:

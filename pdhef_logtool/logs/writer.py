@@ -36,26 +36,18 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from pdhef_logtool import __version__
-from pdhef_logtool.logs.container import RawChunk
+from pdhef_logtool.logs.container import MCAP_MAGIC, RawChunk
 from pdhef_logtool.logs.encoding import CdrEncoder
+from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.version import __version__
 
 LIBRARY = f"pdhef-logtool {__version__}"
-_MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_BYTES = 1 << 20
 _LARGEST_ID = 0xFFFF
-_HEAD = np.dtype(
-    {
-        "names": ["op", "size", "channel", "sequence", "log", "publish"],
-        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
-        "offsets": [0, 1, 9, 11, 15, 23],
-        "itemsize": 31,
-    }
-)
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_PACKED_HEAD = struct.Struct("<BQHIQQ")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,7 +156,7 @@ class McapLogWriter:
             self._file: IO[bytes] = self._temporary.open("wb")
         except OSError as error:
             raise self._failed(error) from error
-        self._emit(_MAGIC)
+        self._emit(MCAP_MAGIC)
         self._emit_record(Header(profile=profile, library=LIBRARY))
 
     def __enter__(self) -> McapLogWriter:
@@ -324,7 +316,7 @@ class McapLogWriter:
                 self._emit_chunk(raw)
                 continue
             group.append(raw)
-            size += len(raw.data) + _HEAD.itemsize
+            size += len(raw.data) + MESSAGE_HEAD.itemsize
             if size >= _CHUNK_BYTES:
                 self._write_group(merged, group, until_ns=raw.log_time_ns)
                 group, size = [], 0
@@ -336,7 +328,7 @@ class McapLogWriter:
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
         payload = encoder.encode(n, batch.fields)
-        head = np.zeros(n, dtype=_HEAD)
+        head = np.zeros(n, dtype=MESSAGE_HEAD)
         head["op"] = Opcode.MESSAGE
         head["size"] = 22 + payload.shape[1]
         head["channel"] = channel
@@ -344,9 +336,9 @@ class McapLogWriter:
         head["log"] = batch.log_time_ns
         head["publish"] = batch.publish_time_ns
         self._sequences[channel] += n
-        rows = np.empty((n, _HEAD.itemsize + payload.shape[1]), dtype=np.uint8)
-        rows[:, : _HEAD.itemsize] = head.view(np.uint8).reshape(n, _HEAD.itemsize)
-        rows[:, _HEAD.itemsize :] = payload
+        rows = np.empty((n, MESSAGE_HEAD.itemsize + payload.shape[1]), dtype=np.uint8)
+        rows[:, : MESSAGE_HEAD.itemsize] = head.view(np.uint8).reshape(n, MESSAGE_HEAD.itemsize)
+        rows[:, MESSAGE_HEAD.itemsize :] = payload
         return _Records(channel, batch.log_time_ns.astype(np.int64), rows)
 
     def _write_group(self, merged: _Merged, group: Sequence[RawMessage], until_ns: int | None) -> None:
@@ -358,9 +350,7 @@ class McapLogWriter:
         if not raws and part.start == part.stop:
             return
         raw_bytes = [
-            _MESSAGE_HEAD.pack(
-                Opcode.MESSAGE, 22 + len(r.data), r.channel, r.sequence, r.log_time_ns, r.publish_time_ns
-            )
+            _PACKED_HEAD.pack(Opcode.MESSAGE, 22 + len(r.data), r.channel, r.sequence, r.log_time_ns, r.publish_time_ns)
             + r.data
             for r in raws
         ]
@@ -525,7 +515,7 @@ class McapLogWriter:
                 summary_crc=zlib.crc32(head, zlib.crc32(summary)),
             )
         )
-        self._emit(_MAGIC)
+        self._emit(MCAP_MAGIC)
 
     def _emit(self, data: bytes) -> None:
         try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
 
 EXIT_OK = 0
 EXIT_FAILURE = 1
@@ -32,9 +31,10 @@ class PdhefError(Exception):
         self.remedy = remedy
         super().__init__(str(self))
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Let it pass between processes."""
-        return partial(type(self), expected=self.expected, got=self.got, where=self.where, remedy=self.remedy), ()
+    def __reduce__(self) -> tuple[partial[PdhefError], tuple[()]]:
+        """Travel between processes with all four parts."""
+        parts = {"expected": self.expected, "got": self.got, "where": self.where, "remedy": self.remedy}
+        return partial(type(self), **parts), ()
 
     def __str__(self) -> str:
         """One line, without a traceback's noise."""

@@ -123,6 +123,8 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
 
 def _read_file(path: Path) -> dict[str, Any]:
     raw = read_toml(path, "a configuration TOML file", UsageError)
+    if twice := [f"{old} and {new}" for old, new in FORMER_KEYS.items() if old in raw and new in raw]:
+        raise UsageError(expected="an entry or its former name", got=", ".join(twice), where=str(path))
     raw = {FORMER_KEYS.get(key, key): value for key, value in raw.items()}
     for key in _FILES:
         value = raw.get(key)

@@ -4,38 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.drive.reading import no_samples
-from pdhef_logtool.drive.windows import DrivePlan, DriveWindow, with_look_ahead
+from pdhef_logtool.drive.reading import Drive, WholeDrive, no_samples
+from pdhef_logtool.drive.windows import with_look_ahead
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, run_window
 from pdhef_logtool.records.geometry import dead_reckon
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.intervals import TrackCalibrator
-
-
-class Readable(Protocol):
-    """A :class:`~pdhef_logtool.drive.reading.Drive`, or a whole one in memory."""
-
-    @property
-    def path(self) -> Path:
-        """The log."""
-        ...
-
-    @property
-    def plan(self) -> DrivePlan:
-        """What was decided beforehand."""
-        ...
-
-    def windows(self) -> Iterator[DriveWindow]:
-        """Yield what the estimators see, in order."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +33,8 @@ class Estimated:
     share_done: float
 
 
-def estimate(
-    drive: Readable,
+def estimate_windows(
+    drive: Drive | WholeDrive,
     estimators: Sequence[Estimator],
     *,
     watched: bool = True,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,11 +27,12 @@ from pdhef_logtool.records.errors import (
     PdhefError,
     UsageError,
 )
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, IntArray, Loss, Signals, join_signals
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals, join_signals
 from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.estimating import calibrator, estimate
+from pdhef_logtool.run.estimating import calibrator, estimate_windows
+from pdhef_logtool.run.scoring import evaluate, in_time
 from pdhef_logtool.run.track_store import TrackStore
-from pdhef_logtool.sinks.base import TRUTH, Event, Sink
+from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.report import (
     EstimatorFacts,
     FrictionFacts,
@@ -51,7 +51,6 @@ from pdhef_logtool.watches.intervals import TrackCalibrator
 
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
-    from pdhef_logtool.evaluation.reasons import ReasonFacts
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
 
 #: ``update(text, share)`` with share in [0, 1].
@@ -227,7 +226,7 @@ def run_log(
         try:
             with TrackStore(folder) as store:
                 signals = _estimate(drive, ready, intervals, sinks, store, progress)
-                rows, events, reasons = _evaluate(store, ready, signals, drive, car)
+                rows, events, reasons = evaluate(drive, [e.name for e in ready], store.read, signals)
             rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in rows]
             if drive.friction.bank is not None:
                 events = sorted([*events, *friction_events(drive.friction, signals.stamps_ns)], key=in_time)
@@ -323,7 +322,7 @@ def _estimate(
 ) -> Signals:
     """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
     seen: list[Signals] = []
-    for window in estimate(drive, estimators, intervals=intervals):
+    for window in estimate_windows(drive, estimators, intervals=intervals):
         seen.append(window.signals)
         for sink in sinks:
             sink.append_signals(window.signals)
@@ -341,65 +340,12 @@ def _estimate(
     return join_signals(seen)
 
 
-def _evaluate(
-    store: TrackStore,
-    estimators: Sequence[Estimator],
-    signals: Signals,
-    drive: Drive,
-    car: Car,
-) -> tuple[list[MetricRow], list[Event], dict[str, tuple[ReasonFacts, ...] | None]]:
-    """Score the stored tracks, one whole track in memory at a time besides the truth.
-
-    Returns the figures, the events, and by estimator why it did not use its sensors as usual.
-    """
-    from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
-    from pdhef_logtool.evaluation.metrics import score_track, state_rows
-    from pdhef_logtool.evaluation.reasons import summarise_reasons
-    from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
-
-    stem, truth = drive.name, store.read(TRUTH)
-    masks = segment_masks(signals, truth, car.vehicle)
-    slow = car.vehicle.low_speed_blend_m_s
-    rows: list[MetricRow] = []
-    reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
-    events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(signals.stamps_ns, without_whole(masks))]
-    for estimator in estimators:
-        track = store.read(estimator.name)
-        assert track is not None
-        if truth is not None:
-            rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
-        else:
-            rows += state_rows(track, masks, log=stem)
-        rows += whiteness_rows(track, masks, log=stem)
-        reasons[estimator.name] = summarise_reasons(track)
-        events += [
-            Event(f"{estimator.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
-            for s in find_intervals(track.stamps_ns, {"diverged": track.diverged})
-        ]
-    if truth is None:
-        for a, b in combinations([e.name for e in estimators], 2):
-            pair = [t for t in (store.read(a), store.read(b)) if t is not None]
-            rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
-    rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
-    return rows, sorted(events, key=in_time), reasons
-
-
-def in_time(event: Event) -> tuple[int, int, str]:
-    """Return what events are sorted by."""
-    return event.start_ns, event.end_ns, event.name
-
-
 def friction_events(friction: FrictionSource, stamps_ns: IntArray) -> list[Event]:
     """Return when an estimated friction was observable; ``stamps_ns`` are those of all windows."""
     from pdhef_logtool.evaluation.segments import find_intervals
 
     found = find_intervals(stamps_ns, {"friction observable": friction.observable})
     return [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in found]
-
-
-def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
-    """Return the masks that are worth an event: not the whole drive, nor what is only not nonlinear."""
-    return {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
 
 
 def report_facts(
@@ -431,7 +377,7 @@ def report_facts(
         log=LogFacts(
             name=drive.name,
             file=drive.path.name,
-            kind=drive.kind,
+            kind=log.kind,
             sha256=drive.sha256,
             start_ns=plan.start_ns,
             end_ns=plan.end_ns,

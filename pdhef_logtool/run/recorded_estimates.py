@@ -24,7 +24,7 @@ from pdhef_logtool.drive.truth import (
     share_equal,
     truth_at,
 )
-from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.drive.windows import DrivePlan, since
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import (
@@ -63,10 +63,10 @@ from pdhef_logtool.run.pipeline import (
     outcome_of,
     read_thresholds,
     report_facts,
-    without_whole,
     write_run,
     write_verdicts,
 )
+from pdhef_logtool.run.scoring import without_whole
 from pdhef_logtool.sinks.base import TRUTH, Event
 from pdhef_logtool.sinks.report import EstimatorFacts, build_report, write_json
 
@@ -189,7 +189,7 @@ class _Scoring:
         truth, truth_losses, samples = read_truth(drive.log, plan, drive.options.window_s)
         progress(drive.name, 0.6)
         signals = _read_sensors(drive)
-        all_losses = merge_losses([drive.log.lost, losses, truth_losses, drive.losses])
+        all_losses = merge_losses([drive.losses, losses, truth_losses])
         progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
@@ -364,7 +364,7 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
         derived = derive_truth(channels, plan=plan.truth)
         tracks.append(_rows(derived.track, done_ns, until))
         done_ns = until
-        channels = {n: _since(c, until - plan.truth.margin_ns) for n, c in channels.items()}
+        channels = {n: since(c, until - plan.truth.margin_ns) for n, c in channels.items()}
     if plan.truth is None or not sum(len(t) for t in tracks):
         raise MappingError(
             expected="truth in the chosen slice",
@@ -393,16 +393,6 @@ _TRUTH_COLUMNS = (
     "y_m",
     "yaw_rad",
 )
-
-
-def _since(channel: Channel, stamp_ns: int) -> Channel:
-    first = int(np.searchsorted(channel.stamps_ns, stamp_ns))
-    return replace(
-        channel,
-        stamps_ns=channel.stamps_ns[first:],
-        arrival_ns=channel.arrival_ns[first:],
-        values=channel.values[first:],
-    )
 
 
 def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:

@@ -72,7 +72,7 @@ class EstimatesSink:
     def append(self, track: StateTrack) -> None:
         """Take one track of this window; [N] rows."""
         waiting = self._waiting.setdefault(track.name, [])
-        waiting.append(_table_from_track(track, self._schema))
+        waiting.append(track_table(track))
         if sum(t.num_rows for t in waiting) < self._rows_a_group:
             return
         joined = pa.concat_tables(waiting)
@@ -107,7 +107,9 @@ class EstimatesSink:
             raise cannot_write(self._pending.target, error) from error
 
 
-def _table_from_track(track: StateTrack, schema: pa.Schema) -> pa.Table:
+def track_table(track: StateTrack) -> pa.Table:
+    """Return a track [N] as rows of estimates.parquet."""
+    schema = arrow_schema("estimates.parquet.json")
     columns: dict[str, Any] = dict(track.columns())
     columns["estimator"] = pa.DictionaryArray.from_arrays(np.zeros(len(track), dtype=np.int32), [track.name])
     arrays = [

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import load_vehicle, read_flat
+from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.car.vehicle import default_vehicle, vehicle_from_dict
 from pdhef_logtool.records.errors import VehicleError
 
@@ -58,6 +61,11 @@ def as_plain(value):
     return [as_plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
+def physics_of(text: str) -> dict[str, Any]:
+    """The entries of a file that are a person's."""
+    return {k: v for k, v in tomllib.loads(text).items() if k not in ("filter", "network")}
+
+
 def write(tmp_path: Path, text: str | bytes) -> Path:
     path = tmp_path / "car.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -75,8 +83,10 @@ def problem(path: Path) -> str:
 
 
 def test_every_entry_of_the_example_is_read(tmp_path):
-    vehicle = load_vehicle(write(tmp_path, EXAMPLE))
-    raw = tomllib.loads(EXAMPLE)
+    flat = read_flat(write(tmp_path, EXAMPLE))
+    vehicle, raw = flat.vehicle, tomllib.loads(EXAMPLE)
+    assert as_plain({name: one.model_dump(exclude_unset=True) for name, one in flat.noise.items()}) == raw.pop("filter")
+    assert flat.trust == Trust(**raw.pop("network"))
     assert as_plain(vehicle.model_dump(exclude_unset=True)) == raw
     assert vehicle_from_dict(as_plain(vehicle.model_dump(exclude_none=True)), where="again") == vehicle
 
@@ -84,20 +94,22 @@ def test_every_entry_of_the_example_is_read(tmp_path):
 def test_defaults_of_what_the_file_leaves_out(tmp_path):
     lines = "mass_kg = 1000\nyaw_inertia_kg_m2 = 1200\ncg_to_front_axle_m = 1.2\ncg_to_rear_axle_m = 1.3\n"
     tyres = "".join(f"[tyres.{a}]\ncornering_stiffness_n_per_rad = 8e4\n" for a in ("front", "rear"))
-    vehicle = load_vehicle(write(tmp_path, lines + tyres))
+    flat = read_flat(write(tmp_path, lines + tyres))
+    vehicle = flat.vehicle
     assert vehicle.friction is None
     assert vehicle.assumed_friction == 1.0
     assert vehicle.imu_position_m == (0.0, 0.0, 0.0)
-    assert vehicle.network.trust_cap == 0.0
-    assert not vehicle.network.has_evidence
-    assert vehicle.filter == {}
+    assert flat.trust is None
+    assert Car.load(tmp_path / "car.toml", network="none").allowed_trust.cap == 0.0
+    assert flat.noise == {}
+    assert flat.learnt_on == ()
     assert vehicle.sensors.ay_std_m_s2 == 0.12
 
 
 def test_the_default_vehicle_is_the_published_one(tmp_path):
     published = EXAMPLE.replace("cornering_stiffness_n_per_rad = 108000.0", "B = 15.4\nC = 1.17\nD_n = 6110.0\nE = 0.2")
     vehicle = load_vehicle(write(tmp_path, published))
-    same = {"imu_position_m", "truth_position_m", "filter", "network", "sensors"}
+    same = {"imu_position_m", "truth_position_m", "sensors"}
     assert default_vehicle().model_dump(exclude=same) == vehicle.model_dump(exclude=same)
 
 
@@ -151,13 +163,13 @@ def test_a_wrong_entry_is_named(tmp_path, old, new, named):
 @pytest.mark.parametrize("entries", [[], [0.02, 0.006, 0.002], [0.02, 0.006, 0.002, 0.001]])
 def test_noise_of_three_or_four_states_is_read(tmp_path, entries):
     text = EXAMPLE.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {entries}")
-    assert load_vehicle(write(tmp_path, text)).filter["phy-ukf-tuned"].q_std == tuple(entries)
+    assert read_flat(write(tmp_path, text)).noise["phy-ukf-tuned"].q_std == tuple(entries)
 
 
 def test_physics_plus_has_two_states_more(tmp_path):
     text = EXAMPLE.replace("filter.phy-ukf-tuned", "filter.physics-plus")
     text = text.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}")
-    assert len(load_vehicle(write(tmp_path, text)).filter["physics-plus"].q_std) == 6
+    assert len(read_flat(write(tmp_path, text)).noise["physics-plus"].q_std) == 6
 
 
 def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
@@ -186,7 +198,7 @@ def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
     ],
 )
 def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor, named):
-    raw = tomllib.loads(EXAMPLE)
+    raw = physics_of(EXAMPLE)
     raw["relaxation_length_m"] = 0.5
     place = next(t for t in (raw, raw["tyres"]["front"], raw["tyres"]["rear"]) if entry in t)
     place[entry] *= factor
@@ -292,7 +304,7 @@ def test_a_folder_is_no_vehicle_file(tmp_path):
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.floats(0.05, 2.0))
 def test_axle_quantities(friction):
-    vehicle = vehicle_from_dict(tomllib.loads(EXAMPLE), where="example")
+    vehicle = vehicle_from_dict(physics_of(EXAMPLE), where="example")
     assert vehicle.wheelbase_m == pytest.approx(2.87)
     weight = 1440.0 * 9.80665
     assert vehicle.axle_load_n(True) + vehicle.axle_load_n(False) == pytest.approx(weight)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+ROOT = Path(__file__).parents[2]
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
     *("inspect", "estimators", "run", "metrics", "view", "simulate", "simulate suite", "simulate conditions"),
@@ -20,7 +21,7 @@ COMMANDS = (
 def _pdhef(
     *arguments: str, cwd: Path | None = None, env: dict[str, str] | None = None
 ) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "COLUMNS": "100", **(env or {})}
+    environment = {**os.environ, "COLUMNS": "100", "PYTHONPATH": str(ROOT), **(env or {})}
     return subprocess.run([*PDHEF, *arguments], capture_output=True, text=True, cwd=cwd, env=environment, check=False)
 
 
@@ -78,7 +79,7 @@ def test_run_prints_a_table_on_stdout_and_warnings_on_stderr(sample_logs_dir: Pa
     )  # fmt: skip
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
-    assert "no --vehicle" in result.stderr
+    assert "no --car" in result.stderr
     assert "warning" not in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines() if "outputs in" not in line)
 
@@ -181,17 +182,17 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
             ("run", "no", "--vehicle", "a.toml", "--model", "none", "--calibration", "none"),
             [
                 "--vehicle is now --car",
-                "--model is now --car (its network)",
-                "--calibration is now --car (its intervals)",
+                "--model is now --network",
+                "--calibration is now --intervals",
             ],
         ),
         (("metrics", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
         (("extract", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
         (("identify", "no", "-v", "a.toml"), ["--vehicle is now --car"]),
-        (("tune", "no", "--model", "m"), ["--model is now --car (its network)"]),
+        (("tune", "no", "--model", "m"), ["--model is now --network"]),
         (("tune", "no", "--signal-map", "m.toml"), ["--signal-map is now --mapping"]),
-        (("trust", "no", "--model", "m"), ["--model is now --car (its network)"]),
-        (("calibrate", "no", "--model", "m"), ["--model is now --car (its network)"]),
+        (("trust", "no", "--model", "m"), ["--model is now --network"]),
+        (("calibrate", "no", "--model", "m"), ["--model is now --network"]),
         (("run", "no", "--car", "a.toml"), []),
     ],
 )
@@ -208,11 +209,32 @@ def test_options_of_old_mean_what_they_meant(capsys: pytest.CaptureFixture[str])
 
     assert run_config({"car": Path("a"), "vehicle": None}) == run_config({"vehicle": Path("a")})
     assert run_config({"signal_map": Path("m")}).mapping == Path("m")
-    assert run_config({"model": Path("n"), "calibration": Path("c")}).calibration == Path("c")
+    assert run_config({"model": Path("n"), "calibration": Path("c")}) == run_config(
+        {"network": Path("n"), "intervals": Path("c")}
+    )
     assert run_config({"estimators": "zero, phy-ukf,"}).estimators == ("zero", "phy-ukf")
     with pytest.raises(UsageError, match="--car or its alias"):
         run_config({"car": Path("a"), "vehicle": Path("a")})
     assert capsys.readouterr().err.count("notice: ") == 5
+
+
+@pytest.mark.slow
+def test_a_run_with_options_of_old_is_the_same_run(sample_logs_dir: Path, tmp_path: Path) -> None:
+    car = str(sample_logs_dir / "vehicle.toml")
+    shipped = ROOT / "pdhef_logtool" / "models" / "default"
+    given = {
+        "new": ("--car", car, "--network", "many-cars", "--intervals", str(shipped / "intervals.json")),
+        "old": ("--vehicle", car, "--model", "many-cars", "--calibration", str(shipped / "intervals.json")),
+    }
+    for name, options in given.items():
+        result = _pdhef(
+            *("run", str(sample_logs_dir / "dlc.mcap"), "-o", str(tmp_path / name), "--annotate", "none"),
+            *("-e", "phy-ukf,pd-hef", "--end", "4", *options),
+        )
+        assert result.returncode == 0, result.stderr
+        assert result.stderr.count("notice: ") == (3 if name == "old" else 0)
+    for file in ("run.json", "metrics.parquet", "logs/dlc/estimates.parquet", "logs/dlc/report.json"):
+        assert (tmp_path / "old" / file).read_bytes() == (tmp_path / "new" / file).read_bytes(), file
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def test_table_goes_to_stdout_and_assumptions_to_stderr(annotated: str) -> None:
     result = _pdhef("metrics", annotated, *ESTIMATE)
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
-    assert "no --vehicle" in result.stderr
+    assert "no --car" in result.stderr
     assert "outputs in" not in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines())
 

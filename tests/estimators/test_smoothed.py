@@ -17,11 +17,12 @@ import torch
 from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pdhef_logtool.estimators.registry import MODEL_ESTIMATORS, NOT_CAUSAL, make_estimator
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 
-from pdhef_logtool.car.vehicle import FilterTuning, Network, default_vehicle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FilterNoise, Trust
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
@@ -29,6 +30,7 @@ from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of, run_window
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, check_inputs
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf
+from pdhef_logtool.estimators.pd_hef import build_smoothed
 from pdhef_logtool.estimators.physics import (
     AX_BIAS,
     LINK_BIASES,
@@ -39,6 +41,7 @@ from pdhef_logtool.estimators.physics import (
     StepLinks,
 )
 from pdhef_logtool.estimators.smoothed import SMOOTHED_Q_STD, SmoothedHybrid, smooth_steps, smoothed_hybrid
+from pdhef_logtool.estimators.table import SPECS, Options, make_estimator
 from pdhef_logtool.records.reasons import (
     BURST_AY,
     BURST_YAW_RATE,
@@ -502,18 +505,19 @@ def test_links_cost_the_filter_no_bit(rough):
 
 
 def test_what_it_says_of_itself(rough):
-    trusted = VEHICLE.model_copy(update={"network": Network(trust_cap=0.6, evidence="a drive of 300 s")})
-    estimator = make_estimator("pd-hef-smoothed", trusted, model=BUNDLE)
+    trusted = Car.of(VEHICLE, network=BUNDLE, trust=Trust(trust_cap=0.6, evidence="a drive of 300 s"))
+    estimator = make_estimator("pd-hef-smoothed", trusted)
     assert estimator.hybrid.trust == 0.6
     assert "a drive of 300 s" in estimator.notes[1]
     assert isinstance(estimator, LookingAhead)
     assert (estimator.name, estimator.causal) == ("pd-hef-smoothed", False)
-    for name in MODEL_ESTIMATORS:
-        if name not in ("pure-lstm", "linear-regression"):
-            assert make_estimator(name, VEHICLE, model=BUNDLE).causal == (name not in NOT_CAUSAL)
+    assert [s.name for s in SPECS if not s.causal] == ["pd-hef-smoothed"]
+    for spec in SPECS:
+        if spec.network == "residual":
+            assert make_estimator(spec.name, trusted).causal == spec.causal
     assert "not causal" in estimator.notes[0]
     assert look_ahead_of(estimator) == 240.0
-    assert look_ahead_of(make_estimator("phy-ukf", VEHICLE)) == 0.0
+    assert look_ahead_of(make_estimator("phy-ukf", trusted)) == 0.0
     track, _ = run_window(estimator, rough, None, None)
     assert track.valid[0], "it needs no arrival"
     assert np.isnan(track.nis).all()
@@ -524,11 +528,12 @@ def test_what_it_says_of_itself(rough):
 
 def test_the_noise_is_its_own_tables_then_the_filters():
     network = NetworkService(BUNDLE)
-    filters = {"pd-hef": FilterTuning(q_std=(0.1, 0.2, 0.04), r_std={"ay_m_s2": 0.7})}
-    own = {"pd-hef-smoothed": FilterTuning(q_std=(0.1, 0.05, 0.02), r_std={"yaw_rate_rad_s": 0.002})}
+    filters = {"pd-hef": FilterNoise(q_std=(0.1, 0.2, 0.04), r_std={"ay_m_s2": 0.7})}
+    own = {"pd-hef-smoothed": FilterNoise(q_std=(0.1, 0.05, 0.02), r_std={"yaw_rate_rad_s": 0.002})}
 
-    def noise(tables: dict[str, FilterTuning]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        hybrid = smoothed_hybrid(VEHICLE.model_copy(update={"filter": tables}), network).hybrid
+    def noise(tables: dict[str, FilterNoise]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        car = Car.of(VEHICLE, network=BUNDLE, noise=tables)
+        hybrid = build_smoothed("pd-hef-smoothed", car, Options(trust=1.0)).hybrid
         return hybrid.q_std, hybrid.r_std
 
     assert noise({}) == (SMOOTHED_Q_STD, HYBRID_R_STD)
@@ -565,8 +570,8 @@ def test_a_run_is_the_same_whatever_its_windows_and_marks_it(sample_logs_dir: Pa
     tables = []
     for window_s in (600.0, 37.0):
         config = RunConfig(
-            vehicle=sample_logs_dir / "vehicle.toml",
-            model=tmp_path / "model",
+            car=sample_logs_dir / "vehicle.toml",
+            network=tmp_path / "model",
             annotate="none",
             estimators=("pd-hef-smoothed", "zero"),
             window_s=window_s,

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
+from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.evaluation.thresholds import load_thresholds
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.documents import MAX_DEPTH, read_json, read_toml, unknown
@@ -21,17 +22,16 @@ from pdhef_logtool.records.errors import PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
 from pdhef_logtool.residual_model.linear_model import load_linear_model
 from pdhef_logtool.run.config import load_config
-from pdhef_logtool.watches.intervals import load_calibration
 
-SHIPPED = SHIPPED_FOLDERS["default"]
+SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
 VALID_CONFIG = {
     "estimators": ["zero"],
-    "vehicle": "car.toml",
+    "car": "car.toml",
     "start": 3,
     "end": "end-2s",
     "friction": 0.5,
     "window_s": 60.0,
-    "model": "none",
+    "network": "none",
     "annotate": "full",
 }
 VALID_MAPPING = {
@@ -41,6 +41,15 @@ VALID_MAPPING = {
     "estimates": {"mine": {"vy_m_s": {"topic": "/filter", "field": "vy"}}},
     "can": {"dbc": ["car.dbc"], "bus": 1, "bus_field": "bus"},
     "fill_recognised": True,
+}
+VALID_FIT = {
+    "format": "pdhef-fit",
+    "version": 1,
+    "physics_sha256": "ab" * 32,
+    "values": {"friction": 0.9, "sensors": {"ay_bias_m_s2": 0.01, "yaw_rate_bias_rad_s": 0.0}},
+    "filter": {"phy-ukf-tuned": {"q_std": [0.1, 0.1, 0.1], "r_std": {"ay_m_s2": 1.0}}},
+    "drives": [{"name": "lap", "sha256": "cd", "start_s": 0.0, "end_s": 9.5}],
+    "scores": {"lap": {"rmse": 0.2}},
 }
 VALID_THRESHOLDS = {"threshold": [{"signal": "sideslip_rad", "metric": "rmse", "max": 0.5, "unit": "deg"}]}
 
@@ -57,12 +66,21 @@ def _model(path: Path) -> object:
     return load_network(path.parent, "residual_rates")
 
 
+def _part(path: Path) -> object:
+    """Read the car that this part stands in."""
+    shutil.copy(CAR / "vehicle.toml", path.parent)
+    return Car.load(path.parent, network="none", intervals="none")
+
+
 LOADERS = [
     Loader("pdhef.toml", lambda path: load_config(path, {}), VALID_CONFIG),
     Loader("mapping.toml", load_mapping, VALID_MAPPING),
     Loader("thresholds.toml", load_thresholds, VALID_THRESHOLDS),
-    Loader("vehicle.toml", load_vehicle, tomllib.loads((SHIPPED / "vehicle.toml").read_text())),
-    Loader("calibration.json", load_calibration, json.loads((SHIPPED / "calibration.json").read_text())),
+    Loader("vehicle.toml", load_vehicle, tomllib.loads((CAR / "vehicle.toml").read_text())),
+    Loader("fit.toml", _part, VALID_FIT),
+    Loader("noise.toml", _part, tomllib.loads((CAR / "noise.toml").read_text())),
+    Loader("network.toml", _part, tomllib.loads((CAR / "network.toml").read_text())),
+    Loader("intervals.json", load_intervals, json.loads((CAR / "intervals.json").read_text())),
     Loader(DOCUMENT_FILE, _model, json.loads((SHIPPED / DOCUMENT_FILE).read_text())),
     Loader(
         "regression.json",
@@ -71,7 +89,7 @@ LOADERS = [
     ),
 ]
 every_loader = pytest.mark.parametrize("loader", LOADERS, ids=lambda loader: loader.name)
-every_toml = pytest.mark.parametrize("loader", LOADERS[:4], ids=lambda loader: loader.name)
+every_toml = pytest.mark.parametrize("loader", LOADERS[:7], ids=lambda loader: loader.name)
 
 
 def to_toml(value: Any, top: bool = False) -> str:
@@ -160,14 +178,15 @@ def test_the_document_that_the_others_are_made_of_is_taken(loader: Loader, tmp_p
 @every_loader
 def test_what_cannot_be_read_is_one_line(loader: Loader, tmp_path: Path) -> None:
     path = tmp_path / loader.name
-    assert "no such file" in outcome(loader, path)
+    # A car needs none of its parts.
+    assert ("no such file" in outcome(loader, path)) == (loader.load is not _part)
     path.write_bytes(b"\xff\xfe\x00")
     assert "utf-8" in outcome(loader, path)
     path.write_text("= ][")
     assert outcome(loader, path)
     path.unlink()
     path.mkdir()
-    assert "directory" in outcome(loader, path) or loader.name == "calibration.json"
+    assert "directory" in outcome(loader, path) or loader.name == "intervals.json"
 
 
 @every_loader
@@ -194,7 +213,7 @@ def test_numbers_without_end_are_one_line(loader: Loader, tmp_path: Path, number
     assert outcome(loader, path)
 
 
-@pytest.mark.parametrize("loader", LOADERS[4:], ids=lambda loader: loader.name)
+@pytest.mark.parametrize("loader", LOADERS[7:], ids=lambda loader: loader.name)
 @pytest.mark.parametrize("document", [[], [1], "text", 3, None, True])
 def test_json_that_is_no_object_is_one_line(loader: Loader, tmp_path: Path, document: Any) -> None:
     assert f"a {type(document).__name__} instead of named entries" in outcome(

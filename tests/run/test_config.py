@@ -65,10 +65,10 @@ def test_empty_slice_is_a_usage_error(start: str | None, end: str | None) -> Non
 
 def test_flags_win_over_file_and_paths_are_relative_to_it(tmp_path: Path) -> None:
     file = tmp_path / "pdhef.toml"
-    file.write_text('estimators = ["zero", "gyro"]\nvehicle = "car.toml"\nannotate = "sidecar"\nstart = 10\n')
+    file.write_text('estimators = ["zero", "gyro"]\ncar = "car.toml"\nannotate = "sidecar"\nstart = 10\n')
     config = load_config(file, {"annotate": "none", "mapping": None})
     assert config.estimators == ("zero", "gyro")
-    assert config.vehicle == tmp_path / "car.toml"
+    assert config.car == tmp_path / "car.toml"
     assert config.annotate == "none"
     assert config.start == "10"
     assert config.mapping is None
@@ -100,14 +100,14 @@ def test_file_of_the_working_directory_is_found(tmp_path: Path, monkeypatch: pyt
         ("start = true", r"start: should be a valid string, got True"),
         ("end = [1]", "end: should be a valid string"),
         (f'end = "{"9" * 400}"', "end: String should have at most 64 characters"),
-        ("vehicle = 3", r"vehicle: should be a path, got 3"),
+        ("car = 3", r"car: should be a path, got 3"),
         ("annotate = 3", "annotate: should be 'full', 'sidecar' or 'none', got 3"),
         ('friction = "0.4"', "friction: "),
         ("friction = 0.0", "friction: "),
         ("friction = true", "friction: "),
-        ('model = ["none"]', "model: should be a path"),
+        ('network = ["none"]', "network: should be a path"),
         ("windows_s = 3", r"windows_s: unknown, did you mean window_s\?"),
-        ('vehicel = "car.toml"', r"vehicel: unknown, did you mean vehicle\?"),
+        ('netwrok = "car"', r"netwrok: unknown, did you mean network\?"),
     ],
 )
 def test_wrong_files_name_what_is_wrong(tmp_path: Path, text: str, named: str) -> None:
@@ -159,14 +159,40 @@ def test_missing_file_is_a_usage_error(tmp_path: Path) -> None:
 
 
 def test_configuration_in_outputs_holds_no_folders(tmp_path: Path) -> None:
-    document = RunConfig(vehicle=tmp_path / "car.toml").to_dict()
-    assert document["vehicle"] == "car.toml"
+    document = RunConfig(car=tmp_path / "car.toml").to_dict()
+    assert document["car"] == "car.toml"
     assert str(tmp_path) not in str(document)
 
 
 def test_words_that_stand_for_files_stay_words(tmp_path: Path) -> None:
     file = tmp_path / "pdhef.toml"
-    file.write_text('model = "none"\ncalibration = "unsure"\nvehicle = "none"\n')
+    file.write_text('network = "none"\nintervals = "unsure"\ncar = "none"\n')
     config = load_config(file, {})
-    assert (config.model, config.calibration) == (Path("none"), Path("unsure"))
-    assert config.vehicle == tmp_path / "none"
+    assert (config.network, config.intervals) == (Path("none"), Path("unsure"))
+    assert config.car == tmp_path / "none"
+
+
+def test_keys_of_older_files_are_read(tmp_path: Path) -> None:
+    for name, words in (("old", ("vehicle", "model", "calibration")), ("new", ("car", "network", "intervals"))):
+        entries = zip(words, ("cars/mine", "none", "wide.json"), strict=True)
+        (tmp_path / f"{name}.toml").write_text("".join(f'{key} = "{value}"\n' for key, value in entries))
+    config = load_config(tmp_path / "old.toml", {})
+    assert config == load_config(tmp_path / "new.toml", {})
+    assert config.car == tmp_path / "cars/mine"
+    assert (config.network, config.intervals) == (Path("none"), tmp_path / "wide.json")
+    (tmp_path / "old.toml").write_text("vehicle = 3\n")
+    with pytest.raises(UsageError, match=r"car: should be a path, got 3"):
+        load_config(tmp_path / "old.toml", {})
+
+
+@pytest.mark.parametrize(("old", "new"), [("vehicle", "car"), ("model", "network"), ("calibration", "intervals")])
+def test_an_old_key_beside_its_new_one_is_refused(tmp_path: Path, old: str, new: str) -> None:
+    (tmp_path / "c.toml").write_text(f'{new} = "a"\n{old} = "b"\n')
+    with pytest.raises(UsageError, match=f"c.toml: expected an entry or its former name, got {old} and {new}"):
+        load_config(tmp_path / "c.toml", {})
+
+
+def test_a_car_and_a_network_may_be_named_by_word(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text('car = "saloon"\nnetwork = "many-cars"\n')
+    config = load_config(tmp_path / "c.toml", {})
+    assert (config.car, config.network) == (Path("saloon"), Path("many-cars"))

@@ -10,7 +10,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, DEFAULT_MODEL_ESTIMATORS, TUNED_ESTIMATORS
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.table import SPECS, default_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.pipeline import run_logs
@@ -43,7 +44,7 @@ field = "rr_m_s"
 
 
 def _config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
-    values: dict[str, Any] = {"vehicle": sample_logs_dir / "vehicle.toml", "annotate": "none", **changes}
+    values: dict[str, Any] = {"car": sample_logs_dir / "vehicle.toml", "annotate": "none", **changes}
     return RunConfig(**values)
 
 
@@ -71,7 +72,7 @@ def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path)
     assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "run.json"}
 
 
-def test_documents_follow_their_schemas(dlc_run: Path) -> None:
+def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
     import jsonschema
 
     report = json.loads((dlc_run / "logs/dlc/report.json").read_text())
@@ -80,9 +81,11 @@ def test_documents_follow_their_schemas(dlc_run: Path) -> None:
     jsonschema.validate(run, load_schema("run.schema.json"))
     assert run["logs"][0]["outcome"] == "ok"
     names = [e["name"] for e in report["estimators"]]
-    assert names[: len(DEFAULT_ESTIMATORS)] == list(DEFAULT_ESTIMATORS)
-    assert set(names[len(DEFAULT_ESTIMATORS) :]) <= set(DEFAULT_MODEL_ESTIMATORS)  # where a network is shipped
-    assert not set(names) & set(TUNED_ESTIMATORS)  # the file is not an identified one
+    plain = [s.name for s in SPECS if s.default and not s.network and not s.needs_noise]
+    assert names[: len(plain)] == plain
+    assert set(names[len(plain) :]) <= {s.name for s in SPECS if s.network and s.default}  # where a network is shipped
+    assert not set(names) & {s.name for s in SPECS if s.needs_noise}  # the file is not an identified one
+    assert names == list(default_names(Car.load(sample_logs_dir / "vehicle.toml")))
 
 
 def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> None:
@@ -204,7 +207,7 @@ def test_all_logs_bad_is_a_failure(sample_logs_dir: Path, tmp_path: Path) -> Non
 def test_wrong_files_for_all_logs_stop_the_run_before_it_starts(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
     with pytest.raises(VehicleError):
-        run_logs([log], tmp_path / "out", RunConfig(vehicle=tmp_path / "none.toml"))
+        run_logs([log], tmp_path / "out", RunConfig(car=tmp_path / "none.toml"))
     with pytest.raises(MappingError):
         run_logs([log], tmp_path / "out", _config(sample_logs_dir, mapping=tmp_path / "none.toml"))
     with pytest.raises(UsageError):
@@ -264,3 +267,43 @@ def test_impossible_readings_are_told(sample_logs_dir: Path, tmp_path: Path) -> 
     told = [x for x in report["losses"] if x["kind"] == "impossible"]
     assert [x["where"] for x in told] == ["ay_m_s2"]
     assert told[0]["count"] > 10
+
+
+def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
+    from mcap.reader import make_reader
+
+    folder = dlc_run / "logs" / "dlc"
+    told = {e["name"]: e["algorithm"] for e in json.loads((folder / "report.json").read_text())["estimators"]}
+    assert None not in told.values()
+    assert told["phy-ukf"]["algorithm"] == "physics-ukf"
+    for metrics in (dlc_run / "metrics.parquet", folder / "metrics.parquet"):
+        rows = pl.read_parquet(metrics).select("estimator", "algorithm").unique()
+        of = {name: digest for name, digest in rows.iter_rows() if name in told}
+        assert of == {name: told[name]["sha256"][:12] for name in of}
+        assert {"phy-ukf", "pd-hef"} <= of.keys()
+    with (folder / "annotated.mcap").open("rb") as stream:
+        (record,) = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == "pdhef.metrics"]
+    assert {n: json.loads(record[f"{n}/algorithm"]) for n in told} == told
+
+
+def test_a_part_that_is_not_used_is_told(sample_logs_dir: Path, tmp_path: Path) -> None:
+    car = tmp_path / "car"
+    car.mkdir()
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    (car / "vehicle.toml").write_text(text)
+    (car / "fit.toml").write_text(
+        'format = "pdhef-fit"\nversion = 1\n'
+        f'physics_sha256 = "{Car.load(car).physics_sha256}"\n[values]\nsteer_offset_rad = 0.02\n'
+    )
+    offset = {}
+    for name, changed in (("same", text), ("other", text.replace("1440.0", "1450.0"))):
+        (car / "vehicle.toml").write_text(changed)
+        said: list[str] = []
+        config = _config(sample_logs_dir, car=car, estimators=("open-loop",), end="3")
+        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, warn=said.append)
+        assert ("fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew" in said) == (
+            name == "other"
+        )
+        estimates = pl.read_parquet(tmp_path / name / "logs/dlc/estimates.parquet")
+        offset[name] = float(estimates.filter(pl.col("estimator") == "open-loop")["sideslip_rad"].abs().mean())
+    assert offset["same"] > 1.5 * offset["other"]

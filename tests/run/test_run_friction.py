@@ -12,11 +12,11 @@ import polars as pl
 import pytest
 from rich.console import Console
 
-from pdhef_logtool.car.vehicle import load_vehicle, vehicle_to_toml
+from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION
 from pdhef_logtool.learning.network.dataset import read_dataset
-from pdhef_logtool.learning.network.extract_command import ExtractSettings, run_extraction
+from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.run.config import RunConfig, load_config
@@ -39,13 +39,13 @@ field = "friction"
 def files(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("files")
     vehicle = load_vehicle(sample_logs_dir / "vehicle.toml").model_copy(update={"friction": None})
-    (folder / "car.toml").write_text(vehicle_to_toml(vehicle))
+    (folder / "car.toml").write_text(vehicle_toml(vehicle))
     (folder / "told.toml").write_text(TOLD)
     return folder
 
 
 def run(log: Path, out: Path, **changes: Any) -> tuple[RunResult, dict[str, Any], pl.DataFrame]:
-    values: dict[str, Any] = {"annotate": "none", "model": Path("none"), "estimators": ("phy-ukf",), **changes}
+    values: dict[str, Any] = {"annotate": "none", "network": Path("none"), "estimators": ("phy-ukf",), **changes}
     result = run_logs([str(log)], out, RunConfig(**values))
     report = result.results[0].report
     assert report is not None
@@ -54,7 +54,7 @@ def run(log: Path, out: Path, **changes: Any) -> tuple[RunResult, dict[str, Any]
 
 @pytest.fixture(scope="module")
 def slippery(files: Path, sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
-    return run(sample_logs_dir / "sweep.mcap", tmp_path_factory.mktemp("out"), vehicle=files / "car.toml")
+    return run(sample_logs_dir / "sweep.mcap", tmp_path_factory.mktemp("out"), car=files / "car.toml")
 
 
 def test_a_slippery_road_is_found(slippery: Any) -> None:
@@ -83,7 +83,7 @@ def test_the_terminal_and_the_warnings_say_it(slippery: Any) -> None:
 
 
 def test_ordinary_driving_shows_no_friction(files: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
-    _, report, track = run(sample_logs_dir / "road.mcap", tmp_path, vehicle=files / "car.toml", end="+90s")
+    _, report, track = run(sample_logs_dir / "road.mcap", tmp_path, car=files / "car.toml", end="+90s")
     assert report["friction"]["observable_share"] < 0.02
     friction = track["friction"].drop_nulls().drop_nans().to_numpy()
     assert np.mean(friction < 0.6) < 0.02
@@ -94,7 +94,7 @@ def test_windows_change_no_byte(
     slippery: Any, files: Path, sample_logs_dir: Path, tmp_path: Path, window_s: float
 ) -> None:
     whole, report, _ = slippery
-    _, again, _ = run(sample_logs_dir / "sweep.mcap", tmp_path, vehicle=files / "car.toml", window_s=window_s)
+    _, again, _ = run(sample_logs_dir / "sweep.mcap", tmp_path, car=files / "car.toml", window_s=window_s)
     assert json.dumps(again) == json.dumps(report)
     for name in ("estimates.parquet", "metrics.parquet"):
         expected = (whole.output / "logs" / "sweep" / name).read_bytes()
@@ -104,14 +104,14 @@ def test_windows_change_no_byte(
 def test_the_friction_of_the_log_does_not_reach_an_estimate(
     slippery: Any, files: Path, sample_logs_dir: Path, tmp_path: Path
 ) -> None:
-    told = {"vehicle": files / "car.toml", "mapping": files / "told.toml", "friction": "estimate"}
+    told = {"car": files / "car.toml", "mapping": files / "told.toml", "friction": "estimate"}
     _, report, track = run(sample_logs_dir / "sweep.mcap", tmp_path, **told)
     assert report["friction"] == slippery[1]["friction"]
     assert track.equals(slippery[2])
 
 
 @pytest.mark.parametrize(
-    ("choice", "with_topic", "vehicle", "source", "value"),
+    ("choice", "with_topic", "car", "source", "value"),
     [
         ("auto", True, "sample", "topic /truth/perfect/state.friction", SLIPPERY),
         ("auto", False, "sample", "vehicle file, 0.85", 0.85),
@@ -121,13 +121,13 @@ def test_the_friction_of_the_log_does_not_reach_an_estimate(
     ],
 )
 def test_what_is_asked_for_is_told_to_the_estimators(
-    choice: Any, with_topic: bool, vehicle: str, source: str, value: float,
+    choice: Any, with_topic: bool, car: str, source: str, value: float,
     files: Path, sample_logs_dir: Path, tmp_path: Path,
 ) -> None:  # fmt: skip
-    car = sample_logs_dir / "vehicle.toml" if vehicle == "sample" else files / "car.toml"
+    file = sample_logs_dir / "vehicle.toml" if car == "sample" else files / "car.toml"
     mapping = files / "told.toml" if with_topic else None
     _, report, track = run(
-        sample_logs_dir / "sweep.mcap", tmp_path, vehicle=car, mapping=mapping, friction=choice, end="+3s"
+        sample_logs_dir / "sweep.mcap", tmp_path, car=file, mapping=mapping, friction=choice, end="+3s"
     )
     said = report["friction"]
     assert (said["source"], said["estimated"], said["observable_share"]) == (source, False, None)
@@ -140,14 +140,14 @@ def test_a_vehicle_file_without_friction_cannot_be_asked_for_it(
     files: Path, sample_logs_dir: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(UsageError, match="--friction"):
-        run(sample_logs_dir / "sweep.mcap", tmp_path, vehicle=files / "car.toml", friction="file")
+        run(sample_logs_dir / "sweep.mcap", tmp_path, car=files / "car.toml", friction="file")
 
 
 def test_the_network_is_trained_with_what_a_run_tells(
     slippery: Any, files: Path, sample_logs_dir: Path, tmp_path: Path
 ) -> None:
-    config = RunConfig(vehicle=files / "car.toml", friction="estimate")
-    result = run_extraction([str(sample_logs_dir / "sweep.mcap")], tmp_path, ExtractSettings(config, split="train"))
+    config = RunConfig(car=files / "car.toml", friction="estimate")
+    result = extract([str(sample_logs_dir / "sweep.mcap")], tmp_path, ExtractSettings(config, split="train"))
     (entry,) = result.manifest["drives"]
     assert entry["friction_from"].startswith("estimate, observable")
     assert result.manifest["settings"]["friction"] == "estimate"

@@ -45,8 +45,8 @@ def stuck_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
     scale = Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0))
     ModelBundle(FEATURES, 8, 1, (4,), 0.01, scale, weights).save(folder / "model")
     config = RunConfig(
-        vehicle=sample_logs_dir / "vehicle.toml",
-        model=folder / "model",
+        car=sample_logs_dir / "vehicle.toml",
+        network=folder / "model",
         estimators=("phy-ukf", "pd-hef"),
         annotate="none",
         window_s=3.0,  # the fault reaches over a cut

@@ -31,14 +31,14 @@ Key = tuple[str, str, str]
 @pytest.fixture(scope="module")
 def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("annotated")
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", estimators=("phy-ukf", "zero"))
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", estimators=("phy-ukf", "zero"))
     run_logs([str(sample_logs_dir / "dlc.mcap")], out, config)
     return out / "logs/dlc"
 
 
 @pytest.fixture
 def config(sample_logs_dir: Path) -> RunConfig:
-    return RunConfig(vehicle=sample_logs_dir / "vehicle.toml")
+    return RunConfig(car=sample_logs_dir / "vehicle.toml")
 
 
 def _figures(metrics: list[dict[str, Any]], estimator: str) -> dict[Key, tuple[float | None, int]]:
@@ -71,7 +71,7 @@ def _value(report: dict[str, Any], signal: str, metric: str, estimator: str | No
 def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(
     annotated: Path, sample_logs_dir: Path, window_s: float
 ) -> None:
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", window_s=window_s)
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", window_s=window_s)
     report = _scored(annotated, config, "/pdhef/phy_ukf/state")
     of_run = _figures(json.loads((annotated / "report.json").read_text())["metrics"], "phy-ukf")
     again = _figures(report["metrics"], "phy-ukf")
@@ -113,7 +113,7 @@ def test_named_fields_and_a_table_with_scale_give_the_same(
         '[estimates.turned.sideslip_rad]\ntopic = "/pdhef/phy_ukf/state"\nfield = "sideslip_rad"\nscale = -1.0\n'
         '[estimates.same.sideslip_rad]\ntopic = "/pdhef/phy_ukf/state"\nfield = "sideslip_rad"\n'
     )
-    tables = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", mapping=tmp_path / "m.toml")
+    tables = RunConfig(car=sample_logs_dir / "vehicle.toml", mapping=tmp_path / "m.toml")
     both = _scored(annotated, tables)
     for metric in ("rmse", "bias", "p95_abs"):
         expected = pytest.approx(_value(whole, "sideslip_rad", metric), rel=1e-9)
@@ -153,7 +153,7 @@ def test_nothing_is_written_without_a_folder(
 
 
 def test_slice_scores_its_stamps_alone(annotated: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", start="3", end="6")
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", start="3", end="6")
     report = _scored(annotated, config, "/pdhef/zero/state", output=tmp_path)
     stamps = pl.read_parquet(tmp_path / "logs/annotated/estimates.parquet")["stamp_ns"]
     assert report["log"]["start_ns"] <= stamps.min() <= stamps.max() < report["log"]["end_ns"]
@@ -190,7 +190,7 @@ def test_names_that_the_tables_use_themselves_are_refused(annotated: Path, confi
 
 def test_no_truth_is_an_error_that_says_what_to_do(annotated: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text('[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_velocity.z"\n')
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", mapping=tmp_path / "m.toml")
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", mapping=tmp_path / "m.toml")
     with pytest.raises(MappingError, match="--truth"):
         _scored(annotated, config, "/pdhef/zero/state")
 
@@ -276,7 +276,7 @@ def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
     assert report["truth"]["latency_s"] is None
     assert any("latency" in note and "0" in note for note in report["truth"]["notes"])
     assert any("no IMU" in text for text in said)
-    assert any("no --vehicle" in text for text in said)
+    assert any("no --car" in text for text in said)
 
 
 DBC = """VERSION ""
@@ -327,7 +327,7 @@ def test_estimate_of_a_control_unit_on_can(tmp_path: Path) -> None:
 
 def test_250_lm_speed_is_not_independent_of_its_truth(shared_dir: Path) -> None:
     log = shared_dir / "data/drives/revs_250lm_a.mcap"
-    config = RunConfig(vehicle=REFERENCE / "vehicles/revs_250lm.toml", start="0", end="60")
+    config = RunConfig(car=REFERENCE / "vehicles/revs_250lm.toml", start="0", end="60")
     estimate = "vx_m_s=/vehicle/status/velocity_status.longitudinal_velocity"
     truth = [f"{s}=/ins/odometry.twist.twist.linear.{a}" for s, a in (("vx_m_s", "x"), ("vy_m_s", "y"))]
     for named in ((), truth):

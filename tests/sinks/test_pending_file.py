@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.sinks.base import PendingFile, write_bytes
+from pdhef_logtool.records.files import PendingFile, write_bytes
 
 DONE = {"out.bin": b"new"}
 

@@ -9,11 +9,9 @@ from types import ModuleType
 
 import pytest
 
-<<<<<<< HEAD
 from studies import truthsim_docs
-=======
+
 pytestmark = pytest.mark.slow
->>>>>>> tests
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "truthsim.md").read_text(encoding="utf-8")

@@ -14,10 +14,16 @@ from pdhef_logtool.car.store import Change, Content, check_output, write_change
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
-from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, tell_drive
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    LearnResult,
+    config_document,
+    no_drive,
+    open_mapping,
+    tell_drive,
+)
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.run.config import RunConfig
 
@@ -34,26 +40,17 @@ _ENTRIES = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class IdentifyResult:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class IdentifyResult(LearnResult):
     """What the command found and wrote."""
 
     identification: Identification
-    car: Path
-    records: tuple[DriveRecord, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part whole, 3 if not."""
-        return exit_code(self.records)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         found = self.identification
         return {
-            "car": str(self.car),
-            "exit_code": self.exit_code,
-            **drives_document(self.records),
+            **super(IdentifyResult, self).to_dict(),
             "parameters": [
                 {
                     "name": p.name,
@@ -111,7 +108,7 @@ def identify(
     check_output(car, output)
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {start.name}")
-    given = None if config.mapping is None else load_mapping(config.mapping)
+    given = open_mapping(config)
     fit: list[FitDrive] = []
     held_out: list[FitDrive] = []
     records: list[DriveRecord] = []
@@ -128,12 +125,7 @@ def identify(
         if scored is not None:
             held_out.append(scored)
     if not fit:
-        raise EstimatorError(
-            expected="at least one drive with truth velocities",
-            got="none",
-            where="identify",
-            remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-        )
+        raise no_drive("truth velocities", "identify")
     found = fit_car(
         fit,
         held_out,
@@ -161,10 +153,11 @@ def identify(
     comments = _comments(found)
     text = part_toml(part, head, {f"values.{k}": v for k, v in comments.items()})
     files: dict[str, Content] = {FIT_FILE: text.encode(), "fit.png": _plot(found)}
-    settings = {"holdout_share": holdout, "notes": list(found.notes)}
-    change = Change("identify", FIT_FILE, files, settings=settings, drives=drives)
-    after = car.with_fit(part)
-    return IdentifyResult(found, write_change(car, after, output, change, comments), tuple(records))
+    settings = {**config_document(config), "holdout": holdout}
+    told = {"holdout_share": holdout, "notes": list(found.notes)}
+    change = Change("identify", FIT_FILE, files, settings=settings, drives=drives, told=told)
+    write_change(car, car.with_fit(part), output, change, comments)
+    return IdentifyResult(car=output, records=tuple(records), identification=found)
 
 
 def _plot(found: Identification) -> Callable[[Path], None]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import INTERVALS_FILE, Car
 from pdhef_logtool.car.parts import Algorithm, IntervalEntry, Intervals
-from pdhef_logtool.car.store import Change, check_output, update_car
+from pdhef_logtool.car.store import Change, update_car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import friction_of
 from pdhef_logtool.estimators.algorithm import resolve
@@ -21,13 +21,13 @@ from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
 from pdhef_logtool.learning.drives import (
     DriveRecord,
+    LearnResult,
     LearnSettings,
     Refusal,
     choose_drives,
-    drives_document,
-    exit_code,
     load_drive,
     open_car,
+    open_mapping,
     tell_drive,
 )
 from pdhef_logtool.learning.evidence.calibrate import (
@@ -46,12 +46,11 @@ from pdhef_logtool.learning.noise.tune_command import HELD_OUT
 from pdhef_logtool.learning.variation import Variation, vary
 from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.run.estimating import estimate
+from pdhef_logtool.run.estimating import estimate_windows
 from pdhef_logtool.sinks.report import json_bytes, tool_versions
 from pdhef_logtool.watches.error_features import error_terms
 from pdhef_logtool.watches.intervals import yaw_rate_terms
@@ -83,23 +82,17 @@ class CalibrateSettings(LearnSettings):
     spread: float = DEFAULT_SPREAD
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibrateResult:
-    """What the command found and wrote."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class CalibrateResult(LearnResult):
+    """What the command found and wrote; ``file`` holds the intervals."""
 
     file: Path
     intervals: Intervals
-    records: tuple[DriveRecord, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part whole, 3 if not."""
-        return exit_code(self.records)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         intervals = self.intervals.model_dump(mode="json")
-        return {"file": str(self.file), "exit_code": self.exit_code, **intervals, **drives_document(self.records)}
+        return {**intervals, **super(CalibrateResult, self).to_dict(), "file": str(self.file)}
 
 
 def calibrate(
@@ -133,10 +126,9 @@ def calibrate(
             expected="a car's folder, or a file name that ends in .json", got=output.name, where="--output",
             remedy="intervals have no place in a vehicle.toml",
         )  # fmt: skip
-    car = open_car(config)
-    if output.suffix != ".json":
-        check_output(car, output)
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    alone = output.suffix == ".json"
+    car = open_car(config, None if alone else output, warn)
+    mapping = open_mapping(config)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     if car.network is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")
@@ -170,12 +162,13 @@ def calibrate(
         )
     intervals = _intervals(settings, car, entries, records)
     data = json_bytes(intervals.model_dump(mode="json"))
-    if output.suffix == ".json":
-        write_bytes(output, data)
-        return CalibrateResult(output, intervals, tuple(records))
-    used = tuple(r.learnt_on for r in records if not r.left_out)
-    change = Change("calibrate", INTERVALS_FILE, {INTERVALS_FILE: data}, settings=settings.to_dict(), drives=used)
-    return CalibrateResult(update_car(car, output, change), intervals, tuple(records))
+    if alone:
+        file = output
+        write_bytes(file, data)
+    else:
+        change = Change("calibrate", INTERVALS_FILE, {INTERVALS_FILE: data}, {}, settings.to_dict(), intervals.drives)
+        file = update_car(car, output, change)
+    return CalibrateResult(car=output, records=tuple(records), file=file, intervals=intervals)
 
 
 def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
@@ -210,7 +203,7 @@ def _run_drive(
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
         available = drive.plan.alignment.available
         estimators, _ = runnable(config.estimators, presumed, available, Options(options.use_speed))
-        for window in estimate(replace(drive, signals=seen), estimators, watched=False, drawn=False):
+        for window in estimate_windows(replace(drive, signals=seen), estimators, watched=False, drawn=False):
             for estimator, track in zip(estimators, window.tracks, strict=True):
                 part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
                 if len(part) >= MIN_SAMPLES:

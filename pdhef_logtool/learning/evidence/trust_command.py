@@ -12,19 +12,21 @@ import numpy as np
 from pdhef_logtool.car.car import NETWORK_FILE, NETWORK_FOLDER, SHOWN_DIGITS, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import LearntOn, Trust
-from pdhef_logtool.car.store import Change, check_output, write_change
+from pdhef_logtool.car.store import Change, write_change
 from pdhef_logtool.drive.reading import Drive, WholeDrive
 from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import (
     DriveRecord,
+    LearnResult,
     LearnSettings,
     Refusal,
     choose_drives,
     drives_document,
-    exit_code,
     load_drive,
+    no_drive,
     open_car,
+    open_mapping,
     record_head,
     tell_drive,
 )
@@ -46,8 +48,7 @@ from pdhef_logtool.learning.evidence.trust import (
 )
 from pdhef_logtool.learning.noise.tune_drives import MIN_SCORED_STAMPS
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 from pdhef_logtool.residual_model.service import RememberingNetwork
@@ -68,25 +69,17 @@ REFUSED = Refusal(
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TrustResult:
-    """What the command decided and wrote; ``rmse_deg`` holds a row a drive, a column a trust."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TrustResult(LearnResult):
+    """What the command decided and wrote; ``rmse_deg`` holds a row a drive that took part, a column a trust."""
 
-    car: Path
     decision: TrustDecision
     trust: Trust
-    drives: tuple[DriveRecord, ...]
-    left_out: tuple[DriveRecord, ...]
     rmse_deg: tuple[tuple[float, ...], ...]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part whole, 3 if not."""
-        return exit_code((*self.drives, *self.left_out))
 
     def drives_document(self) -> dict[str, Any]:
         """Return the drives with their errors at each trust, and those left out."""
-        document = drives_document((*self.drives, *self.left_out))
+        document = drives_document(self.records)
         for drive, rmse in zip(document["drives"], self.rmse_deg, strict=True):
             drive["rmse_deg"] = list(rmse)
         return document
@@ -95,8 +88,7 @@ class TrustResult:
         """Return the result as one JSON-able document."""
         d = self.decision
         return {
-            "car": str(self.car),
-            "exit_code": self.exit_code,
+            **super(TrustResult, self).to_dict(),
             "trust_cap": d.cap,
             "reason": d.reason,
             "evidence": self.trust.evidence,
@@ -130,12 +122,11 @@ def trust(
         No drive can be scored.
     """
     config = settings.config
-    car = open_car(config)
-    check_output(car, output)
+    car = open_car(config, output, warn)
     if car.network is None:
         raise UsageError(expected="a network", got="none", where="--network", remedy="give a folder of pdhef train")
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    mapping = open_mapping(config)
 
     def lacking(drive: Drive) -> str:
         missing = sorted(spec_of("pd-hef").needs - drive.available)
@@ -160,12 +151,7 @@ def trust(
             scored.append(errors_by_trust(car, drive, use_speed=config.read_options.use_speed))
     drives = tuple(f for f in loaded if not f.left_out)
     if not drives:
-        raise EstimatorError(
-            expected="at least one drive with a true sideslip and the signals of pd-hef",
-            got="none",
-            where="trust",
-            remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-        )
+        raise no_drive("a true sideslip and the signals of pd-hef", "trust")
     for text in seen_by_identification(car, drives):
         warn(text)
     together = join_blocks(scored)
@@ -182,8 +168,8 @@ def trust(
         noise_sha256=car.noise_sha256,
         drives=tuple(d.learnt_on for d in drives),
     )
-    left_out = tuple(f for f in loaded if f.left_out)
-    result = TrustResult(output, decision, found, drives, left_out, tuple(_rmse_deg(b) for b in scored))
+    rmse_deg = tuple(_rmse_deg(b) for b in scored)
+    result = TrustResult(car=output, records=tuple(loaded), decision=decision, trust=found, rmse_deg=rmse_deg)
     head = "Written by pdhef trust: which network this car has, how far it is trusted, and why."
     files = {
         NETWORK_FILE: part_toml(found, head).encode(),
@@ -191,9 +177,9 @@ def trust(
     }
     folders = {} if shipped or car.network_folder is None else {NETWORK_FOLDER: car.network_folder}
     change = Change("trust", NETWORK_FILE, files, folders, settings.to_dict(), found.drives)
-    written = write_change(car, replace(car, trust=found), output, change)
+    write_change(car, replace(car, trust=found), output, change)
     progress("done", 1.0)
-    return replace(result, car=written)
+    return result
 
 
 def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErrors:

@@ -22,7 +22,15 @@ from pdhef_logtool.drive.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.estimators.table import spec_of
-from pdhef_logtool.learning.drives import DriveRecord, drives_document, exit_code, record_of, set_manifest, tell_drive
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    drives_document,
+    exit_code,
+    open_mapping,
+    record_of,
+    set_manifest,
+    tell_drive,
+)
 from pdhef_logtool.learning.network.dataset import (
     FORMAT,
     FORMAT_VERSION,
@@ -44,7 +52,6 @@ from pdhef_logtool.learning.network.residuals import (
 from pdhef_logtool.learning.variation import vary
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.signals import Loss
@@ -191,7 +198,7 @@ def extract(
     settings.smoothing_half_s()
     _check_counts(jobs, settings)
     inputs = find_logs(arguments)
-    mapping = None if settings.config.mapping is None else load_mapping(settings.config.mapping)
+    mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
     _check_output(output)
     try:

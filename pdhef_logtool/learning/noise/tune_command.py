@@ -13,16 +13,18 @@ import numpy as np
 from pdhef_logtool.car.car import NOISE_FILE, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Noise
-from pdhef_logtool.car.store import Change, Content, check_output, write_change
+from pdhef_logtool.car.store import Change, Content, write_change
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
+    LearnResult,
     LearnSettings,
     Refusal,
     choose_drives,
     drives_document,
-    exit_code,
+    no_drive,
     open_car,
+    open_mapping,
     record_head,
     tell_drive,
 )
@@ -45,8 +47,7 @@ from pdhef_logtool.learning.noise.search import (
 )
 from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
@@ -95,27 +96,17 @@ class Tuned:
         return best_trial(self.trials)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TuneResult:
-    """What the command found and wrote; ``drives`` are those that were scored."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TuneResult(LearnResult):
+    """What the command found and wrote."""
 
-    car: Path
     tuned: tuple[Tuned, ...]
-    drives: tuple[DriveRecord, ...]
-    left_out: tuple[DriveRecord, ...]
     notes: tuple[str, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part whole, 3 if not."""
-        return exit_code((*self.drives, *self.left_out))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         return {
-            "car": str(self.car),
-            "exit_code": self.exit_code,
-            **drives_document((*self.drives, *self.left_out)),
+            **super(TuneResult, self).to_dict(),
             "estimators": {
                 t.name: {
                     "trials": len(t.trials),
@@ -159,8 +150,7 @@ def tune(
         raise UsageError(expected=f"at least {MIN_TRIALS} trials", got=str(settings.trials), where="--trials")
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
-    car = open_car(config)
-    check_output(car, output)
+    car = open_car(config, output, warn)
     names = choose_names(settings.names, car, with_network=config.network is not None or car.trust is not None)
     has_network = any(spec_of(n).network for n in names)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
@@ -168,8 +158,7 @@ def tune(
         warn(
             "drives of split train: a network is better there than in service, and its filter's noise is tuned to that"
         )
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
-    setup = TuneSetup(config, car, mapping, names)
+    setup = TuneSetup(config, car, open_mapping(config), names)
     with Benches(setup, min(jobs, len(inputs))) as benches:
         done = 0
 
@@ -180,14 +169,8 @@ def tune(
             tell_drive(record, warn)
 
         loaded = benches.load(inputs, splits, told)
-        drives = tuple(d for d in loaded if not d.left_out)
-        if not drives:
-            raise EstimatorError(
-                expected="at least one drive with a true sideslip and the signals of the estimators",
-                got="none",
-                where="tune",
-                remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-            )
+        if all(d.left_out for d in loaded):
+            raise no_drive("a true sideslip and the signals of the estimators", "tune")
         before = benches.score({n: car.noise[n] for n in names if n in car.noise})
 
         def tell(trial: int) -> None:
@@ -203,23 +186,24 @@ def tune(
     notes = _notes(tuned)
     for note in notes:
         warn(note)
-    result = TuneResult(output, tuned, drives, tuple(d for d in loaded if d.left_out), notes)
-    record, summary = _record(result, settings, car), _summary(settings)
-    noise = {t.name: _noise(t, car) for t in tuned}
+    result = TuneResult(car=output, records=tuple(loaded), tuned=tuned, notes=notes)
+    record = _record(result, settings, car)
+    noise = {**_kept(car), **{t.name: _noise(t, car) for t in tuned}}
     part = Noise(
-        filter={**_kept(car), **noise},
-        search={**summary, "drives_sha256": record["drives_sha256"]},
-        drives=tuple(d.learnt_on for d in drives),
+        filter=noise,
+        search={**_summary(settings), "drives_sha256": record["drives_sha256"]},
+        drives=tuple(d.learnt_on for d in result.drives),
     )
     head = "Written by pdhef tune. It belongs to the physics of this car: use it with no other."
     files: dict[str, Content] = {
-        NOISE_FILE: part_toml(part, head).encode(),
+        NOISE_FILE: part_toml(part, head, {f"filter.{n}.q_std": "v_x, v_y, yaw rate" for n in noise}).encode(),
         "noise.record.json": json_bytes(record),
         "noise.png": lambda path: _plot(result, path),
     }
-    change = Change("tune", NOISE_FILE, files, settings={**settings.to_dict(), **summary}, drives=part.drives)
-    after = replace(car, noise={**car.noise, **noise})
-    return replace(result, car=write_change(car, after, output, change))
+    in_words = {f"tuning_{k}": v for k, v in part.search.items()}
+    change = Change("tune", NOISE_FILE, files, settings=settings.to_dict(), drives=part.drives, told=in_words)
+    write_change(car, replace(car, noise={**car.noise, **noise}), output, change)
+    return result
 
 
 def _noise(tuned: Tuned, car: Car) -> FilterNoise:
@@ -236,8 +220,12 @@ def _noise(tuned: Tuned, car: Car) -> FilterNoise:
 
 
 def _kept(car: Car) -> dict[str, FilterNoise]:
-    """Return what the car's noise part holds of other filters."""
-    return {n: one for n, one in car.noise.items() if one.score_deg is not None}
+    """Return what an earlier search found for filters; its scores are not those of the same drives and count no more.
+
+    Noise without a trial is the fit's or a person's: it stays where it is.
+    """
+    found = {n: one for n, one in car.noise.items() if one.trial is not None}
+    return {n: one.model_copy(update={"score_deg": None}) for n, one in found.items()}
 
 
 # ---- the record ----
@@ -281,7 +269,7 @@ def _record(result: TuneResult, settings: TuneSettings, car: Car) -> dict[str, A
             "low_speed_m_s": car.vehicle.low_speed_blend_m_s,
         },
         "drives_sha256": together,
-        **drives_document((*result.drives, *result.left_out)),
+        **drives_document(result.records),
         "estimators": {
             t.name: {
                 "best_trial": t.best.number,
@@ -320,7 +308,7 @@ def _plot(result: TuneResult, path: Path) -> None:
     exploring = sum(x.stage == "sobol" for x in result.tuned[0].trials)
     axes.axvline(exploring + 0.5, color="0.5", lw=0.8)
     axes.set(
-        xlabel="trial (left of the line: Sobol points, right: refinement; dotted: the file's own noise)",
+        xlabel="trial (left of the line: Sobol points, right: refinement; dotted: the noise that the car had)",
         ylabel="objective (°): geometric mean of drives' sideslip RMSE",
         title=f"{len(result.drives)} drives",
     )

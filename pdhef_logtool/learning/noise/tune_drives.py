@@ -167,12 +167,12 @@ class Benches:
                 # No more than one a process ahead, so that the bound on the memory is kept.
                 under_way.append(self._pools[index % len(self._pools)].submit(_load, *what))
             while len(under_way) > (len(self._pools) if index + 1 < len(inputs) else 0):
-                facts = _result(under_way.popleft())
-                loaded.append(facts)
-                held += facts.bytes_held
+                record = _result(under_way.popleft())
+                loaded.append(record)
+                held += record.bytes_held
                 if held > MAX_BYTES:
-                    raise too_big(facts.name)
-                told(facts)
+                    raise too_big(record.name)
+                told(record)
         return loaded
 
     def score(self, tunings: Mapping[str, FilterNoise]) -> dict[str, list[DriveError]]:
@@ -194,9 +194,9 @@ def _result(future: Future[Any]) -> Any:
         ) from None
 
 
-def _done(facts: DriveRecord) -> Future[DriveRecord]:
+def _done(record: DriveRecord) -> Future[DriveRecord]:
     future: Future[DriveRecord] = Future()
-    future.set_result(facts)
+    future.set_result(record)
     return future
 
 

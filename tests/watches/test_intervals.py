@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,29 +12,49 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.car.car import INTERVALS_FILE, UNSURE_FILE, Car, load_intervals
+from pdhef_logtool.car.flat import vehicle_toml
+from pdhef_logtool.car.parts import Algorithm, Inflation, IntervalEntry, Intervals
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.records.errors import PdhefError, VehicleError
 from pdhef_logtool.records.reasons import STUCK_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
 from pdhef_logtool.watches.error_features import FLOOR_RAD, TERMS, error_terms
 from pdhef_logtool.watches.intervals import (
-    FILE,
     SIDESLIP_TERMS,
-    UNSURE_FILE,
     YAW_RATE_TERMS,
-    Calibration,
-    Inflation,
     TrackCalibrator,
     calibrated,
-    find_calibration,
     inflated,
-    inflations_document,
-    load_calibration,
+    make_inflation,
 )
 
 STEP_NS = 10_000_000
-INFLATION = Inflation((1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2), (0.5, 1.2, 0.7), 1.1)
-CALIBRATION = Calibration({"e": INFLATION}, "car", "ab" * 32, 0.009)
+SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2)
+INFLATION = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7), 1.1)
+ROLL = 0.009
+ALGORITHM = Algorithm(
+    algorithm="physics-ukf",
+    options={"roll_correction": True},
+    noise={"q_std": [0.1, 0.1, 0.1]},
+    physics_sha256="ab" * 32,
+    network_sha256="12" * 32,
+)
+
+
+def _intervals(algorithm: Algorithm = ALGORITHM, inflation: Inflation = INFLATION, **changes: Any) -> Intervals:
+    values = {
+        "car": "car",
+        "physics_sha256": "ab" * 32,
+        "roll_gradient_rad_per_m_s2": ROLL,
+        "entries": (IntervalEntry(estimator="e", algorithm=algorithm, inflation=inflation),),
+    }
+    return Intervals(**{**values, **changes})
+
+
+def _calibrator(intervals: Intervals | None, *algorithms: Algorithm, name: str = "e") -> TrackCalibrator:
+    return TrackCalibrator(intervals, {name: algorithms})
 
 
 def _drive(count: int = 900, seed: int = 0) -> tuple[Signals, StateTrack]:
@@ -85,10 +106,10 @@ def _cut(record: Any, a: int, b: int) -> Any:
 def test_joined_windows_equal_the_whole(cuts: tuple[int, ...]) -> None:
     signals, track = _drive()
     track = replace(track, reason=np.where(np.arange(900) % 250 < 40, STUCK_AY, 0))
-    whole, _ = calibrated(track, signals, CALIBRATION)
+    whole, _ = calibrated(track, signals, INFLATION, ROLL)
     carry, parts = None, []
     for a, b in pairwise(cuts):
-        part, carry = calibrated(_cut(track, a, b), _cut(signals, a, b), CALIBRATION, carry)
+        part, carry = calibrated(_cut(track, a, b), _cut(signals, a, b), INFLATION, ROLL, carry)
         if len(part):
             parts.append(part)
     joined = concatenate(parts)
@@ -113,7 +134,7 @@ def test_what_has_not_arrived_changes_nothing(at: int) -> None:
 
 def test_the_estimate_stays_and_the_covariance_is_scaled_as_one() -> None:
     signals, track = _drive()
-    out, _ = calibrated(track, signals, CALIBRATION)
+    out, _ = calibrated(track, signals, INFLATION, ROLL)
     for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"):
         assert getattr(out, name) is getattr(track, name)
     assert np.array_equal(np.isnan(out.sideslip_std_rad), np.isnan(track.sideslip_std_rad))
@@ -130,7 +151,7 @@ def test_the_estimate_stays_and_the_covariance_is_scaled_as_one() -> None:
 def test_the_filters_own_term_alone_changes_nothing_but_the_scale() -> None:
     signals, track = _drive()
     terms, _ = error_terms(track, signals, 0.009, None)
-    only = Inflation(
+    only = make_inflation(
         tuple(2.0 * (t == "filter") for t in SIDESLIP_TERMS), tuple(3.0 * (t == "filter") for t in YAW_RATE_TERMS)
     )
     out = inflated(track, terms, only)
@@ -143,7 +164,7 @@ def test_the_interval_widens_with_every_term() -> None:
     track = replace(track, sideslip_std_rad=np.full(50, 0.001))
     terms = np.full((50, len(TERMS)), 0.001)
     base = inflated(track, terms, INFLATION).sideslip_std_rad
-    np.testing.assert_allclose(base, 0.001 * np.sqrt(np.sum(np.square(INFLATION.sideslip))))
+    np.testing.assert_allclose(base, 0.001 * np.sqrt(np.sum(np.square(SIDESLIP_FACTORS))))
     for i in range(len(TERMS)):
         more = terms.copy()
         more[:, i] = 0.002
@@ -198,69 +219,79 @@ def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
 
 def test_without_an_entry_a_track_stays_as_it_is() -> None:
     signals, track = _drive(60)
-    for calibration in (None, replace(CALIBRATION, inflations={})):
-        calibrator = TrackCalibrator(calibration, "ab" * 32)
+    other = ALGORITHM.model_copy(update={"algorithm": "physics-plus-ukf"})
+    for intervals, ran in ((None, ALGORITHM), (_intervals(entries=()), ALGORITHM), (_intervals(), other)):
+        calibrator = _calibrator(intervals, ran)
         assert calibrator.add(track, signals) is track
         assert calibrator.notes("e") == ("intervals not calibrated",)
-    assert TrackCalibrator(None, "").notes("zero") == ()
+    assert _calibrator(None).notes("zero") == ()
 
 
-def test_the_notes_say_for_what_a_calibration_was_made() -> None:
+def test_the_notes_say_for_what_intervals_were_made() -> None:
     signals, track = _drive(60)
 
-    def notes(calibration: Calibration, model: str | None) -> str:
-        calibrator = TrackCalibrator(calibration, "ab" * 32, model)
-        calibrator.add(track, signals)
+    def notes(intervals: Intervals, ran: Algorithm = ALGORITHM) -> str:
+        calibrator = _calibrator(intervals, ran)
+        assert calibrator.add(track, signals) is not track
         return "; ".join(calibrator.notes("e"))
 
-    made = f"intervals calibrated by {FILE} (12345678) for friction and vehicle"
-    assert notes(replace(CALIBRATION, sha256="1234567890"), None) == f"{made} as told"
-    assert notes(replace(CALIBRATION, sha256="1234567890", spread=0.2), None) == f"{made} wrong by 0.2"
-    assert "another vehicle file (car)" in notes(replace(CALIBRATION, vehicle_sha256="cd" * 32), None)
-    assert "another network" in notes(replace(CALIBRATION, model_sha256="1"), "2")
-    assert "another" not in notes(replace(CALIBRATION, model_sha256="1"), "1")
+    made = "intervals calibrated on car for friction and vehicle"
+    assert notes(_intervals()) == f"{made} as told"
+    assert notes(_intervals(spread=0.2)) == f"{made} wrong by 0.2"
+    for changes, said in (
+        ({"physics_sha256": "cd" * 32}, "physics"),
+        ({"noise": {"q_std": [0.1, 0.1, 0.2]}}, "filter noise"),
+        ({"network_sha256": "34" * 32}, "network"),
+        ({"use_speed": False}, "sensors (with or without the speed)"),
+    ):
+        assert notes(_intervals(), ALGORITHM.model_copy(update=changes)).endswith(
+            f"as told; those intervals were made with other {said}"
+        )
+    # The physics that the whole car has now are no matter: those of what ran are.
+    assert notes(_intervals(physics_sha256="cd" * 32)) == f"{made} as told"
 
 
 # ---- the file ----
 
 
 def _document() -> dict[str, Any]:
-    return {
-        "format": "pdhef-calibration",
-        "version": 1,
-        "vehicle": {"name": "car", "sha256": "ab" * 32, "roll_gradient_rad_per_m_s2": 0.009},
-        "model_sha256": None,
-        "settings": {"vary": 0.0},
-        "estimators": inflations_document({"e": INFLATION}),
-    }
+    return _intervals().model_dump(mode="json")
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    (tmp_path / FILE).write_text(json.dumps(_document()))
-    for path in (tmp_path, tmp_path / FILE):
-        loaded = load_calibration(path)
-        assert replace(loaded, sha256="") == CALIBRATION
-        assert len(loaded.sha256) == 64
+    (tmp_path / INTERVALS_FILE).write_text(json.dumps(_document()))
+    for path in (tmp_path, tmp_path / INTERVALS_FILE):
+        assert load_intervals(path) == _intervals()
+
+
+def _with_entry(**changes: Any) -> dict[str, Any]:
+    return {"entries": [_document()["entries"][0] | changes]}
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "said"),
     [
-        {"format": "pdhef-tuning"},
-        {"version": 2},
-        {"vehicle": {}},
-        {"estimators": {"e": {"sideslip": {}, "yaw_rate": {}, "vy_factor": 1.0}}},
-        {"estimators": inflations_document({"e": replace(INFLATION, vy_factor=-1.0)})},
-        {"estimators": inflations_document({"e": replace(INFLATION, yaw_rate=(1.0, float("nan"), 1.0))})},
-        {"estimators": []},
-        {"settings": {}},
+        ({"format": "pdhef-tuning"}, "format: should be 'pdhef-intervals'"),
+        ({"format": "pdhef-calibration"}, "a calibration filed by name"),
+        ({"version": 2}, "version: should be 1"),
+        ({"physics_sha256": "ab"}, "physics_sha256"),
+        (_with_entry(inflation={"sideslip": {}, "yaw_rate": {}, "vy_factor": 1.0}), "inflation.sideslip.floor"),
+        (_with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": -1.0}), "inflation.vy_factor"),
+        (
+            _with_entry(inflation=_document()["entries"][0]["inflation"] | {"vy_factor": float("nan")}),
+            "inflation.vy_factor",
+        ),
+        ({"entries": {}}, "entries: should be a list"),
+        ({"roll_gradient_rad_per_m_s2": None}, "roll_gradient_rad_per_m_s2"),
+        ({"estimators": {}}, "estimators: unknown"),
     ],
 )
-def test_a_wrong_file_is_one_clear_error(tmp_path: Path, change: dict[str, Any]) -> None:
+def test_a_wrong_file_is_one_clear_error(tmp_path: Path, change: dict[str, Any], said: str) -> None:
     path = tmp_path / "c.json"
     path.write_text(json.dumps(_document() | change))
-    with pytest.raises(ModelError) as caught:
-        load_calibration(path)
+    with pytest.raises(VehicleError) as caught:
+        load_intervals(path)
+    assert said in str(caught.value)
     assert "c.json" in str(caught.value)
     assert "pdhef calibrate" in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -271,33 +302,48 @@ def test_no_file_and_no_json(tmp_path: Path, content: str | None) -> None:
     path = tmp_path / "c.json"
     if content is not None:
         path.write_text(content)
-    with pytest.raises(ModelError):
-        load_calibration(path)
+    with pytest.raises(VehicleError):
+        load_intervals(path)
 
 
-def test_which_calibration_a_run_takes(tmp_path: Path) -> None:
-    model = tmp_path / "model"
-    model.mkdir()
-    assert find_calibration(None, model) is None
-    (model / FILE).write_text(json.dumps(_document()))
-    assert find_calibration(None, model) is not None
-    assert find_calibration(Path("none"), model) is None
-    assert find_calibration(model / FILE, Path("none")) is not None
-    assert find_calibration(None, Path("none")) is None
-    with pytest.raises(ModelError, match="unsure"):
-        find_calibration(Path("unsure"), model)
-    (model / UNSURE_FILE).write_text(json.dumps(_document()))
-    assert find_calibration(Path("unsure"), model) is not None
-    with pytest.raises(ModelError, match="no model"):
-        find_calibration(Path("unsure"), Path("none"))
+def test_which_intervals_a_run_takes(tmp_path: Path) -> None:
+    folder = tmp_path / "car"
+    folder.mkdir()
+    (folder / "vehicle.toml").write_text(vehicle_toml(default_vehicle()))
+
+    def taken(chosen: Path | str | None, car: Path | None = folder) -> str | None:
+        intervals = Car.load(car, network="none", intervals=chosen).intervals
+        return None if intervals is None else intervals.car
+
+    shipped = Car.load("saloon").intervals
+    assert shipped is not None
+    assert taken(None) == shipped.car
+    for name, file in (("mine", INTERVALS_FILE), ("mine, unsure", UNSURE_FILE)):
+        (folder / file).write_text(json.dumps(_document() | {"car": name}))
+    assert taken(None) == "mine"
+    assert taken("none") is None
+    assert taken("unsure") == taken(Path("unsure")) == "mine, unsure"
+    assert taken(folder, None) == taken(folder / INTERVALS_FILE, None) == "mine"
+    assert taken(None, None) == shipped.car
+    with pytest.raises(PdhefError, match="elsewhere"):
+        taken(tmp_path / "elsewhere")
 
 
 def test_an_estimator_that_is_another_one_has_its_intervals() -> None:
     signals, track = _drive()
     renamed = replace(track, name="hybrid")
-    as_it_is = TrackCalibrator(CALIBRATION, "x").add(renamed, signals)
-    as_another = TrackCalibrator(CALIBRATION, "x", stands_for={"hybrid": "e"}).add(renamed, signals)
-    np.testing.assert_array_equal(as_it_is.sideslip_std_rad, track.sideslip_std_rad)
-    own = TrackCalibrator(CALIBRATION, "x").add(track, signals)
+    cautious = ALGORITHM.model_copy(update={"algorithm": "cautious-physics"})
+
+    def with_intervals(algorithms: Sequence[Algorithm], intervals: Intervals | None = None) -> StateTrack:
+        return _calibrator(intervals or _intervals(), *algorithms, name="hybrid").add(renamed, signals)
+
+    np.testing.assert_array_equal(with_intervals([cautious]).sideslip_std_rad, track.sideslip_std_rad)
+    own = _calibrator(_intervals(), ALGORITHM).add(track, signals)
+    as_another = with_intervals([cautious, ALGORITHM])
     np.testing.assert_array_equal(as_another.sideslip_std_rad, own.sideslip_std_rad)
     assert as_another.name == "hybrid"
+    # Its own come first, wherever they stand in the file.
+    wide = make_inflation([3.0 * k for k in SIDESLIP_FACTORS], (0.5, 1.2, 0.7))
+    both = _intervals(entries=(*_intervals().entries, *_intervals(cautious, wide).entries))
+    ratio = with_intervals([cautious, ALGORITHM], both).sideslip_std_rad[3:] / own.sideslip_std_rad[3:]
+    np.testing.assert_allclose(ratio, 3.0)

@@ -1,6 +1,6 @@
 """Mutants: small faults put into the code one at a time, to see whether the tests notice.
 
-    python -m studies.mutants [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused]
+    python tests/mutants.py [--seed 1] [--count 30] [--only sinks] [--jobs 2] [--list] [--focused] [--json FILE]
 
 A seeded draw spreads the faults over five packages, over kinds of faults and over functions: no function gets two.
 What only words a message is left alone, and so is what no test can tell apart by construction. Each mutant lives in a
@@ -11,8 +11,11 @@ died.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import copy
+import functools
+import json
 import os
 import random
 import re
@@ -20,14 +23,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from studies.pages import ROOT, options
-
+ROOT = Path(__file__).resolve().parents[1]
 SOURCES = "pdhef_logtool"
 #: By package that is mutated, the folders of the tests that know it best.
 FOLDERS = {
@@ -67,6 +70,16 @@ class Mutant:
     old: str
     new: str
     compiled: bool
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a mutant; ``by`` is the first test that failed, empty for a survivor."""
+
+    mutant: Mutant
+    killed: bool
+    by: str
+    wall_s: float
 
 
 class _Finder(ast.NodeVisitor):
@@ -194,7 +207,8 @@ def _flip(operator: ast.AST) -> Any:
     return _OPPOSITE[type(operator)]()
 
 
-def possible(package: str, root: Path = ROOT) -> list[Mutant]:
+@functools.cache
+def possible(package: str, root: Path = ROOT) -> tuple[Mutant, ...]:
     """Return every fault that can be put into a package, in order of files and lines."""
     trees = {p: ast.parse(p.read_bytes()) for p in sorted((root / SOURCES).rglob("*.py"))}
     at_import = {name for tree in trees.values() for name in _called_at_import(tree)}
@@ -204,7 +218,7 @@ def possible(package: str, root: Path = ROOT) -> list[Mutant]:
             finder = _Finder(package, path.relative_to(root).as_posix(), path.read_bytes(), at_import)
             finder.visit(tree)
             found += finder.found
-    return found
+    return tuple(found)
 
 
 def _called_at_import(tree: ast.Module) -> Iterator[str]:
@@ -220,7 +234,7 @@ def draw(packages: Sequence[str], count: int, seed: int, root: Path = ROOT) -> l
     drawn: list[Mutant] = []
     for n, package in enumerate(packages):
         rng = random.Random(f"{seed} {package}")
-        left = possible(package, root)
+        left = list(possible(package, root))
         kinds = sorted({m.kind for m in left})
         rng.shuffle(kinds)
         for i in range(count // len(packages) + (n < count % len(packages))):
@@ -306,15 +320,17 @@ def run_tests(tree: Path, arguments: Sequence[str]) -> str | None:
     return failed[1] if failed else f"pytest ended with {done.returncode}"
 
 
-def judge(mutant: Mutant, clean: Path, focused: bool) -> str:
-    """Run the tests on one mutant until one fails; return which, empty for a survivor."""
+def judge(mutant: Mutant, clean: Path, focused: bool) -> Verdict:
+    """Run the tests on one mutant until one fails."""
+    begin = time.monotonic()
     known = [f"tests/{f}" for f in FOLDERS[mutant.package]]
     others = sorted({p.parent.relative_to(clean).as_posix() for p in clean.glob("tests/*/test_*.py")} - set(known))
     stages = [[*known, "-m", "not slow"], [*known, "-m", "slow"], *([] if focused else [others])]
     with tempfile.TemporaryDirectory(prefix="mutant-") as folder:
         tree = copy_tree(clean, Path(folder))
         apply(mutant, tree)
-        return next((failed for stage in stages if (failed := run_tests(tree, stage))), "")
+        by = next((failed for stage in stages if (failed := run_tests(tree, stage))), "")
+    return Verdict(mutant, bool(by), by, time.monotonic() - begin)
 
 
 def _line(mutant: Mutant) -> str:
@@ -324,36 +340,41 @@ def _line(mutant: Mutant) -> str:
 
 def main() -> int:
     """Draw, judge and report."""
-    parser = options("mutants", __doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=30)
     parser.add_argument("--only", choices=FOLDERS, action="append", help="one package; may be given again")
     parser.add_argument("--jobs", type=int, default=2, help="mutants at a time")
     parser.add_argument("--list", action="store_true", help="draw only")
     parser.add_argument("--focused", action="store_true", help="only the tests of the mutants' packages")
-    given = parser.parse_args()
-    packages = given.only or list(FOLDERS)
-    mutants = draw(packages, given.count, given.seed)
-    if given.list:
+    parser.add_argument("--json", type=Path, help="write the verdicts here as well")
+    options = parser.parse_args()
+    packages = options.only or list(FOLDERS)
+    mutants = draw(packages, options.count, options.seed)
+    if options.list:
         print(*map(_line, mutants), sep="\n")
         return 0
-    with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(given.jobs) as pool:
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(options.jobs) as pool:
         clean = copy_tree(ROOT, Path(folder))
-        chosen = sorted({f"tests/{f}" for p in packages for f in FOLDERS[p]}) if given.focused else ["tests"]
-        failed = run_tests(clean, [*chosen, "-n", str(given.jobs), "--dist", "loadfile"])
+        chosen = sorted({f"tests/{f}" for p in packages for f in FOLDERS[p]}) if options.focused else ["tests"]
+        failed = run_tests(clean, [*chosen, "-n", str(options.jobs), "--dist", "loadfile"])
         if failed:
             print(f"the tests do not pass without a mutant: {failed}", file=sys.stderr)
             return 2
-        killers = []
-        for mutant, by in zip(mutants, pool.map(lambda m: judge(m, clean, given.focused), mutants), strict=True):
-            killers.append(by)
-            print(f"{f'killed by {by}' if by else 'SURVIVED'}\n    {_line(mutant)}", flush=True)
+        verdicts = []
+        for verdict in pool.map(lambda m: judge(m, clean, options.focused), mutants):
+            verdicts.append(verdict)
+            print(f"{f'killed by {verdict.by}' if verdict.killed else 'SURVIVED'} in {verdict.wall_s:.0f} s")
+            print(f"    {_line(verdict.mutant)}", flush=True)
     for package in packages:
-        own = [bool(by) for mutant, by in zip(mutants, killers, strict=True) if mutant.package == package]
+        own = [v.killed for v in verdicts if v.mutant.package == package]
         print(f"{package}: {sum(own)} of {len(own)} died")
-    died = sum(map(bool, killers))
-    print(f"seed {given.seed}: {died} of {len(mutants)} died")
-    return 0 if died >= ENOUGH * len(mutants) else 1
+    died = sum(v.killed for v in verdicts)
+    print(f"seed {options.seed}: {died} of {len(verdicts)} died")
+    if options.json:
+        document = {"seed": options.seed, "died": died, "verdicts": [asdict(v) for v in verdicts]}
+        options.json.write_text(json.dumps(document, indent=2) + "\n")
+    return 0 if died >= ENOUGH * len(verdicts) else 1
 
 
 if __name__ == "__main__":
