@@ -242,11 +242,6 @@ class PhysicsPlusUkf:
     causal: bool = True
 
     @property
-    def needs(self) -> frozenset[str]:
-        """Aligned signals without which the filter cannot run; a_x is replaced by a random walk if missing."""
-        return frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
-
-    @property
     def measurement_std(self) -> FloatArray:
         """1-sigma of [a_y, r, v_x], [3]."""
         s = self.vehicle.sensors
