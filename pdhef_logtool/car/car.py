@@ -129,12 +129,14 @@ class Car:
         car = _with_parts(cls(flat.vehicle, flat.vehicle, source=source), flat, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
-        foreign = [n for n, one in car.noise.items() if bundle and one.network_sha256 not in (None, bundle.sha256)]
-        noise = {n: one for n, one in car.noise.items() if n not in foreign}
         found = _intervals_of(folder, intervals)
-        car = replace(car, noise=noise, network=bundle, network_name=name, network_folder=home, intervals=found)
-        stale = [*car.notes, *(_stale(f"noise of {n}", "it belongs to another network", "pdhef tune") for n in foreign)]
-        if other := car._other_than_tried:
+        car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=found)
+        stale = list(car.notes)
+        foreign = [n for n, one in car.noise.items() if bundle and one.network_sha256 not in (None, bundle.sha256)]
+        if foreign:
+            car = replace(car, noise={n: one for n, one in car.noise.items() if n not in foreign})
+            stale.append(_stale(f"noise of {', '.join(foreign)}", "it belongs to another network", "pdhef tune"))
+        elif other := car._other_than_tried:
             stale.append(f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef trust makes it anew")
         own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
         if own and found is not None and found.physics_sha256 != car.physics_sha256:

@@ -133,10 +133,7 @@ def flat_toml(
     provenance.pop("tuning_scores", None)
     if provenance:
         tables["identification"] = provenance
-    for name in {"filter", "network", "identification"} - tables.keys():
-        document.pop(name, None)
-    stand = {name: document[name].unwrap() for name in tables if name in document}
-    _merge(document, stand, tables)
+    _merge(document, given, tables)
     _comment(document, comments or {})
     return tomlkit.dumps(document)
 

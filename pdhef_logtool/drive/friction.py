@@ -183,10 +183,10 @@ def friction_source(
     if choice == "file" or (choice == "auto" and vehicle.friction is not None):
         constant = vehicle.friction if "friction" in available else None
         return FrictionSource(f"vehicle file, {vehicle.friction:g}", constant=constant)
-    from pdhef_logtool.estimators.friction_bank import FrictionBank
+    from pdhef_logtool.estimators.friction_bank import NEEDS, FrictionBank
 
     bank = FrictionBank(vehicle, use_speed=use_speed)
-    missing = sorted(bank.needs - available)
+    missing = sorted(NEEDS - available)
     if not missing:
         nothing = "neither log nor vehicle file gives a friction: it is estimated on line" if choice == "auto" else ""
         return FrictionSource("estimate", nothing, bank=bank)

@@ -196,11 +196,6 @@ class AdaptiveHybridUkf:
     notes: tuple[str, ...] = ()
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the hybrid filter needs."""
-        return self.hybrid.needs
-
-    @property
     def hybrid(self) -> HybridUkf:
         """The fixed filter that F1 is when nothing is wrong."""
         return HybridUkf(

@@ -56,11 +56,6 @@ class CautiousPhysics:
     notes: tuple[str, ...] = ()
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the filter needs."""
-        return self.physics.needs
-
-    @property
     def calibrated_as(self) -> PhysicsUkf | PhysicsPlusUkf:
         """Whose calibrated intervals hold for it where it has none of its own."""
         return self.physics

@@ -36,6 +36,8 @@ from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 
+#: Aligned signals without which nothing can be estimated.
+NEEDS = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
 #: Frictions of the bank, and how likely each is on a road that nothing is known of: mean 0.86, 1-sigma 0.23.
 GRID = (0.12, 0.2, 0.3, 0.4, 0.5, 0.62, 0.75, 0.88, 1.0, 1.12)
 PRIOR = (0.015, 0.02, 0.025, 0.025, 0.03, 0.055, 0.14, 0.27, 0.27, 0.15)
@@ -236,11 +238,6 @@ class FrictionBank:
 
     vehicle: VehicleParameters
     use_speed: bool = True
-
-    @property
-    def needs(self) -> frozenset[str]:
-        """Aligned signals without which nothing can be estimated."""
-        return self._speed_filter.needs
 
     @property
     def _speed_filter(self) -> PhysicsUkf:

@@ -57,11 +57,6 @@ class HybridUkf:
     causal: bool = True
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the physics filter needs."""
-        return self.filter.needs
-
-    @property
     def filter(self) -> PhysicsUkf:
         """The filter that the residual goes into."""
         return PhysicsUkf(

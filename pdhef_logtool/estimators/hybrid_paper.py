@@ -293,11 +293,6 @@ class PaperHybridUkf:
     causal: bool = True
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the physics filter needs."""
-        return parallel_filter(self.vehicle, use_speed=self.use_speed).needs
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """Say where this is not the paper's filter: its network may have other features than the paper's six."""
         names = self.network.bundle.feature_names

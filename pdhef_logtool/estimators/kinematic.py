@@ -62,11 +62,6 @@ class Kinematic:
     name: str = "kinematic"
     causal: bool = True
 
-    @property
-    def needs(self) -> frozenset[str]:
-        """Lateral acceleration, yaw rate and speed."""
-        return frozenset({"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
-
     def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
 

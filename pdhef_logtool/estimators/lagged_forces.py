@@ -11,7 +11,7 @@ vehicle's mass in m/s² (METHOD §3, Eq 5-7).
 - A magic formula that was fitted to an axle holds that loss already, for steady cornering, in which the axle's own
   force says what a_y was: a_y,i = F_ss(α) / m_i. What is left is the ratio (1 − s x²) / (1 − s x_i²): it differs from 1
   only while the axles' forces do not balance, in transients. A tyre that is given by its cornering stiffness knows
-  nothing of it and gets the whole factor. On the drives of ``studies.defaults.tune_physics_plus_q`` the load transfer
+  nothing of it and gets the whole factor. On the drives of ``studies.defaults.tune_physics_q`` the load transfer
   raises the innovation likelihood (1.922 to 1.934 a sample) and leaves the sideslip as it is (median RMSE 0.091°
   without it, 0.090° with it).
 """

@@ -43,11 +43,6 @@ class LinearRegression:
     causal: bool = True
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the physics filter needs, which gives the features."""
-        return parallel_filter(self.vehicle, use_speed=self.use_speed).needs
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """Say which file ran: run.json has the residual network's hash alone."""
         return (f"coefficients {self.model.sha256}",)

@@ -87,11 +87,6 @@ class OpenLoop:
     name: str = "open-loop"
     causal: bool = True
 
-    @property
-    def needs(self) -> frozenset[str]:
-        """Steering and speed."""
-        return frozenset({"steer_rad", "speed_m_s"})
-
     def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         p = model_parameters(self.vehicle)

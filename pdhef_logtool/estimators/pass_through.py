@@ -40,11 +40,6 @@ class PassThrough:
     claims_zero_sideslip: bool
     causal: bool = True
 
-    @property
-    def needs(self) -> frozenset[str]:
-        """Speed and yaw rate."""
-        return frozenset({"speed_m_s", "yaw_rate_rad_s"})
-
     def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         vy = 0.0 if self.claims_zero_sideslip else math.nan

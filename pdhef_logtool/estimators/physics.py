@@ -337,11 +337,6 @@ class PhysicsUkf:
     causal: bool = True
 
     @property
-    def needs(self) -> frozenset[str]:
-        """Aligned signals without which the filter cannot run; a_x is replaced by a random walk if missing."""
-        return frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
-
-    @property
     def _parameters(self) -> ModelParameters:
         return model_parameters(self.vehicle, roll_correction=self.roll_correction)
 

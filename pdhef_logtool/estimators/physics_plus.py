@@ -56,7 +56,7 @@ _WALK_STD = (BIAS_WALK_STD[2], BIAS_WALK_STD[0], BIAS_WALK_STD[1])
 
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r], used where the vehicle file has
 #: no ``[filter.physics-plus]``. By innovation likelihood over simulated drives, as that of ``phy-ukf``
-#: (``benchmarks/tune_physics_plus_q.py``, its result beside it).
+#: (``studies.defaults.tune_physics_q``, its result in ``results/``).
 PHYSICS_PLUS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 INITIAL_STD = (*shell.INITIAL_STD, 0.5, 0.5)
 #: 1-sigma of an axle's force over the mass at a standstill, m/s².
@@ -240,11 +240,6 @@ class PhysicsPlusUkf:
     standstill: bool = True
     name: str = NAME
     causal: bool = True
-
-    @property
-    def needs(self) -> frozenset[str]:
-        """Aligned signals without which the filter cannot run; a_x is replaced by a random walk if missing."""
-        return frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
 
     @property
     def measurement_std(self) -> FloatArray:

@@ -201,11 +201,6 @@ class SmoothedHybrid:
     notes: tuple[str, ...] = (NOT_CAUSAL,)
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the filter needs."""
-        return self.hybrid.needs
-
-    @property
     def look_ahead_s(self) -> float:
         """How much of what follows a window :meth:`run` is to be given."""
         return 2.0 * self.block_s

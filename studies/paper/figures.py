@@ -248,5 +248,4 @@ def draw(r: Results, folder: Path) -> None:
     if any(r.curves.values()):
         trust(folder, {s: c for s, c in r.curves.items() if c})
     rmse_bars(folder, r.experiment, r.ran, (A.name, B.name))
-    if r.times:
-        step_time_bars(folder, r.times)
+    step_time_bars(folder, r.times)

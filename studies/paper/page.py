@@ -412,8 +412,6 @@ def _figure_22(r: Results) -> str:
 
 def _figure_23(r: Results) -> str:
     title = "Figure 23: time of a step"
-    if not r.times:
-        return _nothing(title, "Not measured in this run.", "nothing measured")
     head = ("scheme", "µs a step, median", "fastest … slowest round")
     rows = [(f"`{n}`", number(t.median_us), f"{number(t.low_us)} … {number(t.high_us)}") for n, t in r.times.items()]
     found = Findings()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from pdhef_logtool.car.car import Car
@@ -41,6 +41,8 @@ from truthsim.suite import is_held_out
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
 #: Schemes whose trust or factor on R may move.
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
+#: What improvements are about where nothing else is said.
+FIGURE = "sideslip_deg"
 BASELINES = ("phy-ukf", "phy-ukf-tuned", "physics-plus", "linear-regression", "pure-lstm", "pd-hef-paper")
 
 
@@ -61,7 +63,7 @@ class Results:
     fits: Mapping[str, tuple[ResidualFit, ...]]
     curves: Mapping[str, Mapping[str, TrustCurve]]
     inflations: Mapping[str, Inflation]
-    times: Mapping[str, StepTime] = field(default_factory=dict)
+    times: Mapping[str, StepTime]
 
     @property
     def networks(self) -> dict[int, ModelBundle]:
@@ -88,9 +90,7 @@ class Results:
         """See :func:`~studies.paper.comparison.spread`."""
         return spread(self.experiment, scenario, scheme, figure)
 
-    def improvement(
-        self, scenario: str, scheme: str, baseline: str, figure: str = "sideslip_deg"
-    ) -> Improvement | None:
+    def improvement(self, scenario: str, scheme: str, baseline: str, figure: str = FIGURE) -> Improvement | None:
         """See :func:`~studies.paper.comparison.improvement`."""
         return improvement(self.experiment, scenario, scheme, baseline, figure)
 
@@ -99,7 +99,6 @@ def gather(
     cars: Mapping[int, Car],
     *,
     noise_seeds: Sequence[int],
-    with_times: bool = True,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> Results:
     """Run the whole experiment.
@@ -113,11 +112,9 @@ def gather(
     fits = {s.name: tuple(residual_fit(experiment.drives[s.name], c) for c in cars.values()) for s in (A, B)}
     curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
     inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
-    times: dict[str, StepTime] = {}
-    if with_times:
-        progress("step times")
-        names = [n for n in SCHEMES if n not in experiment.missing]
-        times = step_times(experiment.drives[B.name], on_the_road(next(iter(cars.values())), B.friction), names)
+    progress("step times")
+    names = [n for n in SCHEMES if n not in experiment.missing]
+    times = step_times(experiment.drives[B.name], on_the_road(next(iter(cars.values())), B.friction), names)
     return Results(experiment, cars, histories, fits, curves, inflations, times)
 
 

@@ -213,6 +213,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert car.notes == (
         "fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew",
         "noise of physics-plus is not used: it belongs to other physics; pdhef tune makes it anew",
+        "network.toml allows no trust: it was found with other physics; pdhef trust makes it anew",
     )
     assert car.allowed_trust.cap == 0.0
     assert "other physics; pdhef trust gives it anew" in car.allowed_trust.note
@@ -242,6 +243,13 @@ def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str
     assert (car.physics_sha256, car.noise_sha256) == (before.physics_sha256, before.noise_sha256)
 
 
+def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -> None:
+    """What stands at its default is as if it were absent."""
+    (tmp_path / "mine.toml").write_text(PERSONS)
+    said = {k: v for k, v in tomllib.loads(PERSONS).items() if k not in ("name", "truth_position_m")}
+    assert load(tmp_path / "mine.toml").physics_sha256 == digest(said)
+
+
 def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     add_fit(folder)
     add_noise(folder)
@@ -250,7 +258,10 @@ def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     car = load(folder, "default")
     assert car.vehicle.friction == 0.7
     assert dict(car.noise) == fit.filter
-    assert len(car.notes) == 1 and "noise of physics-plus is not used" in car.notes[0]
+    assert [note.split(":")[0] for note in car.notes] == [
+        "noise of physics-plus is not used",
+        "network.toml allows no trust",
+    ]
     assert car.allowed_trust.cap == 0.0
 
 
@@ -259,7 +270,7 @@ def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
     add_trust(folder)
     add_noise(folder)
     car = load(folder, "default")
-    assert car.notes == ()
+    assert car.notes == ("network.toml allows no trust: it was found with other noise; pdhef trust makes it anew",)
     assert car.allowed_trust.cap == 0.0
     assert "other noise" in car.allowed_trust.reason
 
@@ -274,6 +285,10 @@ def test_noise_of_a_filter_with_another_network_is_left_out(folder: Path) -> Non
     assert dict(other.noise) == {}
     assert other.notes == ("noise of pd-hef is not used: it belongs to another network; pdhef tune makes it anew",)
     assert dict(load(folder, "none").noise) == {"pd-hef": noise}  # no filter that could take it
+    add_noise(folder)
+    add_trust(folder, "many-cars")
+    assert load(folder, "default").notes == ()  # noise of physics alone, and evidence about another network
+    assert "the car's evidence is about network" in load(folder, "default").allowed_trust.reason
 
 
 def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder: Path) -> None:
@@ -286,6 +301,10 @@ def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder
     assert after.physics_sha256 == before.physics_sha256
     assert after.intervals == before.intervals
     assert after.intervals is not None and after.intervals.physics_sha256 == after.physics_sha256
+    assert after.notes == ()
+    edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
+    assert "intervals.json was made with other physics; pdhef calibrate makes it anew" in Car.load(folder).notes
+    assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
 
 
 # --- what is refused -------------------------------------------------------------------------------------------------
@@ -409,17 +428,26 @@ def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder: 
     assert load(written.parent).noise[PLUS] == NEW[PLUS]
     assert {p.name for p in folder.iterdir()} == {VEHICLE_FILE, FIT_FILE}
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["new"]
-    mask = os.umask(0)
-    os.umask(mask)
-    assert written.parent.stat().st_mode & 0o777 == 0o777 & ~mask
 
 
 def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(PERSONS)
     update_car(load(tmp_path / "mine.toml"), tmp_path / "mine", noise_change(NEW))
     assert (tmp_path / "mine" / VEHICLE_FILE).read_text() == PERSONS
+    mask = os.umask(0)
+    os.umask(mask)
+    assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o777 & ~mask
     update_car(Car.load(None, network="none"), tmp_path / "sedan", noise_change(NEW))
     assert load(tmp_path / "sedan").own == default_vehicle()
+
+
+def test_what_the_output_knows_of_the_car_stays(folder: Path, tmp_path: Path) -> None:
+    """The bare file of the same car is named: its folder keeps what other commands found."""
+    fit = add_fit(folder)
+    shutil.copy(folder / VEHICLE_FILE, tmp_path / "mine.toml")
+    update_car(load(tmp_path / "mine.toml"), folder, noise_change(NEW))
+    assert dict(load(folder).noise) == {**fit.filter, **NEW}
+    assert load(folder).learnt_on == DRIVES
 
 
 def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path) -> None:
