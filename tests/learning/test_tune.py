@@ -227,7 +227,7 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
     assert result.exit_code == 0
     assert [d.name for d in result.drives] == ["dlc", "step"]
 
-    before, after = Car.load(sample_logs_dir / "vehicle.toml"), Car.load(tmp_path / "mycar")
+    before, after = Car.load(sample_logs_dir / "vehicle.toml"), Car.load(tmp_path / "mycar", network=tmp_path / "model")
     assert (after.vehicle, after.trust, after.learnt_on) == (before.vehicle, before.trust, before.learnt_on)
     record = json.loads((tmp_path / "mycar/noise.record.json").read_text())
     part = tomllib.loads((tmp_path / "mycar/noise.toml").read_text())
