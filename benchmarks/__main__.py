@@ -32,20 +32,10 @@ def cells(figure: Figure) -> tuple[str, ...]:
     return figure.benchmark, figure.name, f"{value} {figure.unit}", target, verdict
 
 
-def print_table(figures: list[Figure]) -> None:
-    """Print the figures for a terminal."""
-    rows = [_HEADINGS, *(cells(f) for f in figures)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADINGS))]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def write_document(figures: list[Figure]) -> None:
-    """Write the figures and the machine they are from to ``docs/benchmarks.md``."""
-    lines = [_INTRODUCTION, "| " + " | ".join(_HEADINGS) + " |", "| --- " * len(_HEADINGS) + "|"]
-    lines += ["| " + " | ".join(cells(f)) + " |" for f in figures]
-    lines += ["", "Machine: " + ", ".join(f"{key} {value}" for key, value in machine_facts().items()) + ".", ""]
-    DOCUMENT.write_text("\n".join(lines), encoding="utf-8")
+def table(figures: list[Figure]) -> str:
+    """Return the figures as a Markdown table."""
+    rows = [_HEADINGS, ("---",) * len(_HEADINGS), *map(cells, figures)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def main() -> int:
@@ -63,9 +53,10 @@ def main() -> int:
     for name in arguments.names or NAMES:
         print(f"{name} ...", file=sys.stderr)
         figures += import_module(f"benchmarks.{name}").run()
-    print_table(figures)
+    print(table(figures))
     if arguments.write_docs:
-        write_document(figures)
+        machine = ", ".join(f"{key} {value}" for key, value in machine_facts().items())
+        DOCUMENT.write_text(f"{_INTRODUCTION}\n{table(figures)}\n\nMachine: {machine}.\n", encoding="utf-8")
     return 4 if arguments.gate and any(f.passed is False for f in figures) else 0
 
 

@@ -167,8 +167,3 @@ def _images(rng: np.random.Generator, channel: int, begin_s: int, length_s: int)
         )
         data = head + body + rng.bytes(width * height)
         yield RawMessage(channel, stamp + 2_000_000, stamp, begin_s * IMAGE_HZ + i, data)
-
-
-if __name__ == "__main__":
-    for log in (hour_log(), short_log(), image_log()):
-        print(log.name, log.stat().st_size)

@@ -19,7 +19,6 @@ from pathlib import Path
 
 from pdhef_logtool.estimators.table import SPECS, check_names
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.sinks.report import tool_versions
 from studies import fixed_grid
 from studies.condition_drives import independent_runs
 from studies.condition_runs import Setup, Task, as_frame, progress, run_rows
@@ -106,20 +105,16 @@ def run(given: argparse.Namespace) -> None:
     calibration = {}
     if setup.loaded.network is not None and given.calibration_drives > 0:
         grid = simulated(given, "grid", given.calibration_drives, given.seed + CALIBRATION_SEED_OFFSET)
-        folder = given.work / "calibration"
-        calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings")
+        calibration = run_rows(setup, grid, given.work / "calibration", jobs=given.jobs, title="fixed settings")
     metrics = as_frame(scored)
     ran = set(metrics["estimator"].unique())
     budget = {}
     if given.budget_drives > 0:
         names = tuple(dict.fromkeys([*[n for n in BUDGET if n in ran][:1], *[n for n in SUBJECTS if n in ran][:1]]))
-        some = {
-            name: [replace(t, kind="budget") for t in row[: given.budget_drives]]
-            for name, row in tasks.items()
-            if name != INDEPENDENT_ROW
-        }
-        folder = given.work / "budget"
-        budget = run_rows(replace(setup, estimators=names), some, folder, jobs=given.jobs, title="error budget")
+        tasks.pop(INDEPENDENT_ROW, None)
+        some = {n: [replace(t, kind="budget") for t in row[: given.budget_drives]] for n, row in tasks.items()}
+        narrow = replace(setup, estimators=names)
+        budget = run_rows(narrow, some, given.work / "budget", jobs=given.jobs, title="error budget")
     facts = Facts(
         command=_command(given),
         car=setup.loaded.vehicle.name,
@@ -130,7 +125,6 @@ def run(given: argparse.Namespace) -> None:
         references=REFERENCES,
         order=given.estimators,
         notes=tuple(dict.fromkeys([*([absent] if absent else []), *(n for r in scored.values() for n in r.notes)])),
-        versions=tool_versions(),
         calibration_seed=given.seed + CALIBRATION_SEED_OFFSET,
     )
     write_page(given.out, facts, Tables(metrics, as_frame(calibration), as_frame(budget)))

@@ -12,6 +12,7 @@ from types import MappingProxyType
 import numpy as np
 import polars as pl
 
+from pdhef_logtool import __version__
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.signals import FloatArray
@@ -57,7 +58,6 @@ class Facts:
     references: Sequence[str]
     order: Sequence[str]
     notes: Sequence[str]
-    versions: Mapping[str, str]
     calibration_seed: int
 
 
@@ -195,7 +195,7 @@ def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Seque
         "",
         f"Written by `{facts.command}`; every figure comes from that command.",
         "",
-        f"Car: {used}; network {ran}; pdhef-logtool {facts.versions.get('pdhef-logtool', '?')}.",
+        f"Car: {used}; network {ran}; pdhef-logtool {__version__}.",
         f"95 % intervals {intervals}.",
         "The vehicle file stays the same in all rows, whatever car is driven. Friction is told to every estimator from",
         "the drive, times the factor of the row, or not at all where the row says so. Truth is the simulator's state.",

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -69,12 +70,11 @@ def measure(drive: ConditionDrive, manoeuvre: str, friction: float, car: Car) ->
         "estimated": found.friction,
     }
     rmse, rmse_seen = {}, {}
-    for name in ESTIMATORS:
-        for how in TOLD:
-            given = replace(drive.signals, friction=told[how])
-            error = np.degrees(sideslip_error(make_estimator(name, car), drive, given))
-            rmse[name, how] = root_mean_square(error)
-            rmse_seen[name, how] = root_mean_square(error[found.observable])
+    for name, how in product(ESTIMATORS, TOLD):
+        given = replace(drive.signals, friction=told[how])
+        error = np.degrees(sideslip_error(make_estimator(name, car), drive, given))
+        rmse[name, how] = root_mean_square(error)
+        rmse_seen[name, how] = root_mean_square(error[found.observable])
     return Outcome(
         manoeuvre, friction, np.abs(found.friction - drive.signals.friction), found.observable, rmse, rmse_seen
     )
@@ -84,20 +84,18 @@ def measure_all(folder: Path) -> list[Outcome]:
     """Simulate and measure every drive; one that spins is left out, with a line on stderr."""
     car = Car.load(SAMPLE_VEHICLE)
     outcomes = []
-    seed = FIRST_SEED
-    for manoeuvre, (speed, duration) in PLAN.items():
-        for friction in FRICTIONS:
-            seed += 1
-            path = folder / f"{manoeuvre}-{seed}.mcap"
-            print(f"{manoeuvre}, friction {friction:g}", file=sys.stderr)
-            try:
-                made = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration)
-            except SimulationError as error:
-                print(f"left out: {error}", file=sys.stderr)
-                continue
-            write_drive(made, path)
-            outcomes.append(measure(read_drive(path, car), manoeuvre, friction, car))
-            path.unlink()
+    for seed, (manoeuvre, friction) in enumerate(product(PLAN, FRICTIONS), start=FIRST_SEED + 1):
+        speed, duration = PLAN[manoeuvre]
+        path = folder / f"{manoeuvre}-{seed}.mcap"
+        print(f"{manoeuvre}, friction {friction:g}", file=sys.stderr)
+        try:
+            made = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration)
+        except SimulationError as error:
+            print(f"left out: {error}", file=sys.stderr)
+            continue
+        write_drive(made, path)
+        outcomes.append(measure(read_drive(path, car), manoeuvre, friction, car))
+        path.unlink()
     return outcomes
 
 
@@ -124,7 +122,7 @@ def tables(outcomes: Sequence[Outcome]) -> str:
     head = ["drives, friction", "drives", "observable, % of the time", "error there: median", "95 %", "if none is seen"]
     estimate = table(head, body, right_from=1)
 
-    cells = [(e, how) for e in ESTIMATORS for how in TOLD]
+    cells = list(product(ESTIMATORS, TOLD))
     limit = [o for o in outcomes if o.manoeuvre != ORDINARY]
     rows = {m: [[o.rmse_deg[c] for o in outcomes if o.manoeuvre == m] for c in cells] for m in PLAN}
     rows["manoeuvres"] = [[o.rmse_deg[c] for o in limit] for c in cells]

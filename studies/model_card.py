@@ -50,14 +50,16 @@ def error_table(found: dict[str, list[float]]) -> str:
     body = []
     for name, values in found.items():
         low, mid, high = np.quantile(values, [0.1, 0.5, 0.9])
-        pooled = np.sqrt(np.mean(np.square(values)))
-        body.append([f"`{name}`", f"{mid:.3f}", f"{low:.3f} – {high:.3f}", f"{pooled:.3f}", str(len(values))])
+        body.append(
+            [
+                f"`{name}`",
+                f"{mid:.3f}",
+                f"{low:.3f} – {high:.3f}",
+                f"{np.sqrt(np.mean(np.square(values))):.3f}",
+                str(len(values)),
+            ]
+        )
     return table(["estimator", "median °", "10 % – 90 % °", "pooled °", "drives"], body)
-
-
-def size_kb(folder: Path) -> float:
-    """Return the size of everything in a folder."""
-    return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) / 1024.0
 
 
 def network_line(name: str, network: ModelBundle) -> list[str]:
@@ -73,6 +75,7 @@ def page(work: Path, car: Car) -> str:
     """Return the card."""
     model, folder = car.network, car.source
     assert model is not None and folder is not None
+    size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     manifest = json.loads((work / "dataset" / "manifest.json").read_text(encoding="utf-8"))
     recipe = model.provenance["recipe"]
     splits = ", ".join(f"{n} {s['drives']} drives" for n, s in manifest["splits"].items())
@@ -91,7 +94,7 @@ def page(work: Path, car: Car) -> str:
 
 Written by `python -m studies.model_card`; the model by `make train-default`.
 
-- Place: `pdhef_logtool/models/default`, {size_kb(folder) / 1024.0:.2f} MB, sha256 `{model.sha256[:16]}…`.
+- Place: `pdhef_logtool/models/default`, {size / 2**20:.2f} MB, sha256 `{model.sha256[:16]}…`.
 - What it is for: the residual of the nominal single-track model of the simulated saloon (`vehicle.toml` beside it,
   with the filter noise that belongs to it). On another car its trust is capped by that car's own evidence.
 - Data: simulated, {DRIVES} drives of 12.5 s of that car (seed {SETS["one_car"][0]}), friction 0.3 to 1.0, 40 to

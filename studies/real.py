@@ -277,7 +277,11 @@ def regression_features(drive: FitDrive, *, low_pass: bool) -> FloatArray:
 
 def regressions(case: Case, part: Part, mapping_file: Path, car: Car) -> list[Result]:
     """Fit a linear regression of the sideslip on seven features, raw and low-passed, and score it."""
-    fit, score = (_fit_drive(p, mapping_file, car) for p in (part, case.score))
+    loaded = [
+        load_fit_drive(LogInput(DRIVES / p.log, p.log), car, load_mapping(mapping_file), p.config.read_options)[1]
+        for p in (part, case.score)
+    ]
+    fit, score = (d for d in loaded if d is not None)
     results = []
     for low_pass in (False, True):
         moving = np.hypot(fit.truth.vx_m_s, fit.truth.vy_m_s) > case.min_speed_m_s
@@ -290,13 +294,6 @@ def regressions(case: Case, part: Part, mapping_file: Path, car: Car) -> list[Re
         label = "linear regression, 7 features" + (", 2 Hz" if low_pass else "")
         results.append(Result(label, error, score.truth.stamps_ns))
     return results
-
-
-def _fit_drive(part: Part, mapping_file: Path, car: Car) -> FitDrive:
-    log_input = LogInput(DRIVES / part.log, part.log)
-    _, drive = load_fit_drive(log_input, car, load_mapping(mapping_file), part.config.read_options)
-    assert drive is not None
-    return drive
 
 
 def case_table(results: Sequence[Result]) -> str:

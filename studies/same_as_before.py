@@ -128,10 +128,9 @@ def compare(before: Path, after: Path) -> Iterator[tuple[str, str, str, str]]:
     for old in sorted(before.glob("*/logs/*")):
         new = after / old.relative_to(before)
         case = old.relative_to(before).parts[0]
-        yield from ((case, *d) for d in _estimates(old / "estimates.parquet", new / "estimates.parquet"))
-        yield from ((case, *d) for d in _figures(old / "metrics.parquet", new / "metrics.parquet"))
-        if (old / "annotated.mcap").is_file():
-            yield from ((case, *d) for d in _messages(old / "annotated.mcap", new / "annotated.mcap"))
+        files = {"estimates.parquet": _estimates, "metrics.parquet": _figures, "annotated.mcap": _messages}
+        for file in (f for f in files if (old / f).is_file()):
+            yield from ((case, *d) for d in files[file](old / file, new / file))
 
 
 def _estimates(old: Path, new: Path) -> Iterator[tuple[str, str, str]]:

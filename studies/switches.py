@@ -78,14 +78,14 @@ def with_option(estimator: Estimator, name: str, value: bool) -> Estimator:
     return switched
 
 
-def run_option(name: str, value: bool, estimator: Estimator, drive: ConditionDrive) -> StateTrack:
-    """Run with a field of the filter on or off."""
-    return with_option(estimator, name, value).run(drive.signals, None)[0]
-
-
 def run_plain(estimator: Estimator, drive: ConditionDrive) -> StateTrack:
     """Run as it is."""
     return estimator.run(drive.signals, None)[0]
+
+
+def run_option(name: str, value: bool, estimator: Estimator, drive: ConditionDrive) -> StateTrack:
+    """Run with a field of the filter on or off."""
+    return run_plain(with_option(estimator, name, value), drive)
 
 
 def run_unpredicted(estimator: Estimator, drive: ConditionDrive) -> StateTrack:
@@ -187,7 +187,6 @@ def word(bound: Bound) -> str:
 def simulate(folder: Path, count: int) -> dict[str, list[Path]]:
     """Make the drives of every kind that are not there yet; one that spins is left out."""
     found: dict[str, list[Path]] = {}
-    folder.mkdir(parents=True, exist_ok=True)
     table_folder = folder / f"conditions-{count}"
     manifest = write_conditions(table_folder, drives=count, seed=FIRST_SEED, rows=list(CONDITIONS))
     for row in manifest["rows"]:

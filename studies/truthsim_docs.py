@@ -37,17 +37,12 @@ from truthsim.vehicle_files import VEHICLES, load_vehicle
 DRY = 0.85
 COLOURS = {"sedan": "#1f5fa8", "suv": "#b5482a", "hatchback": "#3b8550"}
 _SAVED_DPI = 80
+_STYLE = {**STYLE, "lines.linewidth": 1.4}
 
 
 def open_loop(speed_m_s: float, steer_rad: FloatArray) -> Plan:
     """Return the plan of a steering table."""
     return Plan(speed_m_s, (steer_rad.shape[0] - 1) * 1e-3, steer_rad=steer_rad)
-
-
-def figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, Any]:
-    """Return a figure and its axes, [rows, columns]; of a single one the axes themselves."""
-    fig, axes = subplots(rows, columns, width, height, {**STYLE, "lines.linewidth": 1.4})
-    return fig, axes if axes.size > 1 else axes[0, 0]
 
 
 def free_rolling(car: Vehicle) -> Vehicle:
@@ -70,7 +65,7 @@ def slope(motion: Motion, column: FloatArray) -> float:
 
 def steady_state(folder: Path) -> dict[str, str]:
     """Understeer curves, load transfer, and the table of gradients."""
-    fig, ax = figure(1, 1, 6.4, 3.8)
+    fig, ((ax,),) = subplots(1, 1, 6.4, 3.8, _STYLE)
     rows = []
     for name in VEHICLES:
         car = load_vehicle(name)
@@ -102,7 +97,7 @@ def steady_state(folder: Path) -> dict[str, str]:
     car = load_vehicle("sedan")
     motion = ramp(car, 0.05)
     a_y = motion.column("ay_m_s2")
-    fig, ax = figure(1, 1, 6.4, 3.8)
+    fig, ((ax,),) = subplots(1, 1, 6.4, 3.8, _STYLE)
     shades = dict(zip(WHEELS, ("#7fb0e0", "#1f5fa8", "#e8a487", "#b5482a"), strict=True))
     names = dict(zip(WHEELS, ("front left", "front right", "rear left", "rear right"), strict=True))
     loads_n = axle_loads_n(car)
@@ -140,7 +135,7 @@ def responses(folder: Path) -> dict[str, str]:
     car = load_vehicle("sedan")
     points = np.array([0.3, 0.5, 0.7, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0])
     fine = np.geomspace(0.3, 3.0, 80)
-    fig, axes = figure(2, 2, 8.4, 5.4)
+    fig, axes = subplots(2, 2, 8.4, 5.4, _STYLE)
     worst = {name: [0.0, 0.0] for name in ("yaw rate", "lateral acceleration", "roll")}
     for speed, colour in ((60.0 / 3.6, "#3b8550"), (100.0 / 3.6, "#1f5fa8")):
         found = [measured_response(car, float(f), speed) for f in points]
@@ -187,7 +182,7 @@ def build_up(tyre: Tyre, alpha: float, speed: float, metres: float) -> tuple[Flo
 def relaxation(folder: Path) -> dict[str, str]:
     """Force over distance after a step of the slip angle, and what the whole car's front axle shows."""
     tyre = Tyre()
-    fig, ax = figure(1, 1, 6.4, 3.8)
+    fig, ((ax,),) = subplots(1, 1, 6.4, 3.8, _STYLE)
     for alpha, colour in ((0.3, "#1f5fa8"), (3.0, "#3b8550"), (8.0, "#b5482a")):
         for speed, dash in ((10.0, "-"), (30.0, ":")):
             x, force = build_up(tyre, np.radians(alpha), speed, 3.0)
@@ -223,7 +218,7 @@ def traces(folder: Path) -> dict[str, str]:
     ):
         drive = simulate_drive(manoeuvre, seed=1)
         t, truth = drive.times_s, drive.truth
-        fig, axes = figure(3, 2, 8.4, 6.4)
+        fig, axes = subplots(3, 2, 8.4, 6.4, _STYLE)
         felt = [("ay_m_s2", "a_y", 1 / G), ("specific_force_y_m_s2", "felt by the leaning IMU", 1 / G)]
         panels = (
             ("road-wheel angle, deg", [("steer_rad", "", np.degrees(1.0))]),

@@ -169,12 +169,8 @@ def main(folder: Path) -> None:
     """Fit, print how well, and write the vehicle files."""
     motions = {friction: ramp(friction) for _, friction in ROADS.values()}
     fits = fit_axles(motions)
-    print("axle      B      C     D_n       E      BCD   rms N   largest N (over friction)")
     for axle, fit in fits.items():
-        print(
-            f"{axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {fit.B * fit.C * fit.D_n:8.0f}"
-            f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
-        )
+        print(f"{axle}: {fit}")
     for file, (name, friction) in ROADS.items():
         text = vehicle_text(motions[max(motions)], fits, name=name, friction=friction)
         (folder / file).write_text(text, encoding="utf-8")

@@ -27,10 +27,9 @@ def rmse_by_manoeuvre(drives: list[TuningDrive], leak_s: float | None) -> dict[s
 
 
 def main() -> None:
-    """Try the grid, print the table, write the result."""
+    """Try the grid and no sideslip at all, print what comes of each, write the result."""
     options("defaults.tune_kinematic_leak", __doc__).parse_args()
     drives = tuning_drives()
-    print("leak s    mean     " + "  ".join(dict.fromkeys(d.manoeuvre for d in drives)))
     rows: list[dict[str, float | None]] = []
     means: dict[float, float] = {}
     for leak_s in (*GRID_S, None):
@@ -39,8 +38,7 @@ def main() -> None:
         rows.append({"leak_s": leak_s, "mean_deg": mean, **by})
         if leak_s is not None:
             means[leak_s] = mean
-        label = "beta = 0" if leak_s is None else f"{leak_s:8.1f}"
-        print(f"{label}  {mean:.4f}   " + "  ".join(f"{v:.4f}" for v in by.values()))
+        print(rows[-1])
     best = min(means, key=means.__getitem__)
     print(f"chosen: {best} s")
     criterion = "mean over manoeuvres of the median sideslip RMSE of the drives, degrees"

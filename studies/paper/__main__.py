@@ -42,10 +42,8 @@ def default_cars() -> dict[int, Car]:
 def named_cars(folders: list[str]) -> dict[int, Car]:
     """Return cars by the training seed that their networks name, by their number where two name the same."""
     cars = [Car.load(f) for f in folders]
-    seeds = [(c.network.provenance if c.network else {}).get("recipe", {}).get("seed") for c in cars]
-    if len(set(seeds)) < len(seeds) or None in seeds:
-        seeds = list(range(len(folders)))
-    return dict(zip(seeds, cars, strict=True))
+    seeds = [c.network.provenance.get("recipe", {}).get("seed", i) if c.network else i for i, c in enumerate(cars)]
+    return dict(zip(seeds if len(set(seeds)) == len(seeds) else range(len(seeds)), cars, strict=True))
 
 
 def main() -> int:

@@ -206,8 +206,7 @@ def run_experiment(
 
     Parameters
     ----------
-    cars : with their networks by training seed; the friction is replaced by that of each drive. Of one without a
-        network the schemes that need one are missing.
+    cars : with their networks by training seed; the friction is replaced by that of each drive.
     """
     runs: list[Run] = []
     drives: dict[str, ReadDrive] = {}

@@ -96,10 +96,7 @@ class Results:
 
 
 def gather(
-    cars: Mapping[int, Car],
-    *,
-    noise_seeds: Sequence[int],
-    progress: Callable[[str], None] = lambda _text: None,
+    cars: Mapping[int, Car], *, noise_seeds: Sequence[int], progress: Callable[[str], None] = lambda _text: None
 ) -> Results:
     """Run the whole experiment.
 
