@@ -227,16 +227,16 @@ def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
     data = read_dataset(dataset.output)
     assert data.features == FEATURES
     assert data.period_s == pytest.approx(0.01)
-    for drive in data.drives:
-        found = drive.arrays
-        frame = pl.read_parquet(drive.path).filter(pl.col(FEATURES[0]).is_not_null())
+    for one in data.drives:
+        found = one.arrays
+        frame = pl.read_parquet(one.path).filter(pl.col(FEATURES[0]).is_not_null())
         np.testing.assert_array_equal(found.features, frame.select(FEATURES).to_numpy())
         assert found.features.dtype == found.targets.dtype == found.weight.dtype == np.float32
         assert np.isfinite(found.features).all() and np.isfinite(found.targets).all()
         np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
         assert not found.targets[found.weight == 0].any()
-        assert data.vehicle(drive).name == next(
-            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == drive.entry["vehicle_sha256"]
+        assert data.vehicle(one).name == next(
+            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == one.entry["vehicle_sha256"]
         )
 
 
