@@ -9,7 +9,6 @@ from typing import Literal
 
 from pdhef_logtool.records.errors import UsageError
 
-SENSOR_SUITES = ("full", "esp")
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
 WINDOW_S = 600.0
