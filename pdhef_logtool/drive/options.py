@@ -9,7 +9,6 @@ from typing import Literal
 
 from pdhef_logtool.records.errors import UsageError
 
-SENSOR_SUITES = ("full", "esp")
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
 NANOSECONDS_FROM = 10**15
 WINDOW_S = 600.0
@@ -50,8 +49,7 @@ def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
 
     Raises
     ------
-    UsageError
-        The text is none of these.
+    UsageError : The text is none of these.
     """
     text = text.strip()
     if re.fullmatch(r"\d+", text) and int(text) >= NANOSECONDS_FROM:
@@ -81,8 +79,7 @@ def time_slice(options: ReadOptions, start_ns: int, end_ns: int) -> tuple[int, i
 
     Raises
     ------
-    UsageError
-        The slice is empty or lies outside of the log.
+    UsageError : The slice is empty or lies outside of the log.
     """
     begin = start_ns if options.start is None else parse_time(options.start, start_ns, end_ns, option="--start")
     finish = end_ns if options.end is None else parse_time(options.end, start_ns, end_ns, option="--end")

@@ -9,7 +9,7 @@ from typing import Self
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.friction import FrictionSource, friction_source, friction_topic
+from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
@@ -145,8 +145,7 @@ class Drive:
 
         Raises
         ------
-        EstimatorError
-            The slice holds no stamp, or the drive takes more memory than it may.
+        EstimatorError : The slice holds no stamp, or the drive takes more memory than it may.
         """
         signals, truth, held = [], [], 0
         for window in self.windows(fill_friction=fill_friction):
@@ -202,8 +201,7 @@ def read_drive(
 
     Raises
     ------
-    PdhefError
-        Nothing of the log can be read, the mapping names what it lacks, or the slice is outside of it.
+    PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the slice is outside of it.
     """
     log_input = log if isinstance(log, LogInput) else one_log(str(log))
     notes: list[str] = []
@@ -278,7 +276,8 @@ def friction_of(
     plan: DrivePlan, vehicle: VehicleParameters, options: ReadOptions, factor: float = 1.0
 ) -> FrictionSource:
     """Return the friction of a drive as the options choose it, for a vehicle; ``factor`` makes it wrong on purpose."""
-    topic = friction_topic(plan.mapping)
+    source = plan.mapping.signals.get("friction")
+    topic = "" if source is None else source.label
     if options.friction is None:
         return FrictionSource(f"topic {topic}" if topic else "none")
     available = plan.alignment.available

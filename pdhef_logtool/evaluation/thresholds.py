@@ -157,8 +157,7 @@ def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold,
 
     Raises
     ------
-    UsageError
-        Entries are wrong, unknown, missing or contradict one another, or there is no threshold at all.
+    UsageError : Entries are wrong, unknown, missing or contradict one another, or there is no threshold at all.
     """
     problems = [unknown(key, ("threshold",)) for key in raw if key != "threshold"]
     tables = raw.get("threshold", [])

@@ -13,14 +13,12 @@ from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, 
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
-    compile_decoder,
     concatenate_columns,
     empty_column,
     missing_column,
-    undecodable_topic,
 )
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
-from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves
+from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves, resolve
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -199,10 +197,18 @@ class ColumnarLog:
                     continue
                 schema = self._schema(c, channel)
                 if isinstance(schema, SchemaError):
-                    problems.append(undecodable_topic(topic, str(schema)))
+                    problems.append(
+                        MappingError(
+                            expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
+                            got=str(schema),
+                            where=topic,
+                            remedy="map another topic",
+                        )
+                    )
                     continue
                 try:
-                    decoders[(c, channel.id)] = compile_decoder(schema, topic, paths)
+                    selections = tuple(resolve(schema, topic, path) for path in paths)
+                    decoders[(c, channel.id)] = ChannelDecoder(schema, selections)
                 except MappingError as error:
                     problems.append(error)
         if not found:
@@ -241,7 +247,7 @@ class ColumnarLog:
             block = self.load(c, span, frozenset(topic_of))
             if block is None:
                 continue
-            keep = _in_window(block.log_time_ns, start_ns, end_ns)
+            keep = in_window(block.log_time_ns, start_ns, end_ns)
             for id_, topic in topic_of.items():
                 mine = block.channel == id_
                 rows = np.flatnonzero(mine if keep is None else mine & keep)
@@ -272,7 +278,7 @@ class _Plan:
     decoders: Mapping[tuple[int, int], ChannelDecoder]
 
 
-def _in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
+def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
     """Tell which log times lie in [start, end); None: all of them."""
     keep: BoolArray | None = None
     if start_ns is not None:

@@ -299,9 +299,14 @@ class McapContainer(MappedContainer):
             return bytes(stored)
         if compression == "zstd":
             return self._decompress_zstd(stored, size)
-        if compression == "lz4":
-            return _decompress_lz4(stored)
-        raise SpanDamageError(f"unknown compression {compression!r}")
+        if compression != "lz4":
+            raise SpanDamageError(f"unknown compression {compression!r}")
+        import lz4.frame
+
+        try:
+            return bytes(lz4.frame.decompress(stored))
+        except (RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
+            raise SpanDamageError(str(error)) from error
 
     def _decompress_zstd(self, stored: memoryview, size: int) -> bytes:
         import zstandard
@@ -467,15 +472,6 @@ class _Walk:
             of.lose("truncated", "the file ends without its closing magic bytes", self._after_last())
         of.resolve_channels()
         of.drop_undeclared("channels {}")
-
-
-def _decompress_lz4(stored: memoryview) -> bytes:
-    import lz4.frame
-
-    try:
-        return bytes(lz4.frame.decompress(stored))
-    except (RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
-        raise SpanDamageError(str(error)) from error
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:

@@ -37,8 +37,7 @@ def choose_mapping(
 
     Raises
     ------
-    MappingError
-        The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
+    MappingError : The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
     """
     if mapping is not None and mapping.fill_recognised:
         mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)

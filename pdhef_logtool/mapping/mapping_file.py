@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping as MappingABC
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -118,12 +119,10 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
 
     Raises
     ------
-    MappingError
-        Entries are wrong, unknown, missing or contradict one another.
+    MappingError : Entries are wrong, unknown, missing or contradict one another.
     """
-    problems: list[str] = []
     sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised")
-    problems += [unknown(key, sections) for key in raw if key not in sections]
+    problems = [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
     quality = _read_gate(raw["truth_quality"], problems) if "truth_quality" in raw else None
@@ -133,15 +132,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     if not isinstance(fill, bool):
         problems.append("fill_recognised: should be true or false")
         fill = False
-    mapping = Mapping(
-        signals=signals,
-        truth=truth,
-        quality=quality,
-        origin="file",
-        can=can,
-        estimates=estimates,
-        fill_recognised=fill,
-    )
+    mapping = Mapping(signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill)
     if "can" not in raw:
         # Others than estimators read the estimates, so that they are looked through as well.
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
@@ -333,34 +324,21 @@ def _example_lines() -> list[str]:
 
 
 def _source_lines(source: SignalSource) -> list[str]:
-    lines = [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}"]
-    if source.stamp != AUTO_STAMP:
-        lines.append(f"stamp = {_toml(source.stamp)}")
-    lines.append(f"scale = {_toml(source.scale)}")
-    for key in ("offset", "latency_s"):
-        value = getattr(source, key)
-        if value != 0.0:
-            lines.append(f"{key} = {_toml(value)}")
-    for key in ("valid_min", "valid_max"):
-        value = getattr(source, key)
-        if value is not None:
-            lines.append(f"{key} = {_toml(value)}")
-    if source.stamp_unit != "ros":
-        lines.append(f"stamp_unit = {_toml(source.stamp_unit)}")
-    if source.clock != "utc":
-        lines.append(f"clock = {_toml(source.clock)}")
-    return lines
+    names = ("stamp", "scale", "offset", "latency_s", "valid_min", "valid_max", "stamp_unit", "clock")
+    lines = _lines(source, {n: n for n in names}, always=("scale",))
+    return [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}", *lines]
+
+
+def _gate_lines(gate: QualityGate) -> list[str]:
+    names = {"stamp": "stamp", "minimum": "min", "maximum": "max"}
+    names |= {n: n for n in ("values", "latency_s", "stamp_unit", "clock")}
+    return [f"topic = {_toml(gate.topic)}", f"field = {_toml(gate.field)}", *_lines(gate, names)]
 
 
 def _can_lines(can: CanSettings) -> list[str]:
     files = tuple(path.absolute().as_posix() for path in can.dbc)
-    lines = ["[can]", f"dbc = {_toml(files)}"]
-    for key in ("id_field", "data_field", "length_field", "extended_field", "bus_field"):
-        value = getattr(can, key)
-        if value:
-            lines.append(f"{key} = {_toml(value)}")
-    if can.data_encoding != "bytes":
-        lines.append(f"data_encoding = {_toml(can.data_encoding)}")
+    names = ("id_field", "data_field", "length_field", "extended_field", "bus_field", "data_encoding")
+    lines = ["[can]", f"dbc = {_toml(files)}", *_lines(can, {n: n for n in names})]
     if can.bus is not None:
         lines.append(f"bus = {can.bus}")
     if can.id_mask != CanSettings(()).id_mask:
@@ -368,23 +346,13 @@ def _can_lines(can: CanSettings) -> list[str]:
     return lines
 
 
-def _gate_lines(gate: QualityGate) -> list[str]:
-    lines = [f"topic = {_toml(gate.topic)}", f"field = {_toml(gate.field)}"]
-    if gate.stamp != AUTO_STAMP:
-        lines.append(f"stamp = {_toml(gate.stamp)}")
-    if gate.minimum is not None:
-        lines.append(f"min = {_toml(gate.minimum)}")
-    if gate.maximum is not None:
-        lines.append(f"max = {_toml(gate.maximum)}")
-    if gate.values:
-        lines.append(f"values = {_toml(gate.values)}")
-    if gate.latency_s != 0.0:
-        lines.append(f"latency_s = {_toml(gate.latency_s)}")
-    if gate.stamp_unit != "ros":
-        lines.append(f"stamp_unit = {_toml(gate.stamp_unit)}")
-    if gate.clock != "utc":
-        lines.append(f"clock = {_toml(gate.clock)}")
-    return lines
+def _lines(
+    record: SignalSource | QualityGate | CanSettings, names: MappingABC[str, str], always: tuple[str, ...] = ()
+) -> list[str]:
+    """Return the entries that are not the record's defaults; ``names`` are those of the file by the record's."""
+    default = {f.name: f.default for f in fields(record)}
+    values = {n: getattr(record, n) for n in names}
+    return [f"{names[n]} = {_toml(v)}" for n, v in values.items() if n in always or v != default[n]]
 
 
 def _toml(value: str | float | tuple[str, ...] | tuple[float, ...]) -> str:

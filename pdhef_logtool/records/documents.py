@@ -1,12 +1,14 @@
-"""Documents that people write: read as TOML or JSON, checked by a pydantic model, or refused in one line."""
+"""Documents that people write: read as TOML or JSON, checked by a pydantic model, or refused in one line; and ours."""
 
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields, is_dataclass
 from difflib import get_close_matches
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 from pdhef_logtool.records.errors import PdhefError
@@ -187,3 +189,32 @@ def _entries(annotation: Any, place: Sequence[str]) -> tuple[str, ...]:
     # The items of a container stand one place deeper, the alternatives of a union at the same.
     inner = place[1:] if get_origin(annotation) in (dict, list, tuple) else place
     return next((names for member in get_args(annotation) if (names := _entries(member, inner))), ())
+
+
+def jsonable(value: Any) -> Any:
+    """Turn records, mappings, sequences, numpy values and paths into what JSON holds; NaN and infinity become None.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, PurePath):
+        return str(value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if isinstance(value, set | frozenset):
+        return [jsonable(v) for v in sorted(value)]
+    if isinstance(value, Sequence):
+        return [jsonable(v) for v in value]
+    import numpy as np
+
+    if isinstance(value, np.generic | np.ndarray):
+        return jsonable(value.tolist())
+    raise TypeError(f"no JSON form of {type(value).__name__}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,13 +12,13 @@ from pdhef_logtool.estimators.filter_shell import sideslip_std
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
 from pdhef_logtool.mapping import SignalSource, apply_clock, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.channels import LOSS_TEXTS, si_values
-from pdhef_logtool.mapping.clocks import raw_stamps, stamp_request
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
+from pdhef_logtool.mapping.clocks import raw_stamps
 from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, CovarianceSource, EstimateSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import ESTIMATE_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
-from pdhef_logtool.records.tracks import StateTrack, make_track
+from pdhef_logtool.records.signals import ESTIMATE_UNITS, Channel, FloatArray, IntArray, Loss
+from pdhef_logtool.records.tracks import StateTrack, diagonal_covariance, make_track
 
 #: Nothing is interpolated across a step of more than this many of its median periods.
 GAP_PERIODS = 3.0
@@ -48,16 +48,14 @@ def read_estimate(
 
     Raises
     ------
-    MappingError
-        The slice holds no message of it, or not one number.
+    MappingError : The slice holds no message of it, or not one number.
     """
     log = with_can_signals(log, source.as_mapping())
     mapping = resolve_mapping(log, source.as_mapping())
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     requests: dict[str, list[str]] = {}
     for s in mapping.signals.values():
-        paths = requests.setdefault(s.read_topic, [])
-        paths += [p for p in (*stamp_request(log, s), *s.paths) if p not in paths]
+        request_source(log, s, requests)
     if source.covariance is not None:
         requests[source.covariance.topic].append(source.covariance.field)
     parts: dict[str, list[tuple[IntArray, IntArray, FloatArray]]] = {name: [] for name in mapping.signals}
@@ -75,7 +73,8 @@ def read_estimate(
             values = _in_range(si_values(topic, s), s)
             parts[name].append((stamps[usable], topic.log_time_ns[usable], values[usable]))
             if name == base:
-                losses += _stamp_losses(topic, usable, s)
+                if not usable.all():
+                    losses.append(dropped("bad-stamp", s.topic, topic.log_time_ns[~usable]))
                 if source.covariance is not None:
                     matrices.append(_planar_covariance(topic, source.covariance)[usable])
     channels, kept = {}, {}
@@ -103,13 +102,7 @@ def read_estimate(
 
 def _without_nan(channel: Channel) -> Channel:
     """Return the channel without the samples that are not numbers."""
-    known = np.isfinite(channel.values)
-    return replace(
-        channel,
-        stamps_ns=channel.stamps_ns[known],
-        arrival_ns=channel.arrival_ns[known],
-        values=channel.values[known],
-    )
+    return channel.take(np.isfinite(channel.values))
 
 
 def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
@@ -120,14 +113,6 @@ def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
         if source.valid_max is not None:
             outside |= values > source.valid_max
     return np.where(outside | ~np.isfinite(values), np.nan, values)
-
-
-def _stamp_losses(topic: Columns, usable: BoolArray, source: SignalSource) -> list[Loss]:
-    bad = topic.log_time_ns[~usable]
-    if not bad.shape[0]:
-        return []
-    span = (int(bad.min()), int(bad.max()) + 1)
-    return [Loss("bad-stamp", LOSS_TEXTS["bad-stamp"], source.topic, *span, int(bad.shape[0]))]
 
 
 def _ordered(
@@ -173,7 +158,7 @@ def _track(
             columns["vy_m_s"] = columns["vx_m_s"] * np.tan(columns["sideslip_rad"])
             notes.append("v_y is v_x times tan of the sideslip")
     if covariance is None or not np.isfinite(covariance).any():
-        covariance = _diagonal([columns.get(s, np.full(stamps_ns.shape[0], np.nan)) for s in STDS])
+        covariance = diagonal_covariance([columns.get(s, np.full(stamps_ns.shape[0], np.nan)) for s in STDS])
     flags = {flag: columns[flag] >= 0.5 for flag in ("valid", "diverged") if flag in columns}
     if covariance.shape[0] and "sideslip_std_rad" not in columns and {"vx_m_s", "vy_m_s"} <= columns.keys():
         # Where only deviations are known the correlation of the two velocities counts as 0.
@@ -181,16 +166,6 @@ def _track(
         columns["sideslip_std_rad"] = sideslip_std(columns["vx_m_s"], columns["vy_m_s"], completed)
     state = {n: c for n, c in columns.items() if n not in (*STDS, "valid", "diverged")}
     return make_track(name, stamps_ns, covariance=covariance, **state, **flags), tuple(notes)
-
-
-def _diagonal(stds: Sequence[FloatArray]) -> FloatArray:
-    std = np.stack(stds, axis=1)
-    if not np.isfinite(std).any():
-        return np.empty((0, 3, 3))
-    covariance = np.full((std.shape[0], 3, 3), np.nan)
-    for i in range(3):
-        covariance[:, i, i] = std[:, i] ** 2
-    return covariance
 
 
 def _interpolated(channel: Channel, stamps_ns: IntArray) -> FloatArray:

@@ -7,7 +7,7 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,30 +16,16 @@ import numpy as np
 from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
-from pdhef_logtool.drive.truth import (
-    SAME_SHARE,
-    TruthTrack,
-    dependent_signals,
-    derive_truth,
-    share_equal,
-    truth_at,
-)
-from pdhef_logtool.drive.windows import DrivePlan, since
+from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
+from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
-from pdhef_logtool.mapping import (
-    Mapping as SignalMapping,
-)
-from pdhef_logtool.mapping import (
-    check_mapping,
-    join_channels,
-    load_mapping,
-    merge_losses,
-    read_signals,
-)
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import check_mapping, join_channels, load_mapping, merge_losses, read_signals
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import (
+    ALIGNED_SIGNALS,
     TRUTH_UNITS,
     WHEELS,
     Channel,
@@ -49,7 +35,7 @@ from pdhef_logtool.records.signals import (
     Signals,
     join_signals,
 )
-from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
+from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.run.config import RunConfig
 from pdhef_logtool.run.estimate_channels import RecordedEstimate, gap_ns, read_estimate
@@ -66,7 +52,7 @@ from pdhef_logtool.run.pipeline import (
     write_run,
     write_verdicts,
 )
-from pdhef_logtool.run.scoring import without_whole
+from pdhef_logtool.run.scoring import diverged_events, in_time, segment_events
 from pdhef_logtool.sinks.base import TRUTH, Event
 from pdhef_logtool.sinks.report import EstimatorFacts, build_report, write_json
 
@@ -101,8 +87,7 @@ def score_log(
 
     Raises
     ------
-    PdhefError
-        There is no estimate, no truth, or nothing of the log can be used.
+    PdhefError : There is no estimate, no truth, or nothing of the log can be used.
     """
     log_input = one_log(argument)
     car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
@@ -133,39 +118,35 @@ def _config_document(config: RunConfig, drive: Drive, estimates: Sequence[Estima
     return document
 
 
+@dataclass(slots=True)
 class _Scoring:
     """One log being scored: what was asked for, and which fields were chosen."""
 
-    def __init__(
-        self,
-        config: RunConfig,
-        car: Car,
-        warn: Tell,
-        estimates: Sequence[str],
-        truth: Sequence[str],
-        name: str | None,
-    ) -> None:
-        self.config, self.car, self.warn = config, car, warn
-        self._asked, self._truth, self._name = estimates, truth, name
-        self.estimates: tuple[EstimateSource, ...] = ()
+    config: RunConfig
+    car: Car
+    warn: Tell
+    asked: Sequence[str]
+    truth: Sequence[str]
+    name: str | None
+    estimates: tuple[EstimateSource, ...] = ()
 
     def read(self, log_input: LogInput, mapping: SignalMapping | None) -> Drive:
         """Open the log; decide which fields are estimate, truth and sensors."""
         given = mapping
         if mapping is not None and not mapping.signals and not mapping.truth:
             mapping = None  # a file of estimates alone leaves the rest to recognition
-        elif mapping is not None and self._truth:
+        elif mapping is not None and self.truth:
             mapping = replace(mapping, truth={}, quality=None)
 
         def choose(log: DriveLog, chosen: SignalMapping, tell: Tell) -> SignalMapping:
-            self.estimates = choose_estimates(log, self._asked, given, self._name)
+            self.estimates = choose_estimates(log, self.asked, given, self.name)
             for estimate in self.estimates:
                 check_mapping(estimate.as_mapping(), log)
-            if self._truth:
+            if self.truth:
                 quality = chosen.quality if given is None else given.quality
                 if quality is not None:
                     tell(f"--truth replaces the mapped truth and its gate on {quality.describe()}")
-                named = sources_of(log, self._truth, TRUTH_UNITS, "--truth")[0]
+                named = sources_of(log, self.truth, TRUTH_UNITS, "--truth")[0]
                 can = None if given is None else given.can
                 chosen = replace(chosen, truth=named, quality=None, can=can)
             if not chosen.truth:
@@ -286,16 +267,11 @@ class _Scoring:
         return rows, dependent
 
     def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:
-        from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
+        from pdhef_logtool.evaluation.segments import segment_masks
 
-        masks = without_whole(segment_masks(signals, truth, self.car.vehicle))
-        events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(truth.stamps_ns, masks)]
-        for r in recorded:
-            events += [
-                Event(f"{r.track.name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
-                for s in find_intervals(r.track.stamps_ns, {"diverged": r.track.diverged})
-            ]
-        return sorted(events, key=lambda e: (e.start_ns, e.end_ns, e.name))
+        masks = segment_masks(signals, truth, self.car.vehicle)
+        events = segment_events(truth.stamps_ns, masks) + [e for r in recorded for e in diverged_events(r.track)]
+        return sorted(events, key=in_time)
 
 
 def _read_sensors(drive: Drive) -> Signals | None:
@@ -337,8 +313,7 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
 
     Raises
     ------
-    MappingError
-        The slice holds no truth.
+    MappingError : The slice holds no truth.
     """
     alone = replace(plan.mapping, signals={})
     channels: dict[str, Channel] = {}
@@ -361,10 +336,9 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
         until = newest if b >= plan.end_ns else min(newest, b) - plan.truth.margin_ns
         if done_ns is not None and until <= done_ns:
             continue
-        derived = derive_truth(channels, plan=plan.truth)
-        tracks.append(_rows(derived.track, done_ns, until))
+        tracks.append(derive_truth(channels, plan=plan.truth).track.between(done_ns, until))
         done_ns = until
-        channels = {n: since(c, until - plan.truth.margin_ns) for n, c in channels.items()}
+        channels = {n: c.between(until - plan.truth.margin_ns) for n, c in channels.items()}
     if plan.truth is None or not sum(len(t) for t in tracks):
         raise MappingError(
             expected="truth in the chosen slice",
@@ -374,25 +348,6 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
         )
     gap_s = plan.truth.max_gap_s[plan.truth.base]
     return TruthTrack(concatenate(tracks), gap_s, plan.derivation), losses, samples
-
-
-def _rows(track: StateTrack, start_ns: int | None, end_ns: int) -> StateTrack:
-    lo = 0 if start_ns is None else int(np.searchsorted(track.stamps_ns, start_ns))
-    part = slice(lo, int(np.searchsorted(track.stamps_ns, end_ns)))
-    columns = {n: getattr(track, n)[part] for n in _TRUTH_COLUMNS}
-    return make_track(track.name, track.stamps_ns[part], **columns)
-
-
-_TRUTH_COLUMNS = (
-    "vx_m_s",
-    "vy_m_s",
-    "yaw_rate_rad_s",
-    "sideslip_rad",
-    "ay_m_s2",
-    "x_m",
-    "y_m",
-    "yaw_rad",
-)
 
 
 def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:
@@ -407,11 +362,10 @@ def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:
         at = signals.stamps_ns[known]
         return Bracket(at, stamps_ns, gap_ns(at)).linear(values[known])
 
-    names = ("steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s", "friction")
     return Signals(
         stamps_ns=stamps_ns,
         ready_ns=stamps_ns,
         wheel_speed_m_s=np.full((n, len(WHEELS)), np.nan),
         available=frozenset() if signals is None else signals.available,
-        **{name: column(name) for name in names},
+        **{name: column(name) for name in ALIGNED_SIGNALS},
     )

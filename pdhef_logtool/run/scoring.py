@@ -7,7 +7,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.records.signals import BoolArray, Signals
+from pdhef_logtool.records.signals import BoolArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.sinks.base import TRUTH, Event
 
@@ -33,14 +33,14 @@ def evaluate(
     from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
     from pdhef_logtool.evaluation.metrics import score_track, state_rows
     from pdhef_logtool.evaluation.reasons import summarise_reasons
-    from pdhef_logtool.evaluation.segments import find_intervals, segment_masks
+    from pdhef_logtool.evaluation.segments import segment_masks
 
     stem, truth, vehicle = drive.name, read(TRUTH), drive.car.vehicle
     masks = segment_masks(signals, truth, vehicle)
     slow = vehicle.low_speed_blend_m_s
     rows: list[MetricRow] = []
     reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
-    events = [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(signals.stamps_ns, without_whole(masks))]
+    events = segment_events(signals.stamps_ns, masks)
     for name in names:
         track = read(name)
         assert track is not None
@@ -50,10 +50,7 @@ def evaluate(
             rows += state_rows(track, masks, log=stem)
         rows += whiteness_rows(track, masks, log=stem)
         reasons[name] = summarise_reasons(track)
-        events += [
-            Event(f"{name} diverged", s.start_ns, s.end_ns, "the estimator reports its own divergence")
-            for s in find_intervals(track.stamps_ns, {"diverged": track.diverged})
-        ]
+        events += diverged_events(track)
     if truth is None:
         for a, b in combinations(names, 2):
             pair = [t for t in (read(a), read(b)) if t is not None]
@@ -67,6 +64,18 @@ def in_time(event: Event) -> tuple[int, int, str]:
     return event.start_ns, event.end_ns, event.name
 
 
-def without_whole(masks: dict[str, BoolArray]) -> dict[str, BoolArray]:
-    """Return the masks that are worth an event: not the whole drive, nor what is only not nonlinear."""
-    return {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
+def segment_events(stamps_ns: IntArray, masks: dict[str, BoolArray]) -> list[Event]:
+    """Return the segments that are worth an event: not the whole drive, nor what is only not nonlinear."""
+    from pdhef_logtool.evaluation.segments import find_intervals
+
+    worth = {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
+    return [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(stamps_ns, worth)]
+
+
+def diverged_events(track: StateTrack) -> list[Event]:
+    """Return when an estimator says of itself that it diverges."""
+    from pdhef_logtool.evaluation.segments import find_intervals
+
+    name, text = f"{track.name} diverged", "the estimator reports its own divergence"
+    spans = find_intervals(track.stamps_ns, {"diverged": track.diverged})
+    return [Event(name, s.start_ns, s.end_ns, text) for s in spans]

@@ -118,7 +118,7 @@ def _extract(
 
 def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Usable rows: errors of the residual rates, and indices."""
-    (found,) = read_dataset(result.output).drives
+    (found,) = (d.arrays for d in read_dataset(result.output).drives)
     index = np.round((found.stamps_ns - motion.stamps_ns[0]) / 1e7).astype(int)
     use = found.weight > 0
     error = found.targets[use] / found.step_s[use, None] - motion.residual[index[use]] / 0.01
@@ -228,15 +228,16 @@ def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
     data = read_dataset(dataset.output)
     assert data.features == FEATURES
     assert data.period_s == pytest.approx(0.01)
-    for found in data.drives:
-        frame = pl.read_parquet(found.path).filter(pl.col(FEATURES[0]).is_not_null())
+    for one in data.drives:
+        found = one.arrays
+        frame = pl.read_parquet(one.path).filter(pl.col(FEATURES[0]).is_not_null())
         np.testing.assert_array_equal(found.features, frame.select(FEATURES).to_numpy())
         assert found.features.dtype == found.targets.dtype == found.weight.dtype == np.float32
         assert np.isfinite(found.features).all() and np.isfinite(found.targets).all()
         np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
         assert not found.targets[found.weight == 0].any()
-        assert data.vehicle(found).name == next(
-            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == found.entry["vehicle_sha256"]
+        assert data.vehicle(one).name == next(
+            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == one.entry["vehicle_sha256"]
         )
 
 
@@ -363,8 +364,8 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
     assert result.stderr.splitlines() == ["warning: dlc: perfect truth taken; /rtk/fix, /rtk/odometry not used"]
-    (found,) = read_dataset(out).drives
-    assert found.usable_rows > 0.99 * found.rows
+    (drive,) = read_dataset(out).drives
+    assert drive.usable_rows > 0.99 * drive.rows
     rtk = _pdhef("extract", log, "-o", str(tmp_path / "rtk"), "--prefer-truth", "rtk", "--split", "train", "--json")
     assert rtk.returncode == 0, rtk.stderr
     document = json.loads(rtk.stdout)
@@ -372,7 +373,8 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     (entry,) = document["manifest"]["drives"]
     assert entry["truth"]["kind"] == "recorded" and entry["truth"]["smoothing_half_s"] > 0
     # The two truths of one drive tell of the same residual.
-    (other,) = read_dataset(tmp_path / "rtk").drives
+    found = drive.arrays
+    (other,) = (d.arrays for d in read_dataset(tmp_path / "rtk").drives)
     both = (found.weight > 0) & (other.weight > 0)
     for i in range(2):
         assert np.corrcoef(found.targets[both, i], other.targets[both, i])[0, 1] > 0.95

@@ -261,7 +261,7 @@ def test_big_payloads_are_not_copied_for_the_field_beside_them(tmp_path: Path) -
     block = log.load(0, span)  # type: ignore[attr-defined]
     plan = log._plan("/image", ("header.stamp", "height"))  # type: ignore[attr-defined]
     tracemalloc.start()
-    part = log._decode(plan, 0, span, channel, block, np.arange(len(block)))  # type: ignore[attr-defined]
+    part = log._decode("/image", plan, 0, span, channel, block, np.arange(len(block)))  # type: ignore[attr-defined]
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     log.close()

@@ -167,11 +167,12 @@ def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
         if drive.split != split:
             continue
         slowest = data.vehicle(drive).low_speed_blend_m_s
-        for part in gap_free_runs(drive):
-            vx, vy = np.asarray(drive.truth_velocity[part], dtype=np.float64).T
-            used = (drive.weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
+        rows = drive.arrays
+        for part in gap_free_runs(rows):
+            vx, vy = np.asarray(rows.truth_velocity[part], dtype=np.float64).T
+            used = (rows.weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
             yield SideslipSequence(
-                features=np.asarray(drive.features[part], dtype=np.float64),
-                dt_s=np.concatenate([[np.nan], np.diff(drive.stamps_ns[part]) * 1e-9]),
+                features=np.asarray(rows.features[part], dtype=np.float64),
+                dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),
                 sideslip_rad=np.where(used, np.arctan2(vy, vx), np.nan),
             )
