@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.noise.tune_command import tune as tune
     from pdhef_logtool.mapping import load_mapping as load_mapping
     from pdhef_logtool.records.errors import PdhefError as PdhefError
-    from pdhef_logtool.run.config import RunConfig as RunConfig
-    from pdhef_logtool.run.estimating import estimate_windows as estimate_windows
-    from pdhef_logtool.run.frames import choose as choose
-    from pdhef_logtool.run.frames import estimate as estimate
-    from pdhef_logtool.run.frames import score as score
-    from pdhef_logtool.run.pipeline import run_logs as run  # noqa: F401
+    from pdhef_logtool.runs.config import RunConfig as RunConfig
+    from pdhef_logtool.runs.estimating import estimate_windows as estimate_windows
+    from pdhef_logtool.runs.frames import choose as choose
+    from pdhef_logtool.runs.frames import estimate as estimate
+    from pdhef_logtool.runs.frames import score as score
+    from pdhef_logtool.runs.pipeline import run_logs as run  # noqa: F401
 
 #: Where each name stands, ``module`` or ``module:name there``; it is imported when it is first asked for.
 _HOMES = {
@@ -51,12 +51,12 @@ _HOMES = {
     "tune": "learning.noise.tune_command",
     "load_mapping": "mapping",
     "PdhefError": "records.errors",
-    "RunConfig": "run.config",
-    "estimate_windows": "run.estimating",
-    "choose": "run.frames",
-    "estimate": "run.frames",
-    "score": "run.frames",
-    "run": "run.pipeline:run_logs",
+    "RunConfig": "runs.config",
+    "estimate_windows": "runs.estimating",
+    "choose": "runs.frames",
+    "estimate": "runs.frames",
+    "score": "runs.frames",
+    "run": "runs.pipeline:run_logs",
 }
 __all__ = ["__version__", *sorted(_HOMES)]
 

@@ -29,7 +29,7 @@ from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.estimators.table import Options, make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.files import PendingFile
-from pdhef_logtool.run.estimating import calibrator
+from pdhef_logtool.runs.estimating import calibrator
 from studies import error_budget, fixed_grid
 from studies.condition_drives import read_drive, rmse_row, score, sideslip_error, told
 from studies.pages import ROOT

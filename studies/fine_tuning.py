@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 
 #: How gently a trained network moves; a network from nothing is a small one, for a minute or two of driving.
 GENTLY, SMALL = {"learning_rate": 5e-4, "epochs": 15}, {"hidden": 32, "layers": 1}

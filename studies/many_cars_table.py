@@ -27,7 +27,7 @@ from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import train_on
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, ModelBundle, load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 from studies import many_cars
 from studies.condition_drives import drives_of, independent_runs, read_drive, root_mean_square, sideslip_error
 from studies.defaults.train_default import MAPPING, pdhef

@@ -41,7 +41,7 @@ from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.release import released_steps
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.residual_model.bundle import NO_MODEL, ModelBundle
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 from studies.condition_drives import SIDESLIP
 from studies.fine_tuning import train_on_parts
 from studies.pages import DOCS, DRIVES, ROOT, number, options, table, write

@@ -129,7 +129,7 @@ class Car:
         car = _with_parts(cls(flat.vehicle, flat.vehicle, source=source), flat, folder)
         name, home = _network_of(car, folder, network)
         bundle = None if home is None else load_bundle(home)
-        found = _intervals_of(folder, intervals)
+        found = _intervals_of(folder, name, intervals)
         car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=found)
         stale = list(car.notes)
         foreign = [n for n, one in car.noise.items() if bundle and one.network_sha256 not in (None, bundle.sha256)]
@@ -259,14 +259,15 @@ def _network_of(car: Car, folder: Path | None, chosen: Path | str | None) -> tup
     return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
 
 
-def _intervals_of(folder: Path | None, chosen: Path | str | None) -> Intervals | None:
-    """Return the intervals in force: the chosen ones, else the car's own, else those of the shipped car."""
+def _intervals_of(folder: Path | None, network: str, chosen: Path | str | None) -> Intervals | None:
+    """Return the intervals in force: the chosen ones, else the car's own, else those of the shipped network."""
     if chosen is not None and str(chosen) == NO_INTERVALS:
         return None
     file = UNSURE_FILE if str(chosen) == UNSURE else INTERVALS_FILE
     if chosen is not None and str(chosen) != UNSURE:
         return load_intervals(Path(chosen))
-    homes = [h for h in (folder, *SHIPPED_CARS.values()) if h is not None and (h / file).is_file()]
+    shipped = SHIPPED_CARS.values() if network == SHIPPED else ()
+    homes = [h for h in (folder, *shipped) if h is not None and (h / file).is_file()]
     if not homes and chosen is not None:
         raise UsageError(expected=f"a car with {file}", got="none", where=f"--intervals {UNSURE}")
     return load_intervals(homes[0] / file) if homes else None

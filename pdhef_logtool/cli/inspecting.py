@@ -12,7 +12,7 @@ from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 
 if TYPE_CHECKING:
-    from pdhef_logtool.run.config import RunConfig
+    from pdhef_logtool.runs.config import RunConfig
 
 commands = typer.Typer()
 

@@ -12,7 +12,7 @@ from pdhef_logtool.cli import console, learning_tables, options
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
-    from pdhef_logtool.run.config import RunConfig
+    from pdhef_logtool.runs.config import RunConfig
 
 commands = typer.Typer()
 

@@ -15,7 +15,7 @@ from pdhef_logtool.cli.console import say
 from pdhef_logtool.records.errors import UsageError
 
 if TYPE_CHECKING:
-    from pdhef_logtool.run.config import RunConfig
+    from pdhef_logtool.runs.config import RunConfig
 
 Log = Annotated[str, Argument(metavar="LOG", help="MCAP file, rosbag1 file, rosbag2 folder or .db3 file.")]
 Logs = Annotated[list[str], Argument(metavar="LOG", help="Logs, folders that hold some, or glob patterns.")]
@@ -110,7 +110,7 @@ def run_config(options: dict[str, Any]) -> RunConfig:
     UsageError
         A value is none of those allowed, or an option and its alias are both given.
     """
-    from pdhef_logtool.run.config import load_config
+    from pdhef_logtool.runs.config import load_config
 
     flags = {key: value for key, value in options.items() if value is not None}
     for alias in [a for a in _ALIASES if a in flags]:

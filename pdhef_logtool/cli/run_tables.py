@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from pdhef_logtool.evaluation.thresholds import Verdict
-    from pdhef_logtool.run.pipeline import LogResult, RunResult
+    from pdhef_logtool.runs.pipeline import LogResult, RunResult
 
 _DEG = math.degrees(1.0)
 #: Column head, signal, metric, factor to the shown unit, digits.

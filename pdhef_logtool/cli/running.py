@@ -14,8 +14,8 @@ from pdhef_logtool.cli import console, options
 from pdhef_logtool.records.errors import OutputError
 
 if TYPE_CHECKING:
-    from pdhef_logtool.run.config import RunConfig
-    from pdhef_logtool.run.pipeline import RunResult
+    from pdhef_logtool.runs.config import RunConfig
+    from pdhef_logtool.runs.pipeline import RunResult
 
 commands = typer.Typer()
 RECORDING = "recording.rrd"
@@ -41,7 +41,7 @@ def run(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Run estimators on logs, score and annotate them. Recordings and metrics are written too."""
-    from pdhef_logtool.run.pipeline import run_logs
+    from pdhef_logtool.runs.pipeline import run_logs
 
     with console.progress() as bar:
         result = run_logs(logs, output, config, junit=junit, progress=bar, warn=console.warn)
@@ -82,7 +82,7 @@ def metrics(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Score an estimate that the log itself holds. The figures are those of pdhef run."""
-    from pdhef_logtool.run.recorded_estimates import score_log
+    from pdhef_logtool.runs.recorded_estimates import score_log
 
     with console.progress() as bar:
         result = score_log(

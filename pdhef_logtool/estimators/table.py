@@ -125,12 +125,12 @@ SPECS: tuple[Spec, ...] = (
         "physics:build", _ESP, 0x0072B2,
     ),
     Spec(
-        "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",
-        "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable="always",
-    ),
-    Spec(
         "physics-plus", "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
         "physics_plus:build", _ESP, 0x44AA99, tunable="always",
+    ),
+    Spec(
+        "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",
+        "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable="always",
     ),
     Spec(
         "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",
@@ -146,17 +146,17 @@ SPECS: tuple[Spec, ...] = (
         "hybrid:build", _ESP, 0x117733, network="residual",
     ),
     Spec(
+        "pd-hef-smoothed",
+        "the hybrid filter smoothed with what came later: not causal, ranked apart (needs a network)",
+        "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="residual", tunable="on request",
+    ),
+    Spec(
         "pd-hef-trust0", "the hybrid filter with its network switched off (needs a network)",
         "hybrid:build", _ESP, 0x999933, network="residual",
     ),
     Spec(
         "pd-hef-trust1", "the hybrid filter at trust 1, whatever the car allows (needs a network)",
         "hybrid:build", _ESP, 0x882255, default=False, network="residual",
-    ),
-    Spec(
-        "pd-hef-smoothed",
-        "the hybrid filter smoothed with what came later: not causal, ranked apart (needs a network)",
-        "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="residual", tunable="on request",
     ),
     Spec(
         "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs a network)",

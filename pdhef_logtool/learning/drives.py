@@ -24,7 +24,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
 
 #: What of the configuration decides what is learnt.

@@ -21,7 +21,7 @@ from pdhef_logtool.evaluation.metrics import MetricRow, score_track
 from pdhef_logtool.evaluation.segments import segment_masks
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.run.estimating import estimate_windows
+from pdhef_logtool.runs.estimating import estimate_windows
 from studies.condition_drives import as_logged
 from studies.paper.schemes import SCHEMES
 from truthsim.drive import simulate_drive

@@ -20,7 +20,7 @@ from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.run.estimating import estimate_windows
+from pdhef_logtool.runs.estimating import estimate_windows
 
 
 @pytest.fixture

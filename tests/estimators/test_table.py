@@ -25,7 +25,7 @@ from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, RESIDUAL, Mode
 from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.run.estimating import calibrator
+from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.watches.intervals import make_inflation
 
 pytestmark = pytest.mark.slow

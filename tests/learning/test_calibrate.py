@@ -31,8 +31,8 @@ from pdhef_logtool.learning.evidence.calibrate_command import REFUSED, Calibrate
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined
 
 pytestmark = pytest.mark.slow

@@ -26,7 +26,7 @@ from pdhef_logtool.learning.network.extract_command import ExtractResult, Extrac
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "schemas/dataset.schema.json").read_text(encoding="utf-8"))
 MAPPING = """

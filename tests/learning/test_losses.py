@@ -17,8 +17,8 @@ from pdhef_logtool.learning.evidence.trust_command import trust
 from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
 from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
 from pdhef_logtool.records.errors import EXIT_PARTIAL
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 
 pytestmark = pytest.mark.slow
 

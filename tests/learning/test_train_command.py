@@ -15,8 +15,8 @@ from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.learning.network.train_command import run_training
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 
 pytestmark = pytest.mark.slow
 

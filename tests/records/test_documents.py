@@ -21,7 +21,7 @@ from pdhef_logtool.records.documents import MAX_DEPTH, read_json, read_toml, unk
 from pdhef_logtool.records.errors import PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
 from pdhef_logtool.residual_model.linear_model import load_linear_model
-from pdhef_logtool.run.config import load_config
+from pdhef_logtool.runs.config import load_config
 
 SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
 VALID_CONFIG = {

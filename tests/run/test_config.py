@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from pdhef_logtool.drive.options import ReadOptions, parse_time, time_slice
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.run.config import RunConfig, load_config
+from pdhef_logtool.runs.config import RunConfig, load_config
 
 START = 1_700_000_000_000_000_000
 END = START + 300_000_000_000

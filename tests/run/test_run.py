@@ -13,8 +13,8 @@ import pytest
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.table import SPECS, default_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow

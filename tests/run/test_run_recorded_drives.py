@@ -10,8 +10,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 
 pytestmark = pytest.mark.slow
 

@@ -28,8 +28,8 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 from pdhef_logtool.sinks.report import diverged_line, report_markdown
 from pdhef_logtool.watches.divergence import DivergenceCarry, DivergenceWatch, wrong_branch
 from truthsim.drive import simulate_drive, write_drive

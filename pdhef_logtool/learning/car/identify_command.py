@@ -25,7 +25,7 @@ from pdhef_logtool.learning.drives import (
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 
 #: Entry of vehicle.toml that a parameter's interval is written beside.
 _ENTRIES = {

@@ -50,7 +50,7 @@ from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.run.estimating import estimate_windows
+from pdhef_logtool.runs.estimating import estimate_windows
 from pdhef_logtool.sinks.report import json_bytes, tool_versions
 from pdhef_logtool.watches.error_features import error_terms
 from pdhef_logtool.watches.intervals import yaw_rate_terms

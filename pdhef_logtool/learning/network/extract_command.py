@@ -56,7 +56,7 @@ from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
 
 #: Upper ends of the shares of train and validation in [0, 1); the rest is test.

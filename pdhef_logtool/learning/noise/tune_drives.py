@@ -27,7 +27,7 @@ from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import RememberingNetwork
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 
 #: A drive with fewer scored stamps says nothing of its own.
 MIN_SCORED_STAMPS = 100

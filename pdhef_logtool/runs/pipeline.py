@@ -28,10 +28,10 @@ from pdhef_logtool.records.errors import (
     UsageError,
 )
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals, join_signals
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.estimating import calibrator, estimate_windows
-from pdhef_logtool.run.scoring import evaluate, in_time
-from pdhef_logtool.run.track_store import TrackStore
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.scoring import evaluate, in_time
+from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.report import (
     EstimatorFacts,

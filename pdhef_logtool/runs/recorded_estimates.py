@@ -37,10 +37,10 @@ from pdhef_logtool.records.signals import (
 )
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.estimate_channels import RecordedEstimate, gap_ns, read_estimate
-from pdhef_logtool.run.estimating import DeadReckoning, first_pose
-from pdhef_logtool.run.pipeline import (
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
+from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
+from pdhef_logtool.runs.pipeline import (
     LogResult,
     Progress,
     RunResult,
@@ -52,7 +52,7 @@ from pdhef_logtool.run.pipeline import (
     write_run,
     write_verdicts,
 )
-from pdhef_logtool.run.scoring import diverged_events, in_time, segment_events
+from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
 from pdhef_logtool.sinks.base import TRUTH, Event
 from pdhef_logtool.sinks.report import EstimatorFacts, build_report, write_json
 
@@ -83,7 +83,7 @@ def score_log(
     estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
         the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
     truth : likewise; without any, the mapping's or the recognised truth.
-    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.run.pipeline.run_logs`.
+    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.pipeline.run_logs`.
 
     Raises
     ------

@@ -13,7 +13,7 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import Options, Skipped, runnable
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.run.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.sinks.base import TRUTH
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def score(estimates: Estimates) -> pl.DataFrame:
     """Return the figures of estimates as rows of metrics.parquet; without truth those that need none."""
     import polars as pl
 
-    from pdhef_logtool.run.scoring import evaluate
+    from pdhef_logtool.runs.scoring import evaluate
 
     names = [name for name in estimates.tracks if name != TRUTH]
     rows, _, _ = evaluate(estimates.drive, names, estimates.tracks.get, estimates.signals)
