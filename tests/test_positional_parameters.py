@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import ast
 import re
+from pathlib import Path
 
 import pytest
-from conftest import ROOT
 
+_ROOT = Path(__file__).resolve().parents[1]
 MOST = 8
 #: On the line of the ``def``, or directly above it or its decorators.
 REASON = re.compile(r"#\s*positional: \S.*")
@@ -30,7 +31,7 @@ def overlong(source: str) -> list[str]:
 
 @pytest.mark.parametrize("package", ["pdhef_logtool", "truthsim", "studies", "benchmarks"])
 def test_no_function_takes_many_positional_parameters(package: str) -> None:
-    found = {str(p.relative_to(ROOT)): overlong(p.read_text()) for p in sorted((ROOT / package).rglob("*.py"))}
+    found = {str(p.relative_to(_ROOT)): overlong(p.read_text()) for p in sorted((_ROOT / package).rglob("*.py"))}
     assert found, "nothing was looked at"
     assert {path: names for path, names in found.items() if names} == {}
 
