@@ -311,8 +311,8 @@ def test_which_intervals_a_run_takes(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "vehicle.toml").write_text(vehicle_toml(default_vehicle()))
 
-    def taken(chosen: Path | str | None, car: Path | None = folder) -> str | None:
-        intervals = Car.load(car, network="none", intervals=chosen).intervals
+    def taken(chosen: Path | str | None, car: Path | None = folder, network: str | None = None) -> str | None:
+        intervals = Car.load(car, network=network, intervals=chosen).intervals
         return None if intervals is None else intervals.car
 
     shipped = Car.load("saloon").intervals
@@ -325,6 +325,9 @@ def test_which_intervals_a_run_takes(tmp_path: Path) -> None:
     assert taken("unsure") == taken(Path("unsure")) == "mine, unsure"
     assert taken(folder, None) == taken(folder / INTERVALS_FILE, None) == "mine"
     assert taken(None, None) == shipped.car
+    assert taken(None, network="none") == "mine"
+    for other in ("none", "many-cars"):
+        assert taken(None, None, network=other) is None, "the shipped car's were made with the shipped network"
     with pytest.raises(PdhefError, match="elsewhere"):
         taken(tmp_path / "elsewhere")
 
