@@ -5,21 +5,24 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out/demo
 # The simulated car of the sample logs, with the filter noise that belongs to the shipped network.
-CAR := pdhef_logtool/models/default/vehicle.toml
+CAR := saloon
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: train-default help demo test check lint format bench samples docs-truthsim paper switches clean
+.PHONY: help demo test quick mutants check lint format bench train-default samples conditions real switches \
+  docs-truthsim paper clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
+	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores"
+	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
-	@echo "make bench    speed against peers, and the tuning tables"
+	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
-	@echo "make conditions VEHICLE=car.toml MODEL=model  docs/conditions.md: every estimator on the condition table"
-	@echo "make real MODEL=model  docs/real.md: every estimator on the recorded drives in ../shared"
+	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
+	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
 	@echo "make switches  docs/switches.md: bias states, roll, standstill, slip gate, latency of the filters, on and off"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
@@ -40,8 +43,8 @@ $(VENV)/installed-dev: $(VENV)/installed pyproject.toml
 	@touch $@
 
 demo: $(VENV)/installed $(VENV)/compiled
-	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --vehicle $(CAR)
-	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --vehicle $(CAR) --friction 0.3
+	$(BIN)/pdhef run sample_logs/dlc.mcap sample_logs/road.mcap -o $(OUT) --car $(CAR)
+	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --car $(CAR) --friction 0.3
 	@echo
 	@echo "Outputs: $(OUT)/ and $(OUT)-low-friction/"
 	@echo "  logs/<log>/annotated.mcap   for Foxglove, PlotJuggler or ros2 bag"
@@ -56,6 +59,15 @@ $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/
 
 test: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+quick: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow"
+
+# Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.
+SEED ?= 1
+COUNT ?= 30
+mutants: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python tests/mutants.py --seed $(SEED) --count $(COUNT) --jobs $(JOBS)
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
@@ -86,14 +98,14 @@ docs-truthsim: $(VENV)/installed
 paper: $(VENV)/installed $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.paper
 
-# Every estimator on the condition table; MODEL is the bundle of the network, VEHICLE the file that it belongs to.
+# Every estimator on the condition table, with the car's own network or another.
 DRIVES ?= 30
 conditions: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.conditions --drives $(DRIVES) --jobs $(JOBS) \
-	  $(if $(VEHICLE),--vehicle $(VEHICLE)) $(if $(MODEL),--model $(MODEL))
+	  --car $(CAR) $(if $(NETWORK),--network $(NETWORK))
 
 real: $(VENV)/installed-dev $(VENV)/compiled
-	OMP_NUM_THREADS=1 $(BIN)/python -m studies.real $(if $(MODEL),--model $(MODEL))
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.real $(if $(NETWORK),--network $(NETWORK))
 
 switches: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches

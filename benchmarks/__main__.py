@@ -1,8 +1,8 @@
 """Run the speed benchmarks and print one table.
 
-    python -m benchmarks [NAME ...] [--json] [--list] [--write-docs]
+    python -m benchmarks [NAME ...] [--write-docs] [--gate]
 
-Ends with 1 if a target is missed.
+With ``--gate`` it ends with 4 if a target is missed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import argparse
 import sys
 from importlib import import_module
 
-from benchmarks.measuring import ROOT, Figure, as_json, machine_facts
+from benchmarks.measuring import ROOT, Figure, machine_facts
 
 NAMES = ("reading", "writing", "copying", "filtering")
 DOCUMENT = ROOT / "docs" / "benchmarks.md"
@@ -24,14 +24,6 @@ on what, heads its file in `benchmarks/`.
 """
 
 
-def other_tables() -> list[str]:
-    """Return the commands beside the benchmarks that make the tables behind frozen settings."""
-    own = {*NAMES, "__init__", "__main__", "measuring", "one_hour_log"}
-    found = [p for p in (ROOT / "benchmarks").glob("*.py") if p.stem not in own]
-    folders = [p.parent.name for p in (ROOT / "benchmarks").glob("*/__main__.py")]
-    return sorted([p.stem for p in found if "__main__" in p.read_text(encoding="utf-8")] + folders)
-
-
 def cells(figure: Figure) -> tuple[str, ...]:
     """Return a figure as the cells of a table row."""
     target = "" if figure.limit is None else f"{figure.sense} {figure.limit:g} {figure.unit}"
@@ -40,49 +32,31 @@ def cells(figure: Figure) -> tuple[str, ...]:
     return figure.benchmark, figure.name, f"{value} {figure.unit}", target, verdict
 
 
-def print_table(figures: list[Figure]) -> None:
-    """Print the figures for a terminal."""
-    rows = [_HEADINGS, *(cells(f) for f in figures)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADINGS))]
-    for row in rows:
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-
-
-def write_document(figures: list[Figure]) -> None:
-    """Write the figures and the machine they are from to ``docs/benchmarks.md``."""
-    lines = [_INTRODUCTION, "| " + " | ".join(_HEADINGS) + " |", "| --- " * len(_HEADINGS) + "|"]
-    lines += ["| " + " | ".join(cells(f)) + " |" for f in figures]
-    lines += ["", "Machine: " + ", ".join(f"{key} {value}" for key, value in machine_facts().items()) + ".", ""]
-    DOCUMENT.write_text("\n".join(lines), encoding="utf-8")
+def table(figures: list[Figure]) -> str:
+    """Return the figures as a Markdown table."""
+    rows = [_HEADINGS, ("---",) * len(_HEADINGS), *map(cells, figures)]
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 
 def main() -> int:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description="Speed against peers in the same run.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; all when none is given")
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
-    parser.add_argument("--list", action="store_true", help="print the names, and the commands of the other tables")
     parser.add_argument("--write-docs", action="store_true", help="write docs/benchmarks.md (needs all benchmarks)")
     parser.add_argument("--gate", action="store_true", help="end with 4 if a target is missed")
     arguments = parser.parse_args()
-    unknown = sorted(set(arguments.names) - set(NAMES))
-    if unknown:
-        parser.error(f"no benchmark {', '.join(unknown)}; there are {', '.join(NAMES)}")
+    if set(arguments.names) - set(NAMES):
+        parser.error(f"expected names out of {', '.join(NAMES)}, got {', '.join(arguments.names)}")
     if arguments.write_docs and arguments.names:
         parser.error("--write-docs needs all benchmarks: give no names")
-    if arguments.list:
-        print("\n".join([*NAMES, *(f"python -m benchmarks.{name}" for name in other_tables())]))
-        return 0
     figures: list[Figure] = []
     for name in arguments.names or NAMES:
         print(f"{name} ...", file=sys.stderr)
         figures += import_module(f"benchmarks.{name}").run()
-    if arguments.json:
-        print(as_json(figures))
-    else:
-        print_table(figures)
+    print(table(figures))
     if arguments.write_docs:
-        write_document(figures)
+        machine = ", ".join(f"{key} {value}" for key, value in machine_facts().items())
+        DOCUMENT.write_text(f"{_INTRODUCTION}\n{table(figures)}\n\nMachine: {machine}.\n", encoding="utf-8")
     return 4 if arguments.gate and any(f.passed is False for f in figures) else 0
 
 

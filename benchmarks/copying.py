@@ -26,7 +26,7 @@ _REPORT = {"log": {"name": "hour", "end_ns": START_NS}, "truth": {"available": F
 
 def _track(name: str, begin_s: int) -> StateTrack:
     stamps_ns = START_NS + begin_s * 10**9 + np.arange(_WINDOW_S * 100, dtype=np.int64) * 10_000_000
-    t = (stamps_ns - START_NS) * 1e-9
+    t = np.asarray((stamps_ns - START_NS) * 1e-9, dtype=np.float64)
     return make_track(
         name, stamps_ns, vx_m_s=20.0 + np.sin(t), vy_m_s=0.1 * np.sin(t), yaw_rate_rad_s=0.2 * np.cos(t),
         x_m=20.0 * t, y_m=np.sin(t), yaw_rad=0.1 * np.sin(t),
@@ -69,7 +69,7 @@ def copy_with_mcap(path: Path, end_ns: int) -> None:
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, id_)
             to = channels[channel.id]
             writer.add_message(to, message.log_time, message.data, message.publish_time, message.sequence)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without types
 
 
 def run() -> list[Figure]:

@@ -11,7 +11,8 @@ import numpy as np
 from benchmarks.measuring import Figure, best_seconds
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.physics import INITIAL_STD, PHY_UKF_Q_STD, PhysicsUkf
+from pdhef_logtool.estimators.filter_shell import INITIAL_STD
+from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 STEPS = 60_000

@@ -6,14 +6,13 @@ on a machine that others use too.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -47,10 +46,6 @@ class Figure:
         if self.limit is None:
             return None
         return self.value <= self.limit if self.sense == "at most" else self.value >= self.limit
-
-    def as_document(self) -> dict[str, object]:
-        """Return the figure for JSON."""
-        return {**asdict(self), "passed": self.passed}
 
 
 def best_seconds(ways: Mapping[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
@@ -96,9 +91,3 @@ def _processor() -> str:
     except OSError:
         return platform.processor() or "unknown"
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
-
-
-def as_json(figures: list[Figure]) -> str:
-    """Return one JSON document of the figures and the machine."""
-    document = {"machine": machine_facts(), "figures": [f.as_document() for f in figures]}
-    return json.dumps(document, indent=2)

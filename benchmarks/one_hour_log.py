@@ -32,7 +32,6 @@ HOUR_S = 3600
 IMAGE_LOG_S = 360
 IMAGE_TIMES = 20
 IMAGE_HZ = 5
-MESSAGES_PER_S = 350
 RAW_BYTES_PER_S = 124_650
 _WINDOW_S = 60
 _IMAGE = "sensor_msgs/msg/Image"
@@ -97,9 +96,9 @@ def _window(rng: np.random.Generator, begin_s: int, length_s: int) -> list[Topic
 
     def columns(rate_hz: int, offset_ns: int) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, FloatArray]:
         stamps_ns = _stamps(begin_s, length_s, rate_hz, offset_ns)
-        t = (stamps_ns - START_NS) * 1e-9
-        speed = 20.0 + 5.0 * np.sin(0.02 * t)
-        steer = 0.03 * np.sin(0.4 * t) * np.cos(0.03 * t)
+        t = np.asarray((stamps_ns - START_NS) * 1e-9, dtype=np.float64)
+        speed: FloatArray = 20.0 + 5.0 * np.sin(0.02 * t)
+        steer: FloatArray = 0.03 * np.sin(0.4 * t) * np.cos(0.03 * t)
         return stamps_ns, t, speed, steer, speed * steer / 2.7
 
     def noisy(values: FloatArray, std: float) -> FloatArray:
@@ -168,8 +167,3 @@ def _images(rng: np.random.Generator, channel: int, begin_s: int, length_s: int)
         )
         data = head + body + rng.bytes(width * height)
         yield RawMessage(channel, stamp + 2_000_000, stamp, begin_s * IMAGE_HZ + i, data)
-
-
-if __name__ == "__main__":
-    for log in (hour_log(), short_log(), image_log()):
-        print(log.name, log.stat().st_size)

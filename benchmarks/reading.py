@@ -1,7 +1,7 @@
-"""Reading a mapped run of the one-hour log: against decompression alone, rosbags and mcap; peak memory with images.
+"""Reading a mapped run of the one-hour log: against decompression alone and rosbags; peak memory with images.
 
 All ways read the same eleven fields of five topics with every CRC that the way can check. The floor decompresses every
-chunk and checks its CRC, and does nothing else. The peers decode a tenth of the hour (scaled by 10).
+chunk and checks its CRC, and does nothing else. The peer decodes a tenth of the hour (scaled by 10).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmarks.measuring import Figure, best_seconds, peak_bytes
 from benchmarks.one_hour_log import HOUR_S, MAPPED, START_NS, hour_log, image_log, short_log
 
-#: Share of the hour that the slow ways decode.
+#: Share of the hour that the peer decodes.
 _SLICE = 10
 _SLICE_END_NS = START_NS + HOUR_S // _SLICE * 10**9
 
@@ -67,51 +67,26 @@ def decode_with_rosbags(path: Path, end_ns: int) -> int:
     return n
 
 
-def decode_with_mcap(path: Path, end_ns: int) -> int:
-    """Decode the mapped topics with mcap and mcap-ros2-support; returns the number of messages."""
-    from mcap.reader import make_reader
-    from mcap_ros2.decoder import DecoderFactory
-
-    with path.open("rb") as file:
-        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        return sum(1 for _ in reader.iter_decoded_messages(topics=list(MAPPED), ending_before=end_ns))
-
-
 def run() -> list[Figure]:
     """Measure."""
     path = hour_log()
     messages = read_mapped(path)
     fast = best_seconds({"floor": lambda: decompress_all(path), "ours": lambda: read_mapped(path)}, rounds=5)
-    slow = {"rosbags": lambda: decode_with_rosbags(path, _SLICE_END_NS)}
-    try:
-        import mcap_ros2  # noqa: F401
-    except ImportError:
-        pass
-    else:
-        slow["mcap + mcap_ros2"] = lambda: decode_with_mcap(path, _SLICE_END_NS)
-    slice_messages = decode_with_rosbags(path, _SLICE_END_NS)
-    scale = messages / slice_messages
-    peers = {name: scale * seconds for name, seconds in best_seconds(slow, rounds=2).items()}
+    slow = best_seconds({"rosbags": lambda: decode_with_rosbags(path, _SLICE_END_NS)}, rounds=2)
+    peer = slow["rosbags"] * messages / decode_with_rosbags(path, _SLICE_END_NS)
     ours = fast["ours"]
     without = peak_bytes("benchmarks.reading", str(short_log()))
     with_images = peak_bytes("benchmarks.reading", str(image_log()))
-    figures = [
+    return [
         Figure("reading", "floor: decompress all, CRC", fast["floor"], "s"),
         Figure("reading", "ours: 11 fields of 5 topics, CRC", ours, "s"),
         Figure("reading", "ours / floor", ours / fast["floor"], "x", 2.0, "at most"),
-    ]
-    for name, seconds in peers.items():
-        target = (35.0, "at least") if name == "rosbags" else (None, "")
-        figures += [
-            Figure("reading", f"{name}: decode the same topics", seconds, "s"),
-            Figure("reading", f"{name} / ours", seconds / ours, "x", *target),
-            Figure("reading", f"{name} / floor", seconds / fast["floor"], "x"),
-        ]
-    figures += [
+        Figure("reading", "rosbags: decode the same topics", peer, "s"),
+        Figure("reading", "rosbags / ours", peer / ours, "x", 35.0, "at least"),
+        Figure("reading", "rosbags / floor", peer / fast["floor"], "x"),
         Figure("reading", "peak memory, 6 min", without / 1e6, "MB"),
         Figure("reading", "more with 20 x image bytes", (with_images - without) / 1e6, "MB", 100.0, "at most"),
     ]
-    return figures
 
 
 if __name__ == "__main__":

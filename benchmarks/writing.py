@@ -125,7 +125,7 @@ def write_with_peers(store: Any, stamps_ns: IntArray, messages: list[tuple[Any, 
                 writer.add_message(state_channel, stamp, data, stamp, i)
                 data = bytes(store.serialize_cdr(odometry, ODOMETRY_TYPE))
                 writer.add_message(odometry_channel, stamp, data, stamp, i)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without types
 
 
 def _check_equal() -> None:

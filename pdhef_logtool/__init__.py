@@ -1,3 +1,69 @@
-"""Offline sideslip estimation, scoring and annotation of drive logs."""
+"""Offline sideslip estimation, scoring and annotation of drive logs: what the command line sits on (docs/api.md)."""
 
-__version__ = "0.1.0"
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.records.version import __version__
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car as Car
+    from pdhef_logtool.drive.options import ReadOptions as ReadOptions
+    from pdhef_logtool.drive.reading import Drive as Drive
+    from pdhef_logtool.drive.reading import read_drive as read_drive
+    from pdhef_logtool.inspection import inspect_log as inspect_log
+    from pdhef_logtool.learning.car.identify_command import identify as identify
+    from pdhef_logtool.learning.drives import LearnSettings as LearnSettings
+    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings as CalibrateSettings
+    from pdhef_logtool.learning.evidence.calibrate_command import calibrate as calibrate
+    from pdhef_logtool.learning.evidence.trust_command import trust as trust
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
+    from pdhef_logtool.learning.network.extract_command import extract as extract
+    from pdhef_logtool.learning.network.train_command import run_training as train  # noqa: F401
+    from pdhef_logtool.learning.noise.tune_command import TuneSettings as TuneSettings
+    from pdhef_logtool.learning.noise.tune_command import tune as tune
+    from pdhef_logtool.mapping import load_mapping as load_mapping
+    from pdhef_logtool.records.errors import PdhefError as PdhefError
+    from pdhef_logtool.runs.config import RunConfig as RunConfig
+    from pdhef_logtool.runs.estimating import estimate_windows as estimate_windows
+    from pdhef_logtool.runs.frames import choose as choose
+    from pdhef_logtool.runs.frames import estimate as estimate
+    from pdhef_logtool.runs.frames import score as score
+    from pdhef_logtool.runs.pipeline import run_logs as run  # noqa: F401
+
+#: Where each name stands, ``module`` or ``module:name there``; it is imported when it is first asked for.
+_HOMES = {
+    "Car": "car.car",
+    "ReadOptions": "drive.options",
+    "Drive": "drive.reading",
+    "read_drive": "drive.reading",
+    "inspect_log": "inspection",
+    "identify": "learning.car.identify_command",
+    "LearnSettings": "learning.drives",
+    "CalibrateSettings": "learning.evidence.calibrate_command",
+    "calibrate": "learning.evidence.calibrate_command",
+    "trust": "learning.evidence.trust_command",
+    "ExtractSettings": "learning.network.extract_command",
+    "extract": "learning.network.extract_command",
+    "train": "learning.network.train_command:run_training",
+    "TuneSettings": "learning.noise.tune_command",
+    "tune": "learning.noise.tune_command",
+    "load_mapping": "mapping",
+    "PdhefError": "records.errors",
+    "RunConfig": "runs.config",
+    "estimate_windows": "runs.estimating",
+    "choose": "runs.frames",
+    "estimate": "runs.frames",
+    "score": "runs.frames",
+    "run": "runs.pipeline:run_logs",
+}
+__all__ = ["__version__", *sorted(_HOMES)]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for: ``import pdhef_logtool`` itself loads nothing."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, own_name = _HOMES[name].partition(":")
+    return getattr(import_module(f"{__name__}.{module}"), own_name or name)

@@ -7,26 +7,31 @@ only through the factor of the row: 1.2 times it, or nothing at all. The bins ar
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.drive import reading
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import auto_map
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.watches.intervals import Calibration, calibrated
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+from studies.independent_sim_logs import write_run
+from studies.pages import INDEPENDENT
 from studies.table_maths import interval_score
+from truthsim.drive import Drive, write_drive
 
 SIDESLIP = "sideslip_rad"
 #: Bins of true |a_y| over μ g (METHOD §10), by name: lower and upper limit.
@@ -50,35 +55,51 @@ _KEPT = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConditionDrive:
-    """Signals [N] as an estimator would get them with the true friction, and the perfect truth [N] at their stamps."""
+    """Signals [N] as an estimator would get them with the true friction, and the perfect truth [N] at their stamps.
+
+    Slower than ``low_speed_m_s`` nothing is scored.
+    """
 
     name: str
     signals: Signals
     truth: StateTrack
-    friction: FloatArray
+    low_speed_m_s: float
+
+    def error(self, track: StateTrack) -> FloatArray:
+        """Return the sideslip error of a track [N] in rad, NaN where it is not scored."""
+        return signal_error(track, self.truth, SIDESLIP, self.low_speed_m_s)
 
 
-def read_drive(path: Path, vehicle: VehicleParameters, name: str, *, friction: float | None = None) -> ConditionDrive:
+def read_drive(path: Path, car: Car, *, friction: float | None = None) -> ConditionDrive:
     """Read a simulated log; ``friction`` where the log has none of its own.
 
     The perfect truth stands on the sensors' clock, so that no latency is looked for: a stuck gyro would bend it.
     """
-    with closing(open_log(path)) as log:
-        mapping = auto_map(log).mapping
-        if friction is None:
-            mapping = replace(
-                mapping,
-                signals={**mapping.signals, "friction": _FRICTION},
-                truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y},
-            )
-        plan = replace(plan_drive(log, mapping, vehicle, log.start_ns, log.end_ns), latency=None)
-        windows = [w for w in DriveReader(log, plan, 600.0).windows() if len(w.signals)]
-    signals = join_signals([w.signals for w in windows])
-    truth = concatenate([w.truth for w in windows if w.truth is not None])
+
+    def with_true_friction(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
+        return replace(
+            mapping, signals={**mapping.signals, "friction": _FRICTION}, truth={**mapping.truth, "ay_m_s2": _TRUE_A_Y}
+        )
+
+    adjust = with_true_friction if friction is None else None
+    with reading.read_drive(path, car, options=ReadOptions(friction=None), adjust=adjust) as drive:
+        drive.plan = replace(drive.plan, latency=None)
+        whole = drive.whole()
+    signals, truth = whole.signals, whole.truth
+    assert truth is not None
     if friction is not None:
         constant = np.full(len(signals), friction)
         signals = replace(signals, friction=constant, available=signals.available | {"friction"})
-    return ConditionDrive(name, signals, truth, signals.friction)
+    return ConditionDrive(whole.name, signals, truth, car.vehicle.low_speed_blend_m_s)
+
+
+def as_logged(drive: Drive, car: Car) -> reading.WholeDrive:
+    """Return a simulated drive the way of every log: written as MCAP, mapped by recognition, read; no friction told."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "drive.mcap"
+        write_drive(drive, path)
+        with reading.read_drive(path, car, options=ReadOptions(friction=None)) as read:
+            return read.whole()
 
 
 def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:
@@ -101,20 +122,20 @@ def told(drive: ConditionDrive, assume: dict[str, Any]) -> Signals:
 def bin_masks(drive: ConditionDrive) -> dict[str, BoolArray]:
     """Return the segments: everything, the bins, and the nonlinear range; by true friction and lateral acceleration."""
     share = np.abs(smooth(drive.truth.stamps_ns, drive.truth.ay_m_s2, GRIP_SMOOTHING_HZ))
-    share = share / (drive.friction * GRAVITY_M_S2)
+    share = share / (drive.signals.friction * GRAVITY_M_S2)
     masks = {name: (share >= low) & (share < high) for name, (low, high) in BINS.items()}
     return {ALL: np.ones(len(share), dtype=np.bool_), **masks, NONLINEAR: share > NONLINEAR_SHARE}
 
 
-def score(track: StateTrack, drive: ConditionDrive, low_speed_m_s: float) -> list[MetricRow]:
+def score(track: StateTrack, drive: ConditionDrive) -> list[MetricRow]:
     """Return the metrics that the table needs: of :mod:`pdhef_logtool.evaluation.metrics`, and of the interval."""
     masks = bin_masks(drive)
     rows = [
         row
-        for row in score_track(track, drive.truth, masks, log=drive.name, low_speed_m_s=low_speed_m_s)
+        for row in score_track(track, drive.truth, masks, log=drive.name, low_speed_m_s=drive.low_speed_m_s)
         if row.signal in (SIDESLIP, "state") or (row.segment == ALL and row.metric in _KEPT.get(row.signal, ()))
     ]
-    error = signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
+    error = drive.error(track)
     sigma = np.hypot(track.sideslip_std_rad, np.nan_to_num(drive.truth.sideslip_std_rad, nan=0.0))
     return rows + interval_rows(error, sigma, masks, log=drive.name, estimator=track.name)
 
@@ -136,24 +157,33 @@ def interval_rows(
     return rows
 
 
-def run_and_score(
-    estimators: Sequence[Estimator],
-    signals: Signals,
-    drive: ConditionDrive,
-    low_speed_m_s: float,
-    calibration: Calibration | None = None,
-) -> list[MetricRow]:
-    """Run estimators on signals and score each against the drive's truth, with calibrated intervals if any."""
-    rows: list[MetricRow] = []
-    for estimator in estimators:
-        track, _ = estimator.run(signals, None)
-        if calibration is not None and track.name in calibration.inflations:
-            track, _ = calibrated(track, signals, calibration)
-        rows += score(track, drive, low_speed_m_s)
-    return rows
+def sideslip_error(estimator: Estimator, drive: ConditionDrive, signals: Signals | None = None) -> FloatArray:
+    """Run an estimator on signals, None: the drive's; returns its sideslip error [N] in rad, NaN where not scored."""
+    return drive.error(estimator.run(drive.signals if signals is None else signals, None)[0])
 
 
-def independent_runs(folder: Path) -> Iterable[tuple[Path, float]]:
-    """Yield the independent simulator's runs with their friction."""
-    for source in sorted(folder.glob("*.parquet")):
-        yield source, float(json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))["mu"])
+def root_mean_square(error: FloatArray) -> float:
+    """Return the root mean square of what is known of an error [N]; NaN for nothing."""
+    known = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+
+
+def rmse_row(drive: str, estimator: str, segment: str, error: FloatArray) -> list[MetricRow]:
+    """Return the sideslip RMSE over an error [N] in rad as a row; none where nothing is known."""
+    n = int(np.count_nonzero(np.isfinite(error)))
+    return [MetricRow(drive, estimator, SIDESLIP, segment, "rmse", root_mean_square(error), "rad", n)] if n else []
+
+
+def drives_of(folder: Path, split: str | None = None) -> list[dict[str, Any]]:
+    """Return the entries of a set's manifest, of one split or all, whose drives could be made."""
+    entries = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["drives"]
+    return [e for e in entries if "sha256" in e and split in (None, e.get("split"))]
+
+
+def independent_runs(folder: Path) -> Iterable[tuple[Path, Path, float]]:
+    """Write the independent simulator's runs as logs into a folder, once; yield run, log and friction of each."""
+    for source in sorted(INDEPENDENT.glob("*.parquet")):
+        log = folder / f"{source.stem}.mcap"
+        if not log.is_file():
+            write_run(source, log)
+        yield source, log, float(json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))["mu"])

@@ -6,16 +6,14 @@ settings, and the sources of what computes. A row whose key is as it was is not 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sys
-import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from functools import cache, lru_cache
+from dataclasses import dataclass, field
+from functools import cache, lru_cache, partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -23,58 +21,49 @@ from typing import Any
 import polars as pl
 import pyarrow.parquet as pq
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import digest
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.estimators.registry import make_estimator, runnable
-from pdhef_logtool.evaluation.metrics import MetricRow, signal_error, summarise_errors
-from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
-from pdhef_logtool.sinks.base import PendingFile
-from pdhef_logtool.watches.intervals import Calibration, find_calibration
+from pdhef_logtool.estimators.table import Options, make_estimator, runnable
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.files import PendingFile
+from pdhef_logtool.runs.estimating import calibrator
 from studies import error_budget, fixed_grid
-from studies.condition_drives import SIDESLIP, read_drive, run_and_score, told
+from studies.condition_drives import read_drive, rmse_row, score, sideslip_error, told
+from studies.pages import ROOT
+from truthsim.vehicle_choice import choose_vehicle
 
-ROOT = Path(__file__).resolve().parents[1]
-FORMAT = 1
 COLUMNS = ("row", "drive", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 _KEY, _NOTES = b"key", b"notes"
-#: What decides the figures, beside the drives: sources by folder or file.
-_SOURCES = (
-    "pdhef_logtool/estimators",
-    "pdhef_logtool/residual_model",
-    "pdhef_logtool/evaluation",
-    "pdhef_logtool/mapping",
-    "pdhef_logtool/drive",
-    "pdhef_logtool/car",
-    "pdhef_logtool/watches",
-    "pdhef_logtool/records",
-    "studies/condition_drives.py",
-    "studies/condition_runs.py",
-    "studies/fixed_grid.py",
-    "studies/table_maths.py",
-)
-_BUDGET_SOURCES = ("truthsim", "studies/error_budget.py", "studies/defaults/fit_nominal_tyres.py")
-
-Say = Callable[[str], None]
+#: What decides the figures, beside the drives: all sources of these folders.
+_SOURCES = ("pdhef_logtool", "truthsim", "studies")
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """What every drive is run with; ``model`` None leaves out what needs a network."""
+    """What every drive is run with: a car as ``--car`` takes it, and a network instead of its own."""
 
-    vehicle: Path
-    model: Path | None
+    car: Path
+    network: Path | None
     estimators: tuple[str, ...]
+
+    @property
+    def loaded(self) -> Car:
+        """The car, read once a process."""
+        return _loaded(self.car, self.network)
 
     @property
     def identity(self) -> dict[str, Any]:
         """What the setup is, by content."""
-        _, model = _loaded(self.vehicle, self.model)
-        calibration = _calibration(self.model)
+        car = self.loaded
+        parts = {"trust": car.trust, "intervals": car.intervals}
         return {
-            "vehicle": hashlib.sha256(self.vehicle.read_bytes()).hexdigest(),
-            "model": None if model is None else model.sha256,
-            "calibration": None if calibration is None else calibration.sha256,
+            "physics": car.physics_sha256,
+            "noise": car.noise_sha256,
+            "network": None if car.network is None else car.network.sha256,
+            **{name: None if part is None else digest(part.model_dump(mode="json")) for name, part in parts.items()},
             "estimators": list(self.estimators),
         }
 
@@ -91,217 +80,152 @@ class Task:
     friction: float | None = None
     entry: dict[str, Any] = field(default_factory=dict)
 
+    @property
+    def use_speed(self) -> bool:
+        """Whether the row has wheel speeds."""
+        return self.assume.get("sensors") != "esp"
+
 
 @dataclass(frozen=True, slots=True)
 class RowResult:
     """What came of a row: figures in the columns ``COLUMNS``, and sentences on what did not run."""
 
-    row: str
-    kind: str
     table: pl.DataFrame
     notes: tuple[str, ...]
 
 
+#: A drive's figures in the columns ``COLUMNS`` but the row's name, and what did not run.
+_Done = tuple[Task, list[tuple[Any, ...]], list[str]]
+
+
 @cache
-def source_digest(*places: str) -> str:
-    """Return the hash of the Python sources under folders or files of the repository."""
-    digest = hashlib.sha256()
-    for place in places:
-        path = ROOT / place
-        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
-            digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
+def source_digest() -> str:
+    """Return the hash of the sources that decide the figures."""
+    files = sorted(file for place in _SOURCES for file in (ROOT / place).rglob("*.py"))
+    return digest([[f.relative_to(ROOT).as_posix(), f.read_text(encoding="utf-8")] for f in files])
 
 
 def row_key(setup: Setup, tasks: Sequence[Task]) -> str:
     """Return the hash of all that the row's figures depend on."""
-    kind = tasks[0].kind
     document = {
-        "format": FORMAT,
-        "kind": kind,
+        "kind": tasks[0].kind,
         "setup": setup.identity,
         "assume": tasks[0].assume,
         "drives": [[t.log.name, t.sha256, t.friction] for t in tasks],
-        "grid": [asdict(s) for s in fixed_grid.GRID],
-        "sources": source_digest(*_SOURCES, *(_BUDGET_SOURCES if kind == "budget" else ())),
+        "sources": source_digest(),
     }
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    return digest(document)
 
 
-def run_rows(
-    setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: int, title: str, say: Say
-) -> dict[str, RowResult]:
+def run_rows(setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: int, title: str) -> dict[str, RowResult]:
     """Run the tasks of every row, keep what is there already, write each row's Parquet as soon as it is whole."""
     folder.mkdir(parents=True, exist_ok=True)
     done: dict[str, RowResult] = {}
-    todo: list[Task] = []
-    keys = {name: row_key(setup, tasks) for name, tasks in rows.items() if tasks}
-    for name, tasks in rows.items():
-        if not tasks:
-            continue
-        kept = _read(folder / f"{name}.parquet", name, tasks[0].kind, keys[name])
-        if kept is None:
-            todo += tasks
-        else:
-            done[name] = kept
-    if done:
-        say(f"{title}: {len(done)} rows kept")
-    open_rows: dict[str, list[tuple[Task, list[tuple[Any, ...]], list[str]]]] = {}
-    began = time.monotonic()
-    with _workers(setup, jobs) as work:
-        for count, (task, rows_of, notes) in enumerate(work(todo), start=1):
-            so_far = open_rows.setdefault(task.row, [])
-            so_far.append((task, rows_of, notes))
-            left = (time.monotonic() - began) / count * (len(todo) - count)
-            say(f"\r{title}: {count} of {len(todo)} drives, {left:.0f} s left   ")
-            if len(so_far) == len(rows[task.row]):
-                done[task.row] = _write(folder / f"{task.row}.parquet", task, so_far, keys[task.row])
-                del open_rows[task.row]
-    if todo:
-        say(f"\n{title}: {len(todo)} drives in {time.monotonic() - began:.0f} s\n")
-    return {name: done[name] for name in rows if name in done}
+    rows = {name: tasks for name, tasks in rows.items() if tasks}
+    with _workers(jobs) as work:
+        for name, tasks in rows.items():
+            path, key = folder / f"{name}.parquet", row_key(setup, tasks)
+            done[name] = _read(path, key) or _write(path, list(work(partial(_run, setup), tasks)), key)
+            progress(f"\r{title}: {len(done)} of {len(rows)} rows   ")
+    progress("\n")
+    return done
 
 
-def _read(path: Path, row: str, kind: str, key: str) -> RowResult | None:
+def _read(path: Path, key: str) -> RowResult | None:
     try:
         metadata = pq.read_metadata(path).metadata or {}
         if metadata.get(_KEY) != key.encode():
             return None
-        return RowResult(row, kind, pl.read_parquet(path), tuple(json.loads(metadata[_NOTES])))
+        return RowResult(pl.read_parquet(path), tuple(json.loads(metadata[_NOTES])))
     except (OSError, ValueError, KeyError):
         return None
 
 
-def _write(path: Path, task: Task, parts: list[tuple[Task, list[tuple[Any, ...]], list[str]]], key: str) -> RowResult:
-    # Processes finish in any order; the file does not show it.
+def _write(path: Path, parts: list[_Done], key: str) -> RowResult:
     parts = sorted(parts, key=lambda p: p[0].log.as_posix())
     schema = dict.fromkeys(COLUMNS, pl.String) | {"value": pl.Float64, "n": pl.Int64}
-    table = pl.DataFrame([(task.row, *r) for _, rows, _ in parts for r in rows], schema=schema, orient="row")
+    table = pl.DataFrame([(task.row, *r) for task, rows, _ in parts for r in rows], schema=schema, orient="row")
     notes = tuple(dict.fromkeys(n for _, _, notes in parts for n in notes))
-    arrow = table.to_arrow()
-    arrow = arrow.replace_schema_metadata({_KEY: key.encode(), _NOTES: json.dumps(notes).encode()})
+    arrow = table.to_arrow().replace_schema_metadata({_KEY: key.encode(), _NOTES: json.dumps(notes).encode()})
     with PendingFile(path) as pending:
         pq.write_table(arrow, pending.path, compression="zstd")
-    return RowResult(task.row, task.kind, table, notes)
-
-
-_Done = tuple[Task, list[tuple[Any, ...]], list[str]]
+    return RowResult(table, notes)
 
 
 @contextmanager
-def _workers(setup: Setup, jobs: int) -> Iterator[Callable[[list[Task]], Iterator[_Done]]]:
-    """Yield a function that runs tasks, here or in processes, and yields what they give in any order."""
+def _workers(jobs: int) -> Iterator[Callable[..., Iterator[_Done]]]:
+    """Yield what maps a function over tasks, here or in processes."""
     if jobs == 1:
-        yield lambda todo: (_run(setup, task) for task in todo)
+        yield map
         return
     # Read by the fresh interpreters when they load the libraries: one thread each, parallel over drives.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-
-        def work(todo: list[Task]) -> Iterator[_Done]:
-            futures = [pool.submit(_run, setup, task) for task in todo]
-            try:
-                for future in as_completed(futures):
-                    yield future.result()
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
-
-        yield work
+        yield pool.map
 
 
 def _run(setup: Setup, task: Task) -> _Done:
-    rows, notes = {"score": _score, "grid": _grid, "budget": _budget}[task.kind](setup, task)
-    return task, [_cells(r) for r in rows], notes
-
-
-def _cells(r: MetricRow) -> tuple[Any, ...]:
-    return (r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.unit, r.n)
+    rows, notes = (_budget if task.kind == "budget" else _score)(setup, task)
+    return task, [(r.log, r.estimator, r.signal, r.segment, r.metric, r.value, r.unit, r.n) for r in rows], notes
 
 
 @cache
-def _loaded(vehicle: Path, model: Path | None) -> tuple[VehicleParameters, ModelBundle | None]:
-    return load_vehicle(vehicle), None if model is None else load_bundle(model)
-
-
-@cache
-def _calibration(model: Path | None) -> Calibration | None:
-    """Return the calibration in the model's folder, as ``pdhef run`` takes it."""
-    return None if model is None else find_calibration(None, model)
+def _loaded(car: Path, network: Path | None) -> Car:
+    return Car.load(car, network=network)
 
 
 @cache
 def _estimators(setup: Setup, available: frozenset[str], use_speed: bool) -> tuple[tuple[Estimator, ...], list[str]]:
     """Build estimators once a process: they are immutable, and the network takes longer to build than to run."""
-    vehicle, model = _loaded(setup.vehicle, setup.model)
-    ready, skipped = runnable(setup.estimators, vehicle, available, use_speed=use_speed, model=model)
+    ready, skipped = runnable(setup.estimators, setup.loaded, available, Options(use_speed))
     return tuple(ready), [f"{s.name} does not run: {s.reason}" for s in skipped]
 
 
 @cache
 def _grid_base(setup: Setup, use_speed: bool) -> HybridUkf | None:
-    vehicle, model = _loaded(setup.vehicle, setup.model)
-    if model is None:
+    if setup.loaded.network is None:
         return None
-    base = make_estimator(fixed_grid.BASE, vehicle, use_speed=use_speed, model=model)
+    base = make_estimator(fixed_grid.BASE, setup.loaded, Options(use_speed))
     return base if isinstance(base, HybridUkf) else None
 
 
 def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
-    vehicle, _ = _loaded(setup.vehicle, setup.model)
-    drive = read_drive(task.log, vehicle, task.log.stem, friction=task.friction)
+    drive = read_drive(task.log, setup.loaded, friction=task.friction)
     signals = told(drive, task.assume)
-    use_speed = task.assume.get("sensors") != "esp"
-    estimators, notes = _estimators(setup, signals.available, use_speed)
-    notes = list(notes)
+    estimators, skipped = _estimators(setup, signals.available, task.use_speed)
+    notes, intervals = list(skipped), calibrator(setup.loaded, estimators)
     rows: list[MetricRow] = []
-    for estimator in estimators:
+    for estimator in estimators if task.kind == "score" else ():
         try:
-            rows += run_and_score([estimator], signals, drive, vehicle.low_speed_blend_m_s, _calibration(setup.model))
+            track, _ = estimator.run(signals, None)
+            rows += score(intervals.add(track, signals), drive)
         except Exception as error:  # noqa: BLE001 (one estimator's failure on one drive is a result, not an end)
             notes.append(f"{estimator.name} failed on {task.row}/{drive.name}: {type(error).__name__}: {error}")
-    base = _grid_base(setup, use_speed)
+    base = _grid_base(setup, task.use_speed)
     if base is not None:
-        rows += fixed_grid.run_grid(base, signals, drive, vehicle.low_speed_blend_m_s)
+        rows += fixed_grid.run_grid(base, signals, drive)
     return rows, notes
 
 
-def _grid(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
-    vehicle, _ = _loaded(setup.vehicle, setup.model)
-    base = _grid_base(setup, task.assume.get("sensors") != "esp")
-    if base is None:
-        return [], []
-    drive = read_drive(task.log, vehicle, task.log.stem)
-    return list(fixed_grid.run_grid(base, told(drive, task.assume), drive, vehicle.low_speed_blend_m_s)), []
-
-
 @lru_cache(maxsize=256)
-def _fitted(car: str, friction: float, file: Path) -> VehicleParameters:
-    return error_budget.fit_vehicle(error_budget.choose_vehicle(car), friction, load_vehicle(file))
+def _fitted(car: str, friction: float, setup: Setup) -> VehicleParameters:
+    return error_budget.fit_vehicle(choose_vehicle(car), friction, setup.loaded.vehicle)
 
 
 def _budget(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     """Sideslip RMSE with nothing and with each cause taken away; the cause stands in ``segment``."""
-    vehicle, model = _loaded(setup.vehicle, setup.model)
+    car = setup.loaded
     run = error_budget.drive_again(task.entry)
-    fitted = _fitted(run.spec.vehicle, run.spec.friction, setup.vehicle)
+    fitted = _fitted(run.spec.vehicle, run.spec.friction, setup)
     rows: list[MetricRow] = []
-    notes: list[str] = []
     for cause in (None, *error_budget.causes_of(run.spec, task.assume)):
-        case = error_budget.without(run, cause, vehicle, task.assume, fitted)
-        ready, _ = runnable(
-            setup.estimators, case.vehicle, case.signals.available, use_speed=case.use_speed, model=model
-        )
+        case = error_budget.without(run, cause, car.vehicle, task.assume, fitted)
+        options = Options(case.use_speed)
+        ready, _ = runnable(setup.estimators, car.with_vehicle(case.vehicle), case.signals.available, options)
         for estimator in ready:
-            track, _ = estimator.run(case.signals, None)
-            error = signal_error(track, case.drive.truth, SIDESLIP, vehicle.low_speed_blend_m_s)
-            use = error[error == error]
-            if use.size:
-                rmse = summarise_errors(use)["rmse"]
-                name = "base" if cause is None else cause
-                rows.append(
-                    MetricRow(task.log.stem, estimator.name, SIDESLIP, name, "rmse", rmse, "rad", int(use.size))
-                )
-    return rows, notes
+            error = sideslip_error(estimator, case.drive, case.signals)
+            rows += rmse_row(task.log.stem, estimator.name, cause or "base", error)
+    return rows, []
 
 
 def as_frame(results: dict[str, RowResult]) -> pl.DataFrame:

@@ -1,10 +1,10 @@
 """The condition table (METHOD §10): every estimator on the same drives with one thing wrong in each row.
 
-    python -m studies.conditions --vehicle car.toml --model model/ [--drives 30] [--jobs 2] [--rows NAME,...]
+    python -m studies.conditions [--car CAR] [--network FOLDER] [--drives 30] [--jobs 2] [--rows NAME,...]
 
 Simulates the drives (``pdhef simulate conditions``; kept once made), runs all registered estimators that can run, and
 writes ``conditions.md`` with ``conditions/`` (tables as Parquet, plots) to ``--out``. Logs and the rows' results lie in
-``--work`` and are kept: a repeated call computes only rows whose drives, vehicle, model, settings or sources changed.
+``--work`` and are kept: a repeated call computes only rows whose drives, car, network, settings or sources changed.
 The independent simulator's runs join as a row where ``../shared`` lies beside the repository.
 """
 
@@ -14,20 +14,18 @@ import argparse
 import hashlib
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, check_names
+from pdhef_logtool.estimators.table import SPECS, check_names
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.sinks.report import tool_versions
 from studies import fixed_grid
 from studies.condition_drives import independent_runs
-from studies.condition_runs import ROOT, Setup, Task, as_frame, progress, run_rows
+from studies.condition_runs import Setup, Task, as_frame, progress, run_rows
 from studies.conditions_page import Facts, Tables, write_page
-from studies.independent_sim_logs import write_run
+from studies.pages import DOCS, ROOT, options
 from truthsim.conditions import ROW_NAMES, ROWS, write_conditions
 
-INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
 INDEPENDENT_ROW = "independent-simulator"
 #: The drives on which the best fixed setting is chosen have the table's seed plus this.
 CALIBRATION_SEED_OFFSET = 1000
@@ -39,22 +37,18 @@ BUDGET = ("phy-ukf-tuned", "phy-ukf")
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Return the command line's options."""
-    parser = argparse.ArgumentParser(prog="python -m studies.conditions", description=__doc__.splitlines()[0])
-    parser.add_argument("--vehicle", type=Path, default=ROOT / "sample_logs" / "vehicle.toml")
-    parser.add_argument("--model", type=Path, help="model bundle; without one no hybrid filter runs")
-    parser.add_argument("--estimators", default=",".join(DESCRIPTIONS), help="names, default all")
+    parser = options("conditions", __doc__)
+    parser.add_argument("--car", type=Path, default=Path("saloon"), help="default: the shipped one")
+    parser.add_argument("--network", type=Path, help="instead of the car's; none: no hybrid filter runs")
+    parser.add_argument("--estimators", default=",".join(s.name for s in SPECS), help="names, default all")
     parser.add_argument("--rows", default=",".join((*ROW_NAMES, INDEPENDENT_ROW)))
     parser.add_argument("--drives", type=int, default=30, help="drives a row")
-    parser.add_argument(
-        "--calibration-drives", type=int, default=10, help="drives a row to choose the fixed setting on"
-    )
-    parser.add_argument(
-        "--budget-drives", type=int, default=10, help="drives a row in the error budget; 0 leaves it out"
-    )
+    parser.add_argument("--calibration-drives", type=int, default=10, help="drives a row for the best fixed setting")
+    parser.add_argument("--budget-drives", type=int, default=10, help="drives a row in the error budget; 0: none")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "conditions")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
+    parser.add_argument("--out", type=Path, default=DOCS)
     given = parser.parse_args(arguments)
     given.estimators = tuple(given.estimators.split(","))
     given.rows = given.rows.split(",")
@@ -73,13 +67,8 @@ def simulated(given: argparse.Namespace, kind: str, drives: int, seed: int) -> d
     # A manifest holds what was asked for: one of some rows must not take the place of that of all.
     part = "" if set(rows) == set(ROW_NAMES) else "-" + hashlib.sha256(",".join(rows).encode()).hexdigest()[:8]
     folder = given.work / f"drives-{seed}-{drives}{part}"
-
-    def say(text: str, _share: float) -> None:
-        progress(f"\rsimulating (seed {seed}): {text}   ")
-
-    manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs, progress=say)
-    progress(f"\rsimulated (seed {seed}): {len(manifest['drives'])} drives        ")
-    progress("\n")
+    manifest = write_conditions(folder, drives=drives, seed=seed, rows=rows, processes=given.jobs)
+    progress(f"simulated (seed {seed}): {len(manifest['drives'])} drives")
     entries = {e["file"]: e for e in manifest["drives"]}
     return {
         row["name"]: [
@@ -94,19 +83,15 @@ def independent(work: Path) -> list[Task]:
     """Return the independent simulator's runs as tasks, converted to logs; none where they are not there."""
     folder = work / INDEPENDENT_ROW
     folder.mkdir(parents=True, exist_ok=True)
-    tasks = []
-    for source, friction in independent_runs(INDEPENDENT):
-        log = folder / f"{source.stem}.mcap"
-        if not log.is_file():
-            write_run(source, log)
-        digest = hashlib.sha256(source.read_bytes()).hexdigest()
-        tasks.append(Task("score", INDEPENDENT_ROW, log, digest, {}, friction=friction))
-    return tasks
+    return [
+        Task("score", INDEPENDENT_ROW, log, hashlib.sha256(source.read_bytes()).hexdigest(), {}, friction=friction)
+        for source, log, friction in independent_runs(folder)
+    ]
 
 
-def run(given: argparse.Namespace) -> Path:
-    """Do everything; returns the page."""
-    setup = Setup(given.vehicle, given.model, given.estimators)
+def run(given: argparse.Namespace) -> None:
+    """Do everything."""
+    setup = Setup(given.car, given.network, given.estimators)
     tasks = simulated(given, "score", given.drives, given.seed)
     absent = ""
     if INDEPENDENT_ROW in given.rows:
@@ -114,59 +99,53 @@ def run(given: argparse.Namespace) -> Path:
         if not tasks[INDEPENDENT_ROW]:
             absent = f"{INDEPENDENT_ROW} is left out: it needs ../shared beside the repository"
             progress(absent)
-    scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators", say=progress)
+    scored = run_rows(setup, tasks, given.work / "rows", jobs=given.jobs, title="estimators")
     if not scored:
         raise SystemExit("no drives to score")
     calibration = {}
-    if given.model is not None and given.calibration_drives > 0:
+    if setup.loaded.network is not None and given.calibration_drives > 0:
         grid = simulated(given, "grid", given.calibration_drives, given.seed + CALIBRATION_SEED_OFFSET)
-        folder = given.work / "calibration"
-        calibration = run_rows(setup, grid, folder, jobs=given.jobs, title="fixed settings", say=progress)
+        calibration = run_rows(setup, grid, given.work / "calibration", jobs=given.jobs, title="fixed settings")
     metrics = as_frame(scored)
     ran = set(metrics["estimator"].unique())
     budget = {}
     if given.budget_drives > 0:
         names = tuple(dict.fromkeys([*[n for n in BUDGET if n in ran][:1], *[n for n in SUBJECTS if n in ran][:1]]))
-        some = {
-            name: [Task("budget", t.row, t.log, t.sha256, t.assume, entry=t.entry) for t in row[: given.budget_drives]]
-            for name, row in tasks.items()
-            if name != INDEPENDENT_ROW
-        }
-        narrow = Setup(given.vehicle, given.model, names)
-        folder = given.work / "budget"
-        budget = run_rows(narrow, some, folder, jobs=given.jobs, title="error budget", say=progress)
+        tasks.pop(INDEPENDENT_ROW, None)
+        some = {n: [replace(t, kind="budget") for t in row[: given.budget_drives]] for n, row in tasks.items()}
+        narrow = replace(setup, estimators=names)
+        budget = run_rows(narrow, some, given.work / "budget", jobs=given.jobs, title="error budget")
     facts = Facts(
         command=_command(given),
-        setup={**setup.identity, "vehicle_file": given.vehicle.name},
+        car=setup.loaded.vehicle.name,
+        setup=setup.identity,
         rows={r.name: r.description for r in ROWS}
         | {INDEPENDENT_ROW: "runs of another simulator, friction as it says"},
         subject=next((n for n in SUBJECTS if n in ran), None),
         references=REFERENCES,
         order=given.estimators,
         notes=tuple(dict.fromkeys([*([absent] if absent else []), *(n for r in scored.values() for n in r.notes)])),
-        versions=tool_versions(),
         calibration_seed=given.seed + CALIBRATION_SEED_OFFSET,
     )
-    return write_page(given.out, facts, Tables(metrics, as_frame(calibration), as_frame(budget)))
+    write_page(given.out, facts, Tables(metrics, as_frame(calibration), as_frame(budget)))
 
 
 def _command(given: argparse.Namespace) -> str:
     """Return the command line that makes the page again; files by name only."""
-    words: list[Any] = ["python -m studies.conditions", "--vehicle", given.vehicle.name]
-    words += [] if given.model is None else ["--model", given.model.name]
-    words += ["--drives", given.drives, "--seed", given.seed, "--calibration-drives", given.calibration_drives]
-    words += ["--budget-drives", given.budget_drives]
-    return " ".join(map(str, words))
+    network = "" if given.network is None else f" --network {given.network.name}"
+    return (
+        f"python -m studies.conditions --car {given.car.name}{network} --drives {given.drives}"
+        f" --seed {given.seed} --calibration-drives {given.calibration_drives} --budget-drives {given.budget_drives}"
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Make the table; 1 with one line where an input is wrong."""
     try:
-        page = run(parse(arguments))
+        run(parse(arguments))
     except PdhefError as error:
         print(error, file=sys.stderr)
         return 1
-    print(page)
     return 0
 
 

@@ -7,21 +7,25 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
 import polars as pl
 
-from pdhef_logtool.estimators.registry import NOT_CAUSAL
+from pdhef_logtool import __version__
+from pdhef_logtool.estimators.table import SPECS
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.sinks.base import PendingFile, write_bytes
 from studies import fixed_grid
 from studies.condition_drives import BIN_LEAST_S, BINS, NONLINEAR, SIDESLIP
 from studies.error_budget import CAUSES
+from studies.pages import number, table, write
+from studies.pictures import save, subplots
 from studies.table_maths import (
     RESAMPLES,
     Bound,
     geometric_mean,
+    median,
     median_ratio,
     percentiles,
     pooled_mean,
@@ -31,6 +35,7 @@ from studies.table_maths import (
 )
 
 ALL = "all"
+NOT_CAUSAL = {s.name for s in SPECS if not s.causal}
 #: Below this share of the scorable stamps an RMSE is marked: it leaves out what the estimator gave up on.
 AVAILABLE = 0.99
 #: A bin with fewer drives is marked.
@@ -46,13 +51,13 @@ class Facts:
     """What the page says besides the figures. ``rows``: description by name, in order; ``order``: of the estimators."""
 
     command: str
-    setup: Mapping[str, Any]
+    car: str
+    setup: Mapping[str, str | None]
     rows: Mapping[str, str]
     subject: str | None
     references: Sequence[str]
     order: Sequence[str]
     notes: Sequence[str]
-    versions: Mapping[str, str]
     calibration_seed: int
 
 
@@ -97,9 +102,7 @@ class Figures:
 
     def estimators(self, row: str | None = None) -> set[str]:
         """Return who has a sideslip RMSE, anywhere or in a row."""
-        return {
-            k[1] for k in self._by if k[2:] == (SIDESLIP, ALL, "rmse") and (row is None or k[0] == row)
-        }  # fmt: skip
+        return {k[1] for k in self._by if k[2:] == (SIDESLIP, ALL, "rmse") and row in (None, k[0])}
 
     def rows(self) -> set[str]:
         """Return the rows that have figures."""
@@ -119,10 +122,9 @@ def choose_fixed(calibration: pl.DataFrame) -> Chosen | None:
     if calibration.is_empty():
         return None
     figures = Figures(calibration)
-    settings = sorted(figures.estimators())
     rows = sorted(figures.rows())
     scores = {
-        s: geometric_mean(np.array([percentiles(figures.get(r, s)[0], (50.0,))[0] for r in rows])) for s in settings
+        s: geometric_mean(np.array([median(figures.get(r, s)[0]) for r in rows])) for s in sorted(figures.estimators())
     }
     ranking = tuple(sorted(scores.items(), key=lambda item: (math.isnan(item[1]), item[1])))
     return Chosen(ranking[0][0], ranking) if ranking else None
@@ -136,13 +138,8 @@ def with_best(metrics: pl.DataFrame, chosen: Chosen | None) -> pl.DataFrame:
     return pl.concat([metrics, rows.with_columns(estimator=pl.lit(fixed_grid.BEST))])
 
 
-def median(values: FloatArray) -> float:
-    """Return the median over drives; NaN without any."""
-    return percentiles(values, (50.0,))[0]
-
-
-def write_page(out: Path, facts: Facts, given: Tables) -> Path:
-    """Write page, Parquet tables and plots; returns the page."""
+def write_page(out: Path, facts: Facts, given: Tables) -> None:
+    """Write page, Parquet tables and plots."""
     chosen = choose_fixed(given.calibration)
     tables = Tables(with_best(given.metrics, chosen), given.calibration, given.budget)
     figures = tables.figures
@@ -170,20 +167,7 @@ def write_page(out: Path, facts: Facts, given: Tables) -> Path:
         _plot_ratios(folder / "ratios.png", figures, rows, facts.subject, references)
         parts.append(f"![{facts.subject} against its references](conditions/ratios.png)\n")
     parts.insert(2, "![Sideslip RMSE by row](conditions/sideslip.png)\n")
-    page = out / "conditions.md"
-    write_bytes(page, "\n".join(p for p in parts if p).encode())
-    return page
-
-
-def table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table."""
-    lines = ["| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *body)]
-    return "\n".join(lines) + "\n"
-
-
-def number(value: float, digits: int = 3) -> str:
-    """Return a figure, a dash for NaN."""
-    return "–" if not math.isfinite(value) else f"{value:.{digits}f}"
+    write(out / "conditions.md", "\n".join(p for p in parts if p))
 
 
 def _deg(value: float, digits: int = 3) -> str:
@@ -191,27 +175,32 @@ def _deg(value: float, digits: int = 3) -> str:
 
 
 def _grid(rows: Sequence[str], names: Sequence[str], cell: Callable[[str, str], str], corner: str = "row") -> str:
-    return table([corner, *names], [[r, *(cell(r, n) for n in names)] for r in rows])
+    return _table([corner, *names], [[r, *(cell(r, n) for n in names)] for r in rows])
+
+
+def _table(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """Return a table with what parts it from the next."""
+    return table(head, body) + "\n"
 
 
 def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Sequence[str]) -> str:
-    model = facts.setup["model"]
-    used = f"`{facts.setup['vehicle_file']}` (sha256 {facts.setup['vehicle'][:12]})"
-    network = "none: no hybrid filter ran" if model is None else f"sha256 {model[:12]}"
-    calibration = facts.setup.get("calibration")
-    intervals = "as the estimators give them" if calibration is None else f"calibrated, sha256 {calibration[:12]}"
+    network, calibrated = facts.setup["network"], facts.setup["intervals"]
+    physics, noise = (str(facts.setup[k])[:12] for k in ("physics", "noise"))
+    used = f"{facts.car} (physics {physics}, noise {noise})"
+    ran = "none: no hybrid filter ran" if network is None else f"sha256 {network[:12]}"
+    intervals = "as the estimators give them" if calibrated is None else f"calibrated, sha256 {calibrated[:12]}"
     drives = {r: max(figures.get(r, n)[0].size for n in figures.estimators(r)) for r in rows}
     lines = [
         "# Condition table",
         "",
         f"Written by `{facts.command}`; every figure comes from that command.",
         "",
-        f"Vehicle file {used}; network {network}; pdhef-logtool {facts.versions.get('pdhef-logtool', '?')}.",
+        f"Car: {used}; network {ran}; pdhef-logtool {__version__}.",
         f"95 % intervals {intervals}.",
         "The vehicle file stays the same in all rows, whatever car is driven. Friction is told to every estimator from",
         "the drive, times the factor of the row, or not at all where the row says so. Truth is the simulator's state.",
         "",
-        table(["row", "drives", "what is different"], [[r, str(drives[r]), facts.rows[r]] for r in rows]),
+        _table(["row", "drives", "what is different"], [[r, str(drives[r]), facts.rows[r]] for r in rows]),
     ]
     if not_causal:
         knows = ", ".join(f"`{n}`" for n in not_causal)
@@ -221,14 +210,9 @@ def _head(facts: Facts, figures: Figures, rows: Sequence[str], not_causal: Seque
     return "\n".join(lines)
 
 
-def _availability(figures: Figures, row: str, name: str) -> float:
-    values, samples = figures.get(row, name, "availability")
-    return pooled_mean(values, samples) if values.size else float("nan")
-
-
 def _sideslip(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
     def mark(row: str, name: str) -> str:
-        return "†" if _availability(figures, row, name) < AVAILABLE else ""
+        return "†" if pooled_mean(*figures.get(row, name, "availability")) < AVAILABLE else ""
 
     def middle(row: str, name: str) -> str:
         return _deg(median(figures.get(row, name)[0])) + mark(row, name)
@@ -276,7 +260,7 @@ def _means(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
     pooled = over(lambda r, n: pooled_rmse(*figures.get(r, n)))
     body = [[n, _deg(m), _deg(p)] for n, m, p in zip(kept, medians, pooled, strict=True)]
     title = f"## Geometric mean over {len(shared)} rows, in degrees\n\nThe rows in which all of these ran.\n"
-    return f"{title}\n{table(['estimator', 'of the medians', 'of the pooled RMSE'], body)}"
+    return f"{title}\n{_table(['estimator', 'of the medians', 'of the pooled RMSE'], body)}"
 
 
 def ratios(figures: Figures, row: str, subject: str, reference: str) -> tuple[Bound, Bound]:
@@ -322,7 +306,7 @@ def _against(figures: Figures, rows: Sequence[str], subject: str | None, referen
             counts = [str(words.count(w)) for w in ("better", "not worse", "open", "worse")]
             body.append([reference, what, *counts, ", ".join(over) or "none"])
     head = ["reference", "of", "better", "not worse", "open", "worse", f"rows with a ratio above {MARGIN}"]
-    return "\n".join([*lines, table(head, body)])
+    return "\n".join([*lines, _table(head, body)])
 
 
 def _fixed(figures: Figures, rows: Sequence[str], chosen: Chosen | None, facts: Facts) -> str:
@@ -330,15 +314,14 @@ def _fixed(figures: Figures, rows: Sequence[str], chosen: Chosen | None, facts: 
     if chosen is None or not settings:
         return ""
     body = []
+    subject = facts.subject or fixed_grid.BEST
     for row in rows:
         medians = {s: median(figures.get(row, s)[0]) for s in settings if figures.get(row, s)[0].size}
         pooled = {s: pooled_rmse(*figures.get(row, s)) for s in medians}
         if medians:
-            m, p = (min(d, key=lambda s, d=d: d[s]) for d in (medians, pooled))
-            subject = facts.subject or fixed_grid.BEST
+            m, p = (min(d, key=d.__getitem__) for d in (medians, pooled))
             own = median(figures.get(row, subject)[0]), pooled_rmse(*figures.get(row, subject))
             body.append([row, m, _deg(medians[m]), _deg(own[0]), p, _deg(pooled[p]), _deg(own[1])])
-    subject = facts.subject or fixed_grid.BEST
     return "\n".join(
         [
             "## The best single fixed setting",
@@ -348,23 +331,17 @@ def _fixed(figures: Figures, rows: Sequence[str], chosen: Chosen | None, facts: 
             f"is the one with the least geometric mean over rows of the median on other drives (seed "
             f"{facts.calibration_seed}): **{chosen.name}**.",
             "",
-            table(["setting", "on the calibration drives, deg"], [[s, _deg(v)] for s, v in chosen.ranking[:5]]),
+            _table(["setting", "on the calibration drives, deg"], [[s, _deg(v)] for s, v in chosen.ranking[:5]]),
             "What nobody could have known beforehand, the best setting of each row on its own drives:",
             "",
-            table(
-                ["row", "best by median", "deg", f"`{subject}`", "best pooled", "deg", f"`{subject}`"],
-                body,
-            ),
+            _table(["row", "best by median", "deg", f"`{subject}`", "best pooled", "deg", f"`{subject}`"], body),
         ]
     )
 
 
 def _nonlinear(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
-    def cell(row: str, name: str) -> str:
-        return _deg(median(figures.get(row, name, segment=NONLINEAR)[0]))
-
     title = "## Sideslip RMSE in the nonlinear range (|a_y| > 0.5 μ g), in degrees: median over drives\n\n"
-    return title + _grid(rows, names, cell)
+    return title + _grid(rows, names, lambda row, name: _deg(median(figures.get(row, name, segment=NONLINEAR)[0])))
 
 
 def _consistency(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
@@ -411,10 +388,10 @@ def _coverage(figures: Figures, rows: Sequence[str], names: Sequence[str], subje
     ]
     first = rows[0]
     body = [[n, *(_bin_cell(figures, first, n, b) for b in BINS)] for n in banded]
-    lines += [f"All estimators in the row `{first}`:", "", table(["estimator", *limits], body)]
+    lines += [f"All estimators in the row `{first}`:", "", _table(["estimator", *limits], body)]
     if subject in banded:
         body = [[r, *(_bin_cell(figures, r, str(subject), b) for b in BINS)] for r in rows]
-        lines += [f"`{subject}` in all rows:", "", table(["row", *limits], body)]
+        lines += [f"`{subject}` in all rows:", "", _table(["row", *limits], body)]
     return "\n".join(lines)
 
 
@@ -425,19 +402,18 @@ def _lags(figures: Figures, rows: Sequence[str], names: Sequence[str]) -> str:
 
     if not names:
         return ""
-    title = (
-        "## Lag of sideslip / yaw rate in ms\n\nBy cross-correlation with the truth, median over drives; + is late.\n"
-    )
-    return f"{title}\n{_grid(rows, names, cell)}"
+    what = "By cross-correlation with the truth, median over drives; + is late."
+    return f"## Lag of sideslip / yaw rate in ms\n\n{what}\n\n{_grid(rows, names, cell)}"
 
 
 def _budget(budget: pl.DataFrame, rows: Sequence[str]) -> str:
     if budget.is_empty():
         return ""
     rmse: dict[tuple[str, str, str], float] = {}
-    for (row, estimator, cause), part in budget.group_by("row", "estimator", "segment"):
-        rmse[str(row), str(estimator), str(cause)] = pooled_rmse(part["value"].to_numpy(), part["n"].to_numpy())
-    drives = budget.group_by("row").agg(pl.col("drive").n_unique())["drive"].max()
+    for key, part in budget.group_by("row", "estimator", "segment"):
+        row, estimator, cause = map(str, key)
+        rmse[row, estimator, cause] = pooled_rmse(part["value"].to_numpy(), part["n"].to_numpy())
+    drives = max(part["drive"].n_unique() for _, part in budget.group_by("row"))
     lines = [
         "## Error budget",
         "",
@@ -462,7 +438,7 @@ def _budget(budget: pl.DataFrame, rows: Sequence[str]) -> str:
                 shares.append("–" if left is None else f"{100 * (1 - (left / base) ** 2):.0f} %")
             body.append([row, _deg(base), *shares, _deg(rmse.get((row, estimator, "all"), math.nan))])
         head = ["row", "pooled RMSE, deg", *CAUSES, "RMSE without all, deg"]
-        lines += [f"`{estimator}`:", "", table(head, body)]
+        lines += [f"`{estimator}`:", "", _table(head, body)]
     return "\n".join(lines)
 
 
@@ -493,52 +469,41 @@ def _write_parquet(folder: Path, tables: Tables, rows: Sequence[str], names: Seq
             frame.write_parquet(pending.path, compression="zstd", compression_level=19)
 
 
-def _figure(width: float, height: float) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots()
-
-
-def _save(figure: Any, path: Path) -> None:
-    with PendingFile(path) as pending:
-        figure.savefig(pending.path, format="png", metadata={"Software": None})
-
-
 def _plot_rows(path: Path, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> None:
     """Median with the span from the 10th to the 90th percentile, a line a row."""
-    figure, axes = _figure(9.0, 1.5 + 0.32 * len(rows))
-    step = 0.75 / max(len(names), 1)
-    for i, name in enumerate(names):
-        spans = np.degrees([percentiles(figures.get(r, name)[0]) for r in rows]).reshape(-1, 3)
-        y = np.arange(len(rows)) + (i - 0.5 * (len(names) - 1)) * step
-        colour = f"C{i}" if i < 10 else f"C{i - 10}"
-        axes.hlines(y, spans[:, 0], spans[:, 2], color=colour, linewidth=1.0, alpha=0.6)
-        axes.plot(spans[:, 1], y, "os^"[i // 10 % 3], markersize=3.0, color=colour, label=name)
-    axes.set(xscale="log", xlabel="sideslip RMSE in degrees: median and 10th to 90th percentile over drives")
-    axes.set_yticks(range(len(rows)), rows)
-    axes.invert_yaxis()
-    axes.grid(alpha=0.3, axis="x")
-    axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    _save(figure, path)
+    spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
+    label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
+    _plot(path, rows, spans, label, row_height=0.32, alpha=0.6, markers="os^")
 
 
 def _plot_ratios(path: Path, figures: Figures, rows: Sequence[str], subject: str, references: Sequence[str]) -> None:
     """Ratios of medians with their intervals."""
-    figure, axes = _figure(9.0, 1.5 + 0.3 * len(rows))
-    step = 0.75 / len(references)
-    for i, reference in enumerate(references):
+    spans = {}
+    for reference in references:
         bounds = [ratios(figures, r, subject, reference)[0] for r in rows]
-        y = np.arange(len(rows)) + (i - 0.5 * (len(references) - 1)) * step
-        axes.hlines(y, [b.low for b in bounds], [b.high for b in bounds], color=f"C{i}", linewidth=1.0, alpha=0.7)
-        axes.plot([b.value for b in bounds], y, "o", markersize=3.0, color=f"C{i}", label=reference)
-    axes.axvline(1.0, color="black", linewidth=0.8)
-    axes.axvline(MARGIN, color="black", linewidth=0.8, linestyle=":")
-    axes.set(xscale="log", xlabel=f"median sideslip RMSE of {subject} over that of the reference, 95 % interval")
+        spans[reference] = np.array([(b.low, b.value, b.high) for b in bounds])
+    label = f"median sideslip RMSE of {subject} over that of the reference, 95 % interval"
+    _plot(path, rows, spans, label, row_height=0.3, alpha=0.7, markers="o", limits={1.0: "-", MARGIN: ":"})
+
+
+def _plot(
+    path: Path, rows: Sequence[str], spans: Mapping[str, FloatArray], label: str, *,
+    row_height: float, alpha: float, markers: str, limits: Mapping[float, str] = MappingProxyType({}),
+) -> None:  # fmt: skip
+    """Draw low, middle and high [rows, 3] of every name, a line a row."""
+    fig, grid = subplots(1, 1, 9.0, 1.5 + row_height * len(rows), {})
+    axes = grid[0, 0]
+    step = 0.75 / max(len(spans), 1)
+    for i, (name, span) in enumerate(spans.items()):
+        y = np.arange(len(rows)) + (i - 0.5 * (len(spans) - 1)) * step
+        marker, colour = markers[i // 10 % len(markers)], f"C{i % 10}"
+        axes.hlines(y, span[:, 0], span[:, 2], color=colour, linewidth=1.0, alpha=alpha)
+        axes.plot(span[:, 1], y, marker, markersize=3.0, color=colour, label=name)
+    for at, dash in limits.items():
+        axes.axvline(at, color="black", linewidth=0.8, linestyle=dash)
+    axes.set(xscale="log", xlabel=label)
     axes.set_yticks(range(len(rows)), rows)
     axes.invert_yaxis()
     axes.grid(alpha=0.3, axis="x")
     axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    _save(figure, path)
+    save(fig, path)

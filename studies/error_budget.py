@@ -37,7 +37,14 @@ from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, WHEELS, Channel, FloatArray, Signals
 from pdhef_logtool.records.tracks import make_track
 from studies.condition_drives import ConditionDrive, told
-from studies.defaults.fit_nominal_tyres import LINEAR_A_Y_M_S2, SCALE, SPEED_KM_H, fit_axle
+from studies.defaults.fit_nominal_tyres import (
+    LINEAR_A_Y_M_S2,
+    axle_curves,
+    axle_loads_n,
+    fit_axle,
+    ramp,
+    roll_gradient_rad_per_m_s2,
+)
 from truthsim.batch import DriveSpec, sensor_noise
 from truthsim.drive import START_NS, reference_steer_rad
 from truthsim.faults import apply_faults, parse_fault, rtk_outages
@@ -48,16 +55,9 @@ from truthsim.vehicle import Vehicle
 from truthsim.vehicle_choice import choose_vehicle
 
 CAUSES = ("told", "vehicle", "bias", "noise", "tilt", "delay", "fault", "all")
-_BIASES = {
-    "acceleration_bias_m_s2": 0.0,
-    "yaw_rate_bias_rad_s": 0.0,
-    "steer_bias_rad": 0.0,
-    "wheel_scale": 0.0,
-    "acceleration_walk_m_s2": 0.0,
-    "yaw_rate_walk_rad_s": 0.0,
-    "steer_gain": 0.0,
-}
-_WHITE = {"acceleration_m_s2": 0.0, "yaw_rate_rad_s": 0.0, "steer_rad": 0.0, "wheel_speed_m_s": 0.0}
+_BIASES = ("acceleration_bias_m_s2", "yaw_rate_bias_rad_s", "steer_bias_rad", "wheel_scale", "steer_gain",
+           "acceleration_walk_m_s2", "yaw_rate_walk_rad_s")  # fmt: skip
+_WHITE = ("acceleration_m_s2", "yaw_rate_rad_s", "steer_rad", "wheel_speed_m_s")
 _SENSOR_OF = {"imu": ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"), "steering": ("steer_rad",)}
 
 
@@ -127,9 +127,9 @@ def without(
     assume : what the row tells the estimator.
     """
     gone = set(CAUSES[:-1]) if cause == "all" else {cause}
-    noise = run.noise._replace(**(_BIASES if "bias" in gone else {}))._replace(**(_WHITE if "noise" in gone else {}))
-    if "delay" in gone:
-        noise = noise._replace(can_delay_s=0.0, jitter_s=0.0)
+    silent = {"bias": _BIASES, "noise": _WHITE, "delay": ("can_delay_s", "jitter_s")}
+    names = [name for cause, kinds in silent.items() if cause in gone for name in kinds]
+    noise = run.noise._replace(**dict.fromkeys(names, 0.0))
     faults = [f for f in map(parse_fault, run.spec.faults) if _group(f.kind) not in gone]
     seed = run.spec.seed
     channels = apply_faults(
@@ -189,7 +189,7 @@ def as_read(channels: Mapping[str, SensorChannel], run: Rerun, vehicle: VehicleP
             for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
         },
     )
-    return ConditionDrive(run.name, signals, truth, signals.friction)
+    return ConditionDrive(run.name, signals, truth, vehicle.low_speed_blend_m_s)
 
 
 def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> VehicleParameters:
@@ -200,22 +200,16 @@ def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> Ve
     SimulationError
         The car cannot be driven through the ramp.
     """
-    ramp = MANOEUVRES["ramp-steer"]
-    speed = SPEED_KM_H / 3.6
-    request = Request(speed, friction, seed=0, duration_s=ramp.default_duration_s(speed), scale=SCALE)
-    motion = simulate_motion(ramp.plan(request), friction, vehicle=car)
-    a_y, roll = motion.column("ay_m_s2"), motion.column("roll_rad")
-    if not np.isfinite(a_y).all():
+    motion = ramp(friction, car)
+    if not np.isfinite(motion.column("ay_m_s2")).all():
         raise SimulationError(expected="a finite ramp steer", got="NaN or infinity", where="error budget")
-    small = np.abs(a_y) < min(LINEAR_A_Y_M_S2, 0.5 * friction * GRAVITY_M_S2)
-    tyres = {}
-    for axle, (alpha, force) in _axle_curves(motion, car).items():
+    tyres, loads_n = {}, axle_loads_n(car)
+    for axle, (alpha, force) in axle_curves(motion, car).items():
         # Beyond the peak the car slides in ever other ways; the curve is fitted up to it.
         whole = slice(0, int(np.argmax(force)) + 1)
-        arm = car.cg_to_rear_axle_m if axle == "front" else car.cg_to_front_axle_m
-        load = car.mass_kg * GRAVITY_M_S2 * arm / (car.cg_to_front_axle_m + car.cg_to_rear_axle_m)
-        fit = fit_axle(alpha[whole] / friction, force[whole] / friction, load)
+        fit = fit_axle(alpha[whole] / friction, force[whole] / friction, loads_n[axle])
         tyres[axle] = AxleTyre(B=fit.B, C=fit.C, D_n=fit.D_n, E=fit.E, reference_friction=1.0)
+    linear_m_s2 = min(LINEAR_A_Y_M_S2, 0.5 * friction * GRAVITY_M_S2)
     return vehicle.model_copy(
         update={
             "mass_kg": car.mass_kg,
@@ -224,19 +218,7 @@ def fit_vehicle(car: Vehicle, friction: float, vehicle: VehicleParameters) -> Ve
             "cg_to_rear_axle_m": car.cg_to_rear_axle_m,
             "track_m": car.track_m,
             "cg_height_m": car.cg_height_m,
-            "roll_gradient_rad_per_m_s2": float(np.polyfit(a_y[small], roll[small], 1)[0]),
+            "roll_gradient_rad_per_m_s2": roll_gradient_rad_per_m_s2(motion, linear_m_s2),
             "tyres": Tyres(front=tyres["front"], rear=tyres["rear"]),
         }
     )
-
-
-def _axle_curves(motion: Motion, car: Vehicle) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Slip angle (rad) and lateral force (N) of both axles by Newton and Euler, as ``fit_nominal_tyres`` does."""
-    lf, lr = car.cg_to_front_axle_m, car.cg_to_rear_axle_m
-    v_x, v_y, r, steer = (motion.column(k) for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad"))
-    force = car.mass_kg * motion.column("ay_m_s2")
-    front = (lr * force + car.yaw_inertia_kg_m2 * motion.column("yaw_acceleration_rad_s2")) / (lf + lr)
-    return {
-        "front": (steer - np.arctan2(v_y + lf * r, v_x), front / np.cos(steer)),
-        "rear": (-np.arctan2(v_y - lr * r, v_x), force - front),
-    }

@@ -6,15 +6,14 @@ row, the one that nobody could have known beforehand. All settings share one pas
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.evaluation.metrics import ALL, MetricRow, signal_error, summarise_errors
+from pdhef_logtool.evaluation.metrics import ALL, MetricRow
 from pdhef_logtool.records.signals import Signals
-from studies.condition_drives import SIDESLIP, ConditionDrive, bin_masks
+from studies.condition_drives import ConditionDrive, bin_masks, rmse_row
 
 TRUSTS = (0.0, 0.5, 1.0)
 #: Factors on the 1-sigma of a_y and on all of the process noise, from those of the hybrid filter with fixed noise.
@@ -46,7 +45,7 @@ GRID = tuple(Setting(*point) for point in product(TRUSTS, AY_FACTORS, Q_FACTORS)
 
 def is_setting(name: str) -> bool:
     """Tell whether an estimator's name is one of the grid."""
-    return re.match(rf"{PREFIX}\(", name) is not None
+    return name.startswith(f"{PREFIX}(")
 
 
 def at(base: HybridUkf, setting: Setting) -> HybridUkf:
@@ -62,17 +61,12 @@ def at(base: HybridUkf, setting: Setting) -> HybridUkf:
     )
 
 
-def run_grid(
-    base: HybridUkf, signals: Signals, drive: ConditionDrive, low_speed_m_s: float, grid: tuple[Setting, ...] = GRID
-) -> Iterator[MetricRow]:
+def run_grid(base: HybridUkf, signals: Signals, drive: ConditionDrive) -> Iterator[MetricRow]:
     """Yield the sideslip RMSE and availability of every setting, over everything and in the nonlinear range."""
     rate, _, _ = base.residual_rate(signals, None)
     masks = {name: m for name, m in bin_masks(drive).items() if name in (ALL, "nonlinear")}
-    for setting in grid:
+    for setting in GRID:
         track, _ = at(base, setting).filter.run(signals, None, setting.trust * rate)
-        error = signal_error(track, drive.truth, SIDESLIP, low_speed_m_s)
+        error = drive.error(track)
         for segment, mask in masks.items():
-            use = error[mask & (error == error)]
-            if use.size:
-                rmse = summarise_errors(use)["rmse"]
-                yield MetricRow(drive.name, setting.name, SIDESLIP, segment, "rmse", rmse, "rad", int(use.size))
+            yield from rmse_row(drive.name, setting.name, segment, error[mask])

@@ -9,24 +9,22 @@ docs/friction.md.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measuring import ROOT
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.friction_bank import USUAL_FRICTION, FrictionBank
-from pdhef_logtool.estimators.registry import make_estimator
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
-from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
-from studies.condition_drives import SIDESLIP, ConditionDrive, read_drive
+from studies.condition_drives import ConditionDrive, read_drive, root_mean_square, sideslip_error
+from studies.pages import DOCS, SAMPLE_VEHICLE, fill, options, table, write
 from truthsim.drive import simulate_drive, write_drive
 
 FIRST_SEED = 6100
@@ -44,8 +42,7 @@ PLAN: dict[str, tuple[float, float | None]] = {
 ORDINARY = "road"
 ESTIMATORS = ("phy-ukf", "pd-hef")
 TOLD = ("true", "1", "0.85", "estimated")
-DOCUMENT = ROOT / "docs" / "friction.md"
-BEGIN, END = "<!-- measured: python -m studies.friction --write-docs -->", "<!-- end -->"
+DOCUMENT = DOCS / "friction.md"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,55 +60,42 @@ class Outcome:
     rmse_seen_deg: Mapping[tuple[str, str], float]
 
 
-def measure(
-    drive: ConditionDrive, manoeuvre: str, friction: float, vehicle: VehicleParameters, model: ModelBundle
-) -> Outcome:
+def measure(drive: ConditionDrive, manoeuvre: str, friction: float, car: Car) -> Outcome:
     """Estimate the friction of a drive, and run every estimator with every friction that it may be told."""
-    found, _ = FrictionBank(vehicle).run(drive.signals, None)
+    found, _ = FrictionBank(car.vehicle).run(drive.signals, None)
     told = {
-        "true": drive.friction,
+        "true": drive.signals.friction,
         "1": np.ones(len(drive.signals)),
         "0.85": np.full(len(drive.signals), 0.85),
         "estimated": found.friction,
     }
     rmse, rmse_seen = {}, {}
-    for name in ESTIMATORS:
-        for how in TOLD:
-            estimator = make_estimator(name, vehicle, use_speed=True, model=model)
-            track, _ = estimator.run(replace(drive.signals, friction=told[how]), None)
-            error = np.degrees(signal_error(track, drive.truth, SIDESLIP, vehicle.low_speed_blend_m_s))
-            rmse[name, how] = root_mean_square(error)
-            rmse_seen[name, how] = root_mean_square(error[found.observable])
-    return Outcome(manoeuvre, friction, np.abs(found.friction - drive.friction), found.observable, rmse, rmse_seen)
-
-
-def root_mean_square(error: FloatArray) -> float:
-    """Return the root mean square of what is known of an error [N]; NaN for nothing."""
-    known = error[np.isfinite(error)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+    for name, how in product(ESTIMATORS, TOLD):
+        given = replace(drive.signals, friction=told[how])
+        error = np.degrees(sideslip_error(make_estimator(name, car), drive, given))
+        rmse[name, how] = root_mean_square(error)
+        rmse_seen[name, how] = root_mean_square(error[found.observable])
+    return Outcome(
+        manoeuvre, friction, np.abs(found.friction - drive.signals.friction), found.observable, rmse, rmse_seen
+    )
 
 
 def measure_all(folder: Path) -> list[Outcome]:
     """Simulate and measure every drive; one that spins is left out, with a line on stderr."""
-    vehicle = load_vehicle(ROOT / "sample_logs" / "vehicle.toml")
-    model = open_model(None)
-    if model is None:
-        raise SystemExit("no shipped model: pdhef train writes one")
+    car = Car.load(SAMPLE_VEHICLE)
     outcomes = []
-    seed = FIRST_SEED
-    for manoeuvre, (speed, duration) in PLAN.items():
-        for friction in FRICTIONS:
-            seed += 1
-            path = folder / f"{manoeuvre}-{seed}.mcap"
-            print(f"{manoeuvre}, friction {friction:g}", file=sys.stderr)
-            try:
-                made = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration)
-            except SimulationError as error:
-                print(f"left out: {error}", file=sys.stderr)
-                continue
-            write_drive(made, path)
-            outcomes.append(measure(read_drive(path, vehicle, path.stem), manoeuvre, friction, vehicle, model))
-            path.unlink()
+    for seed, (manoeuvre, friction) in enumerate(product(PLAN, FRICTIONS), start=FIRST_SEED + 1):
+        speed, duration = PLAN[manoeuvre]
+        path = folder / f"{manoeuvre}-{seed}.mcap"
+        print(f"{manoeuvre}, friction {friction:g}", file=sys.stderr)
+        try:
+            made = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration)
+        except SimulationError as error:
+            print(f"left out: {error}", file=sys.stderr)
+            continue
+        write_drive(made, path)
+        outcomes.append(measure(read_drive(path, car), manoeuvre, friction, car))
+        path.unlink()
     return outcomes
 
 
@@ -124,12 +108,9 @@ def groups(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
     return {name: found for name, found in named.items() if found}
 
 
-def friction_table(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the table of the estimate itself."""
-    lines = [
-        "| drives, friction | drives | observable, % of the time | error there: median | 95 % | if none is seen |",
-        "| --- | ---: | ---: | ---: | ---: | ---: |",
-    ]
+def tables(outcomes: Sequence[Outcome]) -> str:
+    """Return the tables of the estimate itself, and of the sideslip errors: root mean square and median over drives."""
+    body = []
     for name, found in groups(outcomes).items():
         seen = np.concatenate([o.observable for o in found])
         error = np.concatenate([o.error for o in found])[seen]
@@ -137,59 +118,41 @@ def friction_table(outcomes: Sequence[Outcome]) -> list[str]:
         figures = ["", "", ""]
         if error.size:
             figures = [f"{v:.3f}" for v in (np.median(error), np.quantile(error, 0.95), np.median(prior))]
-        lines.append(f"| {name} | {len(found)} | {100 * seen.mean():.0f} | " + " | ".join(figures) + " |")
-    return lines
+        body.append([name, str(len(found)), f"{100 * seen.mean():.0f}", *figures])
+    head = ["drives, friction", "drives", "observable, % of the time", "error there: median", "95 %", "if none is seen"]
+    estimate = table(head, body, right_from=1)
 
-
-def sideslip_table(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the table of the sideslip errors: root mean square and median over the drives."""
-    cells = [(e, how) for e in ESTIMATORS for how in TOLD]
+    cells = list(product(ESTIMATORS, TOLD))
     limit = [o for o in outcomes if o.manoeuvre != ORDINARY]
     rows = {m: [[o.rmse_deg[c] for o in outcomes if o.manoeuvre == m] for c in cells] for m in PLAN}
     rows["manoeuvres"] = [[o.rmse_deg[c] for o in limit] for c in cells]
-    seen = [o for o in limit if np.isfinite(o.rmse_seen_deg[cells[0]])]
-    rows["manoeuvres, where observable"] = [[o.rmse_seen_deg[c] for o in seen] for c in cells]
-    lines = [
-        "| drives | over them | " + " | ".join(f"{name}: {how}" for name, how in cells) + " |",
-        "| --- | --- |" + " ---: |" * len(cells),
-    ]
+    seen_at_all = [o for o in limit if np.isfinite(o.rmse_seen_deg[cells[0]])]
+    rows["manoeuvres, where observable"] = [[o.rmse_seen_deg[c] for o in seen_at_all] for c in cells]
+    body = []
     for name, columns in rows.items():
         pooled = [np.sqrt(np.mean(np.square(c))) for c in columns]
         median = [np.median(c) for c in columns]
         for how, values in ((f"{len(columns[0])}, root mean square", pooled), ("median", median)):
-            lines.append(f"| {name} | {how} | " + " | ".join(f"{v:.3f}" for v in values) + " |")
-    return lines
+            body.append([name, how, *(f"{v:.3f}" for v in values)])
+    sideslip = table(["drives", "over them", *(f"{name}: {how}" for name, how in cells)], body, right_from=2)
+    last = FIRST_SEED + len(PLAN) * len(FRICTIONS)
+    drives = f"{len(outcomes)} drives of seeds {FIRST_SEED + 1} to {last}: {', '.join(PLAN)}."
+    told = "Sideslip RMSE of the drives in degrees, by the friction told:"
+    return "\n\n".join([drives, estimate, told, sideslip])
 
 
-def tables(outcomes: Sequence[Outcome]) -> str:
-    """Return both tables as Markdown."""
-    return "\n".join(
-        [
-            f"{len(outcomes)} drives of seeds {FIRST_SEED + 1} to {FIRST_SEED + len(PLAN) * len(FRICTIONS)}: "
-            f"{', '.join(PLAN)}.",
-            "",
-            *friction_table(outcomes),
-            "",
-            "Sideslip RMSE of the drives in degrees, by the friction told:",
-            "",
-            *sideslip_table(outcomes),
-        ]
-    )
-
-
-def main() -> int:
+def main() -> None:
     """Measure, print, and write if asked for."""
-    parser = argparse.ArgumentParser(prog="python -m studies.friction", description=__doc__.splitlines()[0])
+    parser = options("friction", __doc__)
     parser.add_argument("--write-docs", action="store_true", help=f"put the tables into {DOCUMENT.name}")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         text = tables(measure_all(Path(folder)))
     print(text)
     if arguments.write_docs:
-        head, rest = DOCUMENT.read_text(encoding="utf-8").split(BEGIN)
-        DOCUMENT.write_text(f"{head}{BEGIN}\n{text}\n{END}{rest.split(END, 1)[1]}", encoding="utf-8")
-    return 0
+        page = DOCUMENT.read_text(encoding="utf-8")
+        write(DOCUMENT, fill(page, {"measured": text}, DOCUMENT.name))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -1,17 +1,15 @@
 """Turn the independent simulator's runs (Parquet) into logs as a recorder would leave them.
 
-    python -m studies.independent_sim_logs [../shared/data/independent_sim] [out/independent_sim]
-
 Topics and types are those of the simulated sample logs, so that the same mapping reads both: IMU, steering and wheel
 speeds from the runs' sensor columns, ``/truth/perfect/odometry`` from their states. The runs' licence keeps them out of
-the repository: ``out/`` is ignored by git.
+the repository.
 """
 
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -22,17 +20,16 @@ from truthsim.recording import STEERING_REPORT, quaternion
 
 START_NS = 1_767_225_600_000_000_000
 RADIUS_M = 0.30
-ROOT = Path(__file__).resolve().parents[1]
 
 
-def write_run(source: Path, target: Path) -> int:
-    """Write one run as MCAP and return the number of samples."""
+def write_run(source: Path, target: Path) -> None:
+    """Write one run as MCAP."""
     run = pl.read_parquet(source)
     facts = json.loads(source.with_suffix(".json").read_text(encoding="utf-8"))
     column = {name: run[name].to_numpy().astype(np.float64) for name in run.columns}
     stamps = START_NS + np.round((column["t"] - column["t"][0]) * 1e6).astype(np.int64) * 1000
     zero = np.zeros(stamps.shape[0])
-    topics = {
+    topics: dict[str, tuple[str, dict[str, Any], dict[str, Any], str | None]] = {
         "/imu/data": (
             "sensor_msgs/msg/Imu",
             {"header.frame_id": "base_link", "orientation_covariance": [-1.0] + [0.0] * 8},
@@ -78,21 +75,3 @@ def write_run(source: Path, target: Path) -> int:
             writer.add_topic(topic, type_name, constants=constants, definition=definition)
         writer.metadata("independent_sim", {"run": str(facts["run"]), "friction": repr(facts["mu"])})
         writer.write([TopicBatch(topic, stamps, stamps, fields) for topic, (_, _, fields, _) in topics.items()])
-    return int(stamps.shape[0])
-
-
-def main(source: Path, target: Path) -> None:
-    """Convert every run of a folder."""
-    runs = sorted(source.glob("*.parquet"))
-    if not runs:
-        raise SystemExit(f"{source}: expected Parquet runs, got none")
-    target.mkdir(parents=True, exist_ok=True)
-    for path in runs:
-        log = target / f"{path.stem}.mcap"
-        print(f"{log}: {write_run(path, log)} samples")
-
-
-if __name__ == "__main__":
-    given = [Path(argument) for argument in sys.argv[1:]]
-    defaults = [ROOT.parent / "shared" / "data" / "independent_sim", ROOT / "out" / "independent_sim"]
-    main(*given, *defaults[len(given) :])

@@ -1,7 +1,5 @@
 """Short drives of many simulated cars, each with a vehicle file of its own: what one network for many cars learns from.
 
-    python -m studies.many_cars [-o out/many-cars] [--cars 300] [--jobs 2]
-
 Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
 that no network ever saw. A car's file is fitted to a ramp steer of it (``error_budget.fit_vehicle``), as somebody who
 has measured his car would have it. Drives are split by car.
@@ -9,23 +7,21 @@ has measured his car would have it. Drives are split by car.
 
 from __future__ import annotations
 
-import argparse
-import os
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_to_toml
+from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.records.errors import SimulationError
 from studies.error_budget import fit_vehicle
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
 from truthsim.sensors import SensorNoise
 from truthsim.suite import draw_spec
-from truthsim.vehicle import GRAVITY_M_S2, Vehicle
+from truthsim.vehicle import GRAVITY_M_S2
 from truthsim.vehicle_choice import choose_vehicle
 
 SEED = 4000
@@ -59,7 +55,7 @@ _ATTEMPTS = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Car:
+class DrawnCar:
     """One car: its name as ``--vehicle`` takes it, its file, and the sensors that it has."""
 
     text: str
@@ -67,7 +63,7 @@ class Car:
     sensors: tuple[tuple[str, float], ...]
 
 
-def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str, ...] = KINDS) -> Car:
+def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str, ...] = KINDS) -> DrawnCar:
     """Draw a car that understeers and can be driven through a ramp steer, with its vehicle file."""
     while True:
         kind = str(rng.choice(kinds))
@@ -83,18 +79,8 @@ def draw_car(rng: np.random.Generator, base: VehicleParameters, kinds: tuple[str
             fitted = fit_vehicle(car, FIT_FRICTION, base)
         except (SimulationError, ValueError):
             continue  # rolls over or spins in the ramp
-        return Car(text, _file_of(car, fitted, text), _sensors(rng))
-
-
-def _file_of(car: Vehicle, fitted: VehicleParameters, name: str) -> VehicleParameters:
-    return fitted.model_copy(
-        update={
-            "name": name,
-            "wheel_radius_m": car.wheel_radius_m,
-            "steering_ratio": car.steering_ratio,
-            "network": Network(),  # the base file's is about another car
-        }
-    )
+        own = {"name": text, "wheel_radius_m": car.wheel_radius_m, "steering_ratio": car.steering_ratio}
+        return DrawnCar(text, fitted.model_copy(update=own), _sensors(rng))
 
 
 def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
@@ -118,7 +104,7 @@ def plan_cars(
         rng = np.random.default_rng(np.random.SeedSequence(entropy=seed, spawn_key=(500, index)))
         car = draw_car(rng, base, kinds)
         file = f"cars/car_{index:04d}.toml"
-        (folder / file).write_text(vehicle_to_toml(car.vehicle), encoding="utf-8")
+        (folder / file).write_text(vehicle_toml(car.vehicle), encoding="utf-8")
         place = (index + 0.5) / cars
         facts: list[tuple[str, Any]] = [
             ("vehicle_file", file),
@@ -130,7 +116,7 @@ def plan_cars(
     return jobs
 
 
-def _spec(rng: np.random.Generator, car: Car) -> DriveSpec:
+def _spec(rng: np.random.Generator, car: DrawnCar) -> DriveSpec:
     return replace(draw_spec(rng, duration_s=DRIVE_S, vehicle=car.text), sensors=car.sensors)
 
 
@@ -139,32 +125,5 @@ def write_cars(
 ) -> dict[str, Any]:
     """Write a set of many cars and its manifest; drives that are there as they should be are kept."""
     planned = plan_cars(cars, drives, seed, folder, load_vehicle(BASE), kinds)
-    head = {"command": "python -m studies.many_cars", "seed": seed, "cars": cars, "drives_per_car": drives}
+    head = {"command": "python -m studies.many_cars_table", "seed": seed, "cars": cars, "drives_per_car": drives}
     return run_jobs(planned, folder, head, processes=jobs)
-
-
-def main() -> int:
-    """Write the set."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=Path("out/many-cars"))
-    parser.add_argument("--cars", type=int, default=CARS)
-    parser.add_argument("--drives", type=int, default=DRIVES_PER_CAR, help="of each car")
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--kinds", nargs="+", default=list(KINDS), help="sedan, suv, hatchback")
-    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
-    given = parser.parse_args()
-    manifest = write_cars(
-        given.output,
-        cars=given.cars,
-        drives=given.drives,
-        seed=given.seed,
-        jobs=given.jobs,
-        kinds=tuple(given.kinds),
-    )
-    made = sum("sha256" in e for e in manifest["drives"])
-    print(f"{made} drives of {given.cars} cars in {given.output}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

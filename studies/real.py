@@ -1,60 +1,61 @@
 """Recorded drives: fit on one part, score once on another that took no part in anything (METHOD §10, §14).
 
-    python -m studies.real [--model model/] [--out docs] [--trials 64] [--cases 250lm,...]
+    python -m studies.real [--network model/] [--out docs] [--trials 64] [--cases 250lm,...]
 
 Where a case has a part to fit on, the vehicle is identified there, a linear regression is fitted there, and the network
-is trained on the first 80 % of it: alone, and from ``--model`` as its start. The rest of the part says how far each
+is trained on the first 80 % of it: alone, and from ``--network`` as its start. The rest of the part says how far each
 network may be trusted. The filters' noise is then tuned on the part with the same trials for each. Every figure is on
 the other part, with an interval by bootstrap of blocks. The other cases are scored with their catalogue vehicle and
-``--model`` as they are. The drives lie in ``../shared`` and may not be redistributed: where they are absent it says so
-and ends with 0, and the page holds figures only.
+``--network`` as they are. The drives lie in ``../shared`` and may not be redistributed: where they are absent it says
+so and ends with 0, and the page holds figures only.
 """
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import butter, sosfilt
 
-from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import Trust
+from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator, runnable
-from pdhef_logtool.estimators.trust_policy import allowed_trust
+from pdhef_logtool.estimators.table import SPECS, runnable
 from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference, block_bootstrap_interval
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive
+from pdhef_logtool.learning.car.identify_command import identify
 from pdhef_logtool.learning.evidence.trust import decide_cap
 from pdhef_logtool.learning.evidence.trust_command import errors_by_trust
-from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
-from pdhef_logtool.records.signals import FloatArray, Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.residual_model.bundle import ModelBundle, load_bundle
-from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig, time_slice
-from pdhef_logtool.sinks.base import write_bytes
-from studies.conditions_page import number, table
-from studies.identify_250lm import _features as regression_features
+from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.residual_model.bundle import NO_MODEL, ModelBundle
+from pdhef_logtool.runs.config import RunConfig
+from studies.condition_drives import SIDESLIP
+from studies.fine_tuning import train_on_parts
+from studies.pages import DOCS, DRIVES, ROOT, number, options, table, write
 
-ROOT = Path(__file__).resolve().parents[1]
-DRIVES = ROOT.parent / "shared" / "data" / "drives"
 REFERENCE = ROOT / "tests" / "reference"
 #: Share of the fit part that the network learns from; the rest, behind a guard, stops its training.
 TRAIN_SHARE, GUARD_S = 0.8, 5.0
 #: Against which all others are judged, the first that ran.
 YARDSTICKS = ("phy-ukf-tuned, identified", "phy-ukf, catalogue")
 
-Say = Callable[[str], None]
+
+def say(text: str) -> None:
+    """Tell who waits."""
+    print(text, file=sys.stderr)
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +66,11 @@ class Part:
     start_s: float = 0.0
     end_s: float | None = None
 
-    def config(self, **more: object) -> RunConfig:
-        """Return the slice as a configuration."""
+    @property
+    def config(self) -> RunConfig:
+        """The slice as a configuration."""
         end = None if self.end_s is None else f"{self.end_s:g}"
-        return replace(RunConfig(start=f"{self.start_s:g}", end=end), **more)
+        return RunConfig(start=f"{self.start_s:g}", end=end)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +87,7 @@ class Case:
     remark: str = ""
 
 
+_SPINS = "Drifts and spins; the origin of the true body frame against the CG is not stated."
 CASES = (
     Case(
         "250lm",
@@ -104,7 +107,7 @@ CASES = (
         "f1tenth",
         Part("f1tenth_hoons_run2.bag"),
         1.0,
-        "Drifts and spins; the origin of the true body frame against the CG is not stated.",
+        _SPINS,
     ),
     Case(
         "f1tenth-hoons",
@@ -114,7 +117,7 @@ CASES = (
         "f1tenth",
         Part("f1tenth_xray_run24.bag"),
         1.0,
-        "Drifts and spins; the origin of the true body frame against the CG is not stated.",
+        _SPINS,
     ),
     Case(
         "v40",
@@ -142,17 +145,7 @@ class Result:
 
     name: str
     error: FloatArray
-    stamps_ns: np.ndarray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Scored:
-    """The scored part in memory."""
-
-    signals: Signals
-    truth: StateTrack
-    dependent: tuple[str, ...]
-    available: frozenset[str]
+    stamps_ns: IntArray
 
 
 def files(case: Case) -> tuple[Path, Path]:
@@ -160,150 +153,135 @@ def files(case: Case) -> tuple[Path, Path]:
     return REFERENCE / "mappings" / f"{case.mapping}.toml", REFERENCE / "vehicles" / f"{case.vehicle}.toml"
 
 
-def read_part(part: Part, mapping_file: Path, vehicle: VehicleParameters) -> Scored:
-    """Read a slice as ``pdhef run`` does, with the vehicle's offsets and biases taken off."""
-    with closing(open_log(DRIVES / part.log)) as log:
-        start, end = time_slice(part.config(), log.start_ns, log.end_ns)
-        plan = plan_drive(log, load_mapping(mapping_file), vehicle, start, end)
-        windows = [w for w in DriveReader(log, plan, 600.0).windows() if len(w.signals)]
-    truth = concatenate([w.truth for w in windows if w.truth is not None])
-    signals = join_signals([w.signals for w in windows])
-    return Scored(signals, truth, tuple(sorted(plan.dependent)), plan.alignment.available)
+def read_part(part: Part, mapping_file: Path, car: Car) -> WholeDrive:
+    """Read a slice as ``pdhef run`` does, with the car's offsets and biases taken off."""
+    options = replace(part.config.read_options, friction=None)
+    with read_drive(DRIVES / part.log, car, load_mapping(mapping_file), options) as drive:
+        return drive.whole()
 
 
-def run_case(case: Case, model: ModelBundle | None, trials: int, say: Say) -> list[Result]:
+def run_case(case: Case, network: Path, trials: int) -> list[Result]:
     """Fit what is to be fitted and return the errors of everything on the scored part."""
     mapping_file, catalogue_file = files(case)
     results: list[Result] = []
 
-    def add(label: str, vehicle: VehicleParameters, names: Sequence[str], network: ModelBundle | None) -> None:
-        part = read_part(case.score, mapping_file, vehicle)
-        known = tuple(n for n in names if n in DESCRIPTIONS)
-        ready, skipped = runnable(known, vehicle, part.available, model=network)
+    def add(label: str, car: Car, names: Sequence[str]) -> None:
+        part = read_part(case.score, mapping_file, car)
+        assert part.truth is not None
+        ready, skipped = runnable(names, car, part.plan.alignment.available)
         for s in skipped:
             say(f"{case.name}: {s.name}, {label} is skipped: {s.reason}")
-        for e in [*ready, *half_trust(ready, network, vehicle)]:
+        for e in [*ready, *half_trust(ready)]:
             say(f"{case.name}: {e.name}, {label}")
             track, _ = e.run(part.signals, None)
-            error = signal_error(track, part.truth, "sideslip_rad", case.min_speed_m_s)
+            error = signal_error(track, part.truth, SIDESLIP, case.min_speed_m_s)
             shown = e.name if e.causal else f"{e.name} (not causal)"
-            if network is not None and e.name in ("pd-hef", "pd-hef-smoothed"):
-                shown += f" at trust {allowed_trust(vehicle, network).cap:g}"
+            if e.name in ("pd-hef", "pd-hef-smoothed"):
+                shown += f" at trust {car.allowed_trust.cap:g}"
             results.append(Result(f"{shown}, {label}" if label else shown, error, part.truth.stamps_ns))
 
-    catalogue = load_vehicle(catalogue_file)
+    catalogue = Car.load(catalogue_file, network=network)
     free = ("zero", "kinematic")
-    bound = tuple(n for n in DESCRIPTIONS if n not in (*free, "gyro"))
-    networks = tuple(n for n in bound if n.startswith(("pd-hef", "pure-lstm", "linear-regression")))
-    physics = tuple(n for n in bound if n not in networks)
-    add("", catalogue, free, None)
-    add("catalogue", catalogue, [n for n in physics if n != "phy-ukf-tuned" or n in catalogue.filter], None)
-    if model is not None:
-        add("catalogue, given network", catalogue, networks, model)
+    networks = tuple(s.name for s in SPECS if s.network)
+    physics = tuple(s.name for s in SPECS if not s.network and s.name not in (*free, "gyro"))
+    add("", catalogue, free)
+    add("catalogue", catalogue, physics)
+    if catalogue.network is not None:
+        add("catalogue, given network", catalogue, networks)
     if case.fit is None:
         return results
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        identified_file = identify(case, case.fit, folder, say)
-        identified = load_vehicle(identified_file)
+        log, config = [str(DRIVES / case.fit.log)], replace(case.fit.config, mapping=mapping_file)
+        say(f"{case.name}: identification")
+        identify(log, folder / "identified", replace(config, car=catalogue_file), holdout=0.0)
+        config = replace(config, car=folder / "identified")
+        identified = Car.load(config.car, network=NO_MODEL)
         results += regressions(case, case.fit, mapping_file, catalogue)
-        add("identified", identified, physics, None)
+        add("identified", identified, physics)
         hybrids = [n for n in networks if n.startswith("pd-hef")]
-        tried: dict[str, ModelBundle] = {} if model is None else {"given network": model}
-        for label, start in (("network of this part", None), ("network fine-tuned", model)):
-            if label == "network fine-tuned" and start is None:
-                continue
-            tried[label] = train(case, case.fit, identified_file, folder / label.replace(" ", "-"), start, say)
+        tried = {"network of this part": train(case, config, folder / "alone", None)}
+        if catalogue.network is not None:
+            own = train(case, config, folder / "fine-tuned", catalogue.network)
+            tried = {"given network": catalogue.network, **tried, "network fine-tuned": own}
         for label, bundle in tried.items():
             say(f"{case.name}: trust in the {label}")
-            add(f"identified, {label}", with_evidence(case, identified, bundle), hybrids, bundle)
+            add(f"identified, {label}", with_evidence(case, identified, bundle), hybrids)
         last, bundle = list(tried.items())[-1]
         bundle.save(folder / "last")
-        tuned = load_vehicle(tune(case, case.fit, identified_file, folder / "last", trials, folder, say))
-        add("tuned", tuned, [n for n in physics if n in ("phy-ukf-tuned", "physics-plus")], None)
-        add(f"tuned, {last}", with_evidence(case, tuned, bundle), hybrids, bundle)
+        say(f"{case.name}: tuning, {trials} trials")
+        config = replace(config, network=folder / "last")
+        tune(log, folder / "tuned", TuneSettings(config=config, trials=trials), warn=say)
+        tuned = Car.load(folder / "tuned", network=NO_MODEL)
+        add("tuned", tuned, [n for n in physics if n in ("phy-ukf-tuned", "physics-plus")])
+        add(f"tuned, {last}", with_evidence(case, tuned, bundle), hybrids)
     return results
 
 
-def split_at_s(part: Part) -> tuple[float, float]:
-    """Return where the network's share of the fit part ends, and where that part ends, in seconds."""
-    with closing(open_log(DRIVES / part.log)) as log:
-        end_s = part.end_s if part.end_s is not None else (log.end_ns - log.start_ns) * 1e-9
-    return part.start_s + TRAIN_SHARE * (end_s - part.start_s), end_s
-
-
-def with_evidence(case: Case, vehicle: VehicleParameters, network: ModelBundle) -> VehicleParameters:
-    """Return the vehicle file with the trust that the end of the fit part allows, which no network was fitted to.
-
-    The vehicle and the filters' noise were fitted to that end as well: there is no more driving to have.
-    """
+def split_fit(case: Case) -> dict[str, Part]:
+    """Return the part that a network learns from, and what is left of the fit part behind a guard."""
     assert case.fit is not None
-    cut, end_s = split_at_s(case.fit)
-    held = read_part(replace(case.fit, start_s=cut + GUARD_S, end_s=end_s), files(case)[0], vehicle)
-    errors = errors_by_trust(vehicle, NetworkService(network), held.signals, held.truth, use_speed=True)
-    decision = decide_cap(errors)
-    found = Network(trust_cap=decision.cap, evidence=decision.reason, model_sha256=network.sha256)
-    return vehicle.model_copy(update={"network": found})
+    part, end_s = case.fit, case.fit.end_s
+    if end_s is None:
+        mapping_file, catalogue_file = files(case)
+        with read_drive(DRIVES / part.log, Car.load(catalogue_file), load_mapping(mapping_file)) as drive:
+            end_s = (drive.log.end_ns - drive.log.start_ns) * 1e-9
+    cut = part.start_s + TRAIN_SHARE * (end_s - part.start_s)
+    return {"train": replace(part, end_s=cut), "validation": replace(part, start_s=cut + GUARD_S, end_s=end_s)}
 
 
-def half_trust(ready: Sequence[Estimator], model: ModelBundle | None, vehicle: VehicleParameters) -> list[Estimator]:
+def with_evidence(case: Case, car: Car, network: ModelBundle) -> Car:
+    """Return the car with a network and the trust that the end of the fit part allows, which none was fitted to.
+
+    The car and the filters' noise were fitted to that end as well: there is no more driving to have.
+    """
+    car = replace(car, network=network)
+    held = read_part(split_fit(case)["validation"], files(case)[0], car)
+    decision = decide_cap(errors_by_trust(car, held, use_speed=True))
+    return replace(car, trust=Trust(trust_cap=decision.cap, evidence=decision.reason, network_sha256=network.sha256))
+
+
+def half_trust(ready: Sequence[Estimator]) -> list[Estimator]:
     """Return the fixed hybrid filter at half trust, where the fixed one runs."""
     name = "pd-hef-fixed-r"
-    if model is None or all(e.name != name for e in ready):
-        return []
-    base = make_estimator(name, vehicle, model=model)
-    return [replace(base, trust=0.5, name=f"{name} at trust 0.5")] if isinstance(base, HybridUkf) else []
+    fixed = [e for e in ready if e.name == name and isinstance(e, HybridUkf)]
+    return [replace(e, trust=0.5, name=f"{name} at trust 0.5") for e in fixed]
 
 
-def identify(case: Case, part: Part, folder: Path, say: Say) -> Path:
-    """Identify the vehicle on the fit part."""
-    from pdhef_logtool.learning.car.identify_command import run_identification
-
-    mapping_file, catalogue_file = files(case)
-    say(f"{case.name}: identification")
-    out = folder / "identified.toml"
-    config = part.config(vehicle=catalogue_file, mapping=mapping_file)
-    run_identification([str(DRIVES / part.log)], out, config, holdout=0.0)
-    return out
-
-
-def tune(case: Case, part: Part, vehicle: Path, model: Path | None, trials: int, folder: Path, say: Say) -> Path:
-    """Tune the noise of all filters that can be, with the same trials, on the fit part."""
-    from pdhef_logtool.learning.noise.tune_command import TuneSettings, run_tuning
-
-    say(f"{case.name}: tuning, {trials} trials")
-    out = folder / "tuned.toml"
-    config = part.config(vehicle=vehicle, mapping=files(case)[0], model=model)
-    run_tuning([str(DRIVES / part.log)], out, TuneSettings(config, trials=trials), warn=say)
-    return out
-
-
-def train(case: Case, part: Part, vehicle: Path, folder: Path, init: ModelBundle | None, say: Say) -> ModelBundle:
+def train(case: Case, config: RunConfig, folder: Path, init: ModelBundle | None) -> ModelBundle:
     """Train a network on the first share of the fit part, stopped by the rest of it; ``init`` is its start."""
-    from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
-    from pdhef_logtool.learning.network.extract_command import ExtractSettings, run_extraction
-    from pdhef_logtool.learning.network.train_command import make_recipe, train_on
-
     say(f"{case.name}: training {folder.name}")
-    cut, end_s = split_at_s(part)
-    blocks = {"train": replace(part, end_s=cut), "validation": replace(part, start_s=cut + GUARD_S, end_s=end_s)}
-    sets: list[Dataset] = []
-    for split, block in blocks.items():
-        config = block.config(vehicle=vehicle, mapping=files(case)[0])
-        run_extraction([str(DRIVES / part.log)], folder / split, ExtractSettings(config, split=split))
-        sets.append(read_dataset(folder / split))
-    both = replace(sets[0], drives=sets[0].drives + sets[1].drives)
-    recipe = make_recipe(paper=False, seed=0, epochs=None, device="cpu")
-    # A minute or two of driving: a small network; and a trained one moves gently.
-    recipe = (
-        replace(recipe, learning_rate=5e-4, epochs=15) if init is not None else replace(recipe, hidden=32, layers=1)
-    )
-    return train_on(both, folder / "model", recipe, init=init).bundle
+    slices = {
+        split: ([DRIVES / part.log], replace(config, start=part.config.start, end=part.config.end))
+        for split, part in split_fit(case).items()
+    }
+    return train_on_parts(slices, folder, init)
 
 
-def regressions(case: Case, part: Part, mapping_file: Path, vehicle: VehicleParameters) -> list[Result]:
+def regression_features(drive: FitDrive, *, low_pass: bool) -> FloatArray:
+    """Return δ, a_y, r, r/v_x, a_y/v_x², δ v_x, a_x and 1 at the stamps [N, 8], as old as an estimator has them.
+
+    With ``low_pass`` all go through a causal 2 Hz filter first.
+    """
+    s = drive.signals
+    known = np.isfinite(s.speed_m_s)
+    speed = np.interp(s.stamps_ns, s.stamps_ns[known], s.speed_m_s[known])
+    turning, sideways, steered = s.yaw_rate_rad_s / speed, s.ay_m_s2 / speed**2, s.steer_rad * speed
+    columns = [s.steer_rad, s.ay_m_s2, s.yaw_rate_rad_s, turning, sideways, steered, s.ax_m_s2]
+    x = np.nan_to_num(np.stack(columns, axis=1))
+    if low_pass:
+        x = sosfilt(butter(2, 2.0, fs=100.0, output="sos"), x, axis=0)
+    x = x[np.maximum(released_steps(s.ready_ns, s.stamps_ns), 0)]
+    return np.column_stack([x, np.ones(len(x))])
+
+
+def regressions(case: Case, part: Part, mapping_file: Path, car: Car) -> list[Result]:
     """Fit a linear regression of the sideslip on seven features, raw and low-passed, and score it."""
-    fit, score = (_fit_drive(p, mapping_file, vehicle) for p in (part, case.score))
+    loaded = [
+        load_fit_drive(LogInput(DRIVES / p.log, p.log), car, load_mapping(mapping_file), p.config.read_options)[1]
+        for p in (part, case.score)
+    ]
+    fit, score = (d for d in loaded if d is not None)
     results = []
     for low_pass in (False, True):
         moving = np.hypot(fit.truth.vx_m_s, fit.truth.vy_m_s) > case.min_speed_m_s
@@ -316,14 +294,6 @@ def regressions(case: Case, part: Part, mapping_file: Path, vehicle: VehiclePara
         label = "linear regression, 7 features" + (", 2 Hz" if low_pass else "")
         results.append(Result(label, error, score.truth.stamps_ns))
     return results
-
-
-def _fit_drive(part: Part, mapping_file: Path, vehicle: VehicleParameters) -> FitDrive:
-    with closing(open_log(DRIVES / part.log)) as log:
-        start, end = time_slice(part.config(), log.start_ns, log.end_ns)
-        drive = load_fit_drive(part.log, log, load_mapping(mapping_file), vehicle, start, end)
-    assert drive is not None
-    return drive
 
 
 def case_table(results: Sequence[Result]) -> str:
@@ -352,25 +322,22 @@ def _interval(found: Interval, sign: str) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the cases and write the page."""
-    parser = argparse.ArgumentParser(prog="python -m studies.real", description=__doc__.splitlines()[0])
-    parser.add_argument("--model", type=Path)
+    parser = options("real", __doc__)
+    parser.add_argument("--network", type=Path, default=Path(NO_MODEL), help="a folder, or a shipped one's name")
     parser.add_argument("--trials", type=int, default=64)
     parser.add_argument("--cases", default=",".join(c.name for c in CASES))
-    parser.add_argument("--out", type=Path, default=ROOT / "docs")
+    parser.add_argument("--out", type=Path, default=DOCS)
     given = parser.parse_args(arguments)
     if not DRIVES.is_dir():
         print("needs ../shared beside the repository (recorded drives that may not be redistributed); nothing is done")
         return 0
-    unknown = sorted(set(given.cases.split(",")) - {c.name for c in CASES})
-    if unknown:
-        parser.error(f"--cases: expected names out of {', '.join(c.name for c in CASES)}, got {', '.join(unknown)}")
+    wanted, known = given.cases.split(","), [c.name for c in CASES]
+    if set(wanted) - set(known):
+        parser.error(f"--cases: expected names out of {', '.join(known)}, got {given.cases}")
 
-    def say(text: str) -> None:
-        sys.stderr.write(text + "\n")
-
-    model = None if given.model is None else load_bundle(given.model)
-    used = "none" if model is None else f"sha256 {model.sha256[:12]}"
-    command = "python -m studies.real" + ("" if given.model is None else f" --model {given.model.name}")
+    network = Car.load(network=given.network).network
+    used = "none" if network is None else f"sha256 {network.sha256[:12]}"
+    command = "python -m studies.real" + ("" if network is None else f" --network {given.network.name}")
     lines = [
         "# Recorded drives",
         "",
@@ -378,18 +345,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "Sideslip RMSE with the 95 % interval of a bootstrap of 10 s blocks. The drives may not be redistributed.",
         "",
     ]
-    for case in CASES:
-        if case.name not in given.cases.split(","):
-            continue
+    for case in (c for c in CASES if c.name in wanted):
         lines += [f"## {case.title}", "", f"Scored above {case.min_speed_m_s:g} m/s. {case.remark}", ""]
         try:
-            lines += [case_table(run_case(case, model, given.trials, say))]
+            lines += [case_table(run_case(case, given.network, given.trials)), ""]
         except PdhefError as error:
             say(str(error))
             lines += [f"Not done: {error}", ""]
-    page = given.out / "real.md"
-    write_bytes(page, "\n".join(lines).encode())
-    print(page)
+    write(given.out / "real.md", "\n".join(lines))
     return 0
 
 

@@ -3,13 +3,12 @@
     python -m studies.switches [--drives 12] [--work out/switches] [--out docs/switches.md]
 
 Simulates the drives (kept once made; seeds from ``FIRST_SEED`` on, which nothing was fitted, tuned or trained on), runs
-the shipped vehicle file and network, and writes the page. Both sides of a switch see the same samples and are scored at
+the shipped car with its network, and writes the page. Both sides of a switch see the same samples and are scored at
 the stamps where both give an estimate; drives are the unit of the paired bootstrap.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -20,27 +19,22 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.measuring import ROOT
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.registry import make_estimator
-from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.release import released_steps
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import open_model
-from pdhef_logtool.sinks.base import write_bytes
-from studies.condition_drives import SIDESLIP, ConditionDrive, read_drive
-from studies.conditions_page import number, table
-from studies.table_maths import Bound, median_ratio, pooled_ratio, pooled_rmse
+from studies.condition_drives import ConditionDrive, read_drive, root_mean_square
+from studies.pages import DOCS, ROOT, number, options, table, write
+from studies.table_maths import Bound, median, median_ratio, pooled_ratio, pooled_rmse
 from truthsim.conditions import write_conditions
 from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
-VEHICLE = ROOT / "pdhef_logtool" / "models" / "default" / "vehicle.toml"
 FIRST_SEED = 11000
 ESTIMATORS = ("phy-ukf-tuned", "physics-plus", "pd-hef")
 #: Ratios nearer to 1 than this are no difference that matters.
@@ -84,14 +78,14 @@ def with_option(estimator: Estimator, name: str, value: bool) -> Estimator:
     return switched
 
 
-def run_option(name: str, value: bool, estimator: Estimator, drive: ConditionDrive) -> StateTrack:
-    """Run with a field of the filter on or off."""
-    return with_option(estimator, name, value).run(drive.signals, None)[0]
-
-
 def run_plain(estimator: Estimator, drive: ConditionDrive) -> StateTrack:
     """Run as it is."""
     return estimator.run(drive.signals, None)[0]
+
+
+def run_option(name: str, value: bool, estimator: Estimator, drive: ConditionDrive) -> StateTrack:
+    """Run with a field of the filter on or off."""
+    return run_plain(with_option(estimator, name, value), drive)
 
 
 def run_unpredicted(estimator: Estimator, drive: ConditionDrive) -> StateTrack:
@@ -199,31 +193,21 @@ def simulate(folder: Path, count: int) -> dict[str, list[Path]]:
         found[row["name"]] = [table_folder / f for f in row["files"]]
     biased = [parse_fault(f"bias{v:g}:{c}:0:end") for c, v in (("ax", 0.24), ("ay", 0.24), ("yaw_rate", 0.0045))]
     late = [parse_fault(f"delay{1000 * LATE_S:g}:steering:0:end")]
-    own: dict[str, Callable[[int], dict[str, Any]]] = {
-        "starts": lambda i: {"manoeuvre": "stop-and-go", "friction": 0.3, "speed_km_h": 40.0 + 2 * i, "duration_s": 25},
-        "stops": lambda i: {
-            "manoeuvre": "stop-and-go",
-            "friction": 0.8,
-            "speed_km_h": 40.0 + 2 * i,
-            "duration_s": 60,
-            "faults": biased,
-        },
-        "steering-late": lambda i: {
-            "manoeuvre": "dlc",
-            "friction": 0.85,
-            "speed_km_h": 70.0 + 3 * i,
-            "faults": late,
-        },
+    stop = {"manoeuvre": "stop-and-go"}
+    #: First speed and its step in km/h, and the rest.
+    own: dict[str, tuple[float, float, dict[str, Any]]] = {
+        "starts": (40.0, 2.0, {**stop, "friction": 0.3, "duration_s": 25}),
+        "stops": (40.0, 2.0, {**stop, "friction": 0.8, "duration_s": 60, "faults": biased}),
+        "steering-late": (70.0, 3.0, {"manoeuvre": "dlc", "friction": 0.85, "faults": late}),
     }
-    for number_of_kind, (kind, make) in enumerate(own.items(), start=1):
+    for number_of_kind, (kind, (first_km_h, step_km_h, more)) in enumerate(own.items(), start=1):
         found[kind] = []
         for i in range(count):
             seed = FIRST_SEED + 100 * number_of_kind + i
             path = folder / f"{kind}-{seed}.mcap"
             if not path.is_file():
                 try:
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    write_drive(simulate_drive(seed=seed, **make(i)), path)
+                    write_drive(simulate_drive(seed=seed, speed_km_h=first_km_h + step_km_h * i, **more), path)
                 except SimulationError as error:
                     print(f"left out: {error}", file=sys.stderr)
                     continue
@@ -231,29 +215,25 @@ def simulate(folder: Path, count: int) -> dict[str, list[Path]]:
     return found
 
 
-def measure(
-    drives: dict[str, list[Path]], vehicle: VehicleParameters, estimators: Sequence[Estimator]
-) -> Iterator[Line]:
+def measure(drives: dict[str, list[Path]], car: Car) -> Iterator[Line]:
     """Run both sides of every switch on its drives, kind by kind."""
+    estimators = [make_estimator(name, car) for name in ESTIMATORS]
     for kind, paths in drives.items():
-        read = [read_drive(p, vehicle, p.stem) for p in paths]
+        read = [read_drive(p, car) for p in paths]
         for switch in (s for s in SWITCHES if s.drives == kind):
             for e in estimators:
                 if e.name in switch.default:
-                    sides = np.array([compare(switch, e, d, vehicle.low_speed_blend_m_s) for d in read]).reshape(-1, 3)
+                    sides = np.array([compare(switch, e, d) for d in read]).reshape(-1, 3)
                     yield Line(switch, e.name, sides[:, 0], sides[:, 1], sides[:, 2])
 
 
-def compare(switch: Switch, estimator: Estimator, drive: ConditionDrive, low_speed_m_s: float) -> list[float]:
+def compare(switch: Switch, estimator: Estimator, drive: ConditionDrive) -> list[float]:
     """Return the sideslip RMSE in degrees on and off, and the number of stamps that both are scored at."""
-    on, off = (
-        np.degrees(signal_error(run(estimator, drive), drive.truth, SIDESLIP, low_speed_m_s))
-        for run in (switch.on, switch.off)
-    )
+    on, off = (np.degrees(drive.error(run(estimator, drive))) for run in (switch.on, switch.off))
     both = np.isfinite(on) & np.isfinite(off)
     if not both.any():
         return [float("nan"), float("nan"), 0.0]
-    return [float(np.sqrt(np.mean(e[both] ** 2))) for e in (on, off)] + [float(both.sum())]
+    return [*(root_mean_square(e[both]) for e in (on, off)), float(both.sum())]
 
 
 NOTES = """How each is switched:
@@ -286,7 +266,7 @@ def page(lines: Sequence[Line], command: str, model_sha256: str, vehicle_name: s
             x.switch.drives,
             f"`{x.estimator}`",
             "on" if x.switch.default[x.estimator] else "off",
-            f"{number(_median(x.on))} / {number(_median(x.off))}",
+            f"{number(median(x.on))} / {number(median(x.off))}",
             _ratio(x.median),
             f"{number(pooled_rmse(x.on, x.samples))} / {number(pooled_rmse(x.off, x.samples))}",
             _ratio(x.pooled),
@@ -294,51 +274,34 @@ def page(lines: Sequence[Line], command: str, model_sha256: str, vehicle_name: s
         ]
         for x in ordered
     ]
-    head = [
-        "switch",
-        "drives",
-        "estimator",
-        "ships",
-        "median on / off, °",
-        "ratio",
-        "pooled on / off, °",
-        "ratio",
-        "on",
-    ]
+    head = "switch | drives | estimator | ships | median on / off, ° | ratio | pooled on / off, ° | ratio | on"
     harms = [x for x in ordered if "harms" in x.says]
     wrong = [x for x in ordered if x.says == ("helps" if not x.switch.default[x.estimator] else "**harms**")]
     most = max(len(x.on) for x in ordered)
-    return "\n".join(
-        [
-            "# Switches, on and off",
-            "",
-            f"Made by `{command}`. Sideslip RMSE on simulated drives, at most {most} a row, seeds from {FIRST_SEED},",
-            f"with the shipped network ({model_sha256[:12]}) and its vehicle file ({vehicle_name}). Ratio: on over",
-            "off, with its 95 % interval by paired bootstrap over drives: *open* where it holds 1, *no matter*",
-            f"where it is within {100 * TRIFLE:g} % of it. *ships*: how the switch stands without being touched.",
-            "",
-            table(head, body),
-            "Drives:",
-            *(f"- `{name}`: {text}" for name, text in kinds.items()),
-            "",
-            "## What does harm",
-            *(_sentence(x) for x in harms),
-            *([] if harms else ["Nothing, as far as the bounds tell."]),
-            "",
-            "## Where the other setting than the shipped one is better on these drives",
-            *(_sentence(x) for x in wrong),
-            *([] if wrong else ["Nowhere, as far as the bounds of both figures tell."]),
-            "",
-            "## How",
-            NOTES,
-            "",
-        ]
-    )
+    kinds_text = "\n".join(f"- `{name}`: {text}" for name, text in kinds.items())
+    harm = "\n".join(map(_sentence, harms)) or "Nothing, as far as the bounds tell."
+    better = "\n".join(map(_sentence, wrong)) or "Nowhere, as far as the bounds of both figures tell."
+    return f"""# Switches, on and off
 
+Made by `{command}`. Sideslip RMSE on simulated drives, at most {most} a row, seeds from {FIRST_SEED},
+with the shipped network ({model_sha256[:12]}) and its vehicle file ({vehicle_name}). Ratio: on over
+off, with its 95 % interval by paired bootstrap over drives: *open* where it holds 1, *no matter*
+where it is within {100 * TRIFLE:g} % of it. *ships*: how the switch stands without being touched.
 
-def _median(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else float("nan")
+{table(head.split(" | "), body)}
+
+Drives:
+{kinds_text}
+
+## What does harm
+{harm}
+
+## Where the other setting than the shipped one is better on these drives
+{better}
+
+## How
+{NOTES}
+"""
 
 
 def _ratio(bound: Bound) -> str:
@@ -353,27 +316,24 @@ def _sentence(x: Line) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Make the page."""
-    parser = argparse.ArgumentParser(prog="python -m studies.switches", description=__doc__.splitlines()[0])
+    parser = options("switches", __doc__)
     parser.add_argument("--drives", type=int, default=12, help="drives a row")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "switches")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "switches.md")
+    parser.add_argument("--out", type=Path, default=DOCS / "switches.md")
     given = parser.parse_args(arguments)
     began = time.monotonic()
-    vehicle, model = load_vehicle(VEHICLE), open_model(None)
-    if model is None:
-        raise SystemExit("no shipped model: make train-default makes one")
-    estimators = [make_estimator(name, vehicle, model=model) for name in ESTIMATORS]
+    car = Car.load("saloon")
     lines = []
-    for line in measure(simulate(given.work, given.drives), vehicle, estimators):
+    for line in measure(simulate(given.work, given.drives), car):
         print(f"{line.switch.name}, {line.switch.drives}, {line.estimator}: {line.says}", file=sys.stderr)
         lines.append(line)
     command = f"python -m studies.switches --drives {given.drives}"
-    write_bytes(given.out, page(lines, command, model.sha256, vehicle.name).encode())
-    print(f"{given.out}, {time.monotonic() - began:.0f} s", file=sys.stderr)
-    return 0
+    assert car.network is not None
+    write(given.out, page(lines, command, car.network.sha256, car.vehicle.name))
+    print(f"{time.monotonic() - began:.0f} s", file=sys.stderr)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -31,10 +31,7 @@ class Bound:
 
 def pooled_rmse(rmse: FloatArray, samples: FloatArray) -> float:
     """Return the RMSE over all samples of all drives from each drive's RMSE [N] and number of samples [N]."""
-    known = np.isfinite(rmse) & (samples > 0)
-    if not known.any():
-        return float("nan")
-    return float(np.sqrt(np.sum(samples[known] * rmse[known] ** 2) / np.sum(samples[known])))
+    return float(np.sqrt(pooled_mean(rmse**2, samples)))
 
 
 def pooled_mean(mean: FloatArray, samples: FloatArray) -> float:
@@ -47,6 +44,11 @@ def percentiles(values: FloatArray, levels: tuple[float, ...] = (10.0, 50.0, 90.
     """Return percentiles over drives [N] by linear interpolation."""
     known = values[np.isfinite(values)]
     return tuple(np.percentile(known, levels).tolist()) if known.size else (float("nan"),) * len(levels)
+
+
+def median(values: FloatArray) -> float:
+    """Return the median over drives [N]; NaN without any."""
+    return percentiles(values, (50.0,))[0]
 
 
 def geometric_mean(values: FloatArray) -> float:

@@ -10,15 +10,16 @@ they are: the page shows peaks, ratios and lags alone.
 
 from __future__ import annotations
 
-import re
-import sys
 import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import WHEELS, FloatArray
+from studies.defaults.fit_nominal_tyres import axle_loads_n
+from studies.pages import DOCS, INDEPENDENT, fill, options, table, write
+from studies.pictures import STYLE, save, subplots
 from truthsim.drive import simulate_drive
 from truthsim.linear_theory import (
     axle_stiffness_n_per_rad,
@@ -29,52 +30,19 @@ from truthsim.linear_theory import (
 from truthsim.manoeuvres import Plan
 from truthsim.motion import Motion, simulate_motion
 from truthsim.tyres import Tyre, forces_n, slip_rates
+from truthsim.vehicle import GRAVITY_M_S2 as G
 from truthsim.vehicle import Vehicle
 from truthsim.vehicle_files import VEHICLES, load_vehicle
 
-G = 9.80665
 DRY = 0.85
-ROOT = Path(__file__).resolve().parents[1]
-INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
-WHEELS = ("fl", "fr", "rl", "rr")
 COLOURS = {"sedan": "#1f5fa8", "suv": "#b5482a", "hatchback": "#3b8550"}
-
-
-def degrees(radians: FloatArray | float) -> Any:
-    """Radians in degrees."""
-    return np.degrees(radians)
+_SAVED_DPI = 80
+_STYLE = {**STYLE, "lines.linewidth": 1.4}
 
 
 def open_loop(speed_m_s: float, steer_rad: FloatArray) -> Plan:
     """Return the plan of a steering table."""
     return Plan(speed_m_s, (steer_rad.shape[0] - 1) * 1e-3, steer_rad=steer_rad)
-
-
-def figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, Any]:
-    """Return a figure and its axes, [rows, columns]."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update(
-        {"font.size": 9, "axes.grid": True, "grid.alpha": 0.3, "lines.linewidth": 1.4, "legend.fontsize": 8}
-    )
-    return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained")
-
-
-def save(fig: Any, folder: Path, name: str) -> None:
-    """Write a figure as a small PNG without a time in it, so that the same figure is the same file."""
-    import matplotlib.pyplot as plt
-
-    fig.savefig(folder / f"{name}.png", dpi=80, metadata={"Software": None})
-    plt.close(fig)
-
-
-def table(head: list[str], rows: list[list[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 def free_rolling(car: Vehicle) -> Vehicle:
@@ -97,8 +65,7 @@ def slope(motion: Motion, column: FloatArray) -> float:
 
 def steady_state(folder: Path) -> dict[str, str]:
     """Understeer curves, load transfer, and the table of gradients."""
-    fig, axes = figure(1, 1, 6.4, 3.8)
-    ax = axes[0, 0]
+    fig, ((ax,),) = subplots(1, 1, 6.4, 3.8, _STYLE)
     rows = []
     for name in VEHICLES:
         car = load_vehicle(name)
@@ -111,19 +78,13 @@ def steady_state(folder: Path) -> dict[str, str]:
         rear = slope(motion, 0.5 * (motion.column("fz_rr_n") - motion.column("fz_rl_n")))
         front_theory, rear_theory = steady_roll(car)[1]
         a_y = motion.column("ay_m_s2") / G
-        rows.append(
-            [
-                name,
-                f"{degrees(understeer) * G:.2f} / {degrees(theory) * G:.2f}",
-                f"{degrees(roll) * G:.2f} / {degrees(roll_theory) * G:.2f}",
-                f"{front * G:.0f} / {front_theory * G:.0f}",
-                f"{rear * G:.0f} / {rear_theory * G:.0f}",
-                f"{a_y.max():.2f}",
-            ]
-        )
-        ax.plot(a_y, degrees(beyond), color=COLOURS[name], label=f"{name}, simulated")
+        angles = ((np.degrees(understeer), np.degrees(theory)), (np.degrees(roll), np.degrees(roll_theory)))
+        loads = ((front, front_theory), (rear, rear_theory))
+        cells = [f"{own * G:.2f} / {said * G:.2f}" for own, said in angles]
+        rows.append([name, *cells, *(f"{own * G:.0f} / {said * G:.0f}" for own, said in loads), f"{a_y.max():.2f}"])
+        ax.plot(a_y, np.degrees(beyond), color=COLOURS[name], label=f"{name}, simulated")
         line = np.array([0.0, 0.5])
-        ax.plot(line, degrees(theory) * G * line, "--", color=COLOURS[name], linewidth=1.0)
+        ax.plot(line, np.degrees(theory) * G * line, "--", color=COLOURS[name], linewidth=1.0)
     ax.set(
         xlabel="lateral acceleration, g",
         ylabel="road-wheel angle beyond L/R, deg",
@@ -131,39 +92,27 @@ def steady_state(folder: Path) -> dict[str, str]:
         title="Understeer: slow ramp at 80 km/h, mu 0.85 (dashed: linear theory)",
     )
     ax.legend()
-    save(fig, folder, "understeer")
+    save(fig, folder / "understeer.png", _SAVED_DPI)
 
     car = load_vehicle("sedan")
     motion = ramp(car, 0.05)
     a_y = motion.column("ay_m_s2")
-    fig, axes = figure(1, 1, 6.4, 3.8)
-    ax = axes[0, 0]
+    fig, ((ax,),) = subplots(1, 1, 6.4, 3.8, _STYLE)
     shades = dict(zip(WHEELS, ("#7fb0e0", "#1f5fa8", "#e8a487", "#b5482a"), strict=True))
     names = dict(zip(WHEELS, ("front left", "front right", "rear left", "rear right"), strict=True))
-    wheelbase = car.cg_to_front_axle_m + car.cg_to_rear_axle_m
+    loads_n = axle_loads_n(car)
     for wheel in WHEELS:
         ax.plot(a_y / G, motion.column(f"fz_{wheel}_n") / 1e3, color=shades[wheel], label=names[wheel])
         front = wheel[0] == "f"
-        arm = car.cg_to_rear_axle_m if front else car.cg_to_front_axle_m
-        static = 0.5 * car.mass_kg * G * arm / wheelbase
+        static = 0.5 * loads_n["front" if front else "rear"]
         moved = steady_roll(car)[1][0 if front else 1] * (1.0 if wheel[1] == "r" else -1.0)
         ax.plot(a_y / G, (static + moved * a_y) / 1e3, "--", color="black", linewidth=0.8)
-    ax.set(
-        xlabel="lateral acceleration to the left, g",
-        ylabel="wheel load, kN",
-        title="Load transfer of the sedan (dashed: statics)",
-    )
+    ax.set(xlabel="lateral acceleration to the left, g", ylabel="wheel load, kN")
+    ax.set_title("Load transfer of the sedan (dashed: statics)")
     ax.legend()
-    save(fig, folder, "load_transfer")
-    head = [
-        "vehicle",
-        "understeer, deg/g",
-        "roll, deg/g",
-        "load moved in front, N/g",
-        "at the rear, N/g",
-        "largest a_y at mu 0.85, g",
-    ]
-    return {"gradients": table(head, rows)}
+    save(fig, folder / "load_transfer.png", _SAVED_DPI)
+    head = "vehicle | understeer, deg/g | roll, deg/g | load moved in front, N/g | at the rear, N/g"
+    return {"gradients": table([*head.split(" | "), "largest a_y at mu 0.85, g"], rows)}
 
 
 def measured_response(car: Vehicle, frequency: float, speed: float) -> tuple[list[complex], float]:
@@ -186,7 +135,7 @@ def responses(folder: Path) -> dict[str, str]:
     car = load_vehicle("sedan")
     points = np.array([0.3, 0.5, 0.7, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0])
     fine = np.geomspace(0.3, 3.0, 80)
-    fig, axes = figure(2, 2, 8.4, 5.4)
+    fig, axes = subplots(2, 2, 8.4, 5.4, _STYLE)
     worst = {name: [0.0, 0.0] for name in ("yaw rate", "lateral acceleration", "roll")}
     for speed, colour in ((60.0 / 3.6, "#3b8550"), (100.0 / 3.6, "#1f5fa8")):
         found = [measured_response(car, float(f), speed) for f in points]
@@ -196,15 +145,15 @@ def responses(folder: Path) -> dict[str, str]:
         for k, name in enumerate(worst):
             ratios = np.array([m[k] for m, _ in found]) / np.array([h[k] for h in theory_here])
             worst[name][0] = max(worst[name][0], float(np.abs(np.abs(ratios) - 1.0).max()))
-            worst[name][1] = max(worst[name][1], float(np.abs(degrees(np.angle(ratios))).max()))
+            worst[name][1] = max(worst[name][1], float(np.abs(np.degrees(np.angle(ratios))).max()))
         theory = np.array([frequency_response(free_rolling(car), float(f), speed, DRY) for f in fine])
         for k, scale in ((0, 1.0), (1, np.radians(1.0) / G)):
             measured = np.array([m[k] for m, _ in found])
             label = f"{speed * 3.6:.0f} km/h"
             axes[0, k].plot(fine, scale * np.abs(theory[:, k]), color=colour, label=f"{label}, linear theory")
             axes[0, k].plot(points, scale * np.abs(measured), "o", color=colour, markersize=4, label="simulated")
-            axes[1, k].plot(fine, degrees(np.unwrap(np.angle(theory[:, k]))), color=colour)
-            axes[1, k].plot(points, degrees(np.unwrap(np.angle(measured))), "o", color=colour, markersize=4)
+            axes[1, k].plot(fine, np.degrees(np.unwrap(np.angle(theory[:, k]))), color=colour)
+            axes[1, k].plot(points, np.degrees(np.unwrap(np.angle(measured))), "o", color=colour, markersize=4)
     for k, title in ((0, "yaw rate over road-wheel angle, 1/s"), (1, "a_y over road-wheel angle, g/deg")):
         axes[0, k].set(title=title, ylim=(0.0, None))
         axes[1, k].set(xlabel="frequency, Hz", ylabel="phase, deg" if k == 0 else "")
@@ -213,7 +162,7 @@ def responses(folder: Path) -> dict[str, str]:
             axes[row, k].set_xticks([0.3, 0.5, 1.0, 2.0, 3.0], ["0.3", "0.5", "1", "2", "3"])
             axes[row, k].minorticks_off()
     axes[0, 0].legend()
-    save(fig, folder, "frequency_response")
+    save(fig, folder / "frequency_response.png", _SAVED_DPI)
     rows = [[name, f"{100 * gain:.2f} %", f"{phase:.2f}°"] for name, (gain, phase) in worst.items()]
     return {"responses": table(["0.3 to 3 Hz, 60 and 100 km/h", "largest amplitude error", "phase error"], rows)}
 
@@ -227,14 +176,13 @@ def build_up(tyre: Tyre, alpha: float, speed: float, metres: float) -> tuple[Flo
         _, side, scaled = forces_n(tyre, 0.0, slip, load, DRY)
         force.append(side)
         slip += step * slip_rates(tyre, 0.0, slip, scaled, speed, -np.tan(alpha) * speed, speed)[1]
-    return np.arange(len(force)) * step * speed, np.array(force)
+    return np.asarray(np.arange(len(force)) * step * speed), np.array(force, dtype=np.float64)
 
 
 def relaxation(folder: Path) -> dict[str, str]:
     """Force over distance after a step of the slip angle, and what the whole car's front axle shows."""
     tyre = Tyre()
-    fig, axes = figure(1, 1, 6.4, 3.8)
-    ax = axes[0, 0]
+    fig, ((ax,),) = subplots(1, 1, 6.4, 3.8, _STYLE)
     for alpha, colour in ((0.3, "#1f5fa8"), (3.0, "#3b8550"), (8.0, "#b5482a")):
         for speed, dash in ((10.0, "-"), (30.0, ":")):
             x, force = build_up(tyre, np.radians(alpha), speed, 3.0)
@@ -242,21 +190,18 @@ def relaxation(folder: Path) -> dict[str, str]:
             ax.plot(x, force / steady, dash, color=colour, label=f"{alpha:g} deg, {speed:g} m/s")
     x = np.linspace(0.0, 3.0, 200)
     ax.plot(x, 1.0 - np.exp(-x / tyre.lateral_relaxation_m), "--", color="black", linewidth=1.0, label="1 - exp(-x/σ)")
-    ax.set(
-        xlabel="distance rolled after the step, m",
-        ylabel="lateral force over its final value",
-        title="Build-up of the lateral force",
-    )
+    ax.set(xlabel="distance rolled after the step, m", ylabel="lateral force over its final value")
+    ax.set_title("Build-up of the lateral force")
     ax.legend()
-    save(fig, folder, "relaxation")
+    save(fig, folder / "relaxation.png", _SAVED_DPI)
     rows = []
     car = load_vehicle("sedan")
     for speed in (10.0, 20.0, 40.0):
         t = np.arange(0.0, 3.0, 1e-3)
         motion = simulate_motion(open_loop(speed, 0.002 * np.sin(4 * np.pi * t)), DRY, vehicle=car, period_s=0.001)
         force = motion.column("fy_fl_n") + motion.column("fy_fr_n")
-        alpha = 0.5 * (motion.column("slip_angle_fl_rad") + motion.column("slip_angle_fr_rad"))
-        basis = np.stack([alpha, -np.gradient(force, 1e-3)], axis=1)[300:-2]
+        slip = 0.5 * (motion.column("slip_angle_fl_rad") + motion.column("slip_angle_fr_rad"))
+        basis = np.stack([slip, -np.gradient(force, 1e-3)], axis=1)[300:-2]
         (_, tau), *_ = np.linalg.lstsq(basis, force[300:-2], rcond=None)
         rows.append(
             [f"{speed:g}", f"{1e3 * tau:.1f}", f"{1e3 * tyre.lateral_relaxation_m / speed:.1f}", f"{tau * speed:.3f}"]
@@ -273,16 +218,14 @@ def traces(folder: Path) -> dict[str, str]:
     ):
         drive = simulate_drive(manoeuvre, seed=1)
         t, truth = drive.times_s, drive.truth
-        fig, axes = figure(3, 2, 8.4, 6.4)
+        fig, axes = subplots(3, 2, 8.4, 6.4, _STYLE)
+        felt = [("ay_m_s2", "a_y", 1 / G), ("specific_force_y_m_s2", "felt by the leaning IMU", 1 / G)]
         panels = (
-            ("road-wheel angle, deg", [("steer_rad", "", degrees(1.0))]),
-            ("yaw rate, deg/s", [("yaw_rate_rad_s", "", degrees(1.0))]),
-            (
-                "acceleration, g",
-                [("ay_m_s2", "a_y", 1 / G), ("specific_force_y_m_s2", "felt by the leaning IMU", 1 / G)],
-            ),
-            ("sideslip, deg", [("sideslip_rad", "", degrees(1.0))]),
-            ("roll, deg", [("roll_rad", "", degrees(1.0))]),
+            ("road-wheel angle, deg", [("steer_rad", "", np.degrees(1.0))]),
+            ("yaw rate, deg/s", [("yaw_rate_rad_s", "", np.degrees(1.0))]),
+            ("acceleration, g", felt),
+            ("sideslip, deg", [("sideslip_rad", "", np.degrees(1.0))]),
+            ("roll, deg", [("roll_rad", "", np.degrees(1.0))]),
             ("wheel load, kN", [(f"fz_{w}_n", w, 1e-3) for w in WHEELS]),
         )
         for ax, (label, lines) in zip(axes.ravel(), panels, strict=True):
@@ -296,28 +239,15 @@ def traces(folder: Path) -> dict[str, str]:
         for ax in axes[-1]:
             ax.set_xlabel("time, s")
         fig.suptitle(title)
-        save(fig, folder, name)
+        save(fig, folder / f"{name}.png", _SAVED_DPI)
         unit = drive.friction * G
-        peaks = {c: float(np.abs(truth[c]).max()) for c in ("yaw_rate_rad_s", "roll_rad")}
-        rows.append(
-            [
-                title.split(",")[0],
-                f"{drive.peak_ay_m_s2 / G:.2f} g = {drive.peak_ay_m_s2 / unit:.2f} mu g",
-                f"{degrees(peaks['yaw_rate_rad_s']):.1f}",
-                f"{degrees(drive.peak_sideslip_rad):.2f}",
-                f"{degrees(peaks['roll_rad']):.2f}",
-                f"{min(float(truth[f'fz_{w}_n'].min()) for w in WHEELS):.0f}",
-            ]
-        )
-    head = [
-        "manoeuvre",
-        "largest a_y",
-        "yaw rate, deg/s",
-        "sideslip, deg",
-        "roll, deg",
-        "lightest wheel, N",
-    ]
-    return {"peaks": table(head, rows)}
+        yaw_rate, roll = (np.degrees(float(np.abs(truth[c]).max())) for c in ("yaw_rate_rad_s", "roll_rad"))
+        largest = f"{drive.peak_ay_m_s2 / G:.2f} g = {drive.peak_ay_m_s2 / unit:.2f} mu g"
+        angles = [f"{yaw_rate:.1f}", f"{np.degrees(drive.peak_sideslip_rad):.2f}", f"{roll:.2f}"]
+        lightest = min(float(truth[f"fz_{w}_n"].min()) for w in WHEELS)
+        rows.append([title.split(",")[0], largest, *angles, f"{lightest:.0f}"])
+    head = "manoeuvre | largest a_y | yaw rate, deg/s | sideslip, deg | roll, deg | lightest wheel, N"
+    return {"peaks": table(head.split(" | "), rows)}
 
 
 def speed() -> dict[str, str]:
@@ -330,17 +260,16 @@ def speed() -> dict[str, str]:
         seconds.append(time.perf_counter() - start)
     # In steps of 50, so that the page does not change with every build.
     times = int(120.0 / min(seconds) // 50 * 50)
-    return {
-        "speed": f"more than {times} times real time on one core (a drive on the road, driver and sensors included)."
-    }
+    what = "times real time on one core (a drive on the road, driver and sensors included)."
+    return {"speed": f"more than {times} {what}"}
 
 
 #: What is known of the other simulator's car and differs from the sedan: no bars, short relaxation, no compliance,
 #: parallel steering, pitch centre at 0.05 m.
 _OTHER_RELAXATION_M = 0.2
 _QUANTITIES = {"a_y": "ay", "yaw rate": "yaw_rate", "sideslip": "beta", "roll": "roll"}
-_UNITS = {"a_y": (1.0, "m/s²"), "yaw rate": (degrees(1.0), "°/s"), "sideslip": (degrees(1.0), "°")}
-_UNITS["roll"] = (degrees(1.0), "°")
+_UNITS = {"a_y": (1.0, "m/s²"), "yaw rate": (np.degrees(1.0), "°/s"), "sideslip": (np.degrees(1.0), "°")}
+_UNITS["roll"] = (np.degrees(1.0), "°")
 
 
 def other_stiffness_n_per_rad(ramp_run: Any) -> tuple[float, float]:
@@ -440,33 +369,15 @@ def independent() -> dict[str, str]:
                 ratio = np.abs(mine).max() / np.abs(theirs).max()
                 line += [f"{factor * np.abs(mine).max():.3g}", f"{ratio:.2f}", lag]
             rows.append(line)
-    head = [
-        "run",
-        "quantity",
-        "other: peak",
-        "sedan: peak",
-        "ratio",
-        "later by",
-        "like the other: peak",
-        "ratio",
-        "later by",
-    ]
+    head = ["run", "quantity", "other: peak"]
+    for car_name in ("sedan", "like the other"):
+        head += [f"{car_name}: peak", "ratio", "later by"]
     own = axle_stiffness_n_per_rad(Vehicle(), DRY)
     words = (
         f"Cornering stiffness of the axles, kN/rad: other {stiffness[0] / 1e3:.0f} and {stiffness[1] / 1e3:.0f}, "
         f"sedan {own[0] / 1e3:.0f} and {own[1] / 1e3:.0f} before compliance.\n\n"
     )
     return {"independent": words + table(head, rows)}
-
-
-def fill(page: str, blocks: dict[str, str]) -> str:
-    """Put the blocks between their comments; a block without a place is an error."""
-    for name, text in blocks.items():
-        pattern = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
-        if len(pattern.findall(page)) != 1:
-            raise SystemExit(f"docs/truthsim.md: expected one place for {name}")
-        page = pattern.sub(lambda found, text=text: f"{found[1]}{text}\n{found[2]}", page)
-    return page
 
 
 def main(docs: Path) -> None:
@@ -479,12 +390,12 @@ def main(docs: Path) -> None:
     blocks.update(speed())
     blocks.update(independent())
     path = docs / "truthsim.md"
-    temporary = path.with_suffix(".md.part")
-    temporary.write_text(fill(path.read_text(encoding="utf-8"), blocks), encoding="utf-8")
-    temporary.replace(path)
+    write(path, fill(path.read_text(encoding="utf-8"), blocks, "docs/truthsim.md"))
     for name, text in blocks.items():
         print(f"{name}\n{text}\n")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs")
+    parser = options("truthsim_docs", __doc__)
+    parser.add_argument("docs", type=Path, nargs="?", default=DOCS)
+    main(parser.parse_args().docs)

@@ -20,3 +20,20 @@ def shared_dir() -> Path:
 @pytest.fixture(scope="session")
 def sample_logs_dir() -> Path:
     return ROOT / "sample_logs"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Refuse a marker ``slow`` that leaves a package without a test in the quick tier.
+
+    The tests of a package are in the folder of its name. Only a collection of all folders can tell; this runs before
+    ``-m`` takes any test away.
+    """
+    tests = ROOT / "tests"
+    collected = {item.path.relative_to(tests).parts[0] for item in items}
+    if not {p.parent.name for p in tests.glob("*/test_*.py")} <= collected:
+        return
+    quick = {item.path.relative_to(tests).parts[0] for item in items if item.get_closest_marker("slow") is None}
+    packages = {p.parent.name for p in (ROOT / "pdhef_logtool").glob("*/__init__.py")} | {"truthsim"}
+    if missing := sorted(packages - quick):
+        raise pytest.UsageError(f"every test of {', '.join(missing)} is marked slow: make quick would not touch it")

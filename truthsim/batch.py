@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool import __version__
 from pdhef_logtool.records.errors import OutputError, SimulationError, UsageError
+from pdhef_logtool.records.version import __version__
 from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import GRAVITY_M_S2

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool import __version__
 from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.writer import McapLogWriter
 from pdhef_logtool.records.errors import SimulationError, UsageError
 from pdhef_logtool.records.signals import WHEELS, FloatArray
+from pdhef_logtool.records.version import __version__
 from truthsim.faults import Fault, apply_faults, rtk_outages
 from truthsim.manoeuvres import (
     CONTROL_STEP_S,

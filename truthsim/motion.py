@@ -71,6 +71,7 @@ def _compiled_loop() -> Callable[..., None]:
         digest.update((folder / name).read_bytes())
     sources = digest.hexdigest()
 
+    # positional: it is compiled and called in one place, just below, with the columns of one record
     @njit(cache=True)
     def loop(
         start_speed_m_s: float,

@@ -8,12 +8,12 @@ became another car's would be a wrong vehicle.
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model, model_validator
+from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
+from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import SimulationError
 from truthsim.tyres import Tyre
 from truthsim.vehicle import GRAVITY_M_S2, Vehicle
@@ -118,24 +118,9 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
     """
     path = _FOLDER / f"{name_or_path}.toml" if str(name_or_path) in VEHICLES else Path(name_or_path)
     remedy = f"name one of {', '.join(VEHICLES)} or a file with the same values as truthsim/vehicles/sedan.toml"
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        got = getattr(error, "strerror", None) or "no text"
-        raise SimulationError(
-            expected="a readable vehicle file", got=got, where=str(name_or_path), remedy=remedy
-        ) from error
-    except tomllib.TOMLDecodeError as error:
-        raise SimulationError(expected="TOML", got=str(error), where=str(path), remedy=remedy) from error
-    try:
-        checked: Any = _vehicle_model().model_validate(data)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        got = "nothing" if first["type"] == "missing" else repr(first["input"]) if where else "values that contradict"
-        raise SimulationError(
-            expected=first["msg"].removeprefix("Value error, "), got=got, where=f"{path}: {where}".rstrip(": ")
-        ) from error
+    raw = read_toml(path, "a vehicle TOML file", SimulationError, remedy)
+    expected = "the entries of a simulated vehicle"
+    checked: Any = validated(_vehicle_model(), raw, str(path), SimulationError, expected=expected, remedy=remedy)
     values = {name: getattr(checked, name) for name in Vehicle._fields}
     for axle in ("front_tyre", "rear_tyre"):
         values[axle] = Tyre(**values[axle].model_dump())

@@ -165,6 +165,7 @@ def substeps(vx, dt, friction, p):  # type: ignore[no-untyped-def]
     return min(max(n, 1), MAX_SUBSTEPS)
 
 
+# positional: scalars throughout, as the model's other functions; every caller has them apart.
 @njit(cache=True)
 def rk4_step(vx, vy, r, steer, ax, friction, dt, n, p, force_scale=1.0):  # type: ignore[no-untyped-def]
     """Advance [v_x, v_y, r] by ``dt`` s in ``n`` RK4 steps with constant inputs."""

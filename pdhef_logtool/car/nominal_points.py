@@ -132,6 +132,7 @@ def _share(vx, c, p):  # type: ignore[no-untyped-def]
     return min(1.0, max(0.0, (vx - p.blend_low_m_s) * c.blend_per_m_s))
 
 
+# positional: numbers of one point in an inner loop that is to become vector instructions.
 @_inline
 def _derivative(vx, vy, r, steer, cos_steer, tan_steer, ax, force, c, p):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r] (Eq 1-4 with the blend to the kinematic model)."""

@@ -2,35 +2,48 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from pdhef_logtool.records.documents import validated
 from pdhef_logtool.records.errors import VehicleError
+from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import Signals
 
 GRAVITY_M_S2 = 9.80665
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
+#: From a 1:10 car's 0.1 m to a truck's 7 m, wherever the CG is.
+AxleDistance = Annotated[float, Field(ge=0.01, le=15)]
+#: Inside a truck; no car's length in mm is.
+Coordinate = Annotated[float, Field(ge=-25, le=25)]
+#: TOML has lists alone.
+Position = Annotated[tuple[Coordinate, Coordinate, Coordinate], Field(strict=False)]
+#: Noise of accelerometers: hard-mounted ones of a 1:10 car show 5 m/s².
+AccelerationStd = Annotated[float, Field(gt=0, le=30)]
+#: More than that is no bias but a mounting that must be mapped.
+AccelerationBias = Annotated[float, Field(ge=-5, le=5)]
+AngleStd = Annotated[float, Field(gt=0, le=0.5)]
 
+#: What to do about a wrong entry.
+REMEDY = "see docs/formats.md for every entry and its unit"
 #: Shape factor of a tyre that is known by its cornering stiffness alone (typical lateral C, Pacejka 2012).
 STIFFNESS_TYRE_SHAPE = 1.35
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+class Record(BaseModel):
+    """A frozen record whose entries are all known, of the right type and finite."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class AxleTyre(_Record):
+class AxleTyre(Record):
     """Axle magic formula at friction 1 (METHOD Eq 3), or a cornering stiffness alone.
 
     ``D_n`` is the axle's peak force in N at friction 1. Eq 3 scales the whole curve with friction, its stiffness too;
@@ -41,11 +54,11 @@ class AxleTyre(_Record):
     """
 
     B: Positive | None = None
-    C: Positive | None = None
+    C: Annotated[float, Field(gt=0, le=3)] | None = None  # 1 to 2 by Pacejka 2012; the force turns round beyond 2
     D_n: Positive | None = None
-    E: Annotated[float, Field(le=1.0, allow_inf_nan=False)] | None = None
+    E: Annotated[float, Field(ge=-100, le=1)] | None = None
     cornering_stiffness_n_per_rad: Positive | None = None
-    reference_friction: Positive | None = None
+    reference_friction: Friction | None = None
 
     @property
     def keeps_stiffness(self) -> bool:
@@ -63,14 +76,14 @@ class AxleTyre(_Record):
         return self
 
 
-class Tyres(_Record):
+class Tyres(Record):
     """The two axles' tyres."""
 
     front: AxleTyre
     rear: AxleTyre
 
 
-class Sensors(_Record):
+class Sensors(Record):
     """1-sigma white noise of the sensors, which is R of the sensor-level filters, and their constant biases.
 
     A bias is what the sensor reads too much; it is taken off before any estimator sees the signal. ``*_bias_std`` is
@@ -78,73 +91,93 @@ class Sensors(_Record):
     §9's for a production car's sensors.
     """
 
-    ax_std_m_s2: Positive = 0.12
-    ay_std_m_s2: Positive = 0.12
-    yaw_rate_std_rad_s: Positive = 0.004
-    speed_std_m_s: Positive = 0.08
-    steer_std_rad: Positive = 0.0008
-    ax_bias_m_s2: Finite = 0.0
-    ay_bias_m_s2: Finite = 0.0
-    yaw_rate_bias_rad_s: Finite = 0.0
-    ay_bias_std_m_s2: Positive = 0.08
-    yaw_rate_bias_std_rad_s: Positive = 0.0015
-    steer_bias_std_rad: Positive = 0.0008
+    ax_std_m_s2: AccelerationStd = 0.12
+    ay_std_m_s2: AccelerationStd = 0.12
+    yaw_rate_std_rad_s: Annotated[float, Field(gt=0, le=3)] = 0.004
+    speed_std_m_s: Annotated[float, Field(gt=0, le=20)] = 0.08
+    steer_std_rad: AngleStd = 0.0008
+    ax_bias_m_s2: AccelerationBias = 0.0
+    ay_bias_m_s2: AccelerationBias = 0.0
+    yaw_rate_bias_rad_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    ay_bias_std_m_s2: AccelerationStd = 0.08
+    yaw_rate_bias_std_rad_s: AngleStd = 0.0015
+    steer_bias_std_rad: AngleStd = 0.0008
 
 
-class FilterTuning(_Record):
-    """Process and measurement 1-sigma that belong to this vehicle file, for one estimator.
+class VehicleParameters(Record):
+    """Everything that the nominal single-track model needs to know of a vehicle (DESIGN §8). SI units, ISO 8855.
 
-    ``q_std`` holds one entry a state (per square root of second), ``r_std`` one a measurement.
+    Ranges reach from a 1:10 car to a truck of 40 t; what only contradicts another entry is found by the relations.
     """
-
-    q_std: tuple[NonNegative, ...] = ()
-    r_std: dict[str, Positive] = Field(default_factory=dict)
-
-
-class Network(_Record):
-    """How far a residual network may be trusted on this vehicle, and on which evidence (``pdhef trust`` writes it).
-
-    ``model_sha256`` is the network that the evidence is about: the cap holds for no other. None: for any.
-    """
-
-    trust_cap: Annotated[float, Field(ge=0, le=1)] = 0.0
-    evidence: str = "none"
-    model_sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
-
-    @property
-    def has_evidence(self) -> bool:
-        """Whether the file says why; without, its cap counts for nothing."""
-        return self.evidence.strip().lower() not in ("", "none")
-
-
-class VehicleParameters(_Record):
-    """Everything that the nominal single-track model needs to know of a vehicle (DESIGN §8). SI units, ISO 8855."""
 
     name: str = "unnamed"
-    mass_kg: Positive
+    mass_kg: Annotated[float, Field(ge=0.5, le=60_000)]
     yaw_inertia_kg_m2: Positive
-    cg_to_front_axle_m: Positive
-    cg_to_rear_axle_m: Positive
-    track_m: Positive = 1.55
-    cg_height_m: NonNegative = 0.55
-    wheel_radius_m: Positive = 0.30
-    steering_ratio: Positive = 16.0
-    steer_offset_rad: Finite = 0.0
-    roll_gradient_rad_per_m_s2: Finite = 0.0
-    friction: Positive | None = None
-    imu_position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    truth_position_m: tuple[Finite, Finite, Finite] = (0.0, 0.0, 0.0)
-    low_speed_blend_m_s: Positive = 3.0
+    cg_to_front_axle_m: AxleDistance
+    cg_to_rear_axle_m: AxleDistance
+    track_m: Annotated[float, Field(gt=0, le=4)] = 1.55
+    cg_height_m: Annotated[float, Field(ge=0, le=4)] = 0.55
+    wheel_radius_m: Annotated[float, Field(ge=0.01, le=1.5)] = 0.30
+    steering_ratio: Annotated[float, Field(ge=0.2, le=60)] = 16.0  # 1: the log holds road-wheel angles; trucks to 30
+    steer_offset_rad: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    #: Cars have 0.005 to 0.015, 3 to 8 degrees per g, trucks up to 0.03; a file in degrees is beyond.
+    roll_gradient_rad_per_m_s2: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0
+    friction: Friction | None = None
+    imu_position_m: Position = (0.0, 0.0, 0.0)
+    truth_position_m: Position = (0.0, 0.0, 0.0)
+    low_speed_blend_m_s: Annotated[float, Field(ge=0.01, le=30)] = 3.0
     #: Way over which a lateral axle force builds up; 0.3-0.7 m for car tyres (METHOD §13; Pacejka 2012, chapter 7).
-    relaxation_length_m: NonNegative = 0.5
+    relaxation_length_m: Annotated[float, Field(ge=0, le=10)] = 0.5
     #: Share of lateral force per load that a tyre loses for each relative excess of load: −p_Dy2/p_Dy1, 0.145/0.990 for
     #: the 205/60 R15 of Pacejka 2012, appendix 3.
-    load_sensitivity: Annotated[float, Field(ge=0, lt=1, allow_inf_nan=False)] = 0.15
+    load_sensitivity: Annotated[float, Field(ge=0, lt=1)] = 0.15
     sensors: Sensors = Sensors()
     tyres: Tyres
-    filter: dict[str, FilterTuning] = Field(default_factory=dict)
-    network: Network = Network()
-    identification: dict[str, str | float | int | list[str]] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _entries_agree(self) -> VehicleParameters:
+        axles = ("cg_to_front_axle_m", "cg_to_rear_axle_m")
+        wrong = [
+            f"{', '.join(self._told(e) for e in (*entries.split(), *axles))} contradict one another: {what} is "
+            f"{values[0]:.3g}, plausible is {low:g} to {high:g}"
+            for what, entries, values, low, high in self._relations()
+            if min(values) > high or max(values) < low
+        ]
+        if wrong:
+            raise ValueError("; ".join(wrong))
+        return self
+
+    def _told(self, entry: str) -> str:
+        given = entry in self.model_fields_set or "." in entry
+        return entry if given else f"{entry} (left out: {getattr(self, entry)})"
+
+    def _relations(self) -> Iterator[tuple[str, str, tuple[float, ...], float, float]]:
+        """Yield what it is, its entries beside the axles' distances, its values (one may do), and their range."""
+        length = self.wheelbase_m
+        # Near 1 for cars; 0.5 for the paper's sedan, 3.6 for the 1:10 car of the F1TENTH model, a guess of its authors
+        # that a fit may still double.
+        inertia = self.yaw_inertia_kg_m2 / (self.mass_kg * self.cg_to_front_axle_m * self.cg_to_rear_axle_m)
+        yield "I_z / (m l_f l_r)", "mass_kg yaw_inertia_kg_m2", (inertia,), 0.15, 8.0
+        for axle, front in (("front", True), ("rear", False)):
+            load, over = self.axle_load_n(front), f"over static load of the {axle} axle"
+            if getattr(self.tyres, axle).D_n is not None:
+                # From ice that the file calls friction 1 to a racing tyre's 2, twice that for a crude curve.
+                peak = self.magic_formula(front, 1.0)[2] / load
+                yield f"peak force {over}", f"tyres.{axle}.D_n mass_kg", (peak,), 0.1, 5.0
+            # Per rad: trucks and 1:10 cars 5, cars 8 to 25, racing cars 40. Eq 3 scales it with friction, so that a
+            # curve may be a plausible one at friction 1 or at the file's.
+            slopes = tuple(self.cornering_stiffness_n_per_rad(front, mu) / load for mu in (1.0, self.assumed_friction))
+            yield f"cornering stiffness {over} in 1/rad", f"tyres.{axle} mass_kg", slopes, 2.0, 100.0
+        # A kart is as wide as long, a coach's wheelbase is three times its track.
+        yield "track over wheelbase", "track_m", (self.track_m / length,), 0.15, 1.5
+        # A laden truck: 2.2 m over 3.5 m.
+        yield "height of the CG over wheelbase", "cg_height_m", (self.cg_height_m / length,), 0.0, 1.2
+        # 0.2 for cars; 1.5 for a 1:10 car with the default.
+        relaxation = self.relaxation_length_m / length
+        yield "relaxation length over wheelbase", "relaxation_length_m", (relaxation,), 0.0, 3.0
+        # Speeds scale with √(g L): 0.6 for the default sedan, 0.17 for the 1:10 car.
+        blend = self.low_speed_blend_m_s / math.sqrt(GRAVITY_M_S2 * length)
+        yield "low-speed limit over sqrt(g wheelbase)", "low_speed_blend_m_s", (blend,), 0.0, 3.0
 
     @property
     def wheelbase_m(self) -> float:
@@ -185,11 +218,6 @@ class VehicleParameters(_Record):
         return self.mass_kg * (lr * cr - lf * cf) / (self.wheelbase_m * cf * cr)
 
 
-def vehicle_sha256(vehicle: VehicleParameters) -> str:
-    """Return the hash of everything that a vehicle file says, whatever its layout and comments."""
-    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()
-
-
 def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
     """Take the vehicle's steering offset and sensor biases off the signals; all estimators get the result."""
     sensors = vehicle.sensors
@@ -227,24 +255,6 @@ def default_vehicle() -> VehicleParameters:
     )
 
 
-def load_vehicle(path: Path) -> VehicleParameters:
-    """Read vehicle.toml.
-
-    Raises
-    ------
-    VehicleError
-        The file is missing, is no TOML, or holds wrong, unknown or missing entries; all of them are named at once.
-    """
-    try:
-        with path.open("rb") as f:
-            raw: dict[str, Any] = tomllib.load(f)
-    except FileNotFoundError:
-        raise VehicleError(expected="a vehicle TOML file", got="no such file", where=str(path)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise VehicleError(expected="a vehicle TOML file", got=str(error), where=str(path)) from None
-    return vehicle_from_dict(raw, where=str(path))
-
-
 def vehicle_from_dict(raw: dict[str, Any], *, where: str) -> VehicleParameters:
     """Build parameters from parsed TOML; problems are reported together.
 
@@ -253,58 +263,11 @@ def vehicle_from_dict(raw: dict[str, Any], *, where: str) -> VehicleParameters:
     VehicleError
         Entries are wrong, unknown or missing.
     """
-    try:
-        vehicle = VehicleParameters.model_validate(raw)
-    except ValidationError as error:
-        problems = "; ".join(
-            f"{'.'.join(str(p) for p in e['loc']) or 'file'}: {e['msg']}" for e in error.errors(include_url=False)
-        )
-        raise VehicleError(
-            expected="the entries of vehicle.toml",
-            got=problems,
-            where=where,
-            remedy="see docs/formats.md for every entry and its unit",
-        ) from None
-    if not math.isfinite(vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)):
-        raise VehicleError(expected="tyres with a finite stiffness", got="an infinite one", where=where)
-    return vehicle
-
-
-def vehicle_to_toml(vehicle: VehicleParameters, comments: Mapping[str, str] | None = None) -> str:
-    """Return vehicle.toml of the parameters; reading it back gives the same parameters.
-
-    Parameters
-    ----------
-    comments : by dotted entry (``tyres.front.B``); ``""`` stands at the head of the file.
-    """
-    notes = dict(comments or {})
-    lines = [f"# {line}" for line in notes.get("", "").splitlines()]
-    document = vehicle.model_dump(exclude_none=True)
-    _toml_table(document, (), notes, lines)
-    return "\n".join(lines).strip("\n") + "\n"
-
-
-def _toml_table(table: Mapping[str, Any], path: tuple[str, ...], notes: Mapping[str, str], lines: list[str]) -> None:
-    plain = {k: v for k, v in table.items() if not isinstance(v, Mapping) or k == "r_std"}
-    if path and plain:
-        lines += ["", f"[{'.'.join(_toml_key(p) for p in path)}]"]
-    for key, value in plain.items():
-        note = notes.get(".".join((*path, key)))
-        lines.append(f"{_toml_key(key)} = {_toml_value(value)}" + (f"  # {note}" if note else ""))
-    for key, value in table.items():
-        if key not in plain:
-            _toml_table(value, (*path, key), notes, lines)
-
-
-def _toml_key(key: str) -> str:
-    return key if key and all(c.isascii() and (c.isalnum() or c in "-_") for c in key) else json.dumps(key)
-
-
-def _toml_value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_toml_key(k)} = {_toml_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    return repr(value)
+    return validated(
+        VehicleParameters,
+        raw,
+        where,
+        VehicleError,
+        expected="the entries of vehicle.toml",
+        remedy=REMEDY,
+    )

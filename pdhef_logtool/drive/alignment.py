@@ -18,11 +18,12 @@ Rules
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray, IntArray, Signals
 
@@ -126,11 +127,7 @@ class AlignmentPlan:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as JSON-able dictionaries and lists."""
-        document = asdict(self)
-        document["channels"] = [asdict(c) for c in self.channels]
-        document["grid_channels"] = list(self.grid_channels)
-        document["unused"] = dict(self.unused)
-        return document
+        return {**jsonable(self), "unused": dict(self.unused)}
 
 
 def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float) -> AlignmentPlan:
@@ -145,8 +142,7 @@ def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wh
 
     Raises
     ------
-    MappingError
-        No IMU channel has two samples in the survey, so that there is no grid.
+    MappingError : No IMU channel has two samples in the survey, so that there is no grid.
     """
     survey = _cut_to_survey(channels)
     periods = {name: _median_period_s(c) for name, c in survey.items()}
@@ -205,7 +201,7 @@ def align(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, e
     """
     margin = plan.margin_ns
     usable = {
-        p.name: _without_late(_cut(channels[p.name], start_ns - margin, end_ns + margin), p)
+        p.name: _without_late(channels[p.name].between(start_ns - margin, end_ns + margin), p)
         for p in plan.channels
         if p.name in channels
     }
@@ -249,7 +245,7 @@ def count_late(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: i
     counts = {}
     for p in plan.channels:
         if p.name in channels:
-            channel = _cut(channels[p.name], start_ns - plan.margin_ns, end_ns + plan.margin_ns)
+            channel = channels[p.name].between(start_ns - plan.margin_ns, end_ns + plan.margin_ns)
             inside = (channel.stamps_ns >= start_ns) & (channel.stamps_ns < end_ns)
             late = int(np.count_nonzero(_is_late(channel, p) & inside))
             if late:
@@ -284,27 +280,11 @@ def _max_gap_s(period_s: float | None) -> float:
     return min(max(periods, MIN_GAP_S), LONGEST_GAP_S)
 
 
-def _cut(channel: Channel, start_ns: int, end_ns: int) -> Channel:
-    lo, hi = np.searchsorted(channel.stamps_ns, [start_ns, end_ns])
-    return _select(channel, slice(int(lo), int(hi)))
-
-
-def _select(channel: Channel, which: slice | BoolArray) -> Channel:
-    return Channel(
-        name=channel.name,
-        unit=channel.unit,
-        source=channel.source,
-        stamps_ns=channel.stamps_ns[which],
-        arrival_ns=channel.arrival_ns[which],
-        values=channel.values[which],
-    )
-
-
 def _cut_to_survey(channels: Mapping[str, Channel]) -> dict[str, Channel]:
     starts = [int(c.stamps_ns[0]) for c in channels.values() if len(c)]
     if not starts:
         return dict(channels)
-    return {name: _cut(c, min(starts), min(starts) + _ns(SURVEY_S)) for name, c in channels.items()}
+    return {name: c.between(min(starts), min(starts) + _ns(SURVEY_S)) for name, c in channels.items()}
 
 
 def _median_period_s(channel: Channel) -> float | None:
@@ -421,7 +401,7 @@ def _is_late(channel: Channel, p: ChannelPlan) -> BoolArray:
 
 def _without_late(channel: Channel, p: ChannelPlan) -> Channel:
     late = _is_late(channel, p)
-    return _select(channel, ~late) if late.any() else channel
+    return channel.take(~late) if late.any() else channel
 
 
 # ---- to the grid ----
@@ -429,7 +409,7 @@ def _without_late(channel: Channel, p: ChannelPlan) -> Channel:
 
 def _grid_stamps(channels: Mapping[str, Channel], plan: AlignmentPlan, start_ns: int, end_ns: int) -> IntArray:
     """Return the union of the IMU channels' stamps in [start_ns, end_ns), late samples included: time still passes."""
-    present = [_cut(channels[name], start_ns, end_ns).stamps_ns for name in plan.grid_channels if name in channels]
+    present = [channels[name].between(start_ns, end_ns).stamps_ns for name in plan.grid_channels if name in channels]
     if not present:
         return np.empty(0, dtype=np.int64)
     if all(np.array_equal(s, present[0]) for s in present[1:]):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,18 +15,11 @@ from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 
 if TYPE_CHECKING:
+    from pdhef_logtool.drive.windows import DriveWindow
     from pdhef_logtool.estimators.friction_bank import FrictionBank, FrictionCarry
 
 #: What may be asked for beside a number.
 CHOICES = ("auto", "file", "estimate")
-
-
-class _Window(Protocol):
-    @property
-    def signals(self) -> Signals: ...
-
-
-WindowT = TypeVar("WindowT", bound=_Window)
 
 
 def parse_friction(text: str | float) -> str | float:
@@ -34,8 +27,7 @@ def parse_friction(text: str | float) -> str | float:
 
     Raises
     ------
-    UsageError
-        The text is neither, or the number is no friction.
+    UsageError : The text is neither, or the number is no friction.
     """
     if text in CHOICES:
         return text
@@ -49,22 +41,6 @@ def parse_friction(text: str | float) -> str | float:
             expected=f"{', '.join(CHOICES)} or a number from {low:g} to {high:g}", got=repr(text), where="--friction"
         )
     return value
-
-
-class _Sources(Protocol):
-    @property
-    def label(self) -> str: ...
-
-
-class _Mapping(Protocol):
-    @property
-    def signals(self) -> Mapping[str, _Sources]: ...
-
-
-def friction_topic(mapping: _Mapping) -> str:
-    """Return where a mapping finds a friction in the log, ``/topic.field``; empty if nowhere."""
-    source = mapping.signals.get("friction")
-    return "" if source is None else source.label
 
 
 @dataclass(slots=True)
@@ -92,6 +68,10 @@ class FrictionSource:
     _std: list[FloatArray] = field(default_factory=list)
     _observable: list[BoolArray] = field(default_factory=list)
 
+    def afresh(self) -> FrictionSource:
+        """Return the same source at the start of a drive."""
+        return FrictionSource(self.label, self.note, self.constant, self.bank, self.factor)
+
     def fill(self, signals: Signals) -> Signals:
         """Return the next window's signals with their friction."""
         if self.constant is not None:
@@ -105,10 +85,10 @@ class FrictionSource:
         self._observable.append(estimate.observable)
         return replace(signals, friction=estimate.friction)
 
-    def fill_windows(self, windows: Iterator[WindowT]) -> Iterator[WindowT]:
+    def fill_windows(self, windows: Iterator[DriveWindow]) -> Iterator[DriveWindow]:
         """Yield the windows of a drive with their friction."""
         for window in windows:
-            yield replace(window, signals=self.fill(window.signals))  # type: ignore[type-var]
+            yield replace(window, signals=self.fill(window.signals))
 
     @property
     def from_log(self) -> bool:
@@ -162,8 +142,7 @@ def friction_source(
 
     Raises
     ------
-    UsageError
-        What was asked for is not there.
+    UsageError : What was asked for is not there.
     """
     if not isinstance(choice, str):
         return FrictionSource(f"option, {choice:g}", constant=choice * factor)
@@ -179,10 +158,10 @@ def friction_source(
     if choice == "file" or (choice == "auto" and vehicle.friction is not None):
         constant = vehicle.friction if "friction" in available else None
         return FrictionSource(f"vehicle file, {vehicle.friction:g}", constant=constant)
-    from pdhef_logtool.estimators.friction_bank import FrictionBank
+    from pdhef_logtool.estimators.friction_bank import NEEDS, FrictionBank
 
     bank = FrictionBank(vehicle, use_speed=use_speed)
-    missing = sorted(bank.needs - available)
+    missing = sorted(NEEDS - available)
     if not missing:
         nothing = "neither log nor vehicle file gives a friction: it is estimated on line" if choice == "auto" else ""
         return FrictionSource("estimate", nothing, bank=bank)

@@ -102,6 +102,12 @@ class _Check:
         both_move = self.accelerations and low > UNRELATED_M_S2 and high < 5.0 * low
         return both_move and abs(self.correlation) < UNRELATED_CORRELATION
 
+    def warning(self, kind: str, message: str, suspects: tuple[str, ...] = ()) -> PlausibilityWarning:
+        """Return a warning of this relation."""
+        signals = tuple(self.powers)
+        text = f"{self.text}: {message}"
+        return PlausibilityWarning(self.text, signals, suspects, kind, self.correlation, self.gain, self.expected, text)
+
 
 @dataclass(frozen=True, slots=True)
 class _Remedy:
@@ -355,31 +361,19 @@ def _gain_warning(check: _Check, remedies: list[_Remedy]) -> PlausibilityWarning
     reasons = " or ".join(f"{r.signal} {r.words}" for r in remedies)
     guess = reasons or f"no single mistake explains it, look at {', '.join(check.powers)}"
     low, high = check.expected
-    return PlausibilityWarning(
-        check=check.text,
-        signals=tuple(check.powers),
-        suspects=suspects,
-        kind=kind,
-        correlation=check.correlation,
-        gain=check.gain,
-        expected=check.expected,
-        message=f"{check.text}: correlation {check.correlation:.2f}, gain {check.gain:.3g} where {low:g} to {high:g} "
-        f"is plausible; perhaps {guess}",
+    message = (
+        f"correlation {check.correlation:.2f}, gain {check.gain:.3g} where {low:g} to {high:g} is plausible; "
+        f"perhaps {guess}"
     )
+    return check.warning(kind, message, suspects)
 
 
 def _unrelated_warning(check: _Check) -> PlausibilityWarning:
-    return PlausibilityWarning(
-        check=check.text,
-        signals=tuple(check.powers),
-        suspects=(),
-        kind="unrelated",
-        correlation=check.correlation,
-        gain=check.gain,
-        expected=check.expected,
-        message=f"{check.text}: both move ({check.sides[0]:.2g} and {check.sides[1]:.2g} m/s^2) and yet their "
-        f"correlation is {check.correlation:.2f}; perhaps another field or axis was mapped",
+    message = (
+        f"both move ({check.sides[0]:.2g} and {check.sides[1]:.2g} m/s^2) and yet their correlation is "
+        f"{check.correlation:.2f}; perhaps another field or axis was mapped"
     )
+    return check.warning("unrelated", message)
 
 
 def _backwards_warning(speed_name: str, share: float) -> PlausibilityWarning:

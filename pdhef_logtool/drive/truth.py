@@ -22,6 +22,7 @@ import numpy as np
 
 from pdhef_logtool.drive.correlation import find_shift, on_common_grid
 from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.geometry import (
     ecef_from_geodetic,
     enu_from_ecef_rotation,
@@ -363,7 +364,7 @@ def _survey(channels: Mapping[str, Channel]) -> dict[str, Channel]:
     for name, c in channels.items():
         n = int(np.searchsorted(c.stamps_ns, min(starts) + _SURVEY_NS)) if starts else 0
         if n >= 2:
-            survey[name] = Channel(name, c.unit, c.source, c.stamps_ns[:n], c.arrival_ns[:n], c.values[:n])
+            survey[name] = c.take(slice(n))
     return survey
 
 
@@ -471,8 +472,8 @@ class _Source:
         """Return a channel at the base stamps, [N] or [N, k]; NaN where it has a gap."""
         channel = self._channels.get(name)
         if channel is None:
-            width = {"quat_wxyz": (4,), "ecef_position_m": (3,), "ecef_velocity_m_s": (3,), "enu_velocity_m_s": (3,)}
-            return np.full((self.stamps_ns.shape[0], *width.get(name, ())), np.nan)
+            n, k = self.stamps_ns.shape[0], VECTOR_COLUMNS.get(name, 1)
+            return np.full((n, k) if k > 1 else n, np.nan)
         bracket = Bracket(channel.stamps_ns, self.stamps_ns, round(self.plan.max_gap_s[name] * 1e9))
         if name in _ANGLES:
             return bracket.angle(channel.values)

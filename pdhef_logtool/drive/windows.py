@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -111,8 +111,7 @@ def plan_drive(
 
     Raises
     ------
-    MappingError
-        The log lacks what is mapped, or there is no IMU to set the stamps.
+    MappingError : The log lacks what is mapped, or there is no IMU to set the stamps.
     """
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     survey = read_signals(log, mapping, clocks, start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
@@ -192,8 +191,8 @@ class DriveReader:
                 continue
             yield self._window(signals, truth, done_ns, until, (b - plan.start_ns) / (plan.end_ns - plan.start_ns))
             done_ns = until
-            signals = {n: _since(c, until - margin) for n, c in signals.items()}
-            truth = {n: _since(c, until - margin) for n, c in truth.items()}
+            signals = {n: c.between(until - margin) for n, c in signals.items()}
+            truth = {n: c.between(until - margin) for n, c in truth.items()}
 
     def _window(
         self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int, share: float
@@ -241,16 +240,6 @@ def _with_following(held: deque[DriveWindow], look_ahead_ns: int) -> tuple[Drive
     return first, cut_signals(following, 0, until)
 
 
-def _since(channel: Channel, stamp_ns: int) -> Channel:
-    first = int(np.searchsorted(channel.stamps_ns, stamp_ns))
-    return replace(
-        channel,
-        stamps_ns=channel.stamps_ns[first:],
-        arrival_ns=channel.arrival_ns[first:],
-        values=channel.values[first:],
-    )
-
-
 def _impossible(signals: Signals) -> list[Loss]:
     losses = []
     for name, mask in impossible_readings(signals).items():
@@ -268,15 +257,8 @@ def _gaps(before: Channel | None, channel: Channel) -> list[Loss]:
         return []
     steps = np.diff(stamps)
     least = max(TOLD_GAP_S * 1e9, TOLD_GAP_PERIODS * float(np.median(steps)))
-    return [
-        Loss(
-            "gap",
-            f"no samples for {steps[i] * 1e-9:.2f} s",
-            channel.source,
-            int(stamps[i]),
-            int(stamps[i + 1]),
-            1,
-            "note",
-        )
+    gaps = [
+        (int(stamps[i]), int(stamps[i + 1]), f"no samples for {steps[i] * 1e-9:.2f} s")
         for i in np.flatnonzero(steps > least)
     ]
+    return [Loss("gap", what, channel.source, start_ns, end_ns, 1, "note") for start_ns, end_ns, what in gaps]

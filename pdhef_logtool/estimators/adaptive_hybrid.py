@@ -19,21 +19,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.checked_inputs import InputCarry, check_inputs, r_scale
+from pdhef_logtool.estimators.filter_shell import VX, VY, YAW_RATE, Z_AY, PosteriorSteps, sideslip_std
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
-from pdhef_logtool.estimators.physics import (
-    VX,
-    VY,
-    YAW_RATE,
-    Z_AY,
-    FilterCarry,
-    PhysicsUkf,
-    PosteriorSteps,
-    sideslip_std,
-)
+from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
 from pdhef_logtool.records.reasons import BURST_AY
-from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
@@ -69,21 +62,13 @@ MEMORY = 2 * LAG_STEPS + 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MixtureSteps:
+class MixtureSteps(StepColumns):
     """By step on measurement time, [K]: when it arrived, weight of F2, factor on R, and the detector's bit mask."""
 
     ready_ns: IntArray
     weight: FloatArray
     r_scale: FloatArray
     reason: IntArray
-
-    def joined(self, other: MixtureSteps) -> MixtureSteps:
-        """Append the steps of the next window."""
-        return MixtureSteps(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__slots__))
-
-    def since(self, index: int) -> MixtureSteps:
-        """Keep the steps from ``index`` on."""
-        return MixtureSteps(*(getattr(self, n)[index:] for n in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,15 +79,14 @@ class AdaptiveCarry:
     plain: FilterCarry
     scaled: FilterCarry
     memory: FloatArray
-    last_stamp_ns: int
+    last_stamp_ns: int | None
     waiting: MixtureSteps
 
 
 @njit(cache=True)
-def _weights(  # type: ignore[no-untyped-def]
-    dt, innovations, starts, skip, ay, noise, usual, vx, vy, vy_variance, yaw_rate, low, high, memory, out
-):
-    """Write the weight of F2 at each step; ``innovations`` [K, 2] of F1 and F2, ``memory`` is updated in place."""
+def _weights(steps, low, high, memory, out):  # type: ignore[no-untyped-def]
+    """Write the weight of F2 at each step; ``memory`` is updated in place."""
+    dt, innovations, starts, skip, ay, noise, usual, vx, vy, vy_variance, yaw_rate = steps
     for k in range(dt.shape[0]):
         step = dt[k] if dt[k] <= RESTART_GAP_S else 0.0
         if starts[k] or step == 0.0:
@@ -212,11 +196,6 @@ class AdaptiveHybridUkf:
     notes: tuple[str, ...] = ()
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the hybrid filter needs."""
-        return self.hybrid.needs
-
-    @property
     def hybrid(self) -> HybridUkf:
         """The fixed filter that F1 is when nothing is wrong."""
         return HybridUkf(
@@ -256,21 +235,18 @@ class AdaptiveHybridUkf:
         steps = MixtureSteps(signals.ready_ns, weight, r_scale(extra, self.r_std), faults.reason)
         if c is not None:
             steps = c.waiting.joined(steps)
-        index = released_steps(steps.ready_ns, signals.stamps_ns)
-        at = np.maximum(index, 0)
-        track = mix(steps.weight[at] if len(steps.weight) else weight, first, second)
-        count = len(signals)
+        released = release(steps.ready_ns, signals.stamps_ns)
+        at = released.at
+        track = mix(steps.weight[at], first, second)
         track = replace(
             track,
             network_trust=np.where(track.valid, self.trust, np.nan),
-            r_scale=np.where(track.valid, steps.r_scale[at], 1.0) if count else np.ones(0),
-            mixture_weight=np.where(track.valid, steps.weight[at], np.nan) if count else np.empty(0),
-            reason=np.where(index >= 0, steps.reason[at], 0) if count else np.empty(0, dtype=np.int64),
+            r_scale=np.where(track.valid, steps.r_scale[at], 1.0),
+            mixture_weight=np.where(track.valid, steps.weight[at], np.nan),
+            reason=np.where(released.arrived, steps.reason[at], 0),
         )
-        newest = int(index[-1]) if count else -1
-        last = int(signals.stamps_ns[-1]) if count else (c.last_stamp_ns if c else -1)
-        after = AdaptiveCarry(inputs, plain_carry, scaled_carry, memory, last, steps.since(max(newest, 0)))
-        return track, after
+        last = last_stamp_ns(signals.stamps_ns, c.last_stamp_ns if c else None)
+        return track, AdaptiveCarry(inputs, plain_carry, scaled_carry, memory, last, steps.since(released.needed))
 
     def _mixture(
         self, plain: PosteriorSteps, scaled: PosteriorSteps, faults: SensorFaults, carry: AdaptiveCarry | None
@@ -278,31 +254,28 @@ class AdaptiveHybridUkf:
         """Return the weight of F2 at each step and the memory after the window."""
         count = len(plain.stamps_ns)
         memory = np.zeros(MEMORY) if carry is None else carry.memory.copy()
-        dt = np.full(count, np.nan)
-        if count:
-            dt[1:] = np.diff(plain.stamps_ns) * 1e-9
-            if carry is not None and carry.last_stamp_ns >= 0:
-                dt[0] = (int(plain.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
+        dt = step_durations_s(plain.stamps_ns, carry.last_stamp_ns if carry else None)
         innovations = np.stack([plain.innovation[:, Z_AY], scaled.innovation[:, Z_AY]], axis=1)
         starts: BoolArray = ~np.isfinite(plain.prior[:, VX])
         skip = faults.reason & BURST_AY > 0
         out = np.empty(count)
-        _weights(
+        given = (
             dt, innovations, starts, skip, faults.filtered.ay_m_s2, faults.noise_std[:, AY], faults.usual_std[:, AY],
-            plain.x[:, VX], plain.x[:, VY], plain.P[:, VY, VY], plain.x[:, YAW_RATE], self.evidence_low,
-            self.evidence_high, memory, out,
+            plain.x[:, VX], plain.x[:, VY], plain.P[:, VY, VY], plain.x[:, YAW_RATE],
         )  # fmt: skip
+        _weights(given, self.evidence_low, self.evidence_high, memory, out)
         return out, memory
 
 
 def adaptive_hybrid_ukf(
     vehicle: VehicleParameters,
     network: NetworkService,
+    noise: FilterNoise | None = None,
     *,
     trust: float = 1.0,
     use_speed: bool = True,
     notes: tuple[str, ...] = (),
 ) -> AdaptiveHybridUkf:
-    """Return ``pd-hef`` with the noise of ``[filter.pd-hef]`` of the vehicle file."""
-    fixed = hybrid_ukf(vehicle, network, trust=trust, use_speed=use_speed)
+    """Return ``pd-hef`` with a noise; what that leaves out is that of the hybrid filter."""
+    fixed = hybrid_ukf(vehicle, network, noise, trust=trust, use_speed=use_speed)
     return AdaptiveHybridUkf(vehicle, network, trust, fixed.q_std, fixed.r_std, use_speed=use_speed, notes=notes)

@@ -17,11 +17,6 @@ class Estimator(Protocol):
         ...
 
     @property
-    def needs(self) -> frozenset[str]:
-        """Aligned signals without which it cannot run."""
-        ...
-
-    @property
     def causal(self) -> bool:
         """Whether an estimate at t uses only what had arrived by t."""
         ...

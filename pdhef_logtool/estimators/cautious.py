@@ -4,35 +4,31 @@ A hybrid filter at trust 0 is a single-track filter on the nominal model alone, 
 chosen with a network. Without evidence (METHOD §14) the estimate comes from a filter on physics instead, and the fault
 detector of ``pd-hef`` takes stuck, dead and spiking samples away from it. Which filter is decided by drives with truth:
 
-- the better of ``phy-ukf-tuned`` and ``physics-plus`` by the scores that ``pdhef tune`` left in the vehicle file;
+- the better of ``phy-ukf-tuned`` and ``physics-plus`` by the scores that ``pdhef tune`` left beside their noise;
 - without such scores ``phy-ukf-tuned``, where ``pdhef identify`` chose its noise on this car;
 - else ``physics-plus``, the better one on simulated cars (docs/many_cars.md).
 """
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
-from pdhef_logtool.estimators.adaptive_hybrid import MixtureSteps, adaptive_hybrid_ukf
-from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.adaptive_hybrid import MixtureSteps
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
 from pdhef_logtool.estimators.physics_plus import NAME as PLUS
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
-from pdhef_logtool.estimators.smoothed import TABLE as SMOOTHED
-from pdhef_logtool.estimators.smoothed import SmoothedHybrid, smoothed_hybrid
 from pdhef_logtool.records.release import released_steps
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.service import NetworkService
 from pdhef_logtool.watches.sensor_faults import FaultCarry, find_faults
 
-_SCORE = re.compile(r"(?P<name>[a-z-]+): (?P<deg>[0-9.]+) deg\b.*")
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +46,7 @@ class CautiousPhysics:
 
     Parameters
     ----------
-    physics : the filter, with the noise of the vehicle file.
+    physics : the filter, with the noise of the car.
     notes : what the report says of it.
     """
 
@@ -60,14 +56,9 @@ class CautiousPhysics:
     notes: tuple[str, ...] = ()
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the filter needs."""
-        return self.physics.needs
-
-    @property
-    def calibrated_as(self) -> str:
-        """Whose calibrated intervals hold for it."""
-        return self.physics.name
+    def calibrated_as(self) -> PhysicsUkf | PhysicsPlusUkf:
+        """Whose calibrated intervals hold for it where it has none of its own."""
+        return self.physics
 
     def run(self, signals: Signals, carry: CautiousCarry | None) -> tuple[StateTrack, CautiousCarry]:
         """Filter one window; joined windows give the same bits as one call over the whole log."""
@@ -85,58 +76,15 @@ class CautiousPhysics:
         return track, CautiousCarry(fault_carry, physics, steps.since(newest))
 
 
-def strongest_physics(vehicle: VehicleParameters, *, use_speed: bool = True) -> PhysicsUkf | PhysicsPlusUkf:
+def strongest_physics(car: Car, *, use_speed: bool = True) -> PhysicsUkf | PhysicsPlusUkf:
     """Return the filter on physics that drives with truth say is the best on this car (see the head of the file)."""
-    listed = vehicle.identification.get("tuning_scores", [])
-    found = [m for text in (listed if isinstance(listed, list) else []) if (m := _SCORE.fullmatch(text))]
-    scores = {m["name"]: float(m["deg"]) for m in found}
-    if TUNED not in vehicle.filter:
+    scores = {n: s for n in (TUNED, PLUS) if n in car.noise and (s := car.noise[n].score_deg) is not None}
+    if TUNED not in car.noise:
         better = PLUS
-    elif PLUS not in vehicle.filter or not {TUNED, PLUS} <= scores.keys():
+    elif len(scores) < 2:
         better = TUNED
     else:
         better = min(TUNED, PLUS, key=lambda name: scores[name])
     if better == TUNED:
-        return physics_ukf_tuned(vehicle, use_speed=use_speed)
-    return physics_plus(vehicle, use_speed=use_speed)
-
-
-def at_trust(
-    vehicle: VehicleParameters,
-    network: NetworkService,
-    trust: float,
-    *,
-    use_speed: bool = True,
-    notes: tuple[str, ...] = (),
-) -> Estimator:
-    """Return ``pd-hef`` at a trust in [0, 1]: the adaptive hybrid filter, or this file's where it is 0."""
-    if trust == 0.0:
-        physics = strongest_physics(vehicle, use_speed=use_speed)
-        said = f"without trust in its network it is {physics.name}, with faulty samples of a_y and gyro left out"
-        return CautiousPhysics(physics, notes=(*notes, said))
-    return adaptive_hybrid_ukf(vehicle, network, trust=trust, use_speed=use_speed, notes=notes)
-
-
-def smoothed_at_trust(
-    vehicle: VehicleParameters,
-    network: NetworkService,
-    trust: float,
-    *,
-    use_speed: bool = True,
-    notes: tuple[str, ...] = (),
-) -> SmoothedHybrid:
-    """Return ``pd-hef-smoothed`` at a trust in [0, 1]; where it is 0 and ``phy-ukf-tuned`` is best, that one smoothed.
-
-    ``physics-plus`` has no smoother: where it is best, the hybrid filter at trust 0 is smoothed.
-    """
-    if trust > 0.0 or strongest_physics(vehicle).name != TUNED:
-        return smoothed_hybrid(vehicle, network, trust=trust, use_speed=use_speed, notes=notes)
-    forward = physics_ukf_tuned(vehicle)
-    assert forward.r_std is not None  # it has every measurement
-    ay_std, yaw_rate_std, speed_std = forward.r_std
-    noise = FilterTuning(q_std=forward.q_std, r_std={"ay_m_s2": ay_std, "yaw_rate_rad_s": yaw_rate_std})
-    sensors = vehicle.sensors.model_copy(update={"speed_std_m_s": speed_std})
-    own = vehicle.model_copy(update={"filter": {SMOOTHED: noise}, "sensors": sensors})
-    said = f"without trust in its network it is {TUNED}, smoothed"
-    smoothed = smoothed_hybrid(own, network, trust=0.0, use_speed=use_speed, notes=(*notes, said))
-    return replace(smoothed, bias_states=False)  # as the filter whose noise it has
+        return physics_ukf_tuned(car.vehicle, car.noise[TUNED], use_speed=use_speed)
+    return physics_plus(car.vehicle, car.noise.get(PLUS), use_speed=use_speed)

@@ -8,6 +8,7 @@ v_x and v_y go on by a_x + v_y r and a_y − v_x r, a_y corrected for body roll.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,10 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
 
@@ -70,11 +75,6 @@ class DirectNetwork:
     causal: bool = True
 
     @property
-    def needs(self) -> frozenset[str]:
-        """What the physics filter needs, which gives the features."""
-        return parallel_filter(self.vehicle, use_speed=self.use_speed).needs
-
-    @property
     def notes(self) -> tuple[str, ...]:
         """Say which file ran: run.json has the residual network's hash alone."""
         return (f"network {self.network.bundle.sha256}",)
@@ -97,3 +97,10 @@ class DirectNetwork:
 
         track, steps = run_stepwise(self.name, signals, carry.steps if carry else None, 0, step)
         return track, DirectCarry(after, network, steps)
+
+
+def build(name: str, car: Car, options: Options) -> DirectNetwork:
+    """Return ``pure-lstm`` of a car whose network has it."""
+    del name
+    assert car.network is not None and car.network.pure_lstm is not None
+    return DirectNetwork(car.vehicle, NetworkService(car.network.pure_lstm), use_speed=options.use_speed)

@@ -30,10 +30,14 @@ from pdhef_logtool.car.nominal_model import (
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.estimators.physics import U_STEER, VX, FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.filter_shell import U_STEER, VX
+from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
 from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 
+#: Aligned signals without which nothing can be estimated.
+NEEDS = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
 #: Frictions of the bank, and how likely each is on a road that nothing is known of: mean 0.86, 1-sigma 0.23.
 GRID = (0.12, 0.2, 0.3, 0.4, 0.5, 0.62, 0.75, 0.88, 1.0, 1.12)
 PRIOR = (0.015, 0.02, 0.025, 0.025, 0.03, 0.055, 0.14, 0.27, 0.27, 0.15)
@@ -75,7 +79,7 @@ class FrictionCarry:
     x: FloatArray
     P: FloatArray
     memory: FloatArray
-    last_stamp_ns: int
+    last_stamp_ns: int | None
     speed_filter: FilterCarry
 
 
@@ -101,11 +105,14 @@ def _advance(v, vy, r, steer, friction, dt, n, p):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _step(x, P, v, v_now, steer, steer_now, friction, dt, ay, yaw_rate, p):  # type: ignore[no-untyped-def]
+def _step(x, P, over, now, friction, dt, p):  # type: ignore[no-untyped-def]
     """Take one filter over a step, x [2] and P [3] (vv, vr, rr) in place; return its log-likelihood, not normalised.
 
-    ``v``, ``steer`` hold over the step, ``v_now``, ``steer_now`` at its end; a measurement may be NaN.
+    ``over`` are speed and steering that hold over the step, ``now`` those at its end, a_y and yaw rate, either of which
+    may be NaN.
     """
+    v, steer = over
+    v_now, steer_now, ay, yaw_rate = now
     limit = MAX_VY_SHARE * v
     vy, r = min(limit, max(-limit, x[0])), x[1]
     n = substeps(v, dt, friction, p)
@@ -168,10 +175,10 @@ def _weigh(weights, prior, log_likelihood, keep):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _bank(  # type: ignore[no-untyped-def]
-    dt, vx, steer, usable, ax, ay, yaw_rate, grid, prior, p, ay_per_friction, weights, x, P, memory, out_mu, out_std
-):  # fmt: skip
-    """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory are updated in place."""
+def _bank(drive, grid, prior, p, ay_per_friction, bank, out_mu, out_std):  # type: ignore[no-untyped-def]
+    """Run the bank over one window; weights [M], x [M, 2], P [M, 3] and memory of ``bank`` are updated in place."""
+    dt, vx, steer, usable, ax, ay, yaw_rate = drive
+    weights, x, P, memory = bank
     count = grid.shape[0]
     likelihood = np.zeros(count)
     for k in range(dt.shape[0]):
@@ -208,12 +215,10 @@ def _bank(  # type: ignore[no-untyped-def]
                 P[j, 0], P[j, 1], P[j, 2] = INITIAL_VY_STD**2, 0.0, INITIAL_YAW_RATE_STD**2
             memory[_STARTED] = 1.0
         else:
-            v = 0.5 * (memory[_SPEED] + vx[k])
-            angle = 0.5 * (memory[_STEER] + steer[k])
+            over = (0.5 * (memory[_SPEED] + vx[k]), 0.5 * (memory[_STEER] + steer[k]))
+            now = (vx[k], steer[k], ay[k], yaw_rate[k])
             for j in range(count):
-                likelihood[j] = LIKELIHOOD_POWER * _step(
-                    x[j], P[j], v, vx[k], angle, steer[k], grid[j], dt[k], ay[k], yaw_rate[k], p
-                )
+                likelihood[j] = LIKELIHOOD_POWER * _step(x[j], P[j], over, now, grid[j], dt[k], p)
         if dt[k] > 0.0:  # not at the very first stamp
             _weigh(weights, prior, likelihood, math.exp(-dt[k] / FORGETTING_S))
         likelihood[:] = 0.0
@@ -233,11 +238,6 @@ class FrictionBank:
 
     vehicle: VehicleParameters
     use_speed: bool = True
-
-    @property
-    def needs(self) -> frozenset[str]:
-        """Aligned signals without which nothing can be estimated."""
-        return self._speed_filter.needs
 
     @property
     def _speed_filter(self) -> PhysicsUkf:
@@ -263,24 +263,19 @@ class FrictionBank:
         count = len(signals)
         if carry is None:
             weights, x, P, memory = prior.copy(), np.zeros((len(grid), 2)), np.zeros((len(grid), 3)), np.zeros(_MEMORY)
-            first_dt, last = math.nan, 0
         else:
             weights, x, P, memory = carry.weights.copy(), carry.x.copy(), carry.P.copy(), carry.memory.copy()
-            last = carry.last_stamp_ns
-            first_dt = (int(signals.stamps_ns[0]) - last) * 1e-9 if count else math.nan
-        dt = np.empty(count)
-        if count:
-            dt[0] = first_dt
-            dt[1:] = np.diff(signals.stamps_ns) * 1e-9
-            last = int(signals.stamps_ns[-1])
+        before_ns = carry.last_stamp_ns if carry else None
+        dt = step_durations_s(signals.stamps_ns, before_ns)
         vx = np.where(steps.valid, steps.x[:, VX], np.nan)
         usable = np.asarray(vx > LEAST_SPEED_BLENDS * parameters.blend_high_m_s)
         friction, std = np.empty(count), np.empty(count)
-        _bank(
+        drive = (
             dt, vx, steps.inputs[:, U_STEER].copy(), usable, signals.ax_m_s2, signals.ay_m_s2, signals.yaw_rate_rad_s,
-            grid, prior, parameters, self.ay_per_friction, weights, x, P, memory, friction, std,
         )  # fmt: skip
-        after = FrictionCarry(weights, x, P, memory, last, speed_carry)
+        bank = (weights, x, P, memory)
+        _bank(drive, grid, prior, parameters, self.ay_per_friction, bank, friction, std)
+        after = FrictionCarry(weights, x, P, memory, last_stamp_ns(signals.stamps_ns, before_ns), speed_carry)
         return FrictionEstimate(friction, std, std < OBSERVABLE_STD), after
 
 

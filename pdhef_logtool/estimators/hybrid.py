@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 
-#: Table of the vehicle file that holds this filter's noise.
-TABLE = "pd-hef"
-#: Used where the file has no such table. Measurement noise at model-error level (METHOD §6): a_y m/s², yaw rate rad/s;
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
+
+#: Name under which a car holds this filter's noise.
+FILTER = "pd-hef"
+#: Used where the car has none. Measurement noise at model-error level (METHOD §6): a_y m/s², yaw rate rad/s;
 #: the speed's is the sensor's.
 HYBRID_R_STD = (1.0, 0.003)
 HYBRID_Q_STD = (0.089, 0.06, 0.03, 0.021)
@@ -49,11 +55,6 @@ class HybridUkf:
     slip_gate: bool = True
     name: str = "pd-hef-fixed-r"
     causal: bool = True
-
-    @property
-    def needs(self) -> frozenset[str]:
-        """What the physics filter needs."""
-        return self.filter.needs
 
     @property
     def filter(self) -> PhysicsUkf:
@@ -92,15 +93,16 @@ class HybridUkf:
 def hybrid_ukf(
     vehicle: VehicleParameters,
     network: NetworkService,
+    noise: FilterNoise | None = None,
     *,
     trust: float = 1.0,
     use_speed: bool = True,
     name: str = "pd-hef-fixed-r",
 ) -> HybridUkf:
-    """Return the filter with the noise of ``[filter.pd-hef]``; what the vehicle file leaves out is the default."""
-    tuning = vehicle.filter.get(TABLE, FilterTuning())
-    q = (*tuning.q_std, *HYBRID_Q_STD[len(tuning.q_std) :])
-    r = (tuning.r_std.get("ay_m_s2", HYBRID_R_STD[0]), tuning.r_std.get("yaw_rate_rad_s", HYBRID_R_STD[1]))
+    """Return the filter with a noise; what that leaves out is the default."""
+    noise = noise or FilterNoise()
+    q = (*noise.q_std, *HYBRID_Q_STD[len(noise.q_std) :])
+    r = (noise.r_std.get("ay_m_s2", HYBRID_R_STD[0]), noise.r_std.get("yaw_rate_rad_s", HYBRID_R_STD[1]))
     return HybridUkf(
         vehicle,
         network,
@@ -110,3 +112,11 @@ def hybrid_ukf(
         use_speed=use_speed,
         name=name,
     )
+
+
+def build(name: str, car: Car, options: Options) -> HybridUkf:
+    """Return the hybrid filter at a fixed trust: 0 for ``pd-hef-trust0``, else 1, unless the options have one."""
+    usual = 0.0 if name == "pd-hef-trust0" else 1.0
+    trust = usual if options.trust is None else options.trust
+    noise = car.noise.get(FILTER)
+    return hybrid_ukf(car.vehicle, options.service(car), noise, trust=trust, use_speed=options.use_speed, name=name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from numba import njit
 
@@ -20,14 +21,19 @@ from pdhef_logtool.estimators.stepwise import (
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
+
 #: Time constant of the leak, s. A pure integrator drifts by bias · time (0.08 m/s² gives 24 m/s in five minutes).
-#: Chosen against the truth of simulated drives by ``benchmarks/tune_kinematic_leak.py``, which is to its advantage.
+#: Chosen against the truth of simulated drives by ``studies.defaults.tune_kinematic_leak``, which is to its advantage.
 LEAK_S = 0.7
 STANDSTILL_SPEED_M_S = 0.05
 
 
 @njit(cache=True)
-def _kinematic(dt, ax, ay, yaw_rate, speed, leak_s, state, values, rates, valid):  # type: ignore[no-untyped-def]
+def _kinematic(sensors, leak_s, state, values, rates, valid):  # type: ignore[no-untyped-def]
+    dt, ax, ay, yaw_rate, speed = sensors
     # state: v_x, age of the speed sample, v_y, v̇_y of the step before
     for k in range(dt.shape[0]):
         advance_speed(state, dt[k], ax[k], speed[k])
@@ -56,19 +62,19 @@ class Kinematic:
     name: str = "kinematic"
     causal: bool = True
 
-    @property
-    def needs(self) -> frozenset[str]:
-        """Lateral acceleration, yaw rate and speed."""
-        return frozenset({"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
-
     def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
 
         def step(
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
         ) -> None:
-            _kinematic(
-                dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, self.leak_s, state, values, rates, valid
-            )
+            sensors = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
+            _kinematic(sensors, self.leak_s, state, values, rates, valid)
 
         return run_stepwise(self.name, signals, carry, 4, step, slip_gate=self.slip_gate)
+
+
+def build(name: str, car: Car, options: Options) -> Kinematic:
+    """Return ``kinematic``."""
+    del name, car, options
+    return Kinematic()

@@ -11,7 +11,7 @@ vehicle's mass in m/s² (METHOD §3, Eq 5-7).
 - A magic formula that was fitted to an axle holds that loss already, for steady cornering, in which the axle's own
   force says what a_y was: a_y,i = F_ss(α) / m_i. What is left is the ratio (1 − s x²) / (1 − s x_i²): it differs from 1
   only while the axles' forces do not balance, in transients. A tyre that is given by its cornering stiffness knows
-  nothing of it and gets the whole factor. On the drives of ``benchmarks/tune_physics_plus_q.py`` the load transfer
+  nothing of it and gets the whole factor. On the drives of ``studies.defaults.tune_physics_q`` the load transfer
   raises the innovation likelihood (1.922 to 1.934 a sample) and leaves the sideslip as it is (median RMSE 0.091°
   without it, 0.090° with it).
 """
@@ -100,6 +100,7 @@ def relaxation_rate(vx, p, f):  # type: ignore[no-untyped-def]
     return max(vx, p.blend_low_m_s) / f.relaxation_length_m
 
 
+# positional: scalars throughout; called four times a step, on sums of them.
 @njit(cache=True)
 def lagged_derivative(vx, vy, r, ff, fr, steer, cos_steer, ax, friction, max_rate, p, f):  # type: ignore[no-untyped-def]
     """Return d/dt [v_x, v_y, r, f_f, f_r], blended to the kinematic model at low speed.
@@ -136,6 +137,7 @@ def lagged_substeps(vx, dt, friction, p, f):  # type: ignore[no-untyped-def]
     return min(n, MAX_SUBSTEPS)
 
 
+# positional: scalars throughout, as ``rk4_step`` of the nominal model with two states more.
 @njit(cache=True)
 def lagged_rk4_step(vx, vy, r, ff, fr, steer, ax, friction, dt, n, p, f):  # type: ignore[no-untyped-def]
     """Advance [v_x, v_y, r, f_f, f_r] by ``dt`` s in ``n`` RK4 steps with constant inputs.

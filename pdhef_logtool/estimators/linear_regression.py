@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.direct_network import write_direct_steps
+from pdhef_logtool.estimators.filter_shell import VX
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import VX, FilterCarry
+from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.estimators.stepwise import StepCarry, run_stepwise
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,11 +41,6 @@ class LinearRegression:
     slip_gate: bool = True
     name: str = "linear-regression"
     causal: bool = True
-
-    @property
-    def needs(self) -> frozenset[str]:
-        """What the physics filter needs, which gives the features."""
-        return parallel_filter(self.vehicle, use_speed=self.use_speed).needs
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -70,3 +71,10 @@ class LinearRegression:
 
         track, steps = run_stepwise(self.name, signals, carry.steps if carry else None, 1, step)
         return track, RegressionCarry(after, steps)
+
+
+def build(name: str, car: Car, options: Options) -> LinearRegression:
+    """Return ``linear-regression`` of a car whose network has it."""
+    del name
+    assert car.network is not None and car.network.linear_regression is not None
+    return LinearRegression(car.vehicle, car.network.linear_regression, use_speed=options.use_speed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from numba import njit
 
@@ -28,12 +29,17 @@ from pdhef_logtool.estimators.stepwise import (
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
+
 #: The rate of a_y is taken along the motion over this time.
 AY_RATE_STEP_S = 0.001
 
 
 @njit(cache=True)
-def _open_loop(dt, steer, ax, speed, friction, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
+def _open_loop(inputs, default_friction, p, state, values, rates, valid):  # type: ignore[no-untyped-def]
+    dt, steer, ax, speed, friction = inputs
     # state: v_x, age of the speed sample, v_y, r, steering and friction of the step before
     for k in range(dt.shape[0]):
         before = state[0]
@@ -81,11 +87,6 @@ class OpenLoop:
     name: str = "open-loop"
     causal: bool = True
 
-    @property
-    def needs(self) -> frozenset[str]:
-        """Steering and speed."""
-        return frozenset({"steer_rad", "speed_m_s"})
-
     def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         p = model_parameters(self.vehicle)
@@ -94,9 +95,14 @@ class OpenLoop:
         def step(
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
         ) -> None:
-            _open_loop(
-                dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction, mu, p, state, values, rates, valid
-            )  # fmt: skip
+            inputs = (dt, s.steer_rad, s.ax_m_s2, s.speed_m_s, s.friction)
+            _open_loop(inputs, mu, p, state, values, rates, valid)
 
         std = self.vehicle.sensors.speed_std_m_s
         return run_stepwise(self.name, signals, carry, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)
+
+
+def build(name: str, car: Car, options: Options) -> OpenLoop:
+    """Return ``open-loop`` of a car."""
+    del name, options
+    return OpenLoop(car.vehicle)

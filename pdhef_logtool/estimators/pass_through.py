@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from numba import njit
 
@@ -11,9 +12,14 @@ from pdhef_logtool.estimators.stepwise import StepCarry, advance_speed, run_step
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
+
 
 @njit(cache=True)
-def _pass_through(dt, ax, ay, yaw_rate, speed, vy, state, values, valid):  # type: ignore[no-untyped-def]
+def _pass_through(sensors, vy, state, values, valid):  # type: ignore[no-untyped-def]
+    dt, ax, ay, yaw_rate, speed = sensors
     for k in range(dt.shape[0]):
         advance_speed(state, dt[k], ax[k], speed[k])
         values[k, 0] = state[0]
@@ -34,11 +40,6 @@ class PassThrough:
     claims_zero_sideslip: bool
     causal: bool = True
 
-    @property
-    def needs(self) -> frozenset[str]:
-        """Speed and yaw rate."""
-        return frozenset({"speed_m_s", "yaw_rate_rad_s"})
-
     def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         vy = 0.0 if self.claims_zero_sideslip else math.nan
@@ -46,6 +47,12 @@ class PassThrough:
         def step(
             dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, _: FloatArray, valid: BoolArray
         ) -> None:
-            _pass_through(dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s, vy, state, values, valid)
+            _pass_through((dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s), vy, state, values, valid)
 
         return run_stepwise(self.name, signals, carry, 2, step)
+
+
+def build(name: str, car: Car, options: Options) -> PassThrough:
+    """Return ``zero`` or ``gyro``."""
+    del car, options
+    return PassThrough(name, claims_zero_sideslip=name == "zero")

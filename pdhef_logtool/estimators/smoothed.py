@@ -27,27 +27,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale
-from pdhef_logtool.estimators.hybrid import TABLE as FILTER_TABLE
+from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
-from pdhef_logtool.estimators.physics import (
-    AX_BIAS,
-    LINK_BIASES,
-    LINK_NONE,
-    FilterCarry,
-    PhysicsUkf,
-    PosteriorSteps,
-    StepLinks,
-)
+from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, PhysicsUkf, StepLinks
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
+from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, cut_signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.service import NetworkService
 
-#: Table of the vehicle file that holds this estimator's noise; without it that of the filter is used.
-TABLE = "pd-hef-smoothed"
-#: Used where the file has neither: v_y's noise is 3/4 of the filter's. On 30 simulated validation drives the geometric
+#: Name under which a car holds this estimator's noise; without it that of the filter is used.
+NAME = "pd-hef-smoothed"
+#: Used where the car has neither: v_y's noise is 3/4 of the filter's. On 30 simulated validation drives the geometric
 #: mean of the sideslip RMSE is 0.0260° with 97 % in the 95 % band: 0.0274° at the filter's noise, 0.0253° but narrower
 #: bands at half of it; without bias states 0.0307° at the filter's noise; the filter itself has 0.0309°.
 SMOOTHED_Q_STD = (0.089, 0.045, 0.03, 0.021)
@@ -90,8 +84,16 @@ def _smoother_gain(cross, predicted, first, L, gain):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _smooth(x, P, prior, kind, predicted_P, cross, first, last, end, out_x, out_P):  # type: ignore[no-untyped-def]
-    """Smooth steps ``first`` to ``last`` with all up to ``end`` (inclusive); writes out_x [K, n], out_P [K, n, n]."""
+def _smooth(forward, links, span, smoothed):  # type: ignore[no-untyped-def]
+    """Smooth the first steps of a span with all of it; writes state [K, n] and covariance [K, n, n].
+
+    ``forward`` are posterior state, covariance and prior state, ``links`` the columns of :class:`~.physics.StepLinks`,
+    ``span`` the first step, the last one that is written and the last one, inclusive.
+    """
+    x, P, prior = forward
+    kind, predicted_P, cross = links
+    first, last, end = span
+    out_x, out_P = smoothed
     n = x.shape[1]
     xs, Ps = x[end].copy(), P[end].copy()
     L, gain, change = np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
@@ -140,19 +142,17 @@ def smooth_steps(
     """
     n = steps.x.shape[1]
     x, P = np.empty((count, n)), np.empty((count, n, n))
+    forward, tied = (steps.x, steps.P, steps.prior), (links.kind, links.predicted_P, links.cross)
     block = (steps.stamps_ns - origin_ns) // block_ns
     for b in np.unique(block[:count]).tolist():
         first, behind = (int(i) for i in np.searchsorted(block, (b, b + 1)))
         end = int(np.searchsorted(block, b + 2)) - 1
-        _smooth(
-            steps.x, steps.P, steps.prior, links.kind, links.predicted_P, links.cross, first,
-            min(behind, count) - 1, end, x, P,
-        )  # fmt: skip
+        _smooth(forward, tied, (first, min(behind, count) - 1, end), (x, P))
     return x, P
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ForwardSteps:
+class ForwardSteps(StepColumns):
     """Steps of the forward pass: posteriors, what ties them, and what was wrong with their samples.
 
     ``extra_r`` [K, 2] and ``reason`` [K] are those of :class:`~.sensor_faults.SensorFaults`.
@@ -166,21 +166,6 @@ class ForwardSteps:
     def __len__(self) -> int:
         """Return the number of steps."""
         return len(self.reason)
-
-    def joined(self, other: ForwardSteps) -> ForwardSteps:
-        """Append the steps that follow."""
-        return ForwardSteps(
-            self.posterior.joined(other.posterior),
-            self.links.joined(other.links),
-            np.concatenate([self.extra_r, other.extra_r]),
-            np.concatenate([self.reason, other.reason]),
-        )
-
-    def since(self, index: int) -> ForwardSteps:
-        """Keep the steps from ``index`` on."""
-        return ForwardSteps(
-            self.posterior.since(index), self.links.since(index), self.extra_r[index:], self.reason[index:]
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,11 +199,6 @@ class SmoothedHybrid:
     name: str = "pd-hef-smoothed"
     causal: bool = False
     notes: tuple[str, ...] = (NOT_CAUSAL,)
-
-    @property
-    def needs(self) -> frozenset[str]:
-        """What the filter needs."""
-        return self.hybrid.needs
 
     @property
     def look_ahead_s(self) -> float:
@@ -300,18 +280,14 @@ class SmoothedHybrid:
 def smoothed_hybrid(
     vehicle: VehicleParameters,
     network: NetworkService,
+    noise: FilterNoise | None = None,
     *,
     trust: float = 1.0,
     use_speed: bool = True,
     notes: tuple[str, ...] = (),
 ) -> SmoothedHybrid:
-    """Return ``pd-hef-smoothed`` with the noise of its own table of the vehicle file, else with that of the filter."""
-    own = None if FILTER_TABLE in vehicle.filter else FilterTuning()
-    own = vehicle.filter.get(TABLE, own)
-    if own is None:
-        tuning = vehicle.filter[FILTER_TABLE]
-    else:
-        tuning = FilterTuning(q_std=(*own.q_std, *SMOOTHED_Q_STD[len(own.q_std) :]), r_std=own.r_std)
-    tuned = vehicle.model_copy(update={"filter": {FILTER_TABLE: tuning}})
-    hybrid = hybrid_ukf(tuned, network, trust=trust, use_speed=use_speed, name=TABLE)
-    return SmoothedHybrid(replace(hybrid, vehicle=vehicle), notes=(NOT_CAUSAL, *notes))
+    """Return ``pd-hef-smoothed`` with a noise; what its ``q_std`` leaves out is :data:`SMOOTHED_Q_STD`."""
+    noise = noise or FilterNoise()
+    noise = noise.model_copy(update={"q_std": (*noise.q_std, *SMOOTHED_Q_STD[len(noise.q_std) :])})
+    hybrid = hybrid_ukf(vehicle, network, noise, trust=trust, use_speed=use_speed, name=NAME)
+    return SmoothedHybrid(hybrid, notes=(NOT_CAUSAL, *notes))

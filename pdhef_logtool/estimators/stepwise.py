@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
+from pdhef_logtool.records.release import StepColumns, last_stamp_ns, predictable, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.watches.speed_slip import ASSUMED_STD_M_S, SlipCarry, believable
@@ -24,7 +24,7 @@ VX, VY, YAW_RATE, AY = 0, 1, 2, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Steps:
+class Steps(StepColumns):
     """Estimates on measurement time: values and rates [K, 4] over [v_x, v_y, r, a_y]; NaN is allowed."""
 
     stamps_ns: IntArray
@@ -33,21 +33,13 @@ class Steps:
     rates: FloatArray
     valid: BoolArray
 
-    def joined(self, other: Steps) -> Steps:
-        """Append the next window's steps."""
-        return Steps(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in self.__slots__))
-
-    def since(self, index: int) -> Steps:
-        """Keep the steps from ``index`` on."""
-        return Steps(*(getattr(self, n)[index:] for n in self.__slots__))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepCarry:
     """Memory of a baseline between windows: its own state vector and the steps that outputs still need."""
 
     state: FloatArray
-    last_stamp_ns: int
+    last_stamp_ns: int | None
     steps: Steps
     slip: SlipCarry | None = None
 
@@ -74,10 +66,8 @@ def run_stepwise(
     signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=slip_gate, reckoned=True)
     count = len(signals)
     state = np.full(state_size, np.nan) if carry is None else carry.state.copy()
-    dt = np.empty(count)
-    if count:
-        dt[0] = np.nan if carry is None else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
-        dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+    before_ns = carry.last_stamp_ns if carry else None
+    dt = step_durations_s(signals.stamps_ns, before_ns)
     values = np.full((count, 4), np.nan)
     rates = np.zeros((count, 4))
     valid = np.zeros(count, dtype=np.bool_)
@@ -85,16 +75,9 @@ def run_stepwise(
     steps = Steps(signals.stamps_ns, signals.ready_ns, values, rates, valid)
     if carry is not None:
         steps = carry.steps.joined(steps)
-    index = released_steps(steps.ready_ns, signals.stamps_ns)
-    at = np.maximum(index, 0)
-    horizon = (signals.stamps_ns - steps.stamps_ns[at]) * 1e-9 if len(steps.stamps_ns) else np.zeros(count)
-    usable = (index >= 0) & (horizon <= MAX_PREDICTION_S)
-    if len(steps.stamps_ns):
-        usable &= steps.valid[at]
-        out = steps.values[at] + steps.rates[at] * horizon[:, None]
-        out[~usable] = np.nan
-    else:
-        out = np.empty((0, 4))
+    released, horizon_s, usable = predictable(steps.stamps_ns, steps.ready_ns, steps.valid, signals.stamps_ns)
+    out = steps.values[released.at] + steps.rates[released.at] * horizon_s[:, None]
+    out[~usable] = np.nan
     track = make_track(
         name,
         signals.stamps_ns,
@@ -104,9 +87,8 @@ def run_stepwise(
         ay_m_s2=out[:, AY].copy(),
         valid=usable,
     )
-    last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else 0)
-    newest = int(index[-1]) if count else -1
-    return track, StepCarry(state, last, steps.since(max(newest, 0)), slip)
+    last = last_stamp_ns(signals.stamps_ns, before_ns)
+    return track, StepCarry(state, last, steps.since(released.needed), slip)
 
 
 @njit(cache=True)

@@ -142,16 +142,17 @@ def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
             d += 1
     if d == 0:
         return 0.0, 0, 0.0
-    A = np.empty((d, d))
+    both = np.empty((2, d, d))  # to allocate takes longer than to compute
+    A, L = both[0], both[1]
     for i in range(d):
         for j in range(d):
             A[i, j] = S[index[i], index[j]]
-    L = np.empty((d, d))
     if not cholesky_lower(A, L):
         repair_covariance(A)
         cholesky_lower(A, L)
     # w = L⁻¹ ν and G = P_xz L⁻ᵀ, by forward substitution
-    w = np.empty(d)
+    gain = np.empty((n + 1, d))
+    G, w = gain[:n], gain[n]
     log_det = 0.0
     nis = 0.0
     for i in range(d):
@@ -161,7 +162,6 @@ def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
         w[i] = s / L[i, i]
         nis += w[i] * w[i]
         log_det += 2.0 * math.log(L[i, i])
-    G = np.empty((n, d))
     for a in range(n):
         for i in range(d):
             s = Pxz[a, index[i]]

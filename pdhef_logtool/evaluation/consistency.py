@@ -23,7 +23,7 @@ from itertools import combinations
 import numpy as np
 
 from pdhef_logtool.drive.interpolation import Bracket
-from pdhef_logtool.evaluation.metrics import MetricRow, state_rows
+from pdhef_logtool.evaluation.metrics import MetricRow, known_by_segment, state_rows
 from pdhef_logtool.evaluation.segments import smooth
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
@@ -72,14 +72,9 @@ def disagreement_rows(
     for a, b in combinations(tracks, 2):
         moving = a.valid & b.valid & (a.vx_m_s > low_speed_m_s) & (b.vx_m_s > low_speed_m_s)
         difference = wrap_angle(a.sideslip_rad - b.sideslip_rad)
-        for segment, mask in masks.items():
-            use = mask & moving & np.isfinite(difference)
-            n = int(np.count_nonzero(use))
-            if n:
-                rms = float(np.sqrt(np.mean(difference[use] ** 2)))
-                rows.append(
-                    MetricRow(log, f"{a.name}~{b.name}", "sideslip_rad", segment, "disagreement_rms", rms, "rad", n)
-                )
+        for segment, inside in known_by_segment(np.where(moving, difference, np.nan), masks):
+            rms, n, pair = float(np.sqrt(np.mean(inside**2))), int(inside.size), f"{a.name}~{b.name}"
+            rows.append(MetricRow(log, pair, "sideslip_rad", segment, "disagreement_rms", rms, "rad", n))
     return rows
 
 
@@ -93,13 +88,10 @@ def sensor_rows(signals: Signals, masks: Mapping[str, BoolArray], *, log: str, l
         ("ay_m_s2", lateral, "m/s^2"),
         ("vx_m_s", _speed_change_residual(signals), "m/s"),
     ):
-        for segment, mask in masks.items():
-            inside = residual[mask & np.isfinite(residual)]
-            if inside.size:
-                n = int(inside.size)
-                rms, bias = float(np.sqrt(np.mean(inside**2))), float(np.mean(inside))
-                rows.append(MetricRow(log, SENSORS, signal, segment, "residual_rms", rms, unit, n))
-                rows.append(MetricRow(log, SENSORS, signal, segment, "residual_bias", bias, unit, n))
+        for segment, inside in known_by_segment(residual, masks):
+            n, rms, bias = int(inside.size), float(np.sqrt(np.mean(inside**2))), float(np.mean(inside))
+            rows.append(MetricRow(log, SENSORS, signal, segment, "residual_rms", rms, unit, n))
+            rows.append(MetricRow(log, SENSORS, signal, segment, "residual_bias", bias, unit, n))
     return rows
 
 

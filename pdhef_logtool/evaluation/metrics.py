@@ -29,7 +29,7 @@ invalid estimate, a missing pose or a gap does not count.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,7 +58,9 @@ MAX_STEP_S = 0.2
 
 @dataclass(frozen=True, slots=True)
 class MetricRow:
-    """One figure. The first eight fields are the columns of metrics.parquet.
+    """One figure. The first eight fields and ``algorithm`` are the columns of metrics.parquet.
+
+    ``algorithm`` is the digest of what ran under the estimator's name; empty where nobody knows (recorded estimates).
 
     ``independent`` is False when the truth of this signal is one of the estimators' inputs; tables and rankings leave
     such rows out. In the file a row with metric ``not_independent`` says so for its estimator and signal.
@@ -73,6 +75,7 @@ class MetricRow:
     unit: str
     n: int
     independent: bool = True
+    algorithm: str = ""
 
 
 def score_track(
@@ -95,8 +98,7 @@ def score_track(
 
     Raises
     ------
-    ValueError
-        The tracks or masks are not at the same stamps.
+    ValueError : The tracks or masks are not at the same stamps.
     """
     _check_shapes(estimate, truth, masks)
     masks = {ALL: np.ones(len(truth), dtype=np.bool_), **masks}
@@ -109,8 +111,10 @@ def score_track(
     dependent = frozenset(not_independent or ()) & frozenset(r.signal for r in rows)
     marked = [replace(r, independent=False) if r.signal in dependent else r for r in rows]
     marks = [
-        MetricRow(log, estimate.name, signal, ALL, "not_independent", 1.0, "1", _count(rows, signal), False)
-        for signal in sorted(dependent)
+        MetricRow(
+            log, estimate.name, s, ALL, "not_independent", 1.0, "1", max(r.n for r in rows if r.signal == s), False
+        )
+        for s in sorted(dependent)
     ]
     return marked + marks
 
@@ -131,6 +135,14 @@ def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -
             share = float(np.mean(track.diverged[mask]))
             rows.append(MetricRow(log, track.name, "state", segment, "diverged", share, "1", inside))
     return rows
+
+
+def known_by_segment(values: FloatArray, masks: Mapping[str, BoolArray]) -> Iterator[tuple[str, FloatArray]]:
+    """Yield the finite ones of values [N] of each segment that has any."""
+    for segment, mask in masks.items():
+        inside = values[mask & np.isfinite(values)]
+        if inside.size:
+            yield segment, inside
 
 
 def truth_speed(truth: StateTrack) -> FloatArray:
@@ -306,14 +318,10 @@ def _nees_rows(estimate: StateTrack, truth: StateTrack, masks: Mapping[str, Bool
         covariance = covariance + truth.covariance
     error = np.stack([getattr(estimate, s) - getattr(truth, s) for s in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")], axis=1)
     value = nees(np.where((estimate.valid & truth.valid)[:, None], error, np.nan), covariance)
-    rows = []
-    for segment, mask in masks.items():
-        inside = value[mask & np.isfinite(value)]
-        if inside.size:
-            rows.append(
-                MetricRow(log, estimate.name, "state", segment, "nees", float(np.mean(inside)), "1", int(inside.size))
-            )
-    return rows
+    return [
+        MetricRow(log, estimate.name, "state", segment, "nees", float(np.mean(inside)), "1", int(inside.size))
+        for segment, inside in known_by_segment(value, masks)
+    ]
 
 
 def _pose_known(truth: StateTrack) -> BoolArray:
@@ -331,7 +339,3 @@ def _dead_reckon(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     vx = np.where(track.valid, track.vx_m_s, np.nan)
     return dead_reckon(track.stamps_ns[first:], vx[first:], track.vy_m_s[first:], track.yaw_rate_rad_s[first:], start)
-
-
-def _count(rows: list[MetricRow], signal: str) -> int:
-    return max(r.n for r in rows if r.signal == signal)

@@ -7,19 +7,18 @@ signal or a log without truth cannot pass a gate silently; ``optional = true`` t
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from pdhef_logtool.evaluation.consistency import SENSORS
 from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, MetricRow
 from pdhef_logtool.evaluation.segments import SEGMENTS
+from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import UsageError
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -150,14 +149,7 @@ def load_thresholds(path: Path) -> tuple[Threshold, ...]:
     UsageError
         The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
     """
-    try:
-        with path.open("rb") as file:
-            raw: dict[str, Any] = tomllib.load(file)
-    except FileNotFoundError:
-        raise UsageError(expected="a thresholds TOML file", got="no such file", where=str(path)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise UsageError(expected="a thresholds TOML file", got=str(error), where=str(path)) from None
-    return thresholds_from_dict(raw, where=str(path))
+    return thresholds_from_dict(read_toml(path, "a thresholds TOML file", UsageError), where=str(path))
 
 
 def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold, ...]:
@@ -165,10 +157,9 @@ def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold,
 
     Raises
     ------
-    UsageError
-        Entries are wrong, unknown, missing or contradict one another, or there is no threshold at all.
+    UsageError : Entries are wrong, unknown, missing or contradict one another, or there is no threshold at all.
     """
-    problems = [f"{key}: unknown table{_near(key, ('threshold',))}" for key in raw if key != "threshold"]
+    problems = [unknown(key, ("threshold",)) for key in raw if key != "threshold"]
     tables = raw.get("threshold", [])
     if not isinstance(tables, list) or not tables:
         problems.append("threshold: give at least one [[threshold]] table")
@@ -193,10 +184,8 @@ def thresholds_from_dict(raw: dict[str, Any], *, where: str) -> tuple[Threshold,
 
 
 def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | None:
-    try:
-        table = _ThresholdTable.model_validate(raw)
-    except ValidationError as error:
-        problems += _pydantic_problems(error, where)
+    table = checked(_ThresholdTable, raw, where, problems)
+    if table is None:
         return None
     before = len(problems)
     for key, value, known in (
@@ -205,7 +194,7 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
         ("segment", table.segment, SEGMENTS),
     ):
         if value not in known:
-            problems.append(f"{where}.{key}: unknown {key} {value!r}{_near(value, known)}")
+            problems.append(f"{where}.{key} = {unknown(value, known)}")
     if table.min is None and table.max is None:
         problems.append(f"{where}: give min, max or both")
     elif table.min is not None and table.max is not None and table.min > table.max:
@@ -219,34 +208,8 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
         allowed = [native, *(u for u, of in _CONVERSIONS if of == native)]
         problems.append(f"{where}.unit: {table.signal} {table.metric} is in {' or '.join(allowed)}, not {unit!r}")
         return None
-    return Threshold(
-        signal=table.signal,
-        metric=table.metric,
-        estimator=table.estimator,
-        segment=table.segment,
-        minimum=table.min,
-        maximum=table.max,
-        unit=unit,
-        factor=factor,
-        optional=table.optional,
-    )
-
-
-def _pydantic_problems(error: ValidationError, where: str) -> list[str]:
-    problems = []
-    for e in error.errors(include_url=False):
-        key = str(e["loc"][0]) if e["loc"] else ""
-        at = f"{where}.{key}" if key else where
-        if e["type"] == "extra_forbidden":
-            problems.append(f"{at}: unknown entry{_near(key, tuple(_ThresholdTable.model_fields))}")
-        else:
-            problems.append(f"{at}: {'is missing' if e['type'] == 'missing' else e['msg']}")
-    return problems
-
-
-def _near(name: str, known: tuple[str, ...]) -> str:
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f" (did you mean {close[0]}?)" if close else ""
+    rest = table.model_dump(exclude={"min", "max", "unit"})
+    return Threshold(minimum=table.min, maximum=table.max, unit=unit, factor=factor, **rest)
 
 
 def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow], *, log: str) -> list[Verdict]:

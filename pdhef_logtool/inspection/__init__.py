@@ -2,26 +2,7 @@
 
 from __future__ import annotations
 
-from pdhef_logtool.inspection.rendering import render_inspection
-from pdhef_logtool.inspection.report import (
-    ClockReport,
-    Inspection,
-    SignalReport,
-    TopicReport,
-    inspect_drive_log,
-    inspect_log,
-    mapping_comments,
-    write_mapping,
-)
-
-__all__ = [
-    "ClockReport",
-    "Inspection",
-    "SignalReport",
-    "TopicReport",
-    "inspect_drive_log",
-    "inspect_log",
-    "mapping_comments",
-    "render_inspection",
-    "write_mapping",
-]
+from pdhef_logtool.inspection.rendering import render_inspection as render_inspection
+from pdhef_logtool.inspection.report import inspect_drive_log as inspect_drive_log
+from pdhef_logtool.inspection.report import inspect_log as inspect_log
+from pdhef_logtool.inspection.report import write_mapping as write_mapping

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, replace
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,7 +31,9 @@ from pdhef_logtool.mapping import (
     read_signals,
     resolve_mapping,
 )
+from pdhef_logtool.mapping.clocks import sources_by_clock
 from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
 
@@ -148,19 +151,19 @@ class Inspection:
             "start_ns": self.start_ns,
             "end_ns": self.end_ns,
             "duration_s": self.duration_s,
-            "topics": [asdict(t) for t in self.topics],
-            "clocks": [asdict(c) for c in self.clocks],
+            "topics": self.topics,
+            "clocks": self.clocks,
             "mapping_origin": self.mapping.origin,
-            "signals": {n: asdict(s) for n, s in self.signals.items()},
-            "truth": {n: asdict(s) for n, s in self.truth.items()},
+            "signals": self.signals,
+            "truth": self.truth,
             "truth_quality": None if self.mapping.quality is None else self.mapping.quality.describe(),
-            "missing": list(self.missing),
-            "ambiguities": [asdict(a) for a in self.ambiguities],
-            "notes": list(self.notes),
-            "warnings": [asdict(w) for w in self.warnings],
-            "lost": [asdict(loss) for loss in self.lost],
+            "missing": self.missing,
+            "ambiguities": self.ambiguities,
+            "notes": self.notes,
+            "warnings": self.warnings,
+            "lost": self.lost,
         }
-        return {key: _json_value(value) for key, value in document.items()}
+        return {key: jsonable(value) for key, value in document.items()}
 
 
 def inspect_log(
@@ -173,16 +176,11 @@ def inspect_log(
 
     Raises
     ------
-    LogError
-        The file is no log.
-    MappingError
-        The mapping names what the log does not hold.
+    LogError : The file is no log.
+    MappingError : The mapping names what the log does not hold.
     """
-    log = open_log(path)
-    try:
+    with closing(open_log(path)) as log:
         return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
-    finally:
-        log.close()
 
 
 def inspect_drive_log(
@@ -213,19 +211,17 @@ def inspect_drive_log(
         for name, channel in channels.signals.items():
             thinned[name].append(_thin(channel))
     reading = merge_losses(losses)
-    signals = {
-        n: _signal_report(s, "signals", gathered, clocks, reading, log, None) for n, s in mapping.signals.items()
-    }
-    truth = {
-        n: _signal_report(s, "truth", gathered, clocks, reading, log, mapping.quality) for n, s in mapping.truth.items()
-    }
+    signals, truth = (
+        {n: _signal_report(s, section, gathered, clocks, reading, log, mapping.quality) for n, s in sources.items()}
+        for section, sources in (("signals", mapping.signals), ("truth", mapping.truth))
+    )
     return Inspection(
         path=str(log.path),
         kind=log.kind,
         start_ns=log.start_ns,
         end_ns=log.end_ns,
         topics=tuple(_topic_report(t, steps[t.name], delays[t.name], log) for t in log.topics),
-        clocks=tuple(_clock_report(s, clocks[clock_key(s)]) for s in _one_per_clock(mapping.sources())),
+        clocks=tuple(_clock_report(s, clocks[key]) for key, s in sources_by_clock(mapping).items()),
         mapping=mapping,
         signals=signals,
         truth=truth,
@@ -352,20 +348,13 @@ def _clock_report(source: SignalSource, clock: ClockModel) -> ClockReport:
     )
 
 
-def _one_per_clock(sources: Iterable[SignalSource]) -> list[SignalSource]:
-    found: dict[str, SignalSource] = {}
-    for source in sources:
-        found.setdefault(clock_key(source), source)
-    return list(found.values())
-
-
 def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
     notes = []
-    for source in _one_per_clock(mapping.sources()):
-        clock = clocks[clock_key(source)]
-        if source.clock == "device" and clock.residual_s > CLOCK_RESIDUAL_S:
+    for key, source in sources_by_clock(mapping).items():
+        residual_s = clocks[key].residual_s
+        if source.clock == "device" and residual_s > CLOCK_RESIDUAL_S:
             notes.append(
-                f"the clock of {clock_key(source)} leaves its fitted line by {clock.residual_s * 1e3:.0f} ms: "
+                f"the clock of {key} leaves its fitted line by {residual_s * 1e3:.0f} ms: "
                 "it stepped, or its drift changed"
             )
     return notes
@@ -373,16 +362,6 @@ def _clock_notes(mapping: Mapping, clocks: dict[str, ClockModel]) -> list[str]:
 
 def _inverse(seconds: float) -> float:
     return 1.0 / seconds if math.isfinite(seconds) and seconds > 0.0 else float("nan")
-
-
-def _json_value(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _json_value(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_json_value(v) for v in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 # ------------------------------------------------------------------------------------------------ mapping
@@ -416,8 +395,7 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
 
     Raises
     ------
-    OutputError
-        The file exists already (somebody may have edited it) or cannot be written.
+    OutputError : The file exists already (somebody may have edited it) or cannot be written.
     """
     if path.exists():
         raise OutputError(

@@ -25,7 +25,6 @@ class StepStatistics:
     """
 
     count: int = 0
-    first_ns: int | None = None
     last_ns: int | None = None
     steps_s: list[FloatArray] = field(default_factory=list)
     long_steps: list[tuple[float, int]] = field(default_factory=list)
@@ -35,7 +34,6 @@ class StepStatistics:
         if times_ns.shape[0] == 0:
             return
         self.count += int(times_ns.shape[0])
-        self.first_ns = int(times_ns[0]) if self.first_ns is None else self.first_ns
         joined = times_ns if self.last_ns is None else np.concatenate([[np.int64(self.last_ns)], times_ns])
         self.last_ns = int(times_ns[-1])
         steps = np.diff(joined) * 1e-9

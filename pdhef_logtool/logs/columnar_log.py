@@ -4,24 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
-    compile_decoder,
     concatenate_columns,
     empty_column,
     missing_column,
-    undecodable_topic,
 )
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
-from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves
+from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves, resolve
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -44,11 +41,11 @@ class ColumnarLog:
     def __init__(
         self, path: Path, kind: str, containers: Sequence[Container], lost: Sequence[Loss] = (), distro: str = ""
     ) -> None:
-        self._path = path
-        self._kind = kind
-        self._containers = tuple(containers)
+        self.path = path
+        self.kind = kind
+        self.containers = tuple(containers)
         self._opened_lost = tuple(lost)
-        self._distro = distro
+        self.distro = distro
         self._damaged: dict[tuple[int, int], Loss] = {}
         # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
         self._undecodable: dict[tuple[int, int, int], IntArray] = {}
@@ -57,31 +54,11 @@ class ColumnarLog:
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
 
     @property
-    def path(self) -> Path:
-        """The file or folder."""
-        return self._path
-
-    @property
-    def kind(self) -> str:
-        """The container format."""
-        return self._kind
-
-    @property
-    def containers(self) -> tuple[Container, ...]:
-        """The files of the log."""
-        return self._containers
-
-    @property
-    def distro(self) -> str:
-        """ROS distribution that types without definitions are taken from; empty if unknown."""
-        return self._distro
-
-    @property
     def topics(self) -> tuple[TopicInfo, ...]:
         """All topics by name; ``messages`` leaves out those of spans found damaged so far."""
         counts: Counter[str] = Counter()
         first: dict[str, ChannelRecord] = {}
-        for c, container in enumerate(self._containers):
+        for c, container in enumerate(self.containers):
             for channel in container.channels.values():
                 first.setdefault(channel.topic, channel)
             for span in container.spans:
@@ -95,18 +72,18 @@ class ColumnarLog:
     @property
     def start_ns(self) -> int:
         """First log time; 0 for a log without messages."""
-        return min((s.start_ns for c in self._containers for s in c.spans), default=0)
+        return min((s.start_ns for c in self.containers for s in c.spans), default=0)
 
     @property
     def end_ns(self) -> int:
         """Last log time + 1; 0 for a log without messages."""
-        return max((s.end_ns for c in self._containers for s in c.spans), default=0)
+        return max((s.end_ns for c in self.containers for s in c.spans), default=0)
 
     @property
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now."""
         found = list(self._opened_lost)
-        for c, container in enumerate(self._containers):
+        for c, container in enumerate(self.containers):
             found.extend(container.lost)
             found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
             found.extend(self._undecodable_losses(c, container))
@@ -123,7 +100,7 @@ class ColumnarLog:
 
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
-        for c, container in enumerate(self._containers):
+        for c, container in enumerate(self.containers):
             for channel in container.channels.values():
                 if channel.topic == topic:
                     schema = self._schema(c, channel)
@@ -143,7 +120,7 @@ class ColumnarLog:
         ------
         MappingError : the log has no such topic, no such field, or cannot decode the topic.
         """
-        plans = {topic: self._cached_plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
+        plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         return self._collect(plans, start_ns, end_ns)
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
@@ -153,12 +130,12 @@ class ColumnarLog:
     def close(self) -> None:
         """Release the files."""
         self._kept.clear()
-        for container in self._containers:
+        for container in self.containers:
             container.close()
 
     def load(self, c: int, span: Span, want: frozenset[int] | None = None) -> Block | None:
         """Read a span of the c-th container; None and a recorded loss if it is damaged."""
-        container = self._containers[c]
+        container = self.containers[c]
         want = want if container.selective else None
         key = (c, span.index)
         if key in self._damaged:
@@ -184,7 +161,7 @@ class ColumnarLog:
         key = (c, channel.id)
         if key not in self._schemas:
             try:
-                self._schemas[key] = channel_schema(channel, self._distro, self._example(c, channel))
+                self._schemas[key] = channel_schema(channel, self.distro, self._example(c, channel))
             except SchemaError as error:
                 self._schemas[key] = error
         return self._schemas[key]
@@ -193,7 +170,7 @@ class ColumnarLog:
         """Return a channel's first message if its schema has to be taken from it."""
         if channel.encoding != "json" or channel.schema_data.strip():
             return None
-        for span in self._containers[c].spans:
+        for span in self.containers[c].spans:
             if channel.id in span.counts:
                 block = self.load(c, span)
                 if block is None:
@@ -205,17 +182,13 @@ class ColumnarLog:
                     return bytes(block.buffer[at : at + n])
         return None
 
-    def _cached_plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:
-        key = (topic, paths)
-        if key not in self._plans:
-            self._plans[key] = self._plan(topic, paths)
-        return self._plans[key]
-
     def _plan(self, topic: str, paths: tuple[str, ...]) -> _Plan:
+        if (topic, paths) in self._plans:
+            return self._plans[topic, paths]
         decoders: dict[tuple[int, int], ChannelDecoder] = {}
         problems: list[MappingError] = []
         found = False
-        for c, container in enumerate(self._containers):
+        for c, container in enumerate(self.containers):
             for channel in container.channels.values():
                 if channel.topic != topic:
                     continue
@@ -224,10 +197,18 @@ class ColumnarLog:
                     continue
                 schema = self._schema(c, channel)
                 if isinstance(schema, SchemaError):
-                    problems.append(undecodable_topic(topic, str(schema)))
+                    problems.append(
+                        MappingError(
+                            expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
+                            got=str(schema),
+                            where=topic,
+                            remedy="map another topic",
+                        )
+                    )
                     continue
                 try:
-                    decoders[(c, channel.id)] = compile_decoder(schema, topic, paths)
+                    selections = tuple(resolve(schema, topic, path) for path in paths)
+                    decoders[(c, channel.id)] = ChannelDecoder(schema, selections)
                 except MappingError as error:
                     problems.append(error)
         if not found:
@@ -236,7 +217,8 @@ class ColumnarLog:
             raise problems[0]
         # A second publisher of another type under the same topic lacks the fields: NaN there.
         selections = next(iter(decoders.values())).selections if decoders else ()
-        return _Plan(selections, decoders)
+        self._plans[topic, paths] = _Plan(selections, decoders)
+        return self._plans[topic, paths]
 
     def _no_such_topic(self, topic: str) -> MappingError:
         import difflib
@@ -246,70 +228,57 @@ class ColumnarLog:
         return MappingError(
             expected="a topic of the log",
             got=repr(topic),
-            where=str(self._path),
+            where=str(self.path),
             remedy=f"nearest: {', '.join(near)}" if near else "the log has no topics",
         )
 
-    def _overlapping(self, start_ns: int | None, end_ns: int | None) -> Iterator[tuple[int, Container, Span]]:
-        for c, container in enumerate(self._containers):
-            for span in container.spans:
-                if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
-                    yield c, container, span
-
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
-        parts: dict[str, list[_Part]] = {topic: [] for topic in plans}
-        for c, container, span in self._overlapping(start_ns, end_ns):
+        parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
+        overlapping = (
+            (c, container, span)
+            for c, container in enumerate(self.containers)
+            for span in container.spans
+            if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
+        )
+        for c, container, span in overlapping:
             topic_of = {i: ch.topic for i, ch in container.channels.items() if ch.topic in plans and i in span.counts}
             if not topic_of:
                 continue
             block = self.load(c, span, frozenset(topic_of))
             if block is None:
                 continue
-            keep = _in_window(block.log_time_ns, start_ns, end_ns)
+            keep = in_window(block.log_time_ns, start_ns, end_ns)
             for id_, topic in topic_of.items():
                 mine = block.channel == id_
                 rows = np.flatnonzero(mine if keep is None else mine & keep)
                 if rows.size:
-                    part = self._decode(plans[topic], c, span, id_, block, rows)
-                    if part is not None:
-                        parts[topic].append(part)
+                    parts[topic].append(self._decode(topic, plans[topic], c, span, id_, block, rows))
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
-    def _decode(self, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray) -> _Part | None:
-        if not plan.selections:
-            return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], {})
+    def _decode(self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray) -> Columns:
         decoder = plan.decoders.get((c, id_))
         if decoder is None:
             fields = {s.path: missing_column(s, len(rows)) for s in plan.selections}
-            return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], fields)
-        fields = decoder.columns(block, rows)
-        if decoder.undecodable:
+        else:
+            fields = decoder.columns(block, rows)
+        if decoder is not None and decoder.undecodable:
             key = (c, id_, span.index)
             seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
             # Count by place in the channel: which other channels a block holds depends on what was asked for.
             places = np.searchsorted(np.flatnonzero(block.channel == id_), decoder.undecodable)
             self._undecodable[key] = np.union1d(seen, places.astype(np.int64))
-        return _Part(block.log_time_ns[rows], block.publish_time_ns[rows], fields)
+        return Columns(topic, block.log_time_ns[rows], block.publish_time_ns[rows], fields)
 
 
+@dataclass(frozen=True, slots=True)
 class _Plan:
     """What is read of one topic: the resolved paths and a decoder a channel."""
 
-    def __init__(self, selections: tuple[Selection, ...], decoders: Mapping[tuple[int, int], ChannelDecoder]) -> None:
-        self.selections = selections
-        self.decoders = decoders
+    selections: tuple[Selection, ...]
+    decoders: Mapping[tuple[int, int], ChannelDecoder]
 
 
-class _Part:
-    """Columns of one topic from one span."""
-
-    def __init__(self, log_time_ns: IntArray, publish_time_ns: IntArray, fields: dict[str, NDArray[Any]]) -> None:
-        self.log_time_ns = log_time_ns
-        self.publish_time_ns = publish_time_ns
-        self.fields = fields
-
-
-def _in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
+def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:
     """Tell which log times lie in [start, end); None: all of them."""
     keep: BoolArray | None = None
     if start_ns is not None:
@@ -319,7 +288,7 @@ def _in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) 
     return None if keep is None or keep.all() else keep
 
 
-def _join(topic: str, plan: _Plan, parts: Sequence[_Part]) -> Columns:
+def _join(topic: str, plan: _Plan, parts: Sequence[Columns]) -> Columns:
     if not parts:
         none = np.empty(0, dtype=np.int64)
         return Columns(topic, none, none.copy(), {s.path: empty_column(s) for s in plan.selections})

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import mmap
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
+from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import IntArray, Loss
 
+# What the files of each format begin with.
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
+SQLITE_MAGIC = b"SQLite format 3\0"
 #: Log times above this (unsigned in the file) cannot be held in int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 
@@ -69,6 +75,12 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
+    @property
+    def counts(self) -> dict[int, int]:
+        """Messages by channel."""
+        channels, counts = np.unique(self.channel, return_counts=True)
+        return dict(zip(channels.tolist(), counts.tolist(), strict=True))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RawChunk:
@@ -121,67 +133,106 @@ class SpanDamageError(Exception):
     """A span cannot be decoded; caught inside this package and turned into a loss."""
 
 
-class Container(Protocol):
-    """One open file of a log."""
+class Container(ABC):
+    """One open file of a log. Opening it fills what stands below.
 
-    @property
-    def path(self) -> Path:
-        """The file as the user named it."""
-        ...
+    Attributes
+    ----------
+    path : the file as the user named it.
+    channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
+    form : ``mcap``, ``rosbag1`` or ``sqlite3``.
+    selective : whether a load can leave out the payloads of unwanted channels.
+    profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
+    remedy : what to do about a file that is none of this format.
+    """
 
-    @property
-    def channels(self) -> Mapping[int, ChannelRecord]:
-        """Channels by their id in this file."""
-        ...
+    form = ""
+    selective = False
+    profile = "ros2"
+    distro = ""
+    remedy = ""
 
-    @property
-    def spans(self) -> Sequence[Span]:
-        """All spans in file order."""
-        ...
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.channels: dict[int, ChannelRecord] = {}
+        self.spans: list[Span] = []
+        self.lost: list[Loss] = []
 
-    @property
-    def lost(self) -> Sequence[Loss]:
-        """Damage found while the file was opened."""
-        ...
-
-    @property
-    def selective(self) -> bool:
-        """Whether a load can leave out the payloads of unwanted channels."""
-        ...
-
+    @abstractmethod
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Read a span's messages (of the channels in ``want`` at least); raises :class:`SpanDamageError`."""
-        ...
 
     def attachments(self) -> Iterator[Attachment]:
-        """Read the attachments."""
-        ...
+        """Read the attachments; a damaged one is among the losses and left out."""
+        yield from ()
 
     def metadata_records(self) -> Iterator[MetadataRecord]:
         """Read the metadata records."""
-        ...
+        yield from ()
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the file."""
+
+    def no_log(self, expected: str, got: str) -> LogError:
+        """Return the error for a file that cannot be opened."""
+        return LogError(expected=expected, got=got, where=str(self.path), remedy=self.remedy)
+
+    def lose(
+        self, kind: str, what: str, start_ns: int | None = None, end_ns: int | None = None, count: int | None = None
+    ) -> None:
+        """Note damage of this file."""
+        self.lost.append(Loss(kind, what, str(self.path), start_ns, end_ns, count))
+
+    def drop_undeclared(self, called: str) -> None:
+        """Take the messages of channels that the file does not declare out of the spans' counts, with a loss each."""
+        for i, span in enumerate(self.spans):
+            unknown = {c: n for c, n in span.counts.items() if c not in self.channels}
+            if unknown:
+                count = sum(unknown.values())
+                what = f"{count} messages on {called.format(sorted(unknown))} that no readable record declares"
+                self.lose("unknown-channel", what, span.start_ns, span.end_ns, count)
+                known = {c: n for c, n in span.counts.items() if c not in unknown}
+                self.spans[i] = Span(span.index, span.start_ns, span.end_ns, known)
+
+
+class MappedContainer(Container):
+    """A file that begins with ``magic`` (``magic_text`` in words), mapped into memory and walked once.
+
+    Parameters
+    ----------
+    path : file to read.
+    shown_path : what to call it in messages (a decompressed copy has another name than its source).
+
+    Raises
+    ------
+    LogError : the file is none of this format.
+    """
+
+    magic = b""
+    magic_text = ""
+
+    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
+        super().__init__(shown_path or path)
+        with path.open("rb") as file:
+            if file.read(len(self.magic)) != self.magic:
+                raise self.no_log(self.magic_text, "other content")
+            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        try:
+            self._walk()
+        except BaseException:
+            self._data.close()
+            raise
+
+    @abstractmethod
+    def _walk(self) -> None:
+        """Fill channels, spans and losses."""
 
     def close(self) -> None:
         """Release the file."""
-        ...
+        self._data.close()
 
 
-def block_from_lists(
-    buffer: bytes | memoryview,
-    channel: Sequence[int],
-    log_time_ns: Sequence[int],
-    publish_time_ns: Sequence[int],
-    sequence: Sequence[int],
-    offset: Sequence[int],
-    length: Sequence[int],
-) -> Block:
-    """Build a block from Python lists."""
-    return Block(
-        buffer,
-        np.array(channel, dtype=np.int64),
-        np.array(log_time_ns, dtype=np.int64),
-        np.array(publish_time_ns, dtype=np.int64),
-        np.array(sequence, dtype=np.int64),
-        np.array(offset, dtype=np.int64),
-        np.array(length, dtype=np.int64),
-    )
+def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:
+    """Build a block from Python lists, in the order of its columns."""
+    return Block(buffer, *(np.array(column, dtype=np.int64) for column in columns))

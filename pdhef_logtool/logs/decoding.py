@@ -29,18 +29,12 @@ from pdhef_logtool.logs.message_schema import (
     Selection,
     Step,
     bytes_of_text,
+    example_node,
     json_schema,
-    resolve,
     ros_schema,
-    schema_from_example,
     value_at,
 )
-from pdhef_logtool.logs.wire_layout import (
-    LayoutReader,
-    NoLayoutError,
-    layout_of_message,
-)
-from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, layout_of_message
 from pdhef_logtool.records.signals import IntArray
 
 #: Stands in a time column where the message lacks the time (NaN of int64).
@@ -73,7 +67,7 @@ def channel_schema(channel: ChannelRecord, distro: str = "", example: bytes | No
             return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"))
         if example is not None:
             try:
-                return schema_from_example(channel.type_name, json.loads(example))
+                return MessageSchema(channel.type_name, "json", example_node(json.loads(example)))
             except ValueError as error:
                 raise SchemaError(f"the first message is no JSON: {error}") from error
         raise SchemaError("JSON without a schema and without a message")
@@ -88,7 +82,7 @@ def channel_schema(channel: ChannelRecord, distro: str = "", example: bytes | No
 
 @dataclass(slots=True)
 class ChannelDecoder:
-    """Decodes the messages of one channel for one set of paths; made by :func:`compile_decoder`.
+    """Decodes the messages of one channel for one set of paths.
 
     ``undecodable`` holds the rows of the last block whose payload does not fit their type (their fields are NaN).
     """
@@ -110,7 +104,7 @@ class ChannelDecoder:
             partial.append((left, self._read_singly(block, rows[left])))
         if len(partial) == 1 and len(partial[0][0]) == len(rows):
             order, columns = partial[0]
-            if _is_sorted(order):
+            if np.all(order[1:] >= order[:-1]):
                 return columns
             back = np.argsort(order)
             return {path: column[back] for path, column in columns.items()}
@@ -197,29 +191,19 @@ class ChannelDecoder:
         return lambda message: bytes_of_text(plain(message), selection.text)
 
     def _single_decoder(self) -> Callable[[bytes], object]:
+        """Return what decodes one message; None where its payload does not fit the type."""
         if self.schema.wire == "protobuf":
-            return _protobuf_decoder(self.schema.message_class)
-        store, name = self.schema.store, self.schema.type_name
+            from google.protobuf.message import DecodeError
+
+            return _none_on((DecodeError,), self.schema.message_class.FromString)
+        store = self.schema.store
         if store is None:
-
-            def decode_json(data: bytes) -> object:
-                try:
-                    return json.loads(data)
-                except ValueError:
-                    return None
-
-            return decode_json
+            return _none_on((ValueError,), json.loads)
         from rosbags.serde import SerdeError
 
         function = store.deserialize_cdr if self.schema.wire == "cdr" else store.deserialize_ros1
-
-        def decode_ros(data: bytes) -> object:
-            try:
-                return function(data, name)
-            except (SerdeError, struct.error, ValueError, IndexError, MemoryError, OverflowError):
-                return None
-
-        return decode_ros
+        errors = (SerdeError, struct.error, ValueError, IndexError, MemoryError, OverflowError)
+        return _none_on(errors, bind(function, typename=self.schema.type_name))
 
     def _single_column(self, selection: Selection, values: list[object]) -> NDArray[Any]:
         if selection.shape == "dynamic":
@@ -233,36 +217,14 @@ class ChannelDecoder:
         return _column(selection.shape, values, width_known)
 
 
-def _protobuf_decoder(message_class: Any) -> Callable[[bytes], object]:
-    from google.protobuf.message import DecodeError
-
-    def decode_protobuf(data: bytes) -> object:
+def _none_on(errors: tuple[type[Exception], ...], decode: Callable[[bytes], object]) -> Callable[[bytes], object]:
+    def tolerant(data: bytes) -> object:
         try:
-            return message_class.FromString(data)
-        except DecodeError:
+            return decode(data)
+        except errors:
             return None
 
-    return decode_protobuf
-
-
-def compile_decoder(schema: MessageSchema, topic: str, paths: Sequence[str]) -> ChannelDecoder:
-    """Resolve paths against a schema once.
-
-    Raises
-    ------
-    MappingError : the schema has no such path; the nearest ones are named.
-    """
-    return ChannelDecoder(schema, tuple(resolve(schema, topic, path) for path in paths))
-
-
-def undecodable_topic(topic: str, reason: str) -> MappingError:
-    """Return the error for fields asked of a topic whose messages cannot be decoded."""
-    return MappingError(
-        expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
-        got=reason,
-        where=topic,
-        remedy="map another topic",
-    )
+    return tolerant
 
 
 def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -298,10 +260,6 @@ def missing_column(selection: Selection, n: int) -> NDArray[Any]:
     empty = empty_column(selection)
     fill: float | int = NO_TIME_NS if selection.shape == "time" else np.nan
     return np.full((n, *empty.shape[1:]), fill, dtype=empty.dtype)
-
-
-def _is_sorted(order: IntArray) -> bool:
-    return bool(np.all(order[1:] >= order[:-1]))
 
 
 def _record_column(layout: LayoutReader, parts: Sequence[NDArray[Any]], n: int, selection: Selection) -> NDArray[Any]:

@@ -36,8 +36,7 @@ def find_logs(arguments: Sequence[str]) -> list[LogInput]:
 
     Raises
     ------
-    UsageError
-        An argument stands for no log at all.
+    UsageError : An argument stands for no log at all.
     """
     found: dict[str, Path] = {}
     for argument in arguments:

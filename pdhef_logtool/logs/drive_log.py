@@ -63,36 +63,29 @@ class DriveLog(Protocol):
     @property
     def path(self) -> Path:
         """The file or folder."""
-        ...
 
     @property
     def kind(self) -> str:
         """``mcap``, ``rosbag1``, ``rosbag2-sqlite3`` or ``rosbag2-mcap``."""
-        ...
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
         """All topics, by name."""
-        ...
 
     @property
     def start_ns(self) -> int:
         """First log time; 0 for a log without messages."""
-        ...
 
     @property
     def end_ns(self) -> int:
         """Last log time + 1 (intervals are [start, end)); 0 for a log without messages."""
-        ...
 
     @property
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now (complete after a full read)."""
-        ...
 
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
-        ...
 
     def read(
         self,
@@ -101,15 +94,12 @@ class DriveLog(Protocol):
         end_ns: int | None = None,
     ) -> dict[str, Columns]:
         """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded."""
-        ...
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
         """Read only log and publish times of every topic (``fields`` empty); payloads are not decoded."""
-        ...
 
     def close(self) -> None:
         """Release the files."""
-        ...
 
 
 def windows(start_ns: int, end_ns: int, length_ns: int) -> Iterator[tuple[int, int]]:

@@ -21,7 +21,7 @@ from pdhef_logtool.logs.message_schema import (
     resolve,
     ros_schema,
 )
-from pdhef_logtool.logs.wire_layout import Leaf, NoLayoutError, Steps, WireLayout, build_layout
+from pdhef_logtool.logs.wire_layout import NoLayoutError, Steps, WireLayout, build_layout, leaf_at
 from pdhef_logtool.records.errors import MappingError
 
 
@@ -163,11 +163,7 @@ class CdrEncoder:
     def _put_leaf(
         self, layout: WireLayout, rows: NDArray[np.uint8], steps: Steps, values: NDArray[Any], path: str
     ) -> None:
-        leaf = layout.leaves.get(steps)
-        if leaf is None and isinstance(steps[-1], int):
-            whole = layout.leaves.get(steps[:-1])
-            if whole is not None and whole.count is not None and steps[-1] < whole.count:
-                leaf = Leaf(whole.offset + steps[-1] * whole.dtype.itemsize, whole.dtype, None)
+        leaf = leaf_at(layout, steps)
         if leaf is None:
             raise self._misfit(path, "an element that the message holds", "an index outside its sequence")
         if values.ndim != (1 if leaf.count is None else 2) or (

@@ -10,7 +10,7 @@ import mmap
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,9 +24,11 @@ from mcap.records import Channel, Metadata, Schema
 
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
+    MCAP_MAGIC,
     Attachment,
     Block,
     ChannelRecord,
+    MappedContainer,
     MetadataRecord,
     RawChunk,
     Span,
@@ -34,13 +36,11 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import IntArray, Loss
+from pdhef_logtool.records.signals import IntArray
 
 if TYPE_CHECKING:
     import zstandard
 
-MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
@@ -49,85 +49,41 @@ _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this si
 _MAPPED_BYTES = 32 << 20  # pages of the file that may stay mapped, roughly
 _PAGES_AROUND_BYTES = 64 << 10  # Linux maps this much around a place that is read
 _LARGEST_CHUNK_BYTES = 4 << 30  # a larger claim is damage, not a chunk
-_MESSAGE_HEAD = np.dtype(
-    {
-        "names": ["op", "size", "channel", "sequence", "log", "publish"],
-        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
-        "offsets": [0, 1, 9, 11, 15, 23],
-        "itemsize": 31,
-    }
+#: What stands before the payload of a message record.
+MESSAGE_HEAD = np.dtype(
+    [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 
 
-class McapContainer:
-    """One MCAP file; see :class:`~pdhef_logtool.logs.container.Container`.
+class McapContainer(MappedContainer):
+    """One MCAP 1.0 file; its spans are chunks and runs of unchunked messages, in file order."""
 
-    Parameters
-    ----------
-    path : file to read.
-    shown_path : what to call it in messages (a decompressed copy has another name than its source).
-
-    Raises
-    ------
-    LogError : no MCAP file, or a draft of the format before 1.0.
-    """
+    form = "mcap"
+    magic = MCAP_MAGIC
+    magic_text = "the MCAP magic bytes"
+    remedy = "is it an MCAP 1.0 recording?"
 
     def __init__(self, path: Path, shown_path: Path | None = None) -> None:
-        self.path = shown_path or path
         self.profile = ""
         self.library = ""
-        self._lost: list[Loss] = []
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
-        self._channels: dict[int, ChannelRecord] = {}
-        self._spans: list[Span] = []
         self._extents: list[tuple[int, int, bool, tuple[int, int]]] = []  # start, end, is chunk, its message indexes
         self._attachment_at: list[tuple[int, int]] = []
         self._metadata_at: list[tuple[int, int]] = []
         self._zstd: zstandard.ZstdDecompressor | None = None
         self._touched_bytes = 0
-        with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                raise self._no_log("the MCAP magic bytes", "other content")
-            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        try:
-            self._walk()
-        except BaseException:
-            self._data.close()
-            raise
-
-    @property
-    def channels(self) -> Mapping[int, ChannelRecord]:
-        """Channels that have a message or are declared, by id."""
-        return self._channels
-
-    @property
-    def spans(self) -> Sequence[Span]:
-        """Chunks and runs of unchunked messages, in file order."""
-        return self._spans
-
-    @property
-    def selective(self) -> bool:
-        """A chunk is decompressed as a whole."""
-        return False
-
-    @property
-    def lost(self) -> Sequence[Loss]:
-        """Damage found by the walk."""
-        return self._lost
-
-    def _no_log(self, expected: str, got: str) -> LogError:
-        return LogError(expected=expected, got=got, where=str(self.path), remedy="is it an MCAP 1.0 recording?")
+        super().__init__(path, shown_path)
 
     def _walk(self) -> None:
         data, size = self._data, len(self._data)
-        at = len(MAGIC)
+        at = len(MCAP_MAGIC)
         if at + 9 > size or data[at] != Opcode.HEADER:
-            raise self._no_log("a header record after the magic bytes", "none")
+            raise self.no_log("a header record after the magic bytes", "none")
         walk = _Walk(self)
         header_seen = False
         while at < size:
-            if size - at == len(MAGIC) and data[at:size] == MAGIC:
+            if size - at == len(MCAP_MAGIC) and data[at:size] == MCAP_MAGIC:
                 walk.closed = True
                 break
             if at + 9 > size:
@@ -137,7 +93,7 @@ class McapContainer:
             end = at + 9 + length
             if end > size or opcode == 0:
                 if not header_seen:
-                    raise self._no_log("a complete header record", "a record that runs past the end of the file")
+                    raise self.no_log("a complete header record", "a record that runs past the end of the file")
                 resume = self._next_indexed_chunk(at)
                 if resume is None:
                     walk.cut(at)
@@ -164,16 +120,16 @@ class McapContainer:
             profile = self._data[at + 4 : at + 4 + n].decode()
             library = self._data[at + 8 + n : at + 8 + n + m].decode()
         except (struct.error, UnicodeDecodeError) as error:
-            raise self._no_log("a header record with profile and library", "a malformed one") from error
+            raise self.no_log("a header record with profile and library", "a malformed one") from error
         if 8 + n + m > length:
-            raise self._no_log("a header record with profile and library", "a draft of the format before 1.0")
+            raise self.no_log("a header record with profile and library", "a draft of the format before 1.0")
         self.profile, self.library = profile, library
 
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that the summary names, or None."""
         data, size = self._data, len(self._data)
-        foot = size - len(MAGIC) - _FOOTER_BYTES
-        if foot <= after or data[foot] != Opcode.FOOTER or data[-len(MAGIC) :] != MAGIC:
+        foot = size - len(MCAP_MAGIC) - _FOOTER_BYTES
+        if foot <= after or data[foot] != Opcode.FOOTER or data[-len(MCAP_MAGIC) :] != MCAP_MAGIC:
             return None
         (at,) = struct.unpack_from("<Q", data, foot + 9)
         found: list[int] = []
@@ -203,7 +159,7 @@ class McapContainer:
             name = schema.name if schema else ""
             encoding = schema.encoding if schema else ""
             is_ros = channel.message_encoding in ("cdr", "ros1")
-            self._channels[id_] = ChannelRecord(
+            self.channels[id_] = ChannelRecord(
                 id=id_,
                 topic=channel.topic,
                 type_name=ros2_type_name(name) if is_ros else name,
@@ -216,7 +172,7 @@ class McapContainer:
             )
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Decode one span; see :class:`~pdhef_logtool.logs.container.Container`."""
+        """Decode one span."""
         del want
         start, end, is_chunk, index_extent = self._extents[span.index]
         if not is_chunk:
@@ -269,7 +225,7 @@ class McapContainer:
         if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
             return None  # the index could not hold the time that the message has
         content = bytes(block.buffer)
-        head = block.offset - _MESSAGE_HEAD.itemsize
+        head = block.offset - MESSAGE_HEAD.itemsize
         others = _records_between(content, np.append(0, block.offset + block.length), np.append(head, len(content)))
         if others is None or not all(self._is_known(op, content[at:end], kept) for op, at, end in others):
             return None
@@ -343,9 +299,14 @@ class McapContainer:
             return bytes(stored)
         if compression == "zstd":
             return self._decompress_zstd(stored, size)
-        if compression == "lz4":
-            return _decompress_lz4(stored)
-        raise SpanDamageError(f"unknown compression {compression!r}")
+        if compression != "lz4":
+            raise SpanDamageError(f"unknown compression {compression!r}")
+        import lz4.frame
+
+        try:
+            return bytes(lz4.frame.decompress(stored))
+        except (RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
+            raise SpanDamageError(str(error)) from error
 
     def _decompress_zstd(self, stored: memoryview, size: int) -> bytes:
         import zstandard
@@ -371,10 +332,6 @@ class McapContainer:
             record = Metadata.read(ReadDataStream(BytesIO(self._data[start:end])))
             yield MetadataRecord(record.name, dict(record.metadata))
 
-    def close(self) -> None:
-        """Release the file."""
-        self._data.close()
-
 
 class _Walk:
     """State of the one pass over the top-level records."""
@@ -383,7 +340,6 @@ class _Walk:
         self.of = container
         self.closed = False
         self.data_end = False
-        self.in_summary = False
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
         self.run_times: list[int] = []
         self.run_counts: Counter[int] = Counter()
@@ -433,7 +389,7 @@ class _Walk:
         (crc,) = struct.unpack_from("<I", of._data, start)
         if crc and not all(is_chunk for _, _, is_chunk, _ in of._extents) and of.crc_up_to(at) != crc:
             what = "the CRC of the data section does not match: some unchunked messages are damaged"
-            of._lost.append(Loss("bad-data-crc", what, str(of.path)))
+            of.lose("bad-data-crc", what)
 
     def _attachment(self, start: int, end: int) -> None:
         of, data = self.of, self.of._data
@@ -442,9 +398,7 @@ class _Walk:
         crc_at = start + stream.count - 4  # a record may be padded behind its last member
         (crc,) = struct.unpack_from("<I", data, crc_at)
         if crc and zlib.crc32(data[start:crc_at]) != crc:
-            of._lost.append(
-                Loss("bad-attachment", f"attachment {record.name!r} has a wrong CRC", str(of.path), count=1)
-            )
+            of.lose("bad-attachment", f"attachment {record.name!r} has a wrong CRC", count=1)
             return
         of._attachment_at.append((start, end))
 
@@ -454,7 +408,7 @@ class _Walk:
         of = self.of
         times = self.run_times
         of._extents.append((*self.run, False, (0, 0)))
-        of._spans.append(Span(len(of._spans), min(times), max(times) + 1, dict(self.run_counts)))
+        of.spans.append(Span(len(of.spans), min(times), max(times) + 1, dict(self.run_counts)))
         self.last_ns = max(times)
         self.run, self.run_times, self.run_counts = None, [], Counter()
 
@@ -467,7 +421,7 @@ class _Walk:
         counts: Mapping[int, int] = dict(self.index_counts)
         extent, known = self.index_extent, set(of._raw_channels)
         self.chunk, self.index_extent, self.index_counts = None, (0, 0), Counter()
-        index = len(of._spans)
+        index = len(of.spans)
         if not index_complete or not counts or not set(counts) <= known:
             try:
                 content = of.chunk_content(start, end)
@@ -476,34 +430,31 @@ class _Walk:
                 # A read of this span reports the damage; without its content the span is kept as it is indexed.
                 pass
             else:
-                channels, per_channel = np.unique(block.channel, return_counts=True)
-                counts = dict(zip(channels.tolist(), per_channel.tolist(), strict=True))
-                if len(block):
-                    first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-                else:
+                if not len(block):
                     return
+                counts = block.counts
+                first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
         of._extents.append((start, end, True, extent))
-        of._spans.append(Span(index, first, last + 1, counts))
+        of.spans.append(Span(index, first, last + 1, counts))
         self.last_ns = last
 
     def cut(self, at: int) -> None:
         """Note that the file ends inside a record."""
         self._end_chunk(index_complete=False)
         self._end_run()
-        where = str(self.of.path)
         what = f"the file ends inside a record at byte {at} of {len(self.of._data)}; what follows is gone"
-        self.of._lost.append(Loss("truncated", what, where, start_ns=self._after_last()))
+        self.of.lose("truncated", what, self._after_last())
 
     def skipped(self, at: int, resume: int) -> None:
         """Note that a damaged stretch was stepped over."""
         self._end_chunk(index_complete=False)
         self._end_run()
         what = f"bytes {at} to {resume} hold no readable record; reading resumes at the next chunk"
-        self.of._lost.append(Loss("bad-record", what, str(self.of.path), start_ns=self._after_last()))
+        self.of.lose("bad-record", what, self._after_last())
 
     def damaged_record(self, at: int, error: Exception) -> None:
         """Note that one record cannot be parsed."""
-        self.of._lost.append(Loss("bad-record", f"the record at byte {at} is malformed: {error}", str(self.of.path)))
+        self.of.lose("bad-record", f"the record at byte {at} is malformed: {error}")
 
     def _after_last(self) -> int | None:
         return None if self.last_ns is None else self.last_ns + 1
@@ -514,41 +465,24 @@ class _Walk:
         self._end_run()
         of = self.of
         if self.closed and not self.data_end:
-            if not of._spans:
-                raise of._no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
-            of._lost.append(Loss("bad-record", "the data end record is missing", str(of.path)))
-        if not self.closed and not any(loss.kind == "truncated" for loss in of._lost):
-            what = "the file ends without its closing magic bytes"
-            of._lost.append(Loss("truncated", what, str(of.path), start_ns=self._after_last()))
+            if not of.spans:
+                raise of.no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
+            of.lose("bad-record", "the data end record is missing")
+        if not self.closed and not any(loss.kind == "truncated" for loss in of.lost):
+            of.lose("truncated", "the file ends without its closing magic bytes", self._after_last())
         of.resolve_channels()
-        for i, span in enumerate(of._spans):
-            unknown = {c: n for c, n in span.counts.items() if c not in of._channels}
-            if unknown:
-                count = sum(unknown.values())
-                what = f"{count} messages on channels {sorted(unknown)} that no readable record declares"
-                of._lost.append(Loss("unknown-channel", what, str(of.path), span.start_ns, span.end_ns, count))
-                counts = {c: n for c, n in span.counts.items() if c not in unknown}
-                of._spans[i] = Span(span.index, span.start_ns, span.end_ns, counts)
-
-
-def _decompress_lz4(stored: memoryview) -> bytes:
-    import lz4.frame
-
-    try:
-        return bytes(lz4.frame.decompress(stored))
-    except (RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
-        raise SpanDamageError(str(error)) from error
+        of.drop_undeclared("channels {}")
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     """Read message headers at known ascending offsets; None if the content holds other messages than these."""
     n = len(content)
-    if offset.size == 0 or offset[0] < 0 or offset[-1] + _MESSAGE_HEAD.itemsize > n:
+    if offset.size == 0 or offset[0] < 0 or offset[-1] + MESSAGE_HEAD.itemsize > n:
         return None
     # Gathered as plain bytes: NumPy copies structured items member by member.
-    plain = np.dtype((np.void, _MESSAGE_HEAD.itemsize))
+    plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
     heads = np.ndarray((n - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))[offset]
-    heads = heads.view(_MESSAGE_HEAD)
+    heads = heads.view(MESSAGE_HEAD)
     size = heads["size"].astype(np.int64)
     ends = offset + (9 + size)
     if (heads["op"] != Opcode.MESSAGE).any() or (size < 22).any() or (ends > n).any():

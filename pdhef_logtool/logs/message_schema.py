@@ -268,16 +268,12 @@ def _json_node(schema: Any, document: Any, depth: int) -> Node:
     return Unknown()
 
 
-def schema_from_example(type_name: str, value: object) -> MessageSchema:
+def example_node(value: object) -> Node:
     """Take the tree from a decoded JSON message."""
-    return MessageSchema(type_name, "json", _example_node(value))
-
-
-def _example_node(value: object) -> Node:
     if isinstance(value, dict):
-        return Struct({str(k): _example_node(v) for k, v in value.items()})
+        return Struct({str(k): example_node(v) for k, v in value.items()})
     if isinstance(value, list):
-        return Array(_example_node(value[0]) if value else Unknown(), None)
+        return Array(example_node(value[0]) if value else Unknown(), None)
     if isinstance(value, bool):
         return Scalar("bool")
     if isinstance(value, (int, float)):
@@ -285,24 +281,20 @@ def _example_node(value: object) -> Node:
     return Scalar("string") if isinstance(value, str) else Unknown()
 
 
-def leaves(root: Node) -> Iterator[FieldInfo]:
+def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
     """List the scalar leaves of a tree, times as one leaf; see :class:`~pdhef_logtool.logs.drive_log.FieldInfo`."""
-    yield from _leaves(root, "")
-
-
-def _leaves(node: Node, path: str) -> Iterator[FieldInfo]:
     if isinstance(node, Struct):
         if path and node.time:
             yield FieldInfo(path, "time")
             return
         for name, member in node.members.items():
-            yield from _leaves(member, f"{path}.{name}" if path else name)
+            yield from leaves(member, f"{path}.{name}" if path else name)
     elif isinstance(node, Array):
         if node.length is not None and node.length <= LISTED_ELEMENTS:
             for i in range(node.length):
-                yield from _leaves(node.item, f"{path}[{i}]")
+                yield from leaves(node.item, f"{path}[{i}]")
         else:
-            yield from _leaves(node.item, f"{path}[]")
+            yield from leaves(node.item, f"{path}[]")
     elif isinstance(node, Scalar):
         yield FieldInfo(path, node.kind)
 
@@ -324,9 +316,8 @@ def parse_path(path: str) -> tuple[Step, ...]:
         found = _PART.match(text, at)
         valid = found is not None and (found[0] != "." or not after_dot) and (not found[1] or after_dot)
         if found is None or not valid or found[2] == "" or (found[2] is not None and after_dot):
-            raise MappingError(
-                expected="a dotted path such as twist.linear.x or data[0]", got=repr(path), where="field path"
-            )
+            after_dot = True
+            break
         if found[1]:
             steps.append(found[1])
         elif found[2]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +12,11 @@ import numpy as np
 
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import (
+    MCAP_MAGIC,
+    ROSBAG1_MAGIC,
+    SQLITE_MAGIC,
     Attachment,
     Block,
-    ChannelRecord,
     Container,
     MetadataRecord,
     Span,
@@ -24,9 +26,6 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
-_MCAP = b"\x89MCAP0\r\n"
-_ROSBAG1 = b"#ROSBAG V2.0\n"
-_SQLITE = b"SQLite format 3\0"
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _MAGIC_BYTES = 16
 _WHAT_IS_A_LOG = "an MCAP file, a ROS 1 bag, a rosbag2 database or a rosbag2 folder"
@@ -43,17 +42,13 @@ def open_log(path: Path | str) -> DriveLog:
     ------
     LogError : the path is missing or is no log.
     """
-    return open_columnar_log(Path(path))
-
-
-def open_columnar_log(path: Path) -> ColumnarLog:
-    """Open a log with access to its containers; see :func:`open_log`."""
+    path = Path(path)
     try:
         if path.is_dir():
             return _open_folder(path)
         if not path.exists():
             raise LogError(expected=_WHAT_IS_A_LOG, got="no such file", where=str(path), remedy="check the path")
-        container, form = _open_file(path)
+        container = _open_file(path)
     except OSError as error:
         raise LogError(
             expected="a readable file",
@@ -61,8 +56,8 @@ def open_columnar_log(path: Path) -> ColumnarLog:
             where=str(path),
             remedy="check its permissions",
         ) from error
-    kind = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[form]
-    return ColumnarLog(path, kind, [container], distro=_distro_of(container))
+    kind = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[container.form]
+    return ColumnarLog(path, kind, [container], distro=container.distro)
 
 
 def is_log_folder(path: Path) -> bool:
@@ -78,15 +73,11 @@ def looks_like_log(path: Path) -> bool:
         head = file.read(_MAGIC_BYTES)
     if head.startswith(_ZSTD):
         return path.name.endswith((".mcap.zstd", ".db3.zstd", ".bag.zstd", ".mcap.zst", ".db3.zst", ".bag.zst"))
-    return head.startswith((_MCAP, _ROSBAG1, _SQLITE))
+    return head.startswith((MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC))
 
 
-def _distro_of(container: Container) -> str:
-    return str(getattr(container, "distro", ""))
-
-
-def _open_file(path: Path) -> tuple[Container, str]:
-    """Open one storage file; returns it and its format."""
+def _open_file(path: Path) -> Container:
+    """Open one storage file."""
     with path.open("rb") as file:
         head = file.read(_MAGIC_BYTES)
     if head.startswith(_ZSTD):
@@ -94,24 +85,24 @@ def _open_file(path: Path) -> tuple[Container, str]:
     return _open_plain(path, path, head)
 
 
-def _open_plain(path: Path, shown_path: Path, head: bytes) -> tuple[Container, str]:
-    if head.startswith(_MCAP):
+def _open_plain(path: Path, shown_path: Path, head: bytes) -> Container:
+    if head.startswith(MCAP_MAGIC):
         from pdhef_logtool.logs.mcap_log import McapContainer
 
-        return McapContainer(path, shown_path), "mcap"
-    if head.startswith(_ROSBAG1):
+        return McapContainer(path, shown_path)
+    if head.startswith(ROSBAG1_MAGIC):
         from pdhef_logtool.logs.rosbag1_log import Rosbag1Container
 
-        return Rosbag1Container(path, shown_path), "rosbag1"
-    if head.startswith(_SQLITE):
+        return Rosbag1Container(path, shown_path)
+    if head.startswith(SQLITE_MAGIC):
         from pdhef_logtool.logs.rosbag2_sqlite_log import SqliteContainer
 
-        return SqliteContainer(path, shown_path), "sqlite3"
+        return SqliteContainer(path, shown_path)
     got = "an empty file" if not head else "a file that is none of these"
     raise LogError(expected=_WHAT_IS_A_LOG, got=got, where=str(shown_path), remedy=_REMEDY)
 
 
-def _open_compressed(path: Path) -> tuple[Container, str]:
+def _open_compressed(path: Path) -> Container:
     """Decompress a file to a temporary one and open that."""
     import zstandard
 
@@ -126,8 +117,7 @@ def _open_compressed(path: Path) -> tuple[Container, str]:
                 cut = Loss("truncated", f"the compressed file is damaged: {error}", str(path))
         with copy.open("rb") as file:
             head = file.read(_MAGIC_BYTES)
-        container, form = _open_plain(copy, path, head)
-        return _TemporaryContainer(container, folder, cut), form
+        return _TemporaryContainer(_open_plain(copy, path, head), folder, cut)
     except BaseException:
         folder.cleanup()
         raise
@@ -142,9 +132,9 @@ def _open_folder(path: Path) -> ColumnarLog:
         raise LogError(
             expected=_WHAT_IS_A_LOG, got=got, where=str(path), remedy="name one recording" if logs else _REMEDY
         )
-    container, form = _open_file(logs[0])
-    kind = {"mcap": "rosbag2-mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[form]
-    return ColumnarLog(path, kind, [container], distro=_distro_of(container))
+    container = _open_file(logs[0])
+    kind = {"mcap": "rosbag2-mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[container.form]
+    return ColumnarLog(path, kind, [container], distro=container.distro)
 
 
 def _read_metadata(path: Path) -> Mapping[str, Any]:
@@ -182,11 +172,11 @@ def _open_rosbag2_folder(path: Path) -> ColumnarLog:
                 lost.append(Loss("missing-file", f"{name} is named in metadata.yaml and absent", str(path)))
                 continue
             try:
-                container, form = _open_file(file)
+                container = _open_file(file)
             except LogError as error:
                 lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
                 continue
-            forms.add(form)
+            forms.add(container.form)
             containers.append(_Rosbag2Container(container, per_message, encodings))
     except BaseException:
         for opened in containers:
@@ -197,7 +187,7 @@ def _open_rosbag2_folder(path: Path) -> ColumnarLog:
         raise LogError(expected=_WHAT_IS_A_LOG, got="no readable storage file", where=str(path), remedy=remedy)
     distro = str(information.get("ros_distro") or "")
     kind = "rosbag2-sqlite3" if forms == {"sqlite3"} else "rosbag2-mcap"
-    return ColumnarLog(path, kind, containers, lost, distro or _distro_of(containers[0]))
+    return ColumnarLog(path, kind, containers, lost, distro or containers[0].distro)
 
 
 def _storage_file(folder: Path, name: str) -> Path | None:
@@ -219,32 +209,14 @@ def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
     return found
 
 
-class _Wrapped:
+class _Wrapped(Container):
     """Passes everything to another container."""
 
     def __init__(self, container: Container) -> None:
         self.container = container
-        self.distro = _distro_of(container)
-
-    @property
-    def path(self) -> Path:
-        return self.container.path
-
-    @property
-    def channels(self) -> Mapping[int, ChannelRecord]:
-        return self.container.channels
-
-    @property
-    def spans(self) -> Sequence[Span]:
-        return self.container.spans
-
-    @property
-    def lost(self) -> Sequence[Loss]:
-        return self.container.lost
-
-    @property
-    def selective(self) -> bool:
-        return self.container.selective
+        self.path, self.form, self.distro = container.path, container.form, container.distro
+        self.channels, self.spans, self.lost = container.channels, container.spans, container.lost
+        self.selective = container.selective
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         return self.container.load(span, want)
@@ -265,11 +237,7 @@ class _TemporaryContainer(_Wrapped):
     def __init__(self, container: Container, folder: tempfile.TemporaryDirectory[str], cut: Loss | None) -> None:
         super().__init__(container)
         self._folder = folder
-        self._cut = cut
-
-    @property
-    def lost(self) -> Sequence[Loss]:
-        return [*([self._cut] if self._cut else []), *self.container.lost]
+        self.lost = [*([cut] if cut else []), *container.lost]
 
     def close(self) -> None:
         super().close()
@@ -283,13 +251,9 @@ class _Rosbag2Container(_Wrapped):
         super().__init__(container)
         self._per_message = per_message
         # A topics table may say cdr by default where the recorder used another format: do not decode it as CDR.
-        self._channels = {
+        self.channels = {
             id_: replace(c, encoding=encodings.get(c.topic, c.encoding)) for id_, c in container.channels.items()
         }
-
-    @property
-    def channels(self) -> Mapping[int, ChannelRecord]:
-        return self._channels
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         block = self.container.load(span, want)

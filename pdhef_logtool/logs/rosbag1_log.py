@@ -10,80 +10,42 @@ import contextlib
 import mmap
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from pdhef_logtool.logs.container import (
-    Attachment,
+    ROSBAG1_MAGIC,
     Block,
     ChannelRecord,
-    MetadataRecord,
+    MappedContainer,
     Span,
     SpanDamageError,
     block_from_lists,
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import Loss
 
-MAGIC = b"#ROSBAG V2.0\n"
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CONNECTION = 2, 3, 4, 5, 7
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 
 
-class Rosbag1Container:
-    """One bag; see :class:`~pdhef_logtool.logs.container.Container`.
+class Rosbag1Container(MappedContainer):
+    """One ROS 1 bag of format 2.0, its connections as channels."""
 
-    Raises
-    ------
-    LogError : no ROS 1 bag of format 2.0.
-    """
+    form = "rosbag1"
+    magic = ROSBAG1_MAGIC
+    magic_text = "'#ROSBAG V2.0' at its start"
+    remedy = "is it a ROS 1 bag?"
 
     def __init__(self, path: Path, shown_path: Path | None = None) -> None:
-        self.path = shown_path or path
-        self._lost: list[Loss] = []
-        self._channels: dict[int, ChannelRecord] = {}
-        self._spans: list[Span] = []
         self._chunks: list[tuple[str, int, int, int]] = []  # compression, uncompressed size, start, end
-        with path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                raise self._no_bag("'#ROSBAG V2.0' at its start", "other content")
-            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        try:
-            self._walk()
-        except BaseException:
-            self._data.close()
-            raise
-
-    @property
-    def channels(self) -> Mapping[int, ChannelRecord]:
-        """Connections by id."""
-        return self._channels
-
-    @property
-    def spans(self) -> Sequence[Span]:
-        """Chunks in file order."""
-        return self._spans
-
-    @property
-    def selective(self) -> bool:
-        """A chunk is decompressed as a whole."""
-        return False
-
-    @property
-    def lost(self) -> Sequence[Loss]:
-        """Damage found by the walk."""
-        return self._lost
-
-    def _no_bag(self, expected: str, got: str) -> LogError:
-        return LogError(expected=expected, got=got, where=str(self.path), remedy="is it a ROS 1 bag?")
+        super().__init__(path, shown_path)
 
     def _walk(self) -> None:
         data, size = self._data, len(self._data)
-        at, index_at = len(MAGIC), 0
+        at, index_at = len(self.magic), 0
         pending: list[tuple[str, int, int, int]] = []  # the chunk whose index records are being read
         times: list[int] = []
         counts: Counter[int] = Counter()
@@ -103,11 +65,10 @@ class Rosbag1Container:
                     at = padded_to  # some writers pad with zeros behind the last chunk or the last record
                     continue
                 if not header_seen:
-                    raise self._no_bag("a complete bag header record", "a cut or malformed one")
+                    raise self.no_log("a complete bag header record", "a cut or malformed one")
                 close_chunk()
                 what = f"the file ends inside a record at byte {at} of {size}; what follows is gone"
-                after = self._spans[-1].end_ns if self._spans else None
-                self._lost.append(Loss("truncated", what, str(self.path), start_ns=after))
+                self.lose("truncated", what, self._end_ns())
                 break
             fields, start, end = record
             op = fields.get("op", b"\0")[0]
@@ -125,34 +86,26 @@ class Rosbag1Container:
                 elif op == _OP_CONNECTION:
                     self._add_connection(fields, data[start:end])
             except (KeyError, struct.error, ValueError, IndexError) as error:
-                what = f"the record at byte {at} is malformed: {error}"
-                self._lost.append(Loss("bad-record", what, str(self.path)))
+                self.lose("bad-record", f"the record at byte {at} is malformed: {error}")
             at = end
         if not header_seen:
-            raise self._no_bag("a bag header record", "none")
+            raise self.no_log("a bag header record", "none")
         close_chunk()
         self._declare_from_chunks()
-        if not index_at and not self._lost:
+        if not index_at and not self.lost:
             what = "the bag has no index (it was not closed); its complete chunks were read by a scan"
-            after = self._spans[-1].end_ns if self._spans else None
-            self._lost.append(Loss("unindexed", what, str(self.path), start_ns=after))
-        self._drop_undeclared()
+            self.lose("unindexed", what, self._end_ns())
+        self.drop_undeclared("connections")
+
+    def _end_ns(self) -> int | None:
+        return self.spans[-1].end_ns if self.spans else None
 
     def _declare_from_chunks(self) -> None:
         """Find connections that only the chunks declare, as in a bag without its index section."""
-        for span in self._spans:
-            if not set(span.counts) <= set(self._channels):
+        for span in self.spans:
+            if not set(span.counts) <= set(self.channels):
                 with contextlib.suppress(SpanDamageError):  # a read of the span reports the damage
                     self._decode(self._chunks[span.index], declare=True)
-
-    def _drop_undeclared(self) -> None:
-        for i, span in enumerate(self._spans):
-            known = {c: n for c, n in span.counts.items() if c in self._channels}
-            if len(known) < len(span.counts):
-                count = sum(span.counts.values()) - sum(known.values())
-                what = f"{count} messages on connections that no readable record declares"
-                self._lost.append(Loss("unknown-channel", what, str(self.path), span.start_ns, span.end_ns, count))
-                self._spans[i] = Span(span.index, span.start_ns, span.end_ns, known)
 
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
@@ -163,7 +116,7 @@ class Rosbag1Container:
             for name in ("callerid", "latching", "md5sum")
             if name in inner
         }
-        self._channels.setdefault(
+        self.channels.setdefault(
             id_,
             ChannelRecord(
                 id=id_,
@@ -178,24 +131,21 @@ class Rosbag1Container:
         )
 
     def _add_chunk(self, chunk: tuple[str, int, int, int], times: Sequence[int], counts: Mapping[int, int]) -> None:
-        index = len(self._spans)
+        index = len(self.spans)
         self._chunks.append(chunk)
         if times:
-            self._spans.append(Span(index, min(times), max(times) + 1, dict(counts)))
+            self.spans.append(Span(index, min(times), max(times) + 1, dict(counts)))
             return
         try:
             block = self._decode(chunk, declare=True)
         except SpanDamageError as error:
             self._chunks.pop()
-            what = f"a chunk without index lost: {error}"
-            self._lost.append(Loss("bad-chunk", what, str(self.path), self._spans[-1].end_ns if self._spans else None))
+            self.lose("bad-chunk", f"a chunk without index lost: {error}", self._end_ns())
             return
         if not len(block):
             self._chunks.pop()
             return
-        channels, per_channel = np.unique(block.channel, return_counts=True)
-        by_channel = dict(zip(channels.tolist(), per_channel.tolist(), strict=True))
-        self._spans.append(Span(index, int(block.log_time_ns.min()), int(block.log_time_ns.max()) + 1, by_channel))
+        self.spans.append(Span(index, int(block.log_time_ns.min()), int(block.log_time_ns.max()) + 1, block.counts))
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
@@ -229,18 +179,6 @@ class Rosbag1Container:
             except (KeyError, struct.error, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
         return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
-
-    def attachments(self) -> Iterator[Attachment]:
-        """Yield nothing: bags hold no attachments."""
-        yield from ()
-
-    def metadata_records(self) -> Iterator[MetadataRecord]:
-        """Yield nothing: bags hold no metadata records."""
-        yield from ()
-
-    def close(self) -> None:
-        """Release the file."""
-        self._data.close()
 
 
 def _record_at(data: bytes | mmap.mmap, at: int, size: int) -> tuple[dict[str, bytes], int, int] | None:

@@ -6,30 +6,19 @@ import shutil
 import sqlite3
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 from urllib.parse import quote
 
-from pdhef_logtool.logs.container import (
-    Attachment,
-    Block,
-    ChannelRecord,
-    MetadataRecord,
-    Span,
-    SpanDamageError,
-    block_from_lists,
-)
+from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError, block_from_lists
 from pdhef_logtool.logs.type_names import ros2_type_name
-from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import Loss
 
-MAGIC = b"SQLite format 3\0"
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
 
 
-class SqliteContainer:
-    """One rosbag2 database; see :class:`~pdhef_logtool.logs.container.Container`.
+class SqliteContainer(Container):
+    """One rosbag2 database, its topics as channels and pages of rows, in order of their ids, as spans.
 
     A database with a write-ahead log beside it is copied to a temporary folder first, as SQLite would write to it.
 
@@ -38,12 +27,12 @@ class SqliteContainer:
     LogError : no SQLite file, or one without rosbag2's tables.
     """
 
+    form = "sqlite3"
+    selective = True  # rows of other topics are not read
+    remedy = "is it a rosbag2 recording?"
+
     def __init__(self, path: Path, shown_path: Path | None = None) -> None:
-        self.path = shown_path or path
-        self.distro = ""
-        self._lost: list[Loss] = []
-        self._channels: dict[int, ChannelRecord] = {}
-        self._spans: list[Span] = []
+        super().__init__(shown_path or path)
         self._pages: list[tuple[int, int]] = []  # first and last row id
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self._db = self._connect(path)
@@ -53,7 +42,7 @@ class SqliteContainer:
             self._read_pages()
         except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
             self.close()
-            raise self._no_log("a readable rosbag2 database", str(error)) from error
+            raise self.no_log("a readable rosbag2 database", str(error)) from error
         except BaseException:
             self.close()
             raise
@@ -69,29 +58,6 @@ class SqliteContainer:
         uri = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
         return sqlite3.connect(uri, uri=True, check_same_thread=False)
 
-    def _no_log(self, expected: str, got: str) -> LogError:
-        return LogError(expected=expected, got=got, where=str(self.path), remedy="is it a rosbag2 recording?")
-
-    @property
-    def channels(self) -> Mapping[int, ChannelRecord]:
-        """Topics by id."""
-        return self._channels
-
-    @property
-    def spans(self) -> Sequence[Span]:
-        """Pages of rows in order of their ids."""
-        return self._spans
-
-    @property
-    def selective(self) -> bool:
-        """Rows of other topics are not read."""
-        return True
-
-    @property
-    def lost(self) -> Sequence[Loss]:
-        """Damage found while the row ids were read."""
-        return self._lost
-
     def _columns_of(self, table: str) -> set[str]:
         return {str(row[0]) for row in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))}
 
@@ -99,7 +65,7 @@ class SqliteContainer:
         topic_columns = self._columns_of("topics")
         needed = {"id", "name", "type", "serialization_format"}
         if not needed <= topic_columns or not {"id", "topic_id", "timestamp", "data"} <= self._columns_of("messages"):
-            raise self._no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
+            raise self.no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
         if "ros_distro" in self._columns_of("schema"):
             row = self._db.execute("SELECT ros_distro FROM schema").fetchone()
             self.distro = str(row[0]) if row and row[0] else ""
@@ -111,7 +77,7 @@ class SqliteContainer:
         query = f"SELECT {', '.join(['id', 'name', 'type', 'serialization_format', *extra])} FROM topics ORDER BY id"  # noqa: S608
         for id_, name, type_name, encoding, *rest in self._db.execute(query):
             schema_encoding, text = definitions.get(type_name, ("", ""))
-            self._channels[int(id_)] = ChannelRecord(
+            self.channels[int(id_)] = ChannelRecord(
                 id=int(id_),
                 topic=str(name),
                 type_name=ros2_type_name(str(type_name)),
@@ -131,14 +97,14 @@ class SqliteContainer:
 
         def close_page() -> None:
             if times:
-                self._spans.append(Span(len(self._spans), min(times), max(times) + 1, dict(counts)))
+                self.spans.append(Span(len(self.spans), min(times), max(times) + 1, dict(counts)))
                 self._pages.append((first, last))
             times.clear()
             counts.clear()
 
         try:
             for id_, topic, timestamp, length in rows:
-                if topic not in self._channels or not isinstance(timestamp, int):
+                if topic not in self.channels or not isinstance(timestamp, int):
                     unknown += 1
                     continue
                 if not times:
@@ -151,16 +117,16 @@ class SqliteContainer:
                     close_page()
         except sqlite3.DatabaseError as error:
             what = f"the rows after id {last} cannot be read: {error}"
-            self._lost.append(Loss("truncated", what, str(self.path), start_ns=max(times) + 1 if times else None))
+            self.lose("truncated", what, max(times) + 1 if times else None)
         close_page()
         if unknown:
             what = f"{unknown} messages of topics that the database does not name, or without a time"
-            self._lost.append(Loss("unknown-channel", what, str(self.path), count=unknown))
+            self.lose("unknown-channel", what, count=unknown)
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Read one page; see :class:`~pdhef_logtool.logs.container.Container`."""
         first, last = self._pages[span.index]
-        wanted = set(self._channels) if want is None else want & set(self._channels)
+        wanted = set(self.channels) if want is None else want & set(self.channels)
         marks = ",".join("?" * len(wanted))
         query = (
             "SELECT topic_id, timestamp, data FROM messages "  # noqa: S608
@@ -178,21 +144,9 @@ class SqliteContainer:
                 payloads.append(data)
         except sqlite3.Error as error:
             raise SpanDamageError(str(error)) from error
-        offsets: list[int] = []
-        at = 0
-        for payload in payloads:
-            offsets.append(at)
-            at += len(payload)
         lengths = [len(p) for p in payloads]
+        offsets = [0, *accumulate(lengths)][:-1]
         return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
-
-    def attachments(self) -> Iterator[Attachment]:
-        """Yield nothing: these databases hold no attachments."""
-        yield from ()
-
-    def metadata_records(self) -> Iterator[MetadataRecord]:
-        """Yield nothing: these databases hold no metadata records."""
-        yield from ()
 
     def close(self) -> None:
         """Release the file and the temporary copy."""

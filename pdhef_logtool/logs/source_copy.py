@@ -10,13 +10,12 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, Container, MetadataRecord, RawChunk, Span
+from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
+from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, MetadataRecord, RawChunk, Span
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.message_schema import SchemaError, ros_schema
@@ -165,26 +164,26 @@ def iterate_raw(
     Messages of equal log time come in file order. Spans that overlap in time are merged; no more of them are held
     than overlap. Damaged spans are left out and reported by ``log.lost``.
     """
-    for item in _iterate(_columnar(log), channels, start_ns, end_ns, whole=False):
+    for item in iterate_copy(log, channels, start_ns, end_ns, whole=False):
         assert isinstance(item, RawMessage)
         yield item
 
 
 def iterate_copy(
-    log: DriveLog, channels: SourceChannels, start_ns: int | None = None, end_ns: int | None = None
+    log: DriveLog,
+    channels: SourceChannels,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    *,
+    whole: bool = True,
 ) -> Iterator[RawMessage | RawChunk]:
-    """Yield what :func:`iterate_raw` does, but chunks that can be copied as they are as such.
+    """Yield what :func:`iterate_raw` does, but (when ``whole``) chunks that can be copied as they are as such.
 
     These are sound chunks of MCAP files (a damaged one is left out and reported) that lie in the window and hold and
     declare nothing but channels with their own ids. They come in order of their first log times, and where they
     overlap in the order of the file.
     """
-    return _iterate(_columnar(log), channels, start_ns, end_ns, whole=True)
-
-
-def _iterate(
-    columnar: ColumnarLog, channels: SourceChannels, start_ns: int | None, end_ns: int | None, whole: bool
-) -> Iterator[RawMessage | RawChunk]:
+    columnar = _columnar(log)
     kept = [frozenset(id_ for of, id_ in channels.verbatim if of == c) for c in range(len(columnar.containers))]
     spans = [
         (span.start_ns, c, span)
@@ -206,9 +205,10 @@ def _iterate(
             block = columnar.load(c, span)
             if block is None:
                 continue
-            if whole:
-                chunk = _raw_chunk(columnar.containers[c], span, block, kept[c])
-                if chunk is not None and _inside(block, start_ns, end_ns):
+            container = columnar.containers[c]
+            if whole and isinstance(container, McapContainer):
+                chunk = container.raw_chunk(span, block, kept[c])
+                if chunk is not None and in_window(block.log_time_ns, start_ns, end_ns) is None:
                     yield chunk
                     continue
             cursor = _Cursor(block, start_ns, end_ns)
@@ -231,16 +231,6 @@ def _iterate(
             if cursor.time >= limit:
                 heapq.heappush(open_spans, (cursor.time, c, index, cursor.taken, cursor))
                 break
-
-
-def _raw_chunk(container: Container, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
-    return container.raw_chunk(span, block, kept) if isinstance(container, McapContainer) else None
-
-
-def _inside(block: Block, start_ns: int | None, end_ns: int | None) -> bool:
-    """Tell whether all messages lie in [start, end)."""
-    after = start_ns is None or int(block.log_time_ns.min()) >= start_ns
-    return after and (end_ns is None or int(block.log_time_ns.max()) < end_ns)
 
 
 def _in_file_order_where_overlapping(
@@ -285,23 +275,12 @@ class _Cursor:
     """Goes through one span's messages in order of log time."""
 
     def __init__(self, block: Block, start_ns: int | None, end_ns: int | None) -> None:
-        keep = np.ones(len(block), dtype=np.bool_)
-        if start_ns is not None:
-            keep &= block.log_time_ns >= start_ns
-        if end_ns is not None:
-            keep &= block.log_time_ns < end_ns
-        rows = np.flatnonzero(keep)
+        keep = in_window(block.log_time_ns, start_ns, end_ns)
+        rows = np.arange(len(block)) if keep is None else np.flatnonzero(keep)
         rows = rows[np.argsort(block.log_time_ns[rows], kind="stable")]
         self.taken = 0
         self._buffer = block.buffer
-        columns = (
-            block.channel,
-            block.log_time_ns,
-            block.publish_time_ns,
-            block.sequence,
-            block.offset,
-            block.length,
-        )
+        columns = (getattr(block, f.name) for f in fields(block) if f.name != "buffer")
         self._rows = list(zip(*(column[rows].tolist() for column in columns), strict=True))
 
     @property
@@ -374,6 +353,7 @@ def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], b
         except (SerdeError, ValueError, IndexError):
             return None
 
+    members = parsed.fielddefs[name][1]
     definition = source.generate_msgdef(name, ros_version=2)[0]
     return (
         replace(
@@ -385,9 +365,5 @@ def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], b
             metadata={},
         ),
         convert,
-        _starts_with_header(parsed.fielddefs[name][1]),
+        bool(members) and members[0][1][1] == _HEADER,
     )
-
-
-def _starts_with_header(members: Sequence[tuple[str, Any]]) -> bool:
-    return bool(members) and members[0][1][1] == _HEADER

@@ -173,7 +173,7 @@ class LayoutReader:
             found.append((0, _CDR_HEAD, _LITTLE_ENDIAN_CDR))
         found += [(offset, _WORD, expected) for offset, expected in layout.guards]
         for steps in wanted:
-            leaf = _leaf_at(layout, steps)
+            leaf = leaf_at(layout, steps)
             if leaf is not None and leaf.count == 0:
                 self._empty[steps] = leaf.dtype
             elif leaf is not None:
@@ -254,7 +254,7 @@ class _Stretch:
     guards: tuple[tuple[str, int], ...]
 
 
-def _leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:
+def leaf_at(layout: WireLayout, steps: Steps) -> Leaf | None:
     """Return the leaf at these steps, be it an element of an array of primitives."""
     leaf = layout.leaves.get(steps)
     if leaf is not None or not steps or not isinstance(steps[-1], int):

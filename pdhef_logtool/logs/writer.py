@@ -13,8 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Literal
+from typing import IO, Any
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -36,26 +35,18 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from pdhef_logtool import __version__
-from pdhef_logtool.logs.container import RawChunk
+from pdhef_logtool.logs.container import MCAP_MAGIC, RawChunk
 from pdhef_logtool.logs.encoding import CdrEncoder
+from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.version import __version__
 
 LIBRARY = f"pdhef-logtool {__version__}"
-_MAGIC = b"\x89MCAP0\r\n"
 _CHUNK_BYTES = 1 << 20
 _LARGEST_ID = 0xFFFF
-_HEAD = np.dtype(
-    {
-        "names": ["op", "size", "channel", "sequence", "log", "publish"],
-        "formats": ["u1", "<u8", "<u2", "<u4", "<u8", "<u8"],
-        "offsets": [0, 1, 9, 11, 15, 23],
-        "itemsize": 31,
-    }
-)
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+_PACKED_HEAD = struct.Struct("<BQHIQQ")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,22 +155,19 @@ class McapLogWriter:
             self._file: IO[bytes] = self._temporary.open("wb")
         except OSError as error:
             raise self._failed(error) from error
-        self._emit(_MAGIC)
+        self._emit(MCAP_MAGIC)
         self._emit_record(Header(profile=profile, library=LIBRARY))
 
     def __enter__(self) -> McapLogWriter:
         """Return the writer."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> Literal[False]:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the file, or remove it if an exception passes."""
         if kind is None:
             self.close()
         else:
             self.abort()
-        return False
 
     def _failed(self, error: OSError) -> OutputError:
         return OutputError(
@@ -258,7 +246,7 @@ class McapLogWriter:
         if schema_name or schema_encoding:
             schema = self._add_schema(schema_name, schema_encoding, schema_data, schema_id)
         if channel_id is None:
-            channel_id = self._free_id(self._channels, first=1)
+            channel_id = self._free_id(self._channels)
         elif channel_id in self._channels:
             raise self._taken("channel", channel_id)
         channel = Channel(
@@ -275,7 +263,7 @@ class McapLogWriter:
     def _add_schema(self, name: str, encoding: str, data: bytes, id_: int | None) -> int:
         key = (name, encoding, data)
         if id_ is None:
-            id_ = self._schema_ids.get(key) or self._free_id(self._schemas, first=1)
+            id_ = self._schema_ids.get(key) or self._free_id(self._schemas)
         known = self._schemas.get(id_)
         if known is None:
             known = Schema(id=id_, data=data, encoding=encoding, name=name)
@@ -286,12 +274,12 @@ class McapLogWriter:
             raise self._taken("schema", id_)
         return id_
 
-    def _free_id(self, taken: Mapping[int, object], first: int) -> int:
+    def _free_id(self, taken: Mapping[int, object]) -> int:
         """Return an id above all that are taken, or a gap where there is none above."""
-        above = max(taken, default=first - 1) + 1
+        above = max(taken, default=0) + 1
         if above <= _LARGEST_ID:
             return above
-        free = next((i for i in range(first, _LARGEST_ID + 1) if i not in taken), None)
+        free = next((i for i in range(1, _LARGEST_ID + 1) if i not in taken), None)
         if free is None:
             raise OutputError(expected="at most 65535 channels", got="more", where=str(self._path))
         return free
@@ -317,18 +305,18 @@ class McapLogWriter:
             if isinstance(raw, RawChunk):
                 start_ns = raw.start_ns
                 if group:
-                    self._write_group(merged, group, until_ns=start_ns)
+                    self._write_merged(group, merged, merged.take_until(start_ns))
                     group, size = [], 0
                 while merged.next_ns is not None and merged.next_ns < start_ns:
                     self._write_merged([], merged, merged.take_chunk())
                 self._emit_chunk(raw)
                 continue
             group.append(raw)
-            size += len(raw.data) + _HEAD.itemsize
+            size += len(raw.data) + MESSAGE_HEAD.itemsize
             if size >= _CHUNK_BYTES:
-                self._write_group(merged, group, until_ns=raw.log_time_ns)
+                self._write_merged(group, merged, merged.take_until(raw.log_time_ns))
                 group, size = [], 0
-        self._write_group(merged, group, until_ns=None)
+        self._write_merged(group, merged, merged.take_until(None))
 
     def _encode(self, batch: TopicBatch) -> _Records:
         if batch.topic not in self._encoders:
@@ -336,7 +324,7 @@ class McapLogWriter:
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
         payload = encoder.encode(n, batch.fields)
-        head = np.zeros(n, dtype=_HEAD)
+        head = np.zeros(n, dtype=MESSAGE_HEAD)
         head["op"] = Opcode.MESSAGE
         head["size"] = 22 + payload.shape[1]
         head["channel"] = channel
@@ -344,23 +332,19 @@ class McapLogWriter:
         head["log"] = batch.log_time_ns
         head["publish"] = batch.publish_time_ns
         self._sequences[channel] += n
-        rows = np.empty((n, _HEAD.itemsize + payload.shape[1]), dtype=np.uint8)
-        rows[:, : _HEAD.itemsize] = head.view(np.uint8).reshape(n, _HEAD.itemsize)
-        rows[:, _HEAD.itemsize :] = payload
+        rows = np.empty((n, MESSAGE_HEAD.itemsize + payload.shape[1]), dtype=np.uint8)
+        rows[:, : MESSAGE_HEAD.itemsize] = head.view(np.uint8).reshape(n, MESSAGE_HEAD.itemsize)
+        rows[:, MESSAGE_HEAD.itemsize :] = payload
         return _Records(channel, batch.log_time_ns.astype(np.int64), rows)
-
-    def _write_group(self, merged: _Merged, group: Sequence[RawMessage], until_ns: int | None) -> None:
-        """Write raw messages and the batch rows that belong before ``until_ns`` (all that are left when None)."""
-        self._write_merged(group, merged, merged.take_until(until_ns))
 
     def _write_merged(self, raws: Sequence[RawMessage], merged: _Merged, part: slice) -> None:
         """Merge raw messages and a part of the batch rows by log time and cut into chunks."""
+        import zstandard
+
         if not raws and part.start == part.stop:
             return
         raw_bytes = [
-            _MESSAGE_HEAD.pack(
-                Opcode.MESSAGE, 22 + len(r.data), r.channel, r.sequence, r.log_time_ns, r.publish_time_ns
-            )
+            _PACKED_HEAD.pack(Opcode.MESSAGE, 22 + len(r.data), r.channel, r.sequence, r.log_time_ns, r.publish_time_ns)
             + r.data
             for r in raws
         ]
@@ -387,14 +371,11 @@ class McapLogWriter:
             for i in np.unique(part_source).tolist():
                 mine = part_source == i
                 _scatter(content, at[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
-            self._emit_compressed(content.tobytes(), channel[first:last], log_time[first:last], at)
+            data = content.tobytes()
+            stored = zstandard.ZstdCompressor(level=3).compress(data)
+            part_channel, part_time = channel[first:last], log_time[first:last]
+            self._emit_chunk(RawChunk("zstd", stored, len(data), zlib.crc32(data), part_channel, part_time, at))
             first = last
-
-    def _emit_compressed(self, content: bytes, channel: IntArray, log_time: IntArray, offset: IntArray) -> None:
-        import zstandard
-
-        stored = zstandard.ZstdCompressor(level=3).compress(content)
-        self._emit_chunk(RawChunk("zstd", stored, len(content), zlib.crc32(content), channel, log_time, offset))
 
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
@@ -525,7 +506,7 @@ class McapLogWriter:
                 summary_crc=zlib.crc32(head, zlib.crc32(summary)),
             )
         )
-        self._emit(_MAGIC)
+        self._emit(MCAP_MAGIC)
 
     def _emit(self, data: bytes) -> None:
         try:

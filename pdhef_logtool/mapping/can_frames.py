@@ -145,6 +145,7 @@ class CanSignalLog:
 
     def __init__(self, log: DriveLog, sources: Sequence[SignalSource], settings: CanSettings) -> None:
         self._log = log
+        self.path, self.kind, self.start_ns, self.end_ns = log.path, log.kind, log.start_ns, log.end_ns
         self._settings = settings
         self._views: dict[str, _CanView] = {}
         self.short_frames: tuple[Loss, ...] = ()
@@ -171,16 +172,6 @@ class CanSignalLog:
             )
 
     @property
-    def path(self) -> Path:
-        """The file or folder."""
-        return self._log.path
-
-    @property
-    def kind(self) -> str:
-        """The container format."""
-        return self._log.kind
-
-    @property
     def topics(self) -> tuple[TopicInfo, ...]:
         """The log's topics, and one for each view."""
         own = {t.name: t for t in self._log.topics}
@@ -188,16 +179,6 @@ class CanSignalLog:
             TopicInfo(name, v.message.name, "can", own[v.source.topic].messages) for name, v in self._views.items()
         )
         return (*own.values(), *views)
-
-    @property
-    def start_ns(self) -> int:
-        """First log time."""
-        return self._log.start_ns
-
-    @property
-    def end_ns(self) -> int:
-        """Last log time + 1."""
-        return self._log.end_ns
 
     @property
     def lost(self) -> tuple[Loss, ...]:

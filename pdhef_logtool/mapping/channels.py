@@ -132,18 +132,17 @@ def read_signals(
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
     gate = resolved.quality
-    gate_source = gate.as_source() if gate is not None else None
     requests: dict[str, list[str]] = {}
     for source in (*resolved.signals.values(), *resolved.truth.values()):
-        _request(log, source, requests)
+        request_source(log, source, requests)
     columns = log.read(requests, start_ns, end_ns) if requests else {}
     losses = _topic_losses(log, resolved, clocks, columns)
     if isinstance(log, CanSignalLog):
         losses += log.short_frames
     signals = {n: _channel(log, s, SIGNAL_UNITS[n], clocks, columns, losses) for n, s in resolved.signals.items()}
     truth = {n: _channel(log, s, TRUTH_UNITS[n], clocks, columns, losses) for n, s in resolved.truth.items()}
-    if gate is not None and gate_source is not None and truth:
-        truth = _apply_gate(log, gate, gate_source, truth, clocks, start_ns, end_ns, losses)
+    if gate is not None and truth:
+        truth = _apply_gate(log, gate, truth, clocks, start_ns, end_ns, losses)
     return MappedChannels(signals=signals, truth=truth, losses=merge_losses([losses]))
 
 
@@ -179,12 +178,14 @@ def merge_losses(parts: Iterable[Iterable[Loss]]) -> tuple[Loss, ...]:
     return tuple(merged.values())
 
 
-def _request(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
+def request_source(log: DriveLog, source: SignalSource, requests: dict[str, list[str]]) -> None:
+    """Add the paths of a source and of its stamp to the requests of a read, by topic."""
     paths = requests.setdefault(source.read_topic, [])
     paths += [p for p in (*stamp_request(log, source), *source.paths) if p not in paths]
 
 
-def _loss(kind: str, where: str, log_time_ns: IntArray) -> Loss:
+def dropped(kind: str, where: str, log_time_ns: IntArray) -> Loss:
+    """Return the loss of what was recorded at these times [N]."""
     return Loss(
         kind=kind,
         what=LOSS_TEXTS[kind],
@@ -211,16 +212,16 @@ def _topic_losses(
         stamps, usable = raw_stamps(log, topic, source)
         times = topic.log_time_ns
         if not usable.all():
-            losses.append(_loss("bad-stamp", source.read_topic, times[~usable]))
+            losses.append(dropped("bad-stamp", source.read_topic, times[~usable]))
             stamps, times = stamps[usable], times[usable]
         if stamps.shape[0] > 1 and not np.all(stamps[1:] > stamps[:-1]):
             late = np.concatenate([[False], stamps[1:] < np.maximum.accumulate(stamps)[:-1]])
             if late.any():
-                losses.append(_loss("out-of-order", source.read_topic, times[late]))
+                losses.append(dropped("out-of-order", source.read_topic, times[late]))
             order = np.argsort(stamps, kind="stable")
             repeated = np.concatenate([[False], stamps[order][1:] == stamps[order][:-1]])
             if repeated.any():
-                losses.append(_loss("duplicate-stamp", source.read_topic, times[order[repeated]]))
+                losses.append(dropped("duplicate-stamp", source.read_topic, times[order[repeated]]))
         clock = clocks.get(key)
         if clock is not None and not clock.delay_known:
             losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.read_topic, severity="note"))
@@ -252,9 +253,9 @@ def _channel(
     clean = clean_samples(measured, arrival, values, valid_min=source.valid_min, valid_max=source.valid_max)
     where = f"{source.name} ({source.label})"
     if clean.nan_at.shape[0]:
-        losses.append(_loss("nan", where, log_time[clean.nan_at]))
+        losses.append(dropped("nan", where, log_time[clean.nan_at]))
     if clean.out_of_range_at.shape[0]:
-        losses.append(_loss("out-of-range", where, log_time[clean.out_of_range_at]))
+        losses.append(dropped("out-of-range", where, log_time[clean.out_of_range_at]))
     return Channel(source.name, unit, source.label, clean.stamps_ns, clean.arrival_ns, clean.values)
 
 
@@ -274,19 +275,19 @@ def si_values(topic: Columns, source: SignalSource) -> FloatArray:
 def _apply_gate(
     log: DriveLog,
     gate: QualityGate,
-    source: SignalSource,
     truth: dict[str, Channel],
     clocks: dict[str, ClockModel],
     start_ns: int,
     end_ns: int,
     losses: list[Loss],
 ) -> dict[str, Channel]:
+    source = gate.as_source()
     clock = clocks.get(clock_key(source), ClockModel())
     period_ns = clock.median_period_s * 1e9
     # A gate that was sent once holds for the whole log.
     hold_ns = int(GATE_HOLD_PERIODS * period_ns) if np.isfinite(period_ns) else max(0, log.end_ns - log.start_ns)
     requests: dict[str, list[str]] = {}
-    _request(log, source, requests)
+    request_source(log, source, requests)
     # Truth in this window may hang on a gate message that was recorded before the window, or after it.
     columns = log.read(requests, start_ns - hold_ns - GATE_MARGIN_NS, end_ns + GATE_MARGIN_NS)
     topic = columns.get(source.read_topic)
@@ -302,11 +303,6 @@ def _apply_gate(
     for name, channel in truth.items():
         keep = gate_mask(channel.stamps_ns, stamps, values, gate, hold_ns)
         if not keep.all():
-            losses.append(_loss("truth-quality", f"{name} ({gate.describe()})", channel.arrival_ns[~keep]))
-        gated[name] = replace(
-            channel,
-            stamps_ns=channel.stamps_ns[keep],
-            arrival_ns=channel.arrival_ns[keep],
-            values=channel.values[keep],
-        )
+            losses.append(dropped("truth-quality", f"{name} ({gate.describe()})", channel.arrival_ns[~keep]))
+        gated[name] = channel.take(keep)
     return gated

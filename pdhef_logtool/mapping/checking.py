@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from difflib import get_close_matches
+from typing import TypeVar
 
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo
 from pdhef_logtool.mapping.can_frames import with_can_signals
-from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, SignalSource
+from pdhef_logtool.mapping.records import AUTO_STAMP, RECORDER_STAMPS, Mapping, QualityGate, SignalSource
 from pdhef_logtool.records.errors import MappingError
 
 #: Where messages keep their measurement time, best first.
@@ -17,6 +18,8 @@ STAMP_PATHS = ("header.stamp", "stamp", "timestamp")
 #: Names that seconds and nanoseconds have in encodings without a time type.
 SECONDS_NAMES = ("sec", "secs")
 NANOSECONDS_NAMES = ("nanosec", "nsec", "nsecs")
+
+TimedT = TypeVar("TimedT", SignalSource, QualityGate)
 
 _INDEX = re.compile(r"\[\d*\]")
 
@@ -48,24 +51,19 @@ def split_stamp(path: str, paths: set[str]) -> tuple[str, str] | None:
 
 def resolve_mapping(log: DriveLog, mapping: Mapping) -> Mapping:
     """Return the mapping with every ``auto`` stamp replaced by what the log's schemas offer."""
-
-    def resolved(source: SignalSource) -> SignalSource:
-        return replace(source, stamp=stamp_path_of(log.fields(source.topic)))
-
     if all(s.stamp != AUTO_STAMP for s in mapping.sources()):
         return mapping
     known = {t.name for t in log.topics}
-    auto = {s.topic for s in mapping.sources() if s.stamp == AUTO_STAMP and s.topic in known}
-    quality = mapping.quality
-    if quality is not None and quality.stamp == AUTO_STAMP and quality.topic in auto:
-        quality = replace(quality, stamp=stamp_path_of(log.fields(quality.topic)))
+
+    def resolved(source: TimedT) -> TimedT:
+        is_auto = source.stamp == AUTO_STAMP and source.topic in known
+        return replace(source, stamp=stamp_path_of(log.fields(source.topic))) if is_auto else source
+
     return replace(
         mapping,
-        signals={
-            n: resolved(s) if s.stamp == AUTO_STAMP and s.topic in auto else s for n, s in mapping.signals.items()
-        },
-        truth={n: resolved(s) if s.stamp == AUTO_STAMP and s.topic in auto else s for n, s in mapping.truth.items()},
-        quality=quality,
+        signals={n: resolved(s) for n, s in mapping.signals.items()},
+        truth={n: resolved(s) for n, s in mapping.truth.items()},
+        quality=None if mapping.quality is None else resolved(mapping.quality),
     )
 
 

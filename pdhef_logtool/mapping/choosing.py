@@ -32,30 +32,24 @@ def choose_mapping(
     *,
     prefer_truth: Literal["perfect", "rtk"],
     require_signals: bool = True,
-    tell_notes: bool = True,
 ) -> tuple[Mapping, tuple[str, ...]]:
     """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently.
 
-    Parameters
-    ----------
-    tell_notes : False keeps what is merely worth knowing of a mapping to itself; ambiguities are told in any case.
-
     Raises
     ------
-    MappingError
-        The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
+    MappingError : The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
     """
     if mapping is not None and mapping.fill_recognised:
         mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)
     if mapping is not None:
         check_mapping(mapping, log)
-        for note in mapping.notes if tell_notes else ():
+        for note in mapping.notes:
             tell(note)
         return mapping, tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
     found = auto_map(log, prefer_truth=prefer_truth)
     for ambiguity in found.ambiguities:
         tell(str(ambiguity))
-    for note in found.mapping.notes if tell_notes else ():
+    for note in found.mapping.notes:
         tell(note)
     if require_signals and not found.mapping.signals:
         raise MappingError(

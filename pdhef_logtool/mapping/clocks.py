@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
-from pdhef_logtool.mapping.records import RECORDER_STAMPS, Clock, Mapping, SignalSource, StampUnit
+from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
@@ -61,6 +61,14 @@ class ClockModel:
 def clock_key(source: SignalSource) -> str:
     """Return the key of a source's clock: the topic and the stamp it uses."""
     return f"{source.read_topic}.{source.stamp}"
+
+
+def sources_by_clock(mapping: Mapping) -> dict[str, SignalSource]:
+    """Return the first source of each clock, by :func:`clock_key`."""
+    found: dict[str, SignalSource] = {}
+    for source in mapping.sources():
+        found.setdefault(clock_key(source), source)
+    return found
 
 
 def apply_clock(stamps_ns: IntArray, clock: ClockModel) -> IntArray:
@@ -124,37 +132,27 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
 
     Raises
     ------
-    MappingError
-        A device clock has no usable stamp in the span.
+    MappingError : A device clock has no usable stamp in the span.
     """
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
-    wanted: dict[str, SignalSource] = {}
-    for source in resolved.sources():
-        wanted.setdefault(clock_key(source), source)
+    wanted = sources_by_clock(resolved)
     requests: dict[str, list[str]] = {}
     for source in wanted.values():
         paths = requests.setdefault(source.read_topic, [])
         paths += [p for p in stamp_request(log, source) if p not in paths]
-    stamps: dict[str, list[IntArray]] = {key: [] for key in wanted}
-    times: dict[str, list[IntArray]] = {key: [] for key in wanted}
-    steps: dict[str, list[FloatArray]] = {key: [] for key in wanted}
+    none = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
+    parts: dict[str, list[tuple[IntArray, IntArray, FloatArray]]] = {key: [none] for key in wanted}
     for window_start, window_end in _survey_windows(start_ns, end_ns):
         columns = log.read(requests, window_start, window_end)
         for key, source in wanted.items():
             if source.read_topic not in columns:
                 continue
             raw, usable = raw_stamps(log, columns[source.read_topic], source)
-            stamps[key].append(raw[usable])
-            times[key].append(columns[source.read_topic].log_time_ns[usable])
-            steps[key].append(np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9)
+            steps = np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9
+            parts[key].append((raw[usable], columns[source.read_topic].log_time_ns[usable], steps))
     return {
-        key: _clock_of(
-            source,
-            np.concatenate(stamps[key]) if stamps[key] else np.empty(0, np.int64),
-            np.concatenate(times[key]) if times[key] else np.empty(0, np.int64),
-            np.concatenate(steps[key]) if steps[key] else np.empty(0),
-        )
+        key: _clock_of(source, *(np.concatenate(column) for column in zip(*parts[key], strict=True)))
         for key, source in wanted.items()
     }
 
@@ -182,8 +180,7 @@ def raw_stamps(log: DriveLog, columns: Columns, source: SignalSource) -> tuple[I
     parts = [np.asarray(columns.fields[p]) for p in paths]
     if len(parts) == 2:
         return _to_nanoseconds(parts, ("s", "ns"))
-    unit: StampUnit = source.stamp_unit
-    return _to_nanoseconds(parts, ("ns" if unit == "ros" else unit,))
+    return _to_nanoseconds(parts, ("ns" if source.stamp_unit == "ros" else source.stamp_unit,))
 
 
 def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) -> tuple[IntArray, NDArray[np.bool_]]:
@@ -211,11 +208,10 @@ def _survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
 
 
 def _clock_of(source: SignalSource, stamps_ns: IntArray, log_time_ns: IntArray, steps_s: FloatArray) -> ClockModel:
-    clock: Clock = source.clock
     n = int(stamps_ns.shape[0])
     period_s = float(np.median(steps_s)) if steps_s.shape[0] else float("nan")
     if n == 0:
-        if clock == "device":
+        if source.clock == "device":
             raise MappingError(
                 expected="stamps of the device clock",
                 got="no usable stamp in the span that is read",
@@ -223,23 +219,20 @@ def _clock_of(source: SignalSource, stamps_ns: IntArray, log_time_ns: IntArray, 
                 remedy='use stamp = "log_time"',
             )
         return ClockModel()
-    reference, reference_log, drift, residual_s = 0, 0, 0.0, 0.0
-    if clock == "device":
+    line = ClockModel()
+    if source.clock == "device":
         reference, reference_log, drift, residual_s = fit_clock_line(stamps_ns, log_time_ns)
-    line = ClockModel(reference_stamp_ns=reference, reference_log_ns=reference_log, drift=drift)
+        line = ClockModel(reference, reference_log, drift, residual_s=residual_s)
     delays_ns = log_time_ns - apply_clock(stamps_ns, line)
     median_ns = float(np.median(delays_ns))
     low_ns, high_ns = (float(q) for q in np.quantile(delays_ns, [0.0, 0.95]))
-    known = clock == "device" or 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS
-    return ClockModel(
-        reference_stamp_ns=reference,
-        reference_log_ns=reference_log,
-        drift=drift,
+    known = source.clock == "device" or 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS
+    return replace(
+        line,
         delay_known=known,
         median_delay_s=median_ns * 1e-9,
         p95_delay_s=high_ns * 1e-9,
         min_delay_s=low_ns * 1e-9,
-        residual_s=residual_s,
         median_period_s=period_s,
         samples=n,
     )

@@ -57,10 +57,8 @@ def choose_estimates(
 
     Raises
     ------
-    UsageError
-        There is none, or none called ``name``, or the flags contradict one another.
-    MappingError
-        The log has no such topic.
+    UsageError : There is none, or none called ``name``, or the flags contradict one another.
+    MappingError : The log has no such topic.
     """
     tables = {} if mapping is None else mapping.estimates
     can = None if mapping is None else mapping.can
@@ -107,10 +105,8 @@ def sources_of(
 
     Raises
     ------
-    UsageError
-        The signal is not known or cannot be told from the topic's type, or one is named twice.
-    MappingError
-        The log has no such topic.
+    UsageError : The signal is not known or cannot be told from the topic's type, or one is named twice.
+    MappingError : The log has no such topic.
     """
     sources: dict[str, SignalSource] = {}
     covariances: list[CovarianceSource] = []

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping as MappingABC
-from difflib import get_close_matches
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.mapping.records import (
     AUTO_STAMP,
@@ -25,6 +24,7 @@ from pdhef_logtool.mapping.records import (
     SignalSource,
     StampUnit,
 )
+from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 
@@ -110,13 +110,7 @@ def load_mapping(path: Path) -> Mapping:
     MappingError
         The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
     """
-    try:
-        with path.open("rb") as f:
-            raw: dict[str, Any] = tomllib.load(f)
-    except FileNotFoundError:
-        raise MappingError(expected="a mapping TOML file", got="no such file", where=str(path)) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise MappingError(expected="a mapping TOML file", got=str(error), where=str(path)) from None
+    raw = read_toml(path, "a mapping TOML file", MappingError)
     return mapping_from_dict(raw, where=str(path), folder=path.parent)
 
 
@@ -125,12 +119,10 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
 
     Raises
     ------
-    MappingError
-        Entries are wrong, unknown, missing or contradict one another.
+    MappingError : Entries are wrong, unknown, missing or contradict one another.
     """
-    problems: list[str] = []
     sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised")
-    problems += [f"{key}: unknown table{_near(key, sections)}" for key in raw if key not in sections]
+    problems = [unknown(key, sections) for key in raw if key not in sections]
     signals = _read_section(raw.get("signals", {}), "signals", tuple(SIGNAL_UNITS), tuple(TRUTH_UNITS), problems)
     truth = _read_section(raw.get("truth", {}), "truth", tuple(TRUTH_UNITS), tuple(SIGNAL_UNITS), problems)
     quality = _read_gate(raw["truth_quality"], problems) if "truth_quality" in raw else None
@@ -138,17 +130,9 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     can = _read_can(raw["can"], folder, problems) if "can" in raw else None
     fill = raw.get("fill_recognised", False)
     if not isinstance(fill, bool):
-        problems.append(f"fill_recognised: true or false expected, got {fill!r}")
+        problems.append("fill_recognised: should be true or false")
         fill = False
-    mapping = Mapping(
-        signals=signals,
-        truth=truth,
-        quality=quality,
-        origin="file",
-        can=can,
-        estimates=estimates,
-        fill_recognised=fill,
-    )
+    mapping = Mapping(signals, truth, quality, can=can, estimates=estimates, fill_recognised=fill)
     if "can" not in raw:
         # Others than estimators read the estimates, so that they are looked through as well.
         every = (*mapping.sources(), *(s for e in estimates.values() for s in e.values()))
@@ -165,11 +149,6 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
     return mapping
 
 
-def _near(name: str, known: tuple[str, ...]) -> str:
-    close = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f" (did you mean {close[0]}?)" if close else ""
-
-
 def _read_section(
     raw: object, section: str, known: tuple[str, ...], other: tuple[str, ...], problems: list[str]
 ) -> dict[str, SignalSource]:
@@ -183,30 +162,17 @@ def _read_section(
             if name in other:
                 problems.append(f"{where}: belongs under [{'truth' if section == 'signals' else 'signals'}.{name}]")
             else:
-                problems.append(f"{where}: unknown name{_near(name, known)}")
+                problems.append(unknown(name, known, section))
             continue
-        try:
-            model = _SourceTable.model_validate(table)
-        except ValidationError as error:
-            problems += _pydantic_problems(error, where, tuple(_SourceTable.model_fields))
+        model = checked(_SourceTable, table, where, problems)
+        if model is None:
             continue
         problem = _shape_problem(name, model)
         if problem:
             problems.append(f"{where}: {problem}")
             continue
-        out[name] = SignalSource(
-            name=name,
-            topic=model.topic,
-            field=tuple(model.field) if isinstance(model.field, list) else model.field,
-            stamp=model.stamp,
-            scale=tuple(model.scale) if isinstance(model.scale, list) else model.scale,
-            offset=tuple(model.offset) if isinstance(model.offset, list) else model.offset,
-            latency_s=model.latency_s,
-            valid_min=model.valid_min,
-            valid_max=model.valid_max,
-            stamp_unit=model.stamp_unit,
-            clock=model.clock,
-        )
+        values: dict[str, Any] = {key: tuple(v) if isinstance(v, list) else v for key, v in model.model_dump().items()}
+        out[name] = SignalSource(name=name, **values)
     return out
 
 
@@ -226,10 +192,8 @@ def _read_estimates(raw: object, problems: list[str]) -> dict[str, dict[str, Sig
 
 
 def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | None:
-    try:
-        model = _CanTable.model_validate(raw)
-    except ValidationError as error:
-        problems += _pydantic_problems(error, "can", tuple(_CanTable.model_fields))
+    model = checked(_CanTable, raw, "can", problems)
+    if model is None:
         return None
     files = model.dbc if isinstance(model.dbc, list) else [model.dbc]
     return CanSettings(dbc=tuple(folder / f for f in files), **model.model_dump(exclude={"dbc"}))
@@ -251,38 +215,11 @@ def _shape_problem(name: str, model: _SourceTable) -> str:
 
 
 def _read_gate(raw: object, problems: list[str]) -> QualityGate | None:
-    try:
-        model = _GateTable.model_validate(raw)
-    except ValidationError as error:
-        problems += _pydantic_problems(error, "truth_quality", tuple(_GateTable.model_fields))
+    model = checked(_GateTable, raw, "truth_quality", problems)
+    if model is None:
         return None
-    return QualityGate(
-        topic=model.topic,
-        field=model.field,
-        minimum=model.min,
-        maximum=model.max,
-        values=tuple(model.values),
-        stamp=model.stamp,
-        stamp_unit=model.stamp_unit,
-        clock=model.clock,
-        latency_s=model.latency_s,
-    )
-
-
-def _pydantic_problems(error: ValidationError, where: str, keys: tuple[str, ...]) -> list[str]:
-    found: dict[str, list[str]] = {}
-    for e in error.errors(include_url=False):
-        key = str(e["loc"][0]) if e["loc"] else ""
-        at = f"{where}.{key}" if key else where
-        if e["type"] == "extra_forbidden":
-            text = f"unknown entry{_near(key, keys)}"
-        elif e["type"] == "missing":
-            text = "is missing"
-        else:
-            text = e["msg"].removeprefix("Value error, ")
-        found.setdefault(at, []).append(text)
-    # A union reports one message an alternative; together they are one problem.
-    return [f"{at}: {' or '.join(dict.fromkeys(texts))}" for at, texts in found.items()]
+    values = model.model_dump(exclude={"min", "max", "values"})
+    return QualityGate(minimum=model.min, maximum=model.max, values=tuple(model.values), **values)
 
 
 def _contradictions(mapping: Mapping) -> list[str]:
@@ -387,34 +324,21 @@ def _example_lines() -> list[str]:
 
 
 def _source_lines(source: SignalSource) -> list[str]:
-    lines = [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}"]
-    if source.stamp != AUTO_STAMP:
-        lines.append(f"stamp = {_toml(source.stamp)}")
-    lines.append(f"scale = {_toml(source.scale)}")
-    for key in ("offset", "latency_s"):
-        value = getattr(source, key)
-        if value != 0.0:
-            lines.append(f"{key} = {_toml(value)}")
-    for key in ("valid_min", "valid_max"):
-        value = getattr(source, key)
-        if value is not None:
-            lines.append(f"{key} = {_toml(value)}")
-    if source.stamp_unit != "ros":
-        lines.append(f"stamp_unit = {_toml(source.stamp_unit)}")
-    if source.clock != "utc":
-        lines.append(f"clock = {_toml(source.clock)}")
-    return lines
+    names = ("stamp", "scale", "offset", "latency_s", "valid_min", "valid_max", "stamp_unit", "clock")
+    lines = _lines(source, {n: n for n in names}, always=("scale",))
+    return [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}", *lines]
+
+
+def _gate_lines(gate: QualityGate) -> list[str]:
+    names = {"stamp": "stamp", "minimum": "min", "maximum": "max"}
+    names |= {n: n for n in ("values", "latency_s", "stamp_unit", "clock")}
+    return [f"topic = {_toml(gate.topic)}", f"field = {_toml(gate.field)}", *_lines(gate, names)]
 
 
 def _can_lines(can: CanSettings) -> list[str]:
     files = tuple(path.absolute().as_posix() for path in can.dbc)
-    lines = ["[can]", f"dbc = {_toml(files)}"]
-    for key in ("id_field", "data_field", "length_field", "extended_field", "bus_field"):
-        value = getattr(can, key)
-        if value:
-            lines.append(f"{key} = {_toml(value)}")
-    if can.data_encoding != "bytes":
-        lines.append(f"data_encoding = {_toml(can.data_encoding)}")
+    names = ("id_field", "data_field", "length_field", "extended_field", "bus_field", "data_encoding")
+    lines = ["[can]", f"dbc = {_toml(files)}", *_lines(can, {n: n for n in names})]
     if can.bus is not None:
         lines.append(f"bus = {can.bus}")
     if can.id_mask != CanSettings(()).id_mask:
@@ -422,23 +346,13 @@ def _can_lines(can: CanSettings) -> list[str]:
     return lines
 
 
-def _gate_lines(gate: QualityGate) -> list[str]:
-    lines = [f"topic = {_toml(gate.topic)}", f"field = {_toml(gate.field)}"]
-    if gate.stamp != AUTO_STAMP:
-        lines.append(f"stamp = {_toml(gate.stamp)}")
-    if gate.minimum is not None:
-        lines.append(f"min = {_toml(gate.minimum)}")
-    if gate.maximum is not None:
-        lines.append(f"max = {_toml(gate.maximum)}")
-    if gate.values:
-        lines.append(f"values = {_toml(gate.values)}")
-    if gate.latency_s != 0.0:
-        lines.append(f"latency_s = {_toml(gate.latency_s)}")
-    if gate.stamp_unit != "ros":
-        lines.append(f"stamp_unit = {_toml(gate.stamp_unit)}")
-    if gate.clock != "utc":
-        lines.append(f"clock = {_toml(gate.clock)}")
-    return lines
+def _lines(
+    record: SignalSource | QualityGate | CanSettings, names: MappingABC[str, str], always: tuple[str, ...] = ()
+) -> list[str]:
+    """Return the entries that are not the record's defaults; ``names`` are those of the file by the record's."""
+    default = {f.name: f.default for f in fields(record)}
+    values = {n: getattr(record, n) for n in names}
+    return [f"{names[n]} = {_toml(v)}" for n, v in values.items() if n in always or v != default[n]]
 
 
 def _toml(value: str | float | tuple[str, ...] | tuple[float, ...]) -> str:

@@ -134,12 +134,6 @@ class _Finding:
     ambiguities: list[Ambiguity] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    def source(
-        self, name: str, topic: str, path: str | tuple[str, ...], *, scale: float = 1.0, offset: float = 0.0
-    ) -> SignalSource:
-        stamp = stamp_path_of(self.log.fields(topic))
-        return SignalSource(name=name, topic=topic, field=path, stamp=stamp, scale=scale, offset=offset)
-
     def values(self, topic: str, path: str) -> FloatArray:
         return self.samples.get(topic, {}).get(path, np.empty(0))
 
@@ -155,6 +149,22 @@ class _Finding:
         seen = self.values(topic, covariance)
         return seen.shape[0] > 0 and bool((seen == -1.0).all())
 
+    def take(
+        self,
+        into: dict[str, SignalSource],
+        name: str,
+        topic: str,
+        path: str | tuple[str, ...],
+        scale: float = 1.0,
+        offset: float = 0.0,
+    ) -> None:
+        """Take a signal or a truth channel from a field."""
+        into[name] = SignalSource(name, topic, path, stamp_path_of(self.log.fields(topic)), scale, offset)
+
+    def doubt(self, subject: str, candidates: tuple[str, ...], chosen: str | None, reason: str) -> None:
+        """Note an ambiguity."""
+        self.ambiguities.append(Ambiguity(subject, candidates, chosen, reason))
+
     def choose(
         self, subject: str, topics: list[TopicInfo], rank: Callable[[TopicInfo], tuple[object, ...]], why: str
     ) -> TopicInfo | None:
@@ -163,9 +173,7 @@ class _Finding:
             return None
         ordered = sorted(topics, key=lambda t: (*rank(t), -t.messages, len(t.name), t.name))
         if len(ordered) > 1:
-            self.ambiguities.append(
-                Ambiguity(subject, tuple(t.name for t in ordered), ordered[0].name, f"{why}, then most messages")
-            )
+            self.doubt(subject, tuple(t.name for t in ordered), ordered[0].name, f"{why}, then most messages")
         return ordered[0]
 
 
@@ -303,11 +311,11 @@ def _map_imu(found: _Finding, topics: list[TopicInfo]) -> None:
         for name, axis in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
             path = f"linear_acceleration.{axis}"
             if found.is_given(imu.name, path):
-                found.signals[name] = found.source(name, imu.name, path)
+                found.take(found.signals, name, imu.name, path)
     if found.is_disowned(imu.name, "angular_velocity_covariance[0]"):
         found.notes.append(f"{imu.name} says that it gives no angular rate (covariance -1)")
     elif found.is_given(imu.name, "angular_velocity.z"):
-        found.signals["yaw_rate_rad_s"] = found.source("yaw_rate_rad_s", imu.name, "angular_velocity.z")
+        found.take(found.signals, "yaw_rate_rad_s", imu.name, "angular_velocity.z")
 
 
 def _map_steering(found: _Finding, topics: list[TopicInfo]) -> None:
@@ -320,7 +328,7 @@ def _map_steering(found: _Finding, topics: list[TopicInfo]) -> None:
         found.notes.append(
             f"steer_rad comes from the command {chosen.name}, not from a measured angle: no lag, no slack"
         )
-    found.signals["steer_rad"] = found.source("steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
+    found.take(found.signals, "steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
 
 
 def _is_command(topic: TopicInfo) -> bool:
@@ -334,20 +342,16 @@ def _map_speed(found: _Finding, topics: list[TopicInfo]) -> None:
         if _type(topic) not in TWIST_FIELDS or _is_truth(topic) or _words(topic.name) & COMMAND_WORDS:
             continue
         if _words(topic.name) & ESTIMATE_WORDS:
-            found.ambiguities.append(
-                Ambiguity(
-                    "speed",
-                    (topic.name,),
-                    None,
-                    "its name says that it is an estimate, which is neither a sensor nor the truth",
-                )
+            found.doubt(
+                "speed",
+                (topic.name,),
+                None,
+                "its name says that it is an estimate, which is neither a sensor nor the truth",
             )
         elif _words(topic.name) & VEHICLE_WORDS:
             twists.append(topic)
         else:
-            found.ambiguities.append(
-                Ambiguity("speed", (topic.name,), None, "its name says neither speed sensor nor truth")
-            )
+            found.doubt("speed", (topic.name,), None, "its name says neither speed sensor nor truth")
     chosen = found.choose(
         "speed",
         [*reports, *twists],
@@ -358,7 +362,7 @@ def _map_speed(found: _Finding, topics: list[TopicInfo]) -> None:
         return
     kind = _type(chosen)
     path = SPEED_FIELDS[kind] if kind in SPEED_FIELDS else _twist(chosen, "linear", "x")
-    found.signals["speed_m_s"] = found.source("speed_m_s", chosen.name, path)
+    found.take(found.signals, "speed_m_s", chosen.name, path)
 
 
 def _map_wheel_speeds(found: _Finding, topics: list[TopicInfo]) -> None:
@@ -368,16 +372,14 @@ def _map_wheel_speeds(found: _Finding, topics: list[TopicInfo]) -> None:
         return
     for wheel in WHEELS:
         name = f"wheel_speed_{wheel}_m_s"
-        found.signals[name] = found.source(name, chosen.name, f"{wheel}_m_s")
+        found.take(found.signals, name, chosen.name, f"{wheel}_m_s")
 
 
 # ------------------------------------------------------------------------------------------------ truth
 
 
 def _truth_group(topic: TopicInfo) -> str:
-    if topic.name.startswith(PERFECT_PREFIX):
-        return "perfect"
-    return "rtk"
+    return "perfect" if topic.name.startswith(PERFECT_PREFIX) else "rtk"
 
 
 def _map_truth(found: _Finding, topics: list[TopicInfo], prefer: str) -> None:
@@ -391,7 +393,7 @@ def _map_truth(found: _Finding, topics: list[TopicInfo], prefer: str) -> None:
         candidates = kept
     for topic in topics:
         if _is_truth(topic) and _type(topic) in SEVERAL_POSITIONS:
-            found.ambiguities.append(Ambiguity("truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)]))
+            found.doubt("truth position", (topic.name,), None, SEVERAL_POSITIONS[_type(topic)])
     velocity = _map_truth_velocity(found, candidates)
     _map_truth_position(found, candidates, velocity)
 
@@ -414,31 +416,25 @@ def _map_truth_velocity(found: _Finding, candidates: list[TopicInfo]) -> TopicIn
         up = found.values(chosen.name, _twist(chosen, "linear", "z"))
         readings = (f"{chosen.name} as body velocity", f"{chosen.name} as east, north, up")
         if body is None or not np.isfinite(up).any():
-            found.ambiguities.append(
-                Ambiguity("truth velocity frame", readings, None, "too little motion to tell the frame")
-            )
+            found.doubt("truth velocity frame", readings, None, "too little motion to tell the frame")
             return None
-        found.ambiguities.append(
-            Ambiguity("truth velocity frame", readings, readings[1], "x is not the direction of travel")
-        )
+        found.doubt("truth velocity frame", readings, readings[1], "x is not the direction of travel")
         paths = tuple(_twist(chosen, "linear", a) for a in "xyz")
-        found.truth["enu_velocity_m_s"] = found.source("enu_velocity_m_s", chosen.name, paths)
+        found.take(found.truth, "enu_velocity_m_s", chosen.name, paths)
         return chosen
     if body is False:
-        found.ambiguities.append(
-            Ambiguity(
-                "truth velocity frame",
-                (f"{chosen.name} as body velocity",),
-                chosen.name,
-                "the type's convention is the body frame, although x is mostly not the direction of travel",
-            )
+        found.doubt(
+            "truth velocity frame",
+            (f"{chosen.name} as body velocity",),
+            chosen.name,
+            "the type's convention is the body frame, although x is mostly not the direction of travel",
         )
     for name, part, axis in (("vx_m_s", "linear", "x"), ("vy_m_s", "linear", "y"), ("yaw_rate_rad_s", "angular", "z")):
         full = _twist(chosen, part, axis)
         values = found.values(chosen.name, full)
         filler = name == "yaw_rate_rad_s" and values.shape[0] > 0 and bool((values == 0.0).all())
         if found.is_given(chosen.name, full) and not filler:
-            found.truth[name] = found.source(name, chosen.name, full)
+            found.take(found.truth, name, chosen.name, full)
     return chosen
 
 
@@ -505,18 +501,18 @@ def _map_truth_position(found: _Finding, candidates: list[TopicInfo], velocity: 
         return
     base = POSE_FIELDS[_type(chosen)]
     for name, axis in (("x_m", "x"), ("y_m", "y")):
-        found.truth[name] = found.source(name, chosen.name, _join(base, f"position.{axis}"))
+        found.take(found.truth, name, chosen.name, _join(base, f"position.{axis}"))
     quat = np.stack([found.values(chosen.name, _join(base, f"orientation.{a}")) for a in "wxyz"])
     norms = np.linalg.norm(quat, axis=0)
     if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < 0.01)):
         paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")
-        found.truth["quat_wxyz"] = found.source("quat_wxyz", chosen.name, paths)
+        found.take(found.truth, "quat_wxyz", chosen.name, paths)
 
 
 def _map_fix(found: _Finding, fix: TopicInfo, *, alone: bool) -> None:
     for name, path in (("lat_deg", "latitude"), ("lon_deg", "longitude"), ("alt_m", "altitude")):
         if found.is_given(fix.name, path):
-            found.truth[name] = found.source(name, fix.name, path)
+            found.take(found.truth, name, fix.name, path)
     # Foxglove's fixes may have angles, clockwise from north; those of vehicles count counter-clockwise from east.
     angles = {p: found.values(fix.name, p) for p in ("heading", "course")}
     given = {p for p, values in angles.items() if np.isfinite(values).any()}
@@ -525,7 +521,7 @@ def _map_fix(found: _Finding, fix: TopicInfo, *, alone: bool) -> None:
         found.notes.append(f"{fix.name}.heading is not used: it repeats the course, so that it tells no sideslip")
     for name, path in (("yaw_rad", "heading"), ("course_rad", "course")):
         if path in given:
-            found.truth[name] = found.source(name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
+            found.take(found.truth, name, fix.name, path, scale=-1.0, offset=np.pi / 2.0)
     if "heading" in given:
         found.notes.append(f"truth yaw comes from {fix.name}.heading: only two antennas or an INS make it a truth")
     status = found.values(fix.name, "status.status")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 EXIT_OK = 0
 EXIT_FAILURE = 1
 EXIT_USAGE = 2
@@ -28,6 +30,11 @@ class PdhefError(Exception):
         self.where = where
         self.remedy = remedy
         super().__init__(str(self))
+
+    def __reduce__(self) -> tuple[partial[PdhefError], tuple[()]]:
+        """Travel between processes with all four parts."""
+        parts = {"expected": self.expected, "got": self.got, "where": self.where, "remedy": self.remedy}
+        return partial(type(self), **parts), ()
 
     def __str__(self) -> str:
         """One line, without a traceback's noise."""

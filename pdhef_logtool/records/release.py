@@ -1,13 +1,50 @@
-"""What had arrived by a scored stamp: the rule that keeps estimates causal."""
+"""Steps on measurement time, and what had arrived of them by a scored stamp: the rule that keeps estimates causal."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
+from typing import Self
+
 import numpy as np
 
-from pdhef_logtool.records.signals import IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
 MAX_PREDICTION_S = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StepColumns:
+    """Base of records whose fields are arrays over the same steps, [K, ...], or such records themselves."""
+
+    def joined(self, other: Self) -> Self:
+        """Append the steps of the next window."""
+        pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
+        return type(self)(*(a.joined(b) if isinstance(a, StepColumns) else np.concatenate([a, b]) for a, b in pairs))
+
+    def since(self, index: int) -> Self:
+        """Keep the steps from ``index`` on."""
+        return self._cut(slice(index, None))
+
+    def until(self, index: int) -> Self:
+        """Keep the steps before ``index``."""
+        return self._cut(slice(index))
+
+    def _cut(self, part: slice) -> Self:
+        columns = [getattr(self, f.name) for f in fields(self)]
+        return type(self)(*(c._cut(part) if isinstance(c, StepColumns) else c[part] for c in columns))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Release:
+    """Which step stands at each scored stamp, [M]: ``arrived`` says whether there is one, ``at`` is 0 where not.
+
+    ``needed`` is the first step that a coming stamp may still ask for.
+    """
+
+    arrived: BoolArray
+    at: IntArray
+    needed: int
 
 
 def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
@@ -16,3 +53,36 @@ def released_steps(ready_ns: IntArray, stamps_ns: IntArray) -> IntArray:
     ``ready_ns`` [K] is non-decreasing, ``stamps_ns`` [M]; the result is int64 [M] (METHOD §1, §6 "Delay").
     """
     return np.searchsorted(ready_ns, stamps_ns, side="right").astype(np.int64) - 1
+
+
+def release(ready_ns: IntArray, stamps_ns: IntArray) -> Release:
+    """Return what :func:`released_steps` says, ready to index the steps with; [0] where there are no stamps."""
+    index = released_steps(ready_ns, stamps_ns)
+    at = np.maximum(index, 0)
+    return Release(index >= 0, at, int(at[-1]) if len(at) else 0)
+
+
+def step_durations_s(stamps_ns: IntArray, before_ns: int | None) -> FloatArray:
+    """Return the time that ends at each step, [K]; NaN at the first where nothing was before it (``before_ns``)."""
+    dt = np.empty(len(stamps_ns))
+    if len(dt):
+        dt[0] = np.nan if before_ns is None else (int(stamps_ns[0]) - before_ns) * 1e-9
+        dt[1:] = np.diff(stamps_ns) * 1e-9
+    return dt
+
+
+def last_stamp_ns(stamps_ns: IntArray, before_ns: int | None) -> int | None:
+    """Return the last stamp of a window, or that of the window before where it is empty."""
+    return int(stamps_ns[-1]) if len(stamps_ns) else before_ns
+
+
+def predictable(
+    steps_ns: IntArray, ready_ns: IntArray, valid: BoolArray, stamps_ns: IntArray
+) -> tuple[Release, FloatArray, BoolArray]:
+    """Return the release of steps [K], how far each scored stamp [M] is ahead of its step in s, and where that may be.
+
+    ``valid`` [K] are the steps with an estimate; a stamp without a step has NaN for the horizon.
+    """
+    released = release(ready_ns, stamps_ns)
+    horizon_s = np.where(released.arrived, (stamps_ns - steps_ns[released.at]) * 1e-9, np.nan)
+    return released, horizon_s, (horizon_s <= MAX_PREDICTION_S) & valid[released.at]

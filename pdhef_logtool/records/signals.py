@@ -111,6 +111,16 @@ class Channel:
         """Return the number of samples."""
         return int(self.stamps_ns.shape[0])
 
+    def take(self, which: slice | BoolArray) -> Channel:
+        """Return the samples of a slice or of a mask [N]."""
+        stamps, arrival, values = self.stamps_ns[which], self.arrival_ns[which], self.values[which]
+        return Channel(self.name, self.unit, self.source, stamps, arrival, values)
+
+    def between(self, start_ns: int, end_ns: int | None = None) -> Channel:
+        """Return the samples with stamps in [start_ns, end_ns), to the last one when ``end_ns`` is None."""
+        first = int(np.searchsorted(self.stamps_ns, start_ns))
+        return self.take(slice(first, None if end_ns is None else int(np.searchsorted(self.stamps_ns, end_ns))))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:

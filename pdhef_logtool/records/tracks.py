@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -103,6 +104,13 @@ class StateTrack:
             if c not in OPTIONAL_COLUMNS or len(getattr(self, c)) == len(self)
         }
 
+    def between(self, start_ns: int | None, end_ns: int) -> StateTrack:
+        """Return the stamps in [start_ns, end_ns), from the first one when ``start_ns`` is None."""
+        first = 0 if start_ns is None else int(np.searchsorted(self.stamps_ns, start_ns))
+        part = slice(first, int(np.searchsorted(self.stamps_ns, end_ns)))
+        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        return StateTrack(name=self.name, **{c: v[part] if len(v) == len(self) else v for c, v in columns.items()})
+
     def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
         """Return a copy with another pose."""
         return replace(self, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad)
@@ -136,6 +144,17 @@ def make_track(name: str, stamps_ns: IntArray, **columns: FloatArray | IntArray 
     if unknown:
         raise TypeError(f"unknown track columns: {sorted(unknown)}")
     return StateTrack(**values)  # type: ignore[arg-type]
+
+
+def diagonal_covariance(stds: Sequence[FloatArray]) -> FloatArray:
+    """Return [N, 3, 3] with the variances of v_x, v_y, r, [N] each, NaN beside them; [0, 3, 3] if none is known."""
+    std = np.stack(stds, axis=1)
+    if not np.isfinite(std).any():
+        return np.empty((0, 3, 3))
+    covariance = np.full((std.shape[0], 3, 3), np.nan)
+    for i in range(3):
+        covariance[:, i, i] = std[:, i] ** 2
+    return covariance
 
 
 def concatenate(tracks: list[StateTrack]) -> StateTrack:

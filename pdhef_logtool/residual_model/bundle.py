@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.records.documents import read_json
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES
@@ -27,7 +28,10 @@ PAPER_FOLDER = "baselines/paper-network"
 
 #: Names instead of a folder: the network that comes with the package, and no network.
 SHIPPED, MANY_CARS, NO_MODEL = "default", "many-cars", "none"
-SHIPPED_FOLDERS = {name: Path(__file__).parents[1] / "models" / name for name in (SHIPPED, MANY_CARS)}
+SHIPPED_FOLDERS = {
+    SHIPPED: Path(__file__).parents[1] / "models" / "default" / "network",
+    MANY_CARS: Path(__file__).parents[1] / "models" / "many-cars",
+}
 
 #: What a network may predict, and how many numbers that is: rates of v_y and r that f_nom lacks, or v_y itself.
 RESIDUAL = "residual_rates"
@@ -183,13 +187,12 @@ def load_network(folder: Path, target: str) -> ModelBundle:
     from safetensors.numpy import load
 
     where = str(folder)
+    expected = f"a model bundle ({DOCUMENT_FILE}, {WEIGHTS_FILE})"
+    document = read_json(folder / DOCUMENT_FILE, expected, ModelError)
     try:
-        document = json.loads((folder / DOCUMENT_FILE).read_text(encoding="utf-8"))
         weights = load((folder / WEIGHTS_FILE).read_bytes())
     except (OSError, ValueError, SafetensorError) as error:
-        raise ModelError(
-            expected=f"a model bundle ({DOCUMENT_FILE}, {WEIGHTS_FILE})", got=str(error), where=where
-        ) from None
+        raise ModelError(expected=expected, got=str(error), where=where) from None
     if document.get("format") != FORMAT or document.get("version") != FORMAT_VERSION:
         got = f"{document.get('format')} {document.get('version')}"
         raise ModelError(expected=f"{FORMAT} {FORMAT_VERSION}", got=got, where=where, remedy="train it anew")
@@ -198,7 +201,7 @@ def load_network(folder: Path, target: str) -> ModelBundle:
     try:
         a, n = document["architecture"], document["normalisation"]
         bundle = ModelBundle(
-            feature_names=tuple(document["features"]),
+            feature_names=tuple(str(name) for name in document["features"]),
             hidden=int(a["hidden"]),
             layers=int(a["layers"]),
             head=tuple(int(w) for w in a["head"]),
@@ -212,7 +215,7 @@ def load_network(folder: Path, target: str) -> ModelBundle:
             provenance=document.get("provenance", {}),
             target=target,
         )
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise ModelError(expected="the entries of model.json", got=f"{error!r}", where=where) from None
     unknown = [f for f in bundle.feature_names if f not in FEATURES]
     if unknown:

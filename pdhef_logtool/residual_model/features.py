@@ -38,6 +38,7 @@ ONE_CAR_FEATURES = FEATURES[:10]
 _VX, _VY, _YAW_RATE = 0, 1, 2
 
 
+# positional: one array a sensor or state, in the order of the features
 def make_features(
     steer_rad: FloatArray,
     ay_m_s2: FloatArray,

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.records.documents import read_json
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES
@@ -81,28 +82,21 @@ def load_linear_model(path: Path) -> LinearModel:
         The file is missing or wrong, or its coefficients do not belong to its hash.
     """
     where = str(path)
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        kind = (document["format"], document["version"], document["target"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ModelError(
-            expected="the coefficients of a linear regression",
-            got=f"{type(error).__name__} {error}",
-            where=where,
-            remedy="pdhef train DATASET -o MODEL --baselines writes them",
-        ) from None
+    remedy = "pdhef train DATASET -o MODEL --baselines writes them"
+    document = read_json(path, "the coefficients of a linear regression", ModelError, remedy)
+    kind = tuple(document.get(key) for key in ("format", "version", "target"))
     if kind != (FORMAT, FORMAT_VERSION, TARGET):
         wanted = f"{FORMAT} {FORMAT_VERSION} of {TARGET}"
-        raise ModelError(expected=wanted, got=f"{kind[0]} {kind[1]} of {kind[2]}", where=where, remedy="train it anew")
+        raise ModelError(expected=wanted, got=f"{kind[0]} {kind[1]} of {kind[2]}", where=where, remedy=remedy)
     try:
         model = LinearModel(
-            feature_names=tuple(document["features"]),
+            feature_names=tuple(str(name) for name in document["features"]),
             coefficients=tuple(float(c) for c in document["coefficients"]),
             intercept_rad=float(document["intercept_rad"]),
             low_pass_hz=float(document["low_pass_hz"]),
             provenance=document.get("provenance", {}),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise ModelError(expected="the entries of a linear regression", got=f"{error!r}", where=where) from None
     unknown = [f for f in model.feature_names if f not in FEATURES]
     if unknown:

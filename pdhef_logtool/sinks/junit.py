@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pdhef_logtool.evaluation.thresholds import Verdict
-from pdhef_logtool.sinks.base import write_bytes
+from pdhef_logtool.records.files import write_bytes
 
 
 def write_junit(path: Path, verdicts: Mapping[str, Sequence[Verdict]]) -> None:
@@ -65,10 +66,4 @@ def _add_case(suite: ET.Element, verdict: Verdict) -> None:
 
 def _text(text: str) -> str:
     """Replace what XML 1.0 cannot hold."""
-    return "".join(
-        c if c in "\t\n\r" or (c >= " " and c not in "\ufffe\uffff" and not _surrogate(c)) else "?" for c in text
-    )
-
-
-def _surrogate(character: str) -> bool:
-    return "\ud800" <= character <= "\udfff"
+    return re.sub("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]", "?", text)

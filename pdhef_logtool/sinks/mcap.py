@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ from pdhef_logtool.logs.source_copy import (
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Loss, Signals
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import Event
+from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.report import json_bytes
 
 #: Everything below this name in a source log is ours and is replaced.
@@ -35,7 +36,6 @@ MAP_FRAME = "map"
 BODY_FRAME = "base_link"
 METRICS_RECORD = "pdhef.metrics"
 REPORT_ATTACHMENT = "report.json"
-_REPORT_MEDIA_TYPE = "application/json"
 
 _STATE_FIELDS = (
     "vx_m_s",
@@ -61,7 +61,7 @@ def topic_of(estimator: str, what: str) -> str:
     return f"{NAMESPACE}{'_' if token[:1].isdigit() else ''}{token}/{what}"
 
 
-class AnnotatedMcapSink:
+class AnnotatedMcapSink(Sink):
     """Writes the annotated log window by window; what the source holds passes through a chunk at a time.
 
     Sound chunks that hold nothing but what stays are written as they are, others message by message.
@@ -77,15 +77,13 @@ class AnnotatedMcapSink:
 
     Raises
     ------
-    OutputError
-        When the file cannot be written.
+    OutputError : When the file cannot be written.
     """
 
     def __init__(self, path: Path, source: DriveLog | None) -> None:
         self._source = source
         self._topics: dict[str, str] = {}
         self._window: dict[str, list[TopicBatch]] = {}
-        self._lost: tuple[Loss, ...] = ()
         self._raws: Iterator[RawMessage | RawChunk] = iter(())
         self._next: RawMessage | RawChunk | None = None
         try:
@@ -98,20 +96,12 @@ class AnnotatedMcapSink:
         if source is None:
             return
         try:
-            channels = register_channels(self._writer, source, leave_out=_is_ours)
+            channels = register_channels(self._writer, source, leave_out=lambda topic: topic.startswith(NAMESPACE))
         except BaseException:
             self._writer.abort()
             raise
-        self._lost = channels.lost
+        self.lost = channels.lost
         self._raws = iterate_copy(source, channels)
-
-    @property
-    def lost(self) -> tuple[Loss, ...]:
-        """What of the source cannot be copied."""
-        return self._lost
-
-    def append_signals(self, signals: Signals) -> None:
-        """Take nothing: the inputs are in the source."""
 
     def append(self, track: StateTrack) -> None:
         """Take one track of this window."""
@@ -129,13 +119,13 @@ class AnnotatedMcapSink:
             if self._source is not None:
                 for attachment in iterate_attachments(self._source):
                     if not _is_our_report(attachment):
-                        self._attach(attachment)
+                        self._writer.attachment(*astuple(attachment))
                 for record in iterate_metadata(self._source):
                     if record.name != METRICS_RECORD:
                         self._writer.metadata(record.name, record.values)
             self._writer.metadata(METRICS_RECORD, metrics_record(report))
             end_ns = int(report["log"]["end_ns"])
-            self._attach(Attachment(REPORT_ATTACHMENT, _REPORT_MEDIA_TYPE, json_bytes(report), end_ns, end_ns))
+            self._writer.attachment(REPORT_ATTACHMENT, "application/json", json_bytes(report), end_ns, end_ns)
             self._writer.close()
         except BaseException:
             self.abort()
@@ -173,33 +163,23 @@ class AnnotatedMcapSink:
                 return
             yield raw
 
-    def _attach(self, attachment: Attachment) -> None:
-        self._writer.attachment(
-            attachment.name,
-            attachment.media_type,
-            attachment.data,
-            log_time_ns=attachment.log_time_ns,
-            create_time_ns=attachment.create_time_ns,
-        )
-
 
 def metrics_record(report: Mapping[str, Any]) -> dict[str, str]:
     """Return the figures as ``estimator/signal/segment/metric`` → ``value unit n=samples`` (``null``: not computable).
 
-    ``log`` and ``truth`` (``available`` or ``no truth``) stand beside them.
+    ``log``, ``truth`` (``available``, ``no truth``) and ``estimator/algorithm`` (what ran, as JSON) stand beside them.
     """
     record = {
         "log": str(report["log"]["name"]),
         "truth": "available" if report["truth"]["available"] else "no truth",
     }
+    for e in report["estimators"]:
+        if e["algorithm"] is not None:
+            record[f"{e['name']}/algorithm"] = json.dumps(e["algorithm"], sort_keys=True)
     for m in report["metrics"]:
         value = "null" if m["value"] is None else repr(float(m["value"]))
         record[f"{m['estimator']}/{m['signal']}/{m['segment']}/{m['metric']}"] = f"{value} {m['unit']} n={m['n']}"
     return record
-
-
-def _is_ours(topic: str) -> bool:
-    return topic.startswith(NAMESPACE)
 
 
 def _is_our_report(attachment: Attachment) -> bool:

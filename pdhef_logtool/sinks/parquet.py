@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,10 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import FloatArray, Loss, Signals
-from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, make_track
-from pdhef_logtool.sinks.base import Event, PendingFile
+from pdhef_logtool.records.files import PendingFile, cannot_write
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
+from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.schema import arrow_schema
 
 #: Rows that are gathered of one estimator before a row group is written: 10 h at 100 Hz make 110 row groups an
@@ -24,53 +26,43 @@ ROWS_A_GROUP = 32768
 
 #: Columns that files of earlier versions have not.
 _LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
+_LATER_METRIC_COLUMNS = ("algorithm",)
 _FLAGS = ("valid", "diverged")
 _STD_COLUMNS = ("vx_std_m_s", "vy_std_m_s", "yaw_rate_std_rad_s")
 
 
-class EstimatesSink:
-    """Writes estimates.parquet; a row group holds one estimator, so that one can be read without the others.
+class RowGroups:
+    """A Parquet file that is written in row groups under a temporary name; a row group holds the rows of one key.
 
     Parameters
     ----------
-    path : where the finished file stands.
-    rows_a_group : rows of one row group.
-
-    Raises
-    ------
-    OutputError
-        When the file cannot be written.
+    path : where the finished file stands. rows_a_group : rows of one row group.
+    dictionaries : columns of few values. failed : error for a file that cannot be written.
+    joined : every row group is written from one piece, so that the same rows give the same bytes.
     """
 
-    def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP) -> None:
-        self._schema = arrow_schema("estimates.parquet.json")
-        self._rows_a_group = rows_a_group
+    def __init__(
+        self,
+        path: Path,
+        schema: pa.Schema,
+        rows_a_group: int,
+        dictionaries: list[str],
+        failed: Callable[[OSError], OutputError],
+        *,
+        joined: bool = False,
+    ) -> None:
+        self._rows_a_group, self._failed, self._joined = rows_a_group, failed, joined
         self._waiting: dict[str, list[pa.Table]] = {}
         self._pending = PendingFile(path)
         try:
-            self._writer = pq.ParquetWriter(
-                self._pending.path,
-                self._schema,
-                compression="zstd",
-                use_dictionary=["estimator"],
-                write_statistics=True,
-                store_schema=True,
-            )
+            self._writer = pq.ParquetWriter(self._pending.path, schema, compression="zstd", use_dictionary=dictionaries)
         except OSError as error:
-            raise _cannot_write(path, error) from error
+            raise failed(error) from error
 
-    @property
-    def lost(self) -> tuple[Loss, ...]:
-        """Nothing: this output holds no source data."""
-        return ()
-
-    def append_signals(self, signals: Signals) -> None:
-        """Take nothing: estimates.parquet holds no inputs."""
-
-    def append(self, track: StateTrack) -> None:
-        """Take one track of this window; [N] rows."""
-        waiting = self._waiting.setdefault(track.name, [])
-        waiting.append(_table_from_track(track, self._schema))
+    def append(self, key: str, table: pa.Table) -> None:
+        """Take the next rows of a key."""
+        waiting = self._waiting.setdefault(key, [])
+        waiting.append(table)
         if sum(t.num_rows for t in waiting) < self._rows_a_group:
             return
         joined = pa.concat_tables(waiting)
@@ -78,12 +70,14 @@ class EstimatesSink:
         self._write(joined.slice(0, whole))
         waiting[:] = [joined.slice(whole)]
 
-    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
-        """Write what waits and give the file its name; the report is not part of this file."""
+    def finish(self, metadata: Mapping[str, str] | None = None) -> None:
+        """Write what waits and the file's metadata, and give the file its name."""
         try:
             for tables in self._waiting.values():
                 self._write(pa.concat_tables(tables))
             self._waiting.clear()
+            if metadata:
+                self._writer.add_key_value_metadata(dict(metadata))
             self._writer.close()
         except BaseException:
             self.abort()
@@ -97,15 +91,48 @@ class EstimatesSink:
         self._pending.discard()
 
     def _write(self, table: pa.Table) -> None:
-        if table.num_rows == 0:
-            return
         try:
-            self._writer.write_table(table, row_group_size=self._rows_a_group)
+            if self._joined:
+                self._writer.write_table(table.combine_chunks(), row_group_size=self._rows_a_group)
+            elif table.num_rows:
+                self._writer.write_table(table, row_group_size=self._rows_a_group)
         except OSError as error:
-            raise _cannot_write(self._pending.target, error) from error
+            raise self._failed(error) from error
 
 
-def _table_from_track(track: StateTrack, schema: pa.Schema) -> pa.Table:
+class EstimatesSink(Sink):
+    """Writes estimates.parquet; a row group holds one estimator, so that one can be read without the others.
+
+    Parameters
+    ----------
+    path : where the finished file stands.
+    rows_a_group : rows of one row group.
+
+    Raises
+    ------
+    OutputError : When the file cannot be written.
+    """
+
+    def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP) -> None:
+        schema = arrow_schema("estimates.parquet.json")
+        self._file = RowGroups(path, schema, rows_a_group, ["estimator"], partial(cannot_write, path))
+
+    def append(self, track: StateTrack) -> None:
+        """Take one track of this window; [N] rows."""
+        self._file.append(track.name, track_table(track))
+
+    def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
+        """Write what waits and give the file its name; the report is not part of this file."""
+        self._file.finish()
+
+    def abort(self) -> None:
+        """Remove what was written."""
+        self._file.abort()
+
+
+def track_table(track: StateTrack) -> pa.Table:
+    """Return a track [N] as rows of estimates.parquet."""
+    schema = arrow_schema("estimates.parquet.json")
     columns: dict[str, Any] = dict(track.columns())
     columns["estimator"] = pa.DictionaryArray.from_arrays(np.zeros(len(track), dtype=np.int32), [track.name])
     arrays = [
@@ -143,8 +170,7 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
 
     Raises
     ------
-    OutputError
-        When the file is no estimates.parquet or holds no such track.
+    OutputError : When the file is no estimates.parquet or holds no such track.
     """
     wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in set(columns)]
     unknown = set(columns or ()) - set(TRACK_COLUMNS)
@@ -196,21 +222,11 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
     return make_track(
         name,
         np.asarray(table["stamp_ns"].to_numpy(), dtype=np.int64),
-        covariance=_diagonal([numbers(c) for c in _STD_COLUMNS]),
+        covariance=diagonal_covariance([numbers(c) for c in _STD_COLUMNS]),
         **floats,
         **flags,
         **known,
     )
-
-
-def _diagonal(stds: list[FloatArray]) -> FloatArray:
-    std = np.stack(stds, axis=1)
-    if not np.isfinite(std).any():
-        return np.empty((0, 3, 3))
-    covariance = np.full((std.shape[0], 3, 3), np.nan)
-    for i in range(3):
-        covariance[:, i, i] = std[:, i] ** 2
-    return covariance
 
 
 def _estimators_of(file: pq.ParquetFile, group: int) -> tuple[str, ...]:
@@ -244,14 +260,15 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
         try:
             pq.write_table(pa.Table.from_arrays(arrays, schema=schema), pending.path, compression="zstd")
         except OSError as error:
-            raise _cannot_write(path, error) from error
+            raise cannot_write(path, error) from error
 
 
 def read_metrics(path: Path) -> list[MetricRow]:
     """Read a metrics.parquet; null becomes NaN, rows marked ``not_independent`` are so again; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
     with _open(path) as file:
-        absent = set(schema.names) - set(file.schema_arrow.names)
+        names = [n for n in schema.names if n in file.schema_arrow.names]
+        absent = set(schema.names) - {*names, *_LATER_METRIC_COLUMNS}
         if absent:
             raise OutputError(
                 expected="a metrics.parquet",
@@ -259,7 +276,7 @@ def read_metrics(path: Path) -> list[MetricRow]:
                 where=str(path),
                 remedy="run the logs again",
             )
-        records = file.read(columns=schema.names).to_pylist()
+        records = file.read(columns=names).to_pylist()
     dependent = {(r["log"], r["estimator"], r["signal"]) for r in records if r["metric"] == "not_independent"}
     return [
         MetricRow(
@@ -268,7 +285,3 @@ def read_metrics(path: Path) -> list[MetricRow]:
         )
         for r in records
     ]
-
-
-def _cannot_write(target: Path, error: OSError) -> OutputError:
-    return OutputError(expected="a place to write to", got=str(error), where=str(target))

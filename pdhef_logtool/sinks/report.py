@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.metadata
 import json
 import math
@@ -12,16 +11,18 @@ from dataclasses import dataclass, field
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import ReasonFacts
+from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.sinks.base import Event, write_bytes
+from pdhef_logtool.sinks.base import Event
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+#: Columns of a figure in the report.
+_METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
 #: Distributions whose version decides what a run computes or writes.
 VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
 
@@ -68,7 +69,8 @@ class SourceFacts:
 class EstimatorFacts:
     """One estimator that was asked for: ``skipped`` holds the reason if it did not run.
 
-    ``reasons``: why it did not use its sensors as usual; None if it does not look.
+    ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the
+    name, with its digest; None if it did not run.
     """
 
     name: str
@@ -76,6 +78,7 @@ class EstimatorFacts:
     skipped: str | None = None
     notes: Sequence[str] = ()
     reasons: Sequence[ReasonFacts] | None = None
+    algorithm: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,28 +158,16 @@ def tool_versions() -> dict[str, str]:
 
 def build_report(facts: ReportFacts) -> dict[str, Any]:
     """Return the document of report.json (schemas/report.schema.json); NaN has become None."""
-    log = facts.log
-    document = {
+    log, about = facts.log, jsonable(facts.log)
+    topics = about.pop("topics")
+    document: dict[str, Any] = {
         "format": "pdhef.report",
         "version": 1,
         "log": {
-            "name": log.name,
+            **about,
             "file": PurePath(log.file).name,
-            "kind": log.kind,
-            "sha256": log.sha256,
-            "start_ns": log.start_ns,
-            "end_ns": log.end_ns,
             "duration_s": (log.end_ns - log.start_ns) * 1e-9,
-            "topics": [
-                {
-                    "name": t.name,
-                    "type": t.type_name,
-                    "encoding": t.encoding,
-                    "messages": t.messages,
-                    "mapped": t.mapped,
-                }
-                for t in log.topics
-            ],
+            "topics": [{"type" if k == "type_name" else k: v for k, v in topic.items()} for topic in topics],
         },
         "mapping": {"signals": list(facts.signals), "missing": list(facts.missing_signals)},
         "vehicle": {"name": facts.vehicle_name, "sha256": facts.vehicle_sha256},
@@ -186,6 +177,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
                 "causal": e.causal,
                 "outcome": "ran" if e.skipped is None else "skipped",
                 "reason": e.skipped,
+                "algorithm": e.algorithm,
                 "notes": list(e.notes),
                 "reasons": None if e.reasons is None else list(e.reasons),
             }
@@ -193,32 +185,17 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         ],
         "truth": {
             "available": bool(facts.truth.quantities),
-            "quantities": list(facts.truth.quantities),
-            "latency_s": facts.truth.latency_s,
+            **jsonable(facts.truth),
             "not_independent": sorted(facts.truth.not_independent),
-            "notes": list(facts.truth.notes),
         },
         "friction": facts.friction,
-        "metrics": [
-            {
-                "log": m.log,
-                "estimator": m.estimator,
-                "signal": m.signal,
-                "segment": m.segment,
-                "metric": m.metric,
-                "value": m.value,
-                "unit": m.unit,
-                "n": m.n,
-            }
-            for m in facts.metrics
-        ],
+        "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
         "segments": list(facts.segments),
         "losses": list(facts.losses),
         "warnings": list(facts.warnings),
         "versions": dict(facts.versions),
     }
-    plain: dict[str, Any] = jsonable(document)
-    return plain
+    return {key: jsonable(value) for key, value in document.items()}
 
 
 def build_run(
@@ -246,35 +223,7 @@ def build_run(
             {"log": o.log, "file": PurePath(o.file).name, "sha256": o.sha256, "outcome": o.outcome} for o in outcomes
         ],
     }
-    plain: dict[str, Any] = jsonable(document)
-    return plain
-
-
-def jsonable(value: Any) -> Any:
-    """Turn records, mappings, sequences, numpy values and paths into what JSON holds; NaN and infinity become None.
-
-    Raises
-    ------
-    TypeError
-        For anything else.
-    """
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, np.generic | np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, PurePath):
-        return str(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: jsonable(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(k): jsonable(v) for k, v in value.items()}
-    if isinstance(value, set | frozenset):
-        return [jsonable(v) for v in sorted(value)]
-    if isinstance(value, Sequence):
-        return [jsonable(v) for v in value]
-    raise TypeError(f"no JSON form of {type(value).__name__}")
+    return {key: jsonable(value) for key, value in document.items()}
 
 
 def json_bytes(document: Mapping[str, Any]) -> bytes:

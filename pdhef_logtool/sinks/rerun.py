@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,11 +13,12 @@ import rerun.blueprint as rrb
 
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.reasons import REASONS
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss, Signals
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import TRUTH, Event, PendingFile
+from pdhef_logtool.sinks.base import TRUTH, Event, Sink
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
 
@@ -76,7 +77,7 @@ _INPUT_RGB = (0x56, 0xB4, 0xE9)
 _REASON_TEXTS = {r.name: r.text for r in REASONS}
 
 
-class RerunSink:
+class RerunSink(Sink):
     """Writes recording.rrd window by window; memory does not grow with the log but for the thinned trajectories.
 
     Errors are drawn at stamps that truth and estimate share.
@@ -88,17 +89,24 @@ class RerunSink:
     input_hash : hexadecimal hash of all that went into the run; names the recording, so that the viewer takes two
         recordings of the same run as one and of different runs as two.
     start_ns : zero of the timeline ``elapsed``.
-    min_speed_m_s : sideslip is not drawn below, where it has no meaning.
+    min_speed_m_s : sideslip is not drawn below, where it has no meaning. colours : 0xRRGGBB by estimator.
 
     Raises
     ------
-    OutputError
-        When the file cannot be written or Rerun is switched off by its environment variable.
+    OutputError : When the file cannot be written or Rerun is switched off by its environment variable.
     """
 
     def __init__(
-        self, path: Path, *, log_name: str, input_hash: str, start_ns: int, min_speed_m_s: float = 1.0
+        self,
+        path: Path,
+        *,
+        log_name: str,
+        input_hash: str,
+        start_ns: int,
+        min_speed_m_s: float = 1.0,
+        colours: Mapping[str, int] | None = None,
     ) -> None:
+        self._colours = colours or {}
         self._start_ns = start_ns
         self._min_speed_m_s = min_speed_m_s
         self._lines: dict[str, _Line] = {}
@@ -122,11 +130,6 @@ class RerunSink:
         self._recording.send_recording_name(log_name)
         self._recording.send_recording_start_time_nanos(start_ns)
 
-    @property
-    def lost(self) -> tuple[Loss, ...]:
-        """Nothing: this output holds no source data."""
-        return ()
-
     def append_signals(self, signals: Signals) -> None:
         """Draw what the estimators saw in this window."""
         for entity, column, factor in _INPUTS:
@@ -141,7 +144,7 @@ class RerunSink:
             # Without this the file falls behind and the difference waits in memory: 380 MB more after one hour.
             self._recording.flush()
         self._window[track.name] = track
-        rgb = colour_rgb(track.name)
+        rgb = colour_rgb(track.name, self._colours)
         fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
         for plot in _STATES + _HEALTH:
             values = np.asarray(getattr(track, plot.column)) * plot.factor
@@ -153,7 +156,10 @@ class RerunSink:
             self._draw(entity, track.name, rgb, track.stamps_ns, values, sparse=plot.sparse)
             if plot.std is not None:
                 half = STD_OF_95_PERCENT * plot.factor * np.asarray(getattr(track, plot.std))
-                self._draw_band(f"{entity}/band95", track.name, rgb, track.stamps_ns, values, half)
+                labels = [f"{track.name} 95 % low", f"{track.name} 95 % high"]
+                style = rr.SeriesLines(names=labels, colors=[(*rgb, 110)] * 2, widths=[0.75] * 2)
+                edges = np.stack([values - half, values + half], axis=1)
+                self._draw_lines(f"{entity}/band95", style, track.stamps_ns, edges)
         if len(track.reason) == len(track):
             self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
         self._draw_path(track, rgb)
@@ -165,20 +171,17 @@ class RerunSink:
             for name, path in self._paths.items():
                 self._log_static(
                     f"/plan/{name}",
-                    rr.LineStrips2D(path.strips(), colors=[colour_rgb(name)], radii=[rr.Radius.ui_points(1.5)]),
+                    rr.LineStrips2D(
+                        path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
+                    ),
                 )
             found = self._draw_reasons()
             if events or found:
                 ordered = sorted([*events, *found], key=lambda e: (e.start_ns, e.end_ns, e.name))
-                rr.send_columns(
-                    "/events",
-                    indexes=self._times(np.array([e.start_ns for e in ordered], dtype=np.int64)),
-                    columns=rr.TextLog.columns(text=[_event_text(e) for e in ordered], level=["INFO"] * len(ordered)),
-                    recording=self._recording,
-                    strict=True,
-                )
+                text = rr.TextLog.columns(text=[_event_text(e) for e in ordered], level=["INFO"] * len(ordered))
+                self._send("/events", np.array([e.start_ns for e in ordered], dtype=np.int64), text)
             self._log_static("/report", rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN))
-            self._close()
+            self._recording.disconnect()
         except BaseException:
             self.abort()
             raise
@@ -186,17 +189,15 @@ class RerunSink:
 
     def abort(self) -> None:
         """Remove what was written."""
-        self._close()
+        self._recording.disconnect()
         self._pending.discard()
 
-    def _close(self) -> None:
-        self._recording.disconnect()
-
-    def _times(self, stamps_ns: IntArray) -> list[rr.TimeColumn]:
-        return [
+    def _send(self, entity: str, stamps_ns: IntArray, columns: Iterable[rr.ComponentColumn]) -> None:
+        times = [
             rr.TimeColumn("time", timestamp=stamps_ns.astype("datetime64[ns]")),
             rr.TimeColumn("elapsed", duration=(stamps_ns - self._start_ns).astype("timedelta64[ns]")),
         ]
+        rr.send_columns(entity, indexes=times, columns=columns, recording=self._recording, strict=True)
 
     def _log_static(self, entity: str, what: rr.AsComponents) -> None:
         self._recording.log(entity, what, static=True, strict=True)
@@ -212,31 +213,11 @@ class RerunSink:
         sparse: bool = False,
     ) -> None:
         """Send one line; [N] stamps and values, NaN where unknown."""
-        self._send(entity, [label], [rgb], 2.0 if label == TRUTH else 1.5, stamps_ns, values[:, None], sparse=sparse)
+        style = rr.SeriesLines(names=[label], colors=[rgb], widths=[2.0 if label == TRUTH else 1.5])
+        self._draw_lines(entity, style, stamps_ns, values[:, None], sparse=sparse)
 
-    def _draw_band(
-        self,
-        entity: str,
-        label: str,
-        rgb: tuple[int, int, int],
-        stamps_ns: IntArray,
-        middle: FloatArray,
-        half: FloatArray,
-    ) -> None:
-        labels = [f"{label} 95 % low", f"{label} 95 % high"]
-        edges = np.stack([middle - half, middle + half], axis=1)
-        self._send(entity, labels, [(*rgb, 110)] * 2, 0.75, stamps_ns, edges)
-
-    def _send(
-        self,
-        entity: str,
-        labels: list[str],
-        colours: Sequence[tuple[int, ...]],
-        width: float,
-        stamps_ns: IntArray,
-        values: FloatArray,
-        *,
-        sparse: bool = False,
+    def _draw_lines(
+        self, entity: str, style: rr.SeriesLines, stamps_ns: IntArray, values: FloatArray, *, sparse: bool = False
     ) -> None:
         """Send the known rows of ``values`` [N, k]; an empty row, which breaks the line, stands for missing ones."""
         line = self._lines.get(entity)
@@ -244,19 +225,13 @@ class RerunSink:
         if line is None:
             if not known.any():
                 return
-            self._log_static(entity, rr.SeriesLines(names=labels, colors=list(colours), widths=[width] * len(labels)))
+            self._log_static(entity, style)
             line = self._lines[entity] = _Line(LONGEST_BRIDGE_NS if sparse else 0)
         stamps, rows, is_break = line.rows(stamps_ns, known)
         if len(stamps) == 0:
             return
         lengths = np.where(is_break, 0, values.shape[1])
-        rr.send_columns(
-            entity,
-            indexes=self._times(stamps),
-            columns=rr.Scalars.columns(scalars=values[rows].reshape(-1)).partition(lengths),
-            recording=self._recording,
-            strict=True,
-        )
+        self._send(entity, stamps, rr.Scalars.columns(scalars=values[rows].reshape(-1)).partition(lengths))
 
     def _draw_path(self, track: StateTrack, rgb: tuple[int, int, int]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
@@ -272,13 +247,8 @@ class RerunSink:
         slot = track.stamps_ns // DOT_STEP_NS
         shown = known & (np.diff(slot, prepend=slot[:1] - 1) != 0)
         if shown.any():
-            rr.send_columns(
-                f"/plan/{track.name}/now",
-                indexes=self._times(track.stamps_ns[shown]),
-                columns=rr.Points2D.columns(positions=plan[shown]),
-                recording=self._recording,
-                strict=True,
-            )
+            points = rr.Points2D.columns(positions=plan[shown])
+            self._send(f"/plan/{track.name}/now", track.stamps_ns[shown], points)
 
     def _draw_reasons(self) -> list[Event]:
         """Draw each reason as a state that holds in its intervals; return the intervals as events."""
@@ -287,13 +257,8 @@ class RerunSink:
             for reason, spans in intervals.intervals().items():
                 text = _REASON_TEXTS[reason]
                 stamps = np.array([t for s in spans for t in (s.start_ns, s.end_ns)], dtype=np.int64)
-                rr.send_columns(
-                    f"/reasons/{name}/{reason}",
-                    indexes=self._times(stamps),
-                    columns=rr.StateChange.columns(state=[text, ""] * len(spans)),  # the empty one ends the state
-                    recording=self._recording,
-                    strict=True,
-                )
+                states = rr.StateChange.columns(state=[text, ""] * len(spans))  # the empty one ends the state
+                self._send(f"/reasons/{name}/{reason}", stamps, states)
                 events += [Event(f"{name}: {text}", s.start_ns, s.end_ns, "") for s in spans]
         return events
 
@@ -317,7 +282,7 @@ class RerunSink:
                 self._draw(
                     f"/error/{plot.entity}/{name}",
                     name,
-                    colour_rgb(name),
+                    colour_rgb(name, self._colours),
                     track.stamps_ns[of_track],
                     np.where(known, error, np.nan),
                 )

@@ -27,7 +27,7 @@ from numba import njit
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -53,13 +53,20 @@ MEMORY_SIZE = 15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DivergenceCarry:
-    """Memory between windows: the sum's state, and the flags of steps [K] that coming stamps still need."""
+class FlagSteps(StepColumns):
+    """When steps arrived and whether the flag is set at them, [K]."""
 
-    memory: FloatArray
-    last_stamp_ns: int
     ready_ns: IntArray
     flags: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DivergenceCarry:
+    """Memory between windows: the sum's state, and the flags of steps that coming stamps still need."""
+
+    memory: FloatArray
+    last_stamp_ns: int | None
+    waiting: FlagSteps
 
 
 @dataclass(slots=True)
@@ -93,29 +100,27 @@ def wrong_branch(
     """
     signals = without_impossible(signals)
     count = len(signals)
-    if count == 0:
-        empty = np.zeros(0, dtype=np.bool_)
-        return empty, carry or DivergenceCarry(np.zeros(MEMORY_SIZE), 0, signals.ready_ns, empty)
-    dt = np.diff(signals.stamps_ns, prepend=signals.stamps_ns[0]) * 1e-9
-    dt[0] = math.inf if carry is None else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
+    before_ns = carry.last_stamp_ns if carry else None
     memory = np.zeros(MEMORY_SIZE) if carry is None else carry.memory.copy()
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
-    flags = np.empty(count, dtype=np.bool_)
-    _watch(
-        dt, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
-        track.valid, vehicle.assumed_friction, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2,
-        vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s,
-        vehicle.imu_position_m[0], vehicle.imu_position_m[1], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
-        memory, flags,
+    steps = FlagSteps(signals.ready_ns, np.empty(count, dtype=np.bool_))
+    dt_s = step_durations_s(signals.stamps_ns, before_ns)
+    motion = (
+        dt_s, signals.ay_m_s2, signals.yaw_rate_rad_s, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
+        track.valid,
     )  # fmt: skip
-    ready = signals.ready_ns
+    sensors = vehicle.sensors
+    car = (
+        vehicle.assumed_friction, 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2, sensors.ay_std_m_s2,
+        sensors.yaw_rate_std_rad_s, *vehicle.imu_position_m[:2], LEAST_SPEED_BLENDS * vehicle.low_speed_blend_m_s,
+    )  # fmt: skip
+    _watch(motion, car, memory, steps.flags)
     if carry is not None:
-        ready, flags = np.concatenate([carry.ready_ns, ready]), np.concatenate([carry.flags, flags])
-    index = released_steps(ready, signals.stamps_ns)
-    newest = np.maximum(index, 0)
-    released: BoolArray = flags[newest] & (index >= 0)
-    keep = int(newest[-1])
-    return released, DivergenceCarry(memory, int(signals.stamps_ns[-1]), ready[keep:], flags[keep:])
+        steps = carry.waiting.joined(steps)
+    released = release(steps.ready_ns, signals.stamps_ns)
+    flags: BoolArray = steps.flags[released.at] & released.arrived
+    last = last_stamp_ns(signals.stamps_ns, before_ns)
+    return flags, DivergenceCarry(memory, last, steps.since(released.needed))
 
 
 @njit(cache=True)
@@ -130,11 +135,10 @@ def _hold(sample, dt, value, age, run, memory):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _watch(  # type: ignore[no-untyped-def]
-    dt, ay, gyro, friction, vx, vy, rate, valid, default_friction, tilt, ay_std, gyro_std, imu_x, imu_y, least_speed,
-    memory, flags,
-):  # fmt: skip
+def _watch(motion, car, memory, flags):  # type: ignore[no-untyped-def]
     """Advance the memory over the steps [N] and write the flags [N] in place; ``dt[k]`` ends at step k."""
+    dt, ay, gyro, friction, vx, vy, rate, valid = motion
+    default_friction, tilt, ay_std, gyro_std, imu_x, imu_y, least_speed = car
     for k in range(dt.shape[0]):
         step = dt[k]
         if not step <= RESTART_GAP_S:

@@ -15,7 +15,7 @@ term          unit  definition
 ============  ====  ================================================================================================
 
 The sensors' samples of a stamp arrive later than the stamp. So the terms are computed on measurement time and each
-scored stamp takes those of the newest step that had arrived (``base.released_steps``), as the estimates themselves do.
+scored stamp takes those of the newest step that had arrived (:mod:`~.release`), as the estimates themselves do.
 Samples that the estimator says are faulty leave the terms as they are.
 """
 
@@ -30,7 +30,7 @@ from numba import njit
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.release import released_steps
+from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -58,13 +58,20 @@ STEP_SIZE = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class TermSteps(StepColumns):
+    """When steps arrived, [K], and their grip share, kinematic and yaw-rate terms, [K, 3]."""
+
+    ready_ns: IntArray
+    terms: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class FeatureCarry:
     """Memory between windows: the filters' state, and the steps that coming stamps still need."""
 
     memory: FloatArray
-    last_stamp_ns: int
-    ready_ns: IntArray
-    steps: FloatArray
+    last_stamp_ns: int | None
+    waiting: TermSteps
 
 
 def error_terms(
@@ -80,27 +87,21 @@ def error_terms(
     """
     signals = without_impossible(signals)
     count = len(signals)
-    dt = np.empty(count)
-    if count:
-        dt[0] = math.inf if carry is None else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
-        dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+    before_ns = carry.last_stamp_ns if carry else None
     friction = np.where(np.isfinite(track.friction), track.friction, signals.friction)
     friction = np.where(np.isfinite(friction), friction, ASSUMED_FRICTION)
     memory = np.zeros(MEMORY_SIZE) if carry is None else carry.memory.copy()
-    steps = np.empty((count, STEP_SIZE))
-    ay, yaw_rate = believed(track, signals)
-    _advance(
-        dt, ay, yaw_rate, friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s,
-        1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2, memory, steps,
+    steps = TermSteps(signals.ready_ns, np.empty((count, STEP_SIZE)))
+    dt_s = step_durations_s(signals.stamps_ns, before_ns)
+    motion = (
+        dt_s, *believed(track, signals), friction, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
     )  # fmt: skip
-    ready = signals.ready_ns
+    _advance(motion, 1.0 + GRAVITY_M_S2 * roll_gradient_rad_per_m_s2, memory, steps.terms)
     if carry is not None:
-        ready, steps = np.concatenate([carry.ready_ns, ready]), np.concatenate([carry.steps, steps])
-    index = released_steps(ready, signals.stamps_ns)
-    released = np.where((index >= 0)[:, None], steps[np.maximum(index, 0)], 0.0) if len(ready) else np.zeros((0, 3))
-    newest = max(int(index[-1]), 0) if count else 0
-    last = int(signals.stamps_ns[-1]) if count else (0 if carry is None else carry.last_stamp_ns)
-    grip = released[:, 0]
+        steps = carry.waiting.joined(steps)
+    released = release(steps.ready_ns, signals.stamps_ns)
+    known = np.where(released.arrived[:, None], steps.terms[released.at], 0.0)
+    grip = known[:, 0]
     terms = np.stack(
         [
             np.full(count, FLOOR_RAD),
@@ -108,12 +109,13 @@ def error_terms(
             _known(np.abs(track.sideslip_rad)),
             GRIP_RAD * grip,
             GRIP2_RAD * grip**2,
-            released[:, 1],
-            released[:, 2],
+            known[:, 1],
+            known[:, 2],
         ],
         axis=1,
     )
-    return terms, FeatureCarry(memory, last, ready[newest:], steps[newest:])
+    last = last_stamp_ns(signals.stamps_ns, before_ns)
+    return terms, FeatureCarry(memory, last, steps.since(released.needed))
 
 
 def believed(track: StateTrack, signals: Signals) -> tuple[FloatArray, FloatArray]:
@@ -132,11 +134,12 @@ def _known(values: FloatArray) -> FloatArray:
 
 
 @njit(cache=True)
-def _advance(dt, ay, rate, friction, vx, vy, yaw_rate, tilt, memory, out):  # type: ignore[no-untyped-def]
+def _advance(motion, tilt, memory, out):  # type: ignore[no-untyped-def]
     """Advance the memory over the steps [N] and write grip share, kinematic and yaw-rate terms [N, 3] in place.
 
     A step with a sample missing leaves the filters that need it as they are.
     """
+    dt, ay, rate, friction, vx, vy, yaw_rate = motion
     for k in range(dt.shape[0]):
         step = dt[k]
         if not step <= RESTART_GAP_S:

@@ -13,32 +13,26 @@ is scaled row and column alike, so that its correlations stay. Estimates themsel
 
 from __future__ import annotations
 
-import hashlib
-import json
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.car.parts import (
+    Algorithm,
+    Inflation,
+    IntervalEntry,
+    Intervals,
+    SideslipCoefficients,
+    YawRateCoefficients,
+)
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import model_folder
 
 if TYPE_CHECKING:
     from pdhef_logtool.watches.error_features import FeatureCarry
 
-FORMAT = "pdhef-calibration"
-FORMAT_VERSION = 1
-#: Name of the file beside a model bundle.
-FILE = "calibration.json"
-#: Instead of a file: leave all intervals as the estimators give them.
-NO_CALIBRATION = "none"
-#: Instead of a file: the wide one beside the model, for a car that may not be as its vehicle file says.
-UNSURE, UNSURE_FILE = "unsure", "calibration_unsure_vehicle.json"
 #: Terms of the sideslip's variance; those of the yaw rate's, where ``filter`` is its own 1-sigma.
 SIDESLIP_TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate")
 YAW_RATE_TERMS = ("floor", "filter", "yaw_rate")
@@ -46,48 +40,16 @@ YAW_RATE_TERMS = ("floor", "filter", "yaw_rate")
 MAX_SIDESLIP_STD_RAD = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class Inflation:
-    """The coefficients k of one estimator, in the order of the terms, and the factor of v_y."""
-
-    sideslip: tuple[float, ...]
-    yaw_rate: tuple[float, ...]
-    vy_factor: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """What ``pdhef calibrate`` wrote.
-
-    Attributes
-    ----------
-    inflations : by estimator. vehicle_sha256, vehicle_name : of the vehicle file that it was made with.
-    roll_gradient_rad_per_m_s2 : of that file. name, sha256 : of the calibration file.
-    model_sha256 : of the network, None without. spread : by which friction and vehicle were made wrong too; 0, not.
-    """
-
-    inflations: Mapping[str, Inflation]
-    vehicle_name: str
-    vehicle_sha256: str
-    roll_gradient_rad_per_m_s2: float
-    model_sha256: str | None = None
-    spread: float = 0.0
-    name: str = FILE
-    sha256: str = ""
-
-
 @dataclass(slots=True)
 class TrackCalibrator:
-    """Applies a calibration, or none, to the tracks of a drive window by window.
+    """Applies intervals, or none, to the tracks of a drive window by window.
 
-    ``vehicle_sha256`` and ``model_sha256`` are those of the run, for the notes. ``stands_for`` says by name which
-    estimator's coefficients are used where they are not its own.
+    ``algorithms`` says by name what ran, then what else its intervals may be taken from. Intervals are found by the
+    structure of what ran, never by its name; what else they rest on (noise, physics, network) is compared and told.
     """
 
-    calibration: Calibration | None
-    vehicle_sha256: str
-    model_sha256: str | None = None
-    stands_for: Mapping[str, str] = field(default_factory=dict)
+    intervals: Intervals | None
+    algorithms: Mapping[str, Sequence[Algorithm]]
     _carries: dict[str, FeatureCarry] = field(default_factory=dict)
     _has_interval: set[str] = field(default_factory=set)
 
@@ -95,11 +57,15 @@ class TrackCalibrator:
         """Return the next window of a track with calibrated intervals, or as it is where it has no entry."""
         if np.isfinite(track.sideslip_std_rad).any():
             self._has_interval.add(track.name)
-        like = self.stands_for.get(track.name, track.name)
-        if self.calibration is None or like not in self.calibration.inflations:
+        found = self._found(track.name)
+        if self.intervals is None or found is None:
             return track
         track, self._carries[track.name] = calibrated(
-            track, signals, self.calibration, self._carries.get(track.name), like=like
+            track,
+            signals,
+            found[0].inflation,
+            self.intervals.roll_gradient_rad_per_m_s2,
+            self._carries.get(track.name),
         )
         return track
 
@@ -107,54 +73,63 @@ class TrackCalibrator:
         """Return what the report says of an estimator's intervals; nothing for one without."""
         if name not in self._has_interval:
             return ()
-        made = self.calibration
-        if made is None or self.stands_for.get(name, name) not in made.inflations:
+        found = self._found(name)
+        if self.intervals is None or found is None:
             return ("intervals not calibrated",)
+        made = self.intervals
         of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
-        said = [f"intervals calibrated by {made.name} ({made.sha256[:8]}) for friction and vehicle {of}"]
-        if made.vehicle_sha256 != self.vehicle_sha256:
-            said.append(f"that calibration was made for another vehicle file ({made.vehicle_name})")
-        if made.model_sha256 is not None and made.model_sha256 != self.model_sha256:
-            said.append("that calibration was made for another network")
+        then, now = found[0].algorithm, found[1]
+        said = [f"intervals calibrated on {made.car} for friction and vehicle {of}"]
+        said += [
+            f"those intervals were made with other {what}"
+            for what, differs in (
+                ("physics", then.physics_sha256 not in (None, now.physics_sha256)),
+                ("filter noise", then.noise != now.noise),
+                ("network", then.network_sha256 not in (None, now.network_sha256)),
+                ("sensors (with or without the speed)", then.use_speed != now.use_speed),
+            )
+            if differs
+        ]
         return tuple(said)
+
+    def _found(self, name: str) -> tuple[IntervalEntry, Algorithm] | None:
+        """Return the entry for a name and the algorithm that it was found by."""
+        entries = {} if self.intervals is None else {e.algorithm.structure: e for e in self.intervals.entries}
+        for algorithm in self.algorithms.get(name, ()):
+            if algorithm.structure in entries:
+                return entries[algorithm.structure], algorithm
+        return None
 
 
 def calibrated(
     track: StateTrack,
     signals: Signals,
-    calibration: Calibration,
+    inflation: Inflation,
+    roll_gradient_rad_per_m_s2: float,
     carry: FeatureCarry | None = None,
-    *,
-    like: str | None = None,
 ) -> tuple[StateTrack, FeatureCarry]:
     """Return a track with calibrated 1-sigmas and covariance; joined windows equal the whole bit for bit.
 
     Parameters
     ----------
-    track, signals : [N] at the same stamps. carry : of the previous window.
-    like : name with an entry; None is the track's.
-
-    Raises
-    ------
-    KeyError
-        The calibration has no entry for the estimator.
+    track, signals : [N] at the same stamps. roll_gradient_rad_per_m_s2 : of the car that the fit was made on.
+    carry : of the previous window.
     """
     from pdhef_logtool.watches.error_features import error_terms
 
-    inflation = calibration.inflations[track.name if like is None else like]
-    terms, carry = error_terms(track, signals, calibration.roll_gradient_rad_per_m_s2, carry)
+    terms, carry = error_terms(track, signals, roll_gradient_rad_per_m_s2, carry)
     return inflated(track, terms, inflation), carry
 
 
 def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> StateTrack:
     """Scale a track's 1-sigmas and covariance by an inflation; ``terms`` [N, 7]. NaN stays NaN."""
     own = track.sideslip_std_rad
-    sideslip = np.minimum(combined(terms, inflation.sideslip), MAX_SIDESLIP_STD_RAD)
+    sideslip = np.minimum(combined(terms, _ordered(inflation.sideslip, SIDESLIP_TERMS)), MAX_SIDESLIP_STD_RAD)
     sideslip = np.where(np.isfinite(own), sideslip, np.nan)
     covariance = track.covariance
     if covariance.shape[0]:
         rate_std = track.yaw_rate_std_rad_s
-        rate = combined(yaw_rate_terms(terms, rate_std), inflation.yaw_rate)
+        rate = combined(yaw_rate_terms(terms, rate_std), _ordered(inflation.yaw_rate, YAW_RATE_TERMS))
         scale = np.ones((len(track), 3))
         scale[:, 1] = inflation.vy_factor * _ratio(sideslip, own)
         scale[:, 2] = _ratio(rate, rate_std)
@@ -183,94 +158,14 @@ def _ratio(new: FloatArray, old: FloatArray) -> FloatArray:
     return np.where(good, new / np.where(good, old, 1.0), 1.0)
 
 
-# ---- the file ----
+def _ordered(coefficients: YawRateCoefficients, terms: Sequence[str]) -> tuple[float, ...]:
+    return tuple(getattr(coefficients, term) for term in terms)
 
 
-def inflations_document(inflations: Mapping[str, Inflation]) -> dict[str, Any]:
-    """Return the coefficients by estimator and term, as they stand under ``estimators`` of the file."""
-    return {
-        name: {
-            "sideslip": dict(zip(SIDESLIP_TERMS, i.sideslip, strict=True)),
-            "yaw_rate": dict(zip(YAW_RATE_TERMS, i.yaw_rate, strict=True)),
-            "vy_factor": i.vy_factor,
-        }
-        for name, i in inflations.items()
-    }
-
-
-def load_calibration(path: Path) -> Calibration:
-    """Read a calibration file, or the one in a model's folder.
-
-    Raises
-    ------
-    ModelError
-        The file is missing, is no calibration, or an entry is wrong.
-    """
-    file = path / FILE if path.is_dir() else path
-    remedy = "pdhef calibrate writes one"
-    try:
-        data = file.read_bytes()
-        document = json.loads(data)
-    except (OSError, ValueError) as error:
-        raise ModelError(expected="a calibration file", got=str(error), where=str(file), remedy=remedy) from None
-    said = document if isinstance(document, dict) else {}
-    if said.get("format") != FORMAT or said.get("version") != FORMAT_VERSION:
-        got = f"{said.get('format')} {said.get('version')}"
-        raise ModelError(expected=f"{FORMAT} {FORMAT_VERSION}", got=got, where=str(file), remedy=remedy)
-    try:
-        return Calibration(
-            inflations={str(n): _inflation(entry) for n, entry in said["estimators"].items()},
-            vehicle_name=str(said["vehicle"]["name"]),
-            vehicle_sha256=str(said["vehicle"]["sha256"]),
-            roll_gradient_rad_per_m_s2=_finite(said["vehicle"]["roll_gradient_rad_per_m_s2"], low=-math.inf),
-            model_sha256=None if said.get("model_sha256") is None else str(said["model_sha256"]),
-            spread=_finite(said["settings"]["vary"]),
-            name=file.name,
-            sha256=hashlib.sha256(data).hexdigest(),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ModelError(
-            expected="the entries of a calibration file", got=f"{error!r}", where=str(file), remedy=remedy
-        ) from None
-
-
-def _inflation(entry: Mapping[str, Any]) -> Inflation:
+def make_inflation(sideslip: Sequence[float], yaw_rate: Sequence[float], vy_factor: float = 1.0) -> Inflation:
+    """Return an inflation of coefficients in the order of :data:`SIDESLIP_TERMS` and :data:`YAW_RATE_TERMS`."""
     return Inflation(
-        sideslip=tuple(_finite(entry["sideslip"][t]) for t in SIDESLIP_TERMS),
-        yaw_rate=tuple(_finite(entry["yaw_rate"][t]) for t in YAW_RATE_TERMS),
-        vy_factor=_finite(entry["vy_factor"]),
+        sideslip=SideslipCoefficients(**dict(zip(SIDESLIP_TERMS, map(float, sideslip), strict=True))),
+        yaw_rate=YawRateCoefficients(**dict(zip(YAW_RATE_TERMS, map(float, yaw_rate), strict=True))),
+        vy_factor=float(vy_factor),
     )
-
-
-def _finite(value: Any, low: float = 0.0) -> float:
-    number = float(value)
-    if isinstance(value, bool) or not math.isfinite(number) or number < low:
-        raise ValueError(f"{value!r} is not a number of at least {low:g}")
-    return number
-
-
-def find_calibration(chosen: Path | None, model: Path | None) -> Calibration | None:
-    """Return the calibration of a run: the chosen file's, nothing for ``none``, else that beside its model if any.
-
-    ``unsure`` is the wide one beside the model.
-
-    Parameters
-    ----------
-    model : as :func:`~pdhef_logtool.residual_model.bundle.open_model` takes it.
-
-    Raises
-    ------
-    ModelError
-        The file is missing or wrong.
-    """
-    beside = model_folder(model)
-    if str(chosen) == UNSURE:
-        if beside is None:
-            raise ModelError(
-                expected=f"a model folder with {UNSURE_FILE}", got="no model", where="--calibration unsure",
-                remedy="name the file itself",
-            )  # fmt: skip
-        return load_calibration(beside / UNSURE_FILE)
-    if chosen is not None:
-        return None if str(chosen) == NO_CALIBRATION else load_calibration(chosen)
-    return load_calibration(beside) if beside is not None and (beside / FILE).is_file() else None

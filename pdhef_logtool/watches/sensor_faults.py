@@ -32,6 +32,7 @@ from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, BURST_YAW_RATE, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
+from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 
 # The two channels; the bits of the second are those of the first, shifted left by one.
@@ -106,14 +107,11 @@ WITNESS_MEMORY = 9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaultCarry:
-    """What the detector takes from window to window: memory of the channels [2, m] and of the witnesses [w].
-
-    ``last_stamp_ns`` is −1 before the first step.
-    """
+    """What the detector takes from window to window: memory of the channels [2, m] and of the witnesses [w]."""
 
     channels: FloatArray
     witness: FloatArray
-    last_stamp_ns: int
+    last_stamp_ns: int | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -299,11 +297,10 @@ def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _detect(  # type: ignore[no-untyped-def]
-    dt, steer, ay, yaw_rate, speed, friction, default_friction, s0, p, channels, w, extra, noise, usual_noise, reason,
-    usable,
-):  # fmt: skip
+def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignore[no-untyped-def]
     """Run over one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
+    dt, steer, ay, yaw_rate, speed, friction = window
+    extra, noise, usual_noise, reason, usable = found
     for k in range(dt.shape[0]):
         step = dt[k] if math.isfinite(dt[k]) else 0.0
         mask = 0
@@ -401,23 +398,24 @@ def find_faults(
     witness = np.zeros(WITNESS_MEMORY) if carry is None else carry.witness.copy()
     if carry is None:
         witness[W_SPEED_AGE] = np.inf
-    dt = np.empty(count)
-    if count:
-        dt[0] = (
-            np.nan
-            if carry is None or carry.last_stamp_ns < 0
-            else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
-        )
-        dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+    before_ns = carry.last_stamp_ns if carry else None
+    window = (
+        step_durations_s(signals.stamps_ns, before_ns), signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s,
+        signals.speed_m_s, signals.friction,
+    )  # fmt: skip
     extra, noise, usual, usable = (np.empty((count, 2)) for _ in range(4))
     reason = np.empty(count, dtype=np.int64)
     s0 = np.array([vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s])
     _detect(
-        dt, signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.friction,
-        vehicle.assumed_friction, s0, model_parameters(vehicle), channels, witness, extra, noise, usual, reason,
-        usable,
-    )  # fmt: skip
-    last = int(signals.stamps_ns[-1]) if count else (carry.last_stamp_ns if carry else -1)
+        window,
+        vehicle.assumed_friction,
+        s0,
+        model_parameters(vehicle),
+        channels,
+        witness,
+        (extra, noise, usual, reason, usable),
+    )
+    last = last_stamp_ns(signals.stamps_ns, before_ns)
     filtered: dict[str, Any] = {"ay_m_s2": usable[:, AY].copy(), "yaw_rate_rad_s": usable[:, YAW_RATE].copy()}
     seen: dict[str, Any] = {
         "ay_m_s2": np.where(reason & BURST_AY, np.nan, usable[:, AY]),

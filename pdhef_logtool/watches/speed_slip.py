@@ -26,6 +26,7 @@ import numpy as np
 from numba import njit
 
 from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 #: A speed that changes by this much more or less than the accelerometer says is contradicted: no hill is so steep.
@@ -77,7 +78,7 @@ class SlipCarry:
     """Memory between windows; ``last_stamp_ns`` is that of the last step."""
 
     memory: FloatArray
-    last_stamp_ns: int
+    last_stamp_ns: int | None
 
 
 @njit(cache=True)
@@ -175,11 +176,12 @@ def _while_slipping(m, z, wheels, bound):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _gate(dt, ax, yaw_rate, speed, wheels, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
+def _gate(window, bound, m, believed, reckoned):  # type: ignore[no-untyped-def]
     """Run over one window; ``dt[k]`` ends at step k, NaN = start. Returns whether any sample is not as it was.
 
     ``believed`` [N] is the speed for filters, ``reckoned`` [N] that with v̂ in place of what is missing.
     """
+    dt, ax, yaw_rate, speed, wheels = window
     changed = False
     for k in range(dt.shape[0]):
         if not dt[k] <= RESTART_GAP_S:
@@ -271,17 +273,14 @@ def _run(
     signals: Signals, speed_std_m_s: float, carry: SlipCarry | None
 ) -> tuple[bool, FloatArray, FloatArray, SlipCarry]:
     count = len(signals)
-    dt = np.empty(count)
-    if count:
-        dt[0] = math.nan if carry is None else (int(signals.stamps_ns[0]) - carry.last_stamp_ns) * 1e-9
-        dt[1:] = np.diff(signals.stamps_ns) * 1e-9
+    before_ns = carry.last_stamp_ns if carry else None
     memory = np.zeros(_MEMORY) if carry is None else carry.memory.copy()
     believed, reckoned = np.empty(count), np.empty(count)
-    changed = _gate(
-        dt, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s,
-        max(LEAST_BOUND_M_S, BOUND_SIGMAS * speed_std_m_s), memory, believed, reckoned,
-    )  # fmt: skip
-    last = int(signals.stamps_ns[-1]) if count else (0 if carry is None else carry.last_stamp_ns)
+    dt_s = step_durations_s(signals.stamps_ns, before_ns)
+    window = (dt_s, signals.ax_m_s2, signals.yaw_rate_rad_s, signals.speed_m_s, signals.wheel_speed_m_s)
+    bound = max(LEAST_BOUND_M_S, BOUND_SIGMAS * speed_std_m_s)
+    changed = _gate(window, bound, memory, believed, reckoned)
+    last = last_stamp_ns(signals.stamps_ns, before_ns)
     return changed, believed, reckoned, SlipCarry(memory, last)
 
 

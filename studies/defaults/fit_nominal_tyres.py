@@ -1,6 +1,6 @@
 """Fit the nominal axle tyres to slow ramp steers of the truth vehicle on two roads; write the samples' vehicle files.
 
-    python benchmarks/fit_nominal_tyres.py [sample_logs]
+    python -m studies.defaults.fit_nominal_tyres [sample_logs]
 
 The nominal model (METHOD section 2) knows one slip angle an axle, from the mean steering angle and the motion of the
 CG. So load transfer, compliance and both wheels of an axle go into its magic formula. Forces follow from Newton and
@@ -14,7 +14,6 @@ other.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from pdhef_logtool.records.signals import FloatArray
+from studies.pages import options
 from truthsim.manoeuvres import GRAVITY_M_S2, MANOEUVRES, Request
 from truthsim.motion import Motion, simulate_motion
 from truthsim.sensors import SensorNoise
@@ -53,12 +53,12 @@ class AxleFit:
     peak_n: float
 
 
-def axle_curves(motion: Motion) -> dict[str, tuple[FloatArray, FloatArray]]:
+def axle_curves(motion: Motion, car: Vehicle = CAR) -> dict[str, tuple[FloatArray, FloatArray]]:
     """Return slip angle (rad) and lateral force (N) of both axles over a motion."""
-    lf, lr = CAR.cg_to_front_axle_m, CAR.cg_to_rear_axle_m
+    lf, lr = car.cg_to_front_axle_m, car.cg_to_rear_axle_m
     v_x, v_y, r, steer = (motion.column(k) for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "steer_rad"))
-    force = CAR.mass_kg * motion.column("ay_m_s2")
-    front = (lr * force + CAR.yaw_inertia_kg_m2 * motion.column("yaw_acceleration_rad_s2")) / (lf + lr)
+    force = car.mass_kg * motion.column("ay_m_s2")
+    front = (lr * force + car.yaw_inertia_kg_m2 * motion.column("yaw_acceleration_rad_s2")) / (lf + lr)
     return {
         "front": (steer - np.arctan2(v_y + lf * r, v_x), front / np.cos(steer)),
         "rear": (-np.arctan2(v_y - lr * r, v_x), force - front),
@@ -90,32 +90,37 @@ def fit_axle(alpha: FloatArray, force: FloatArray, load_n: float) -> AxleFit:
 
 def fit_axles(motions: dict[float, Motion]) -> dict[str, AxleFit]:
     """Fit both axles to one motion a friction."""
-    wheelbase = CAR.cg_to_front_axle_m + CAR.cg_to_rear_axle_m
-    arms = {"front": CAR.cg_to_rear_axle_m, "rear": CAR.cg_to_front_axle_m}
     curves = {friction: axle_curves(motion) for friction, motion in motions.items()}
     return {
         axle: fit_axle(
             np.concatenate([curve[axle][0] / friction for friction, curve in curves.items()]),
             np.concatenate([curve[axle][1] / friction for friction, curve in curves.items()]),
-            CAR.mass_kg * GRAVITY_M_S2 * arm / wheelbase,
+            load_n,
         )
-        for axle, arm in arms.items()
+        for axle, load_n in axle_loads_n(CAR).items()
     }
 
 
-def roll_gradient_rad_per_m_s2(motion: Motion) -> float:
+def axle_loads_n(car: Vehicle) -> dict[str, float]:
+    """Return the static load of both axles."""
+    wheelbase = car.cg_to_front_axle_m + car.cg_to_rear_axle_m
+    arms = {"front": car.cg_to_rear_axle_m, "rear": car.cg_to_front_axle_m}
+    return {axle: car.mass_kg * GRAVITY_M_S2 * arm / wheelbase for axle, arm in arms.items()}
+
+
+def roll_gradient_rad_per_m_s2(motion: Motion, linear_m_s2: float = LINEAR_A_Y_M_S2) -> float:
     """Return the roll angle per planar lateral acceleration in the linear range."""
     a_y, roll = motion.column("ay_m_s2"), motion.column("roll_rad")
-    small = np.abs(a_y) < LINEAR_A_Y_M_S2
+    small = np.abs(a_y) < linear_m_s2
     return float(np.polyfit(a_y[small], roll[small], 1)[0])
 
 
-def ramp(friction: float) -> Motion:
+def ramp(friction: float, car: Vehicle = CAR) -> Motion:
     """Return the slow ramp steer that everything is fitted to."""
     manoeuvre = MANOEUVRES["ramp-steer"]
     duration_s = manoeuvre.default_duration_s(SPEED_KM_H / 3.6)
     request = Request(SPEED_KM_H / 3.6, friction, seed=0, duration_s=duration_s, scale=SCALE)
-    return simulate_motion(manoeuvre.plan(request), friction, vehicle=CAR)
+    return simulate_motion(manoeuvre.plan(request), friction, vehicle=car)
 
 
 def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, friction: float) -> str:
@@ -126,7 +131,7 @@ def vehicle_text(motion: Motion, fits: dict[str, AxleFit], *, name: str, frictio
         for axle, fit in fits.items()
     )
     roads = " and ".join(f"{road:g}" for _, road in ROADS.values())
-    return f"""# Nominal vehicle of the simulated sample logs, made by benchmarks/fit_nominal_tyres.py:
+    return f"""# Nominal vehicle of the simulated sample logs, made by studies/defaults/fit_nominal_tyres.py:
 # mass and geometry of the paper's Table 3; axle tyres and roll gradient fitted to
 # ramp steers at {SPEED_KM_H:g} km/h into the plateau of the front axle, on roads of friction {roads}.
 # Peak forces follow the friction, stiffness does not (reference_friction).
@@ -164,16 +169,14 @@ def main(folder: Path) -> None:
     """Fit, print how well, and write the vehicle files."""
     motions = {friction: ramp(friction) for _, friction in ROADS.values()}
     fits = fit_axles(motions)
-    print("axle      B      C     D_n       E      BCD   rms N   largest N (over friction)")
     for axle, fit in fits.items():
-        print(
-            f"{axle:5} {fit.B:6.2f} {fit.C:6.3f} {fit.D_n:7.0f} {fit.E:7.3f} {fit.B * fit.C * fit.D_n:8.0f}"
-            f" {fit.rms_n:7.1f} {fit.peak_n:11.0f}"
-        )
+        print(f"{axle}: {fit}")
     for file, (name, friction) in ROADS.items():
         text = vehicle_text(motions[max(motions)], fits, name=name, friction=friction)
         (folder / file).write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1] if len(sys.argv) > 1 else "sample_logs"))
+    parser = options("defaults.fit_nominal_tyres", __doc__)
+    parser.add_argument("folder", type=Path, nargs="?", default=Path("sample_logs"))
+    main(parser.parse_args().folder)

@@ -1,18 +1,18 @@
-"""Train the model that the package ships, from nothing: simulate, extract, train, tune.
+"""Make the car that the package ships from nothing: simulate, extract, train, tune, trust, calibrate.
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--jobs 2]
 
 Short drives of one simulated car whose vehicle file is right, with the friction told. The residual network, the direct
 network, the regression and the paper's network see the same rows. Filter noise of all tuned estimators is chosen on
-validation drives in one search (``pdhef tune``) and stands in ``vehicle.toml`` beside the network, which it belongs to.
-Seeds other than 0 train networks for spreads and take the noise of seed 0. A second set, other cars of the same kind,
-is for the model card. Logs that are there already as they should be are kept.
+validation drives in one search (``pdhef tune``). Seeds other than 0 train networks for spreads and take the noise of
+the shipped car. A second set, other cars of the same kind, is for the model card. Logs that are there already as they
+should be are kept.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -21,16 +21,16 @@ from pathlib import Path
 
 import torch
 
+from pdhef_logtool.car.car import NETWORK_FOLDER, NOISE_FILE, SHIPPED_CARS, UNSURE_FILE, VEHICLE_FILE
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
-from pdhef_logtool.residual_model.bundle import PAPER_FOLDER
+from pdhef_logtool.residual_model.bundle import PAPER_FOLDER, SHIPPED
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
-from pdhef_logtool.watches.intervals import FILE, UNSURE_FILE
+from studies.pages import SAMPLE_VEHICLE, options
 
-HOME = Path("pdhef_logtool/models/default")
-VEHICLE = Path("sample_logs/vehicle.toml")
+HOME = SHIPPED_CARS["saloon"]
 #: Seeds and vehicles of the sets: apart from those of the condition table, the paper's scenarios and the tests.
 SETS = {"one_car": (1000, "default"), "other_cars": (2000, "randomised"), "evidence": (3000, "default")}
 DRIVES = 800
@@ -51,22 +51,29 @@ field = "friction"
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Train and write the model folder."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Train and write the car."""
+    parser = options("defaults.train_default", __doc__)
     parser.add_argument("--seed", type=int, default=0, help="of weights, order and dropout; the data stay the same")
-    parser.add_argument("-o", "--output", type=Path, default=HOME, help="model folder")
+    parser.add_argument("-o", "--output", type=Path, default=HOME, help="the car's folder")
     parser.add_argument("--work", type=Path, default=Path("out/train-default"), help="logs and dataset; kept")
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1))
     parser.add_argument("--drives", type=int, default=DRIVES, help="of each of the two sets")
     parser.add_argument("--epochs", type=int, default=EPOCHS)
+    parser.add_argument("--trials", type=int, default=TRIALS, help="of each tuned estimator")
     given = parser.parse_args(arguments)
     began = time.monotonic()
 
     def say(text: str) -> None:
         print(f"[{(time.monotonic() - began) / 60.0:5.1f} min] {text}", flush=True)
 
-    work, model = given.work, given.output
+    work, car = given.work, given.output
+    network = car / NETWORK_FOLDER
     work.mkdir(parents=True, exist_ok=True)
+    if not (car / VEHICLE_FILE).is_file():
+        car.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(SAMPLE_VEHICLE, car / VEHICLE_FILE)
+        if given.seed:
+            shutil.copyfile(HOME / NOISE_FILE, car / NOISE_FILE)
     mapping = work / "mapping.toml"
     mapping.write_text(MAPPING, encoding="utf-8")
     for name, (seed, vehicles) in SETS.items():
@@ -75,10 +82,10 @@ def main(arguments: list[str] | None = None) -> int:
         what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", given.jobs]
         pdhef("simulate", "suite", *what, "-o", work / name)
     say("extract")
-    told = ["--vehicle", VEHICLE, "--mapping", mapping, "--jobs", given.jobs]
-    pdhef("extract", work / "one_car", "-o", work / "dataset", *told, "--resume")
+    told = ["--car", car, "--mapping", mapping]
+    pdhef("extract", work / "one_car", "-o", work / "dataset", *told, "--jobs", given.jobs, "--resume")
     say("train the residual network, and beside it the baselines on the same rows")
-    arguments = ["-o", model, "--baselines", "--seed", given.seed, "--epochs", given.epochs]
+    arguments = ["-o", network, "--baselines", "--seed", given.seed, "--epochs", given.epochs]
     beside = _start("train", work / "dataset", *arguments)
     if given.jobs == 1:
         _finish(beside)
@@ -89,26 +96,24 @@ def main(arguments: list[str] | None = None) -> int:
     def epoch(text: str, _share: float) -> None:
         say(text)
 
-    train_on(data, model, recipe, progress=epoch)
+    train_on(data, network, recipe, progress=epoch)
     say("train the paper's network on the same rows")
     paper = replace(recipe, feature_names=PAPER_FEATURES, hidden=128, dropout=0.2, epochs=PAPER_EPOCHS)
-    train_on(data, model / PAPER_FOLDER, paper, progress=epoch)
+    train_on(data, network / PAPER_FOLDER, paper, progress=epoch)
     _finish(beside)
-    vehicle = HOME / "vehicle.toml"
+    # The shipped network goes by its name, wherever the package lies.
+    told += ["--network", SHIPPED if car.resolve() == HOME else network]
+    validation = [work / "one_car", "--split", "validation", *told]
     if given.seed == 0:
         say("tune the noise of all tuned estimators alike, on validation drives")
-        search = ["--split", "validation", "--trials", TRIALS, "--model", model]
-        vehicle = model / "vehicle.toml"
-        pdhef("tune", work / "one_car", *search, *told, "-o", vehicle)
+        pdhef("tune", *validation, "--trials", given.trials, "--jobs", given.jobs, "-o", car)
     say("evidence that the network helps on this car")
-    trusted = ["--vehicle", vehicle, "--model", model, "--mapping", mapping]
-    pdhef("trust", work / "evidence", *trusted, "--any-split", "-o", model / "vehicle.toml")
+    pdhef("trust", work / "evidence", *told, "--any-split", "-o", car)
     if given.seed == 0:
         say("calibrate the intervals: for a car that is as its file says, and for one that may have changed")
-        drives = [work / "one_car", "--split", "validation", "--vehicle", vehicle, "--mapping", mapping]
-        for spread, file in ((0, FILE), (UNSURE_SPREAD, UNSURE_FILE)):
-            pdhef("calibrate", *drives, "--model", model, "--vary", spread, "-o", model / file)
-    say(f"done: {model}")
+        for spread, place in ((0, car), (UNSURE_SPREAD, car / UNSURE_FILE)):
+            pdhef("calibrate", *validation, "--vary", spread, "-o", place)
+    say(f"done: {car}")
     return 0
 
 

@@ -1,26 +1,31 @@
-"""Simulated drives on which the fixed baselines are tuned: aligned signals as from a log, and the perfect truth.
+"""Simulated drives on which the fixed baselines are tuned, and what those who tune on them share.
 
-None of their seeds is used for a sample log or for an evaluation drive.
+A drive is aligned signals as from a log, and the perfect truth. None of their seeds is used for a sample log or for an
+evaluation drive. Results are written to ``studies/defaults/results``.
 """
 
 from __future__ import annotations
 
-import tempfile
-from contextlib import closing
+import json
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
-from pdhef_logtool.drive.alignment import align, plan_alignment
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import auto_map, fit_clocks, read_signals
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.records.signals import FloatArray, Signals
-from truthsim.drive import Drive, simulate_drive, write_drive
+from studies.condition_drives import as_logged
+from studies.pages import ROOT
+from truthsim.drive import simulate_drive
 
 FIRST_SEED = 1000
 VEHICLE_FILE = "sample_logs/vehicle.toml"
+RESULTS = Path(__file__).parent / "results"
 
 #: Manoeuvre, then speeds in km/h and frictions that are combined; the seed counts on.
 PLAN: dict[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
@@ -44,48 +49,39 @@ class TuningDrive:
     sideslip_rad: FloatArray
 
 
-def signals_of(drive: Drive, vehicle: VehicleParameters, folder: Path) -> Signals:
-    """Take a drive the way of every log: written as MCAP, mapped by recognition, aligned."""
-    path = folder / f"{drive.manoeuvre}-{drive.seed}.mcap"
-    write_drive(drive, path)
-    with closing(open_log(path)) as log:
-        mapping = auto_map(log).mapping
-        clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-        channels = read_signals(log, mapping, clocks, log.start_ns, log.end_ns).signals
-        plan = plan_alignment(channels, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m)
-        signals = align(channels, plan, log.start_ns, log.end_ns)
-    path.unlink()
-    return signals
-
-
-def tuning_drives(root: Path) -> list[TuningDrive]:
+def tuning_drives() -> list[TuningDrive]:
     """Simulate the drives of ``PLAN``; a drive that spins is left out."""
-    nominal = load_vehicle(root / VEHICLE_FILE)
+    nominal = load_vehicle(ROOT / VEHICLE_FILE)
+    plan = [(name, *point) for name, (speeds, frictions) in PLAN.items() for point in product(speeds, frictions)]
     drives: list[TuningDrive] = []
-    seed = FIRST_SEED
-    with tempfile.TemporaryDirectory() as folder:
-        for manoeuvre, (speeds, frictions) in PLAN.items():
-            for speed in speeds:
-                for friction in frictions:
-                    drive = simulate_drive(
-                        manoeuvre,
-                        speed_km_h=speed,
-                        friction=friction,
-                        seed=seed,
-                        duration_s=ROAD_DURATION_S if manoeuvre == "road" else None,
-                    )
-                    seed += 1
-                    if drive.spun:
-                        print(f"left out, it spun: {drive.command}")
-                        continue
-                    vehicle = nominal.model_copy(update={"friction": friction})
-                    signals = signals_of(drive, vehicle, Path(folder))
-                    at = (signals.stamps_ns - drive.start_ns) * 1e-9
-                    truth = {
-                        k: np.interp(at, drive.times_s, drive.truth[k], left=np.nan, right=np.nan)
-                        for k in ("vx_m_s", "vy_m_s")
-                    }
-                    moving = np.hypot(truth["vx_m_s"], truth["vy_m_s"]) > vehicle.low_speed_blend_m_s
-                    sideslip = np.where(moving, np.arctan2(truth["vy_m_s"], truth["vx_m_s"]), np.nan)
-                    drives.append(TuningDrive(manoeuvre, drive.command, vehicle, signals, sideslip))
+    for seed, (manoeuvre, speed, friction) in enumerate(plan, start=FIRST_SEED):
+        duration_s = ROAD_DURATION_S if manoeuvre == "road" else None
+        drive = simulate_drive(manoeuvre, speed_km_h=speed, friction=friction, seed=seed, duration_s=duration_s)
+        if drive.spun:
+            print(f"left out, it spun: {drive.command}")
+            continue
+        vehicle = nominal.model_copy(update={"friction": friction})
+        signals = as_logged(drive, Car.of(vehicle)).signals
+        at = (signals.stamps_ns - drive.start_ns) * 1e-9
+        vx, vy = (np.interp(at, drive.times_s, drive.truth[k], left=np.nan, right=np.nan) for k in ("vx_m_s", "vy_m_s"))
+        moving = np.hypot(vx, vy) > vehicle.low_speed_blend_m_s
+        sideslip = np.where(moving, np.arctan2(vy, vx), np.nan)
+        drives.append(TuningDrive(manoeuvre, drive.command, vehicle, signals, sideslip))
     return drives
+
+
+def sideslip_rmse_deg(drive: TuningDrive, estimator: Estimator | None) -> float:
+    """Return the sideslip RMSE of a drive in degrees; None stands for no sideslip at all."""
+    error = drive.sideslip_rad
+    if estimator is not None:
+        track, _ = estimator.run(drive.signals, None)
+        error = (track.sideslip_rad - drive.sideslip_rad)[track.valid]
+    return float(np.rad2deg(np.sqrt(np.nanmean(error**2))))
+
+
+def write_result(name: str, drives: list[TuningDrive], **found: Any) -> None:
+    """Write ``results/NAME.json`` with the drives that it comes from."""
+    document = {**found, "first_seed": FIRST_SEED, "drives": [d.command for d in drives]}
+    path = RESULTS / f"{name}.json"
+    path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    print(f"wrote {path.relative_to(ROOT)}")

@@ -97,7 +97,7 @@ def improvement(
         bounds = np.percentile(share(squares[draws].sum(axis=1)), [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
         low, high = float(bounds[0]), float(bounds[1])
     by_network = []
-    for training_seed in sorted({r.training_seed for r in (*ours, *theirs)} - {None}):
+    for training_seed in sorted({r.training_seed for r in (*ours, *theirs) if r.training_seed is not None}):
         c, d = _mean_squares(ours, figure, training_seed), _mean_squares(theirs, figure, training_seed)
         by_network.append(float(share(np.array([[c[s], d[s]] for s in seeds]).sum(axis=0))))
     value = float(share(squares.sum(axis=0)))

@@ -1,33 +1,30 @@
 """Simulate the paper's two manoeuvres, run every scheme on them and score it, as ``pdhef run`` would.
 
 A drive is written as an MCAP file and read back by the tool's own path: recognised mapping, alignment, the estimators
-of the registry on aligned signals, the metrics of :mod:`pdhef_logtool.evaluation.metrics`. Friction is known: the
-vehicle file is told that of the drive. Noise seeds change the sensors alone; training seeds change the network alone.
+of the table on aligned signals, the metrics of :mod:`pdhef_logtool.evaluation.metrics`. Friction is known: the
+car is told that of the drive. Noise seeds change the sensors alone; training seeds change the network alone.
 """
 
 from __future__ import annotations
 
 import math
-import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import Network, VehicleParameters
-from pdhef_logtool.drive.windows import DriveReader, DriveWindow, plan_drive
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import WholeDrive
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.table import runnable, spec_of
 from pdhef_logtool.evaluation.metrics import MetricRow, score_track
 from pdhef_logtool.evaluation.segments import segment_masks
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import choose_mapping
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.residual_model.bundle import ModelBundle
-from studies.paper.schemes import SCHEMES, schemes_for
-from truthsim.drive import Drive, simulate_drive, write_drive
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.estimating import estimate_windows
+from studies.condition_drives import as_logged
+from studies.paper.schemes import SCHEMES
+from truthsim.drive import simulate_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import MANOEUVRES
 
@@ -35,7 +32,6 @@ GRAVITY_M_S2 = 9.80665
 #: Sensor errors of the reported drives; sample logs have seeds of one digit, tuning drives from 1000 on.
 FIRST_NOISE_SEED = 52_001
 NOISE_SEEDS = 8
-WINDOW_S = 600.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,29 +69,25 @@ class ReadDrive:
 
     Attributes
     ----------
-    windows : of the reading path; signals and truth at the same stamps.
-    vehicle : the vehicle file with the friction of the drive.
+    whole : of the reading path; signals and truth at the same stamps.
     facts : of the simulated drive, JSON-able; ``truth_latency_s`` is what the comparison took off.
     """
 
     scenario: Scenario
     noise_seed: int
-    vehicle: VehicleParameters
-    windows: tuple[DriveWindow, ...]
-    period_s: float
-    available: frozenset[str]
-    not_independent: dict[str, str]
+    whole: WholeDrive
     facts: dict[str, object]
 
     @property
     def signals(self) -> Signals:
-        """All windows' signals."""
-        return join_signals([w.signals for w in self.windows])
+        """What the estimators see."""
+        return self.whole.signals
 
     @property
     def truth(self) -> StateTrack:
-        """All windows' truth."""
-        return concatenate([w.truth for w in self.windows if w.truth is not None])
+        """What they are scored against."""
+        assert self.whole.truth is not None
+        return self.whole.truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,36 +102,18 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Model:
-    """A trained network, the seed of its training, and how far it may be trusted on which evidence (``pdhef trust``).
-
-    ``trust`` is that of the vehicle file beside it; None leaves what the nominal vehicle file says.
-    """
-
-    seed: int
-    bundle: ModelBundle
-    trust: Network | None = None
-
-    def on(self, vehicle: VehicleParameters) -> VehicleParameters:
-        """Return a vehicle file with the evidence about this network."""
-        return vehicle if self.trust is None else vehicle.model_copy(update={"network": self.trust})
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Experiment:
     """Everything that was run.
 
     Attributes
     ----------
     missing : by scheme, why it is not in the tables.
-    networks : schemes that depend on the network.
-    tracks : of the first noise seed and first model, by scenario and scheme.
+    tracks : of the first noise seed and first car, by scenario and scheme.
     drives : of the first noise seed, by scenario.
     """
 
     runs: tuple[Run, ...]
     missing: dict[str, str]
-    networks: frozenset[str]
     drives: dict[str, ReadDrive]
     tracks: dict[tuple[str, str], StateTrack]
     facts: tuple[dict[str, object], ...]
@@ -166,22 +140,16 @@ FIGURES: dict[str, tuple[str, str, str, float]] = {
 OVERSHOOTS = {"sideslip_overshoot": "sideslip_rad", "ay_overshoot": "ay_m_s2"}
 
 
-def simulate(scenario: Scenario, noise_seed: int) -> Drive:
-    """Drive a scenario with the sensor errors of a seed."""
-    return simulate_drive(scenario.manoeuvre, seed=noise_seed, faults=[parse_fault(f) for f in scenario.faults])
+def on_the_road(car: Car, friction: float) -> Car:
+    """Return a car that is told the friction of a drive."""
+    return car.with_vehicle(car.vehicle.model_copy(update={"friction": friction}))
 
 
-def read_simulated(scenario: Scenario, noise_seed: int, nominal: VehicleParameters) -> ReadDrive:
+def read_simulated(scenario: Scenario, noise_seed: int, car: Car) -> ReadDrive:
     """Simulate a drive, write it as a log and read it as ``pdhef run`` does."""
-    drive = simulate(scenario, noise_seed)
-    vehicle = nominal.model_copy(update={"friction": drive.friction})
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "drive.mcap"
-        write_drive(drive, path)
-        with closing(open_log(path)) as log:
-            mapping, _ = choose_mapping(log, None, lambda _text: None, prefer_truth="perfect")
-            plan = plan_drive(log, mapping, vehicle, log.start_ns, log.end_ns)
-            windows = tuple(w for w in DriveReader(log, plan, WINDOW_S).windows() if len(w.signals))
+    faults = [parse_fault(f) for f in scenario.faults]
+    drive = simulate_drive(scenario.manoeuvre, seed=noise_seed, faults=faults)
+    whole = as_logged(drive, on_the_road(car, drive.friction))
     facts = {
         "scenario": scenario.name,
         "noise_seed": noise_seed,
@@ -189,41 +157,29 @@ def read_simulated(scenario: Scenario, noise_seed: int, nominal: VehicleParamete
         "duration_s": drive.duration_s,
         "peak_ay_g": drive.peak_ay_m_s2 / GRAVITY_M_S2,
         "peak_sideslip_deg": math.degrees(drive.peak_sideslip_rad),
-        "truth_latency_ms": 1e3 * plan.truth_latency_s,
+        "truth_latency_ms": 1e3 * whole.plan.truth_latency_s,
         "friction": drive.friction,
         "notes": list(drive.notes),
     }
-    return ReadDrive(
-        scenario,
-        noise_seed,
-        vehicle,
-        windows,
-        plan.alignment.grid_period_s,
-        plan.alignment.available,
-        plan.dependent,
-        facts,
-    )
+    return ReadDrive(scenario, noise_seed, whole, facts)
 
 
-def estimate(estimator: Estimator, drive: ReadDrive) -> StateTrack:
-    """Run an estimator over a drive, window by window."""
-    tracks, carry = [], None
-    for window in drive.windows:
-        track, carry = estimator.run(window.signals, carry)
-        tracks.append(track)
-    return concatenate(tracks)
+def track_of(estimator: Estimator, drive: ReadDrive) -> StateTrack:
+    """Run an estimator over a drive."""
+    (window,) = estimate_windows(drive.whole, [estimator], watched=False, drawn=False)
+    return window.tracks[0]
 
 
 def figures_of(track: StateTrack, drive: ReadDrive) -> dict[str, float]:
     """Score a track; the figures of ``FIGURES`` and ``OVERSHOOTS`` that it has."""
-    truth = drive.truth
+    truth, plan = drive.truth, drive.whole.plan
     rows = score_track(
         track,
         truth,
-        segment_masks(drive.signals, truth, drive.vehicle),
+        segment_masks(drive.signals, truth, plan.vehicle),
         log=drive.scenario.name,
-        low_speed_m_s=drive.vehicle.low_speed_blend_m_s,
-        not_independent=drive.not_independent,
+        low_speed_m_s=plan.vehicle.low_speed_blend_m_s,
+        not_independent=plan.dependent,
     )
     by_key: dict[tuple[str, str, str], MetricRow] = {(r.signal, r.segment, r.metric): r for r in rows}
     values = {
@@ -239,8 +195,7 @@ def figures_of(track: StateTrack, drive: ReadDrive) -> dict[str, float]:
 
 
 def run_experiment(
-    nominal: VehicleParameters,
-    models: Sequence[Model],
+    cars: Mapping[int, Car],
     *,
     scenarios: Iterable[Scenario] = (A, B, BURST),
     noise_seeds: Sequence[int] = tuple(range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + NOISE_SEEDS)),
@@ -251,32 +206,31 @@ def run_experiment(
 
     Parameters
     ----------
-    nominal : vehicle file; its friction is replaced by that of each drive.
-    models : without any, the drives alone are made.
+    cars : with their networks by training seed; the friction is replaced by that of each drive.
     """
     runs: list[Run] = []
     drives: dict[str, ReadDrive] = {}
     tracks: dict[tuple[str, str], StateTrack] = {}
     facts: list[dict[str, object]] = []
     missing: dict[str, str] = {}
-    networks: set[str] = set()
+    first = next(iter(cars))
     for scenario in scenarios:
         for noise_seed in noise_seeds:
-            drive = read_simulated(scenario, noise_seed, nominal)
+            drive = read_simulated(scenario, noise_seed, cars[first])
             facts.append(drive.facts)
             first_drive = scenario.name not in drives
             drives.setdefault(scenario.name, drive)
-            for model in models:
-                schemes, skipped = schemes_for(names, model.on(drive.vehicle), drive.available, model.bundle)
-                missing.update(skipped)
-                networks.update(s.name for s in schemes if s.uses_network)
+            for seed, car in cars.items():
+                own = on_the_road(car, scenario.friction)
+                schemes, skipped = runnable(names, own, drive.whole.plan.alignment.available)
+                missing.update({s.name: s.reason for s in skipped})
                 for scheme in schemes:
-                    if model is not models[0] and not scheme.uses_network:
+                    by_network = bool(spec_of(scheme.name).network)
+                    if seed != first and not by_network:
                         continue
-                    track = estimate(scheme.estimator, drive)
-                    seed = model.seed if scheme.uses_network else None
-                    runs.append(Run(scenario.name, noise_seed, scheme.name, seed, figures_of(track, drive)))
-                    if first_drive and model is models[0]:
+                    track, training_seed = track_of(scheme, drive), seed if by_network else None
+                    runs.append(Run(scenario.name, noise_seed, scheme.name, training_seed, figures_of(track, drive)))
+                    if first_drive and seed == first:
                         tracks[scenario.name, scheme.name] = track
             progress(f"scenario {scenario.name}, noise seed {noise_seed}")
-    return Experiment(tuple(runs), missing, frozenset(networks), drives, tracks, tuple(facts))
+    return Experiment(tuple(runs), missing, drives, tracks, tuple(facts))

@@ -1,40 +1,30 @@
-"""The pictures of Figures 9 to 23 with our data, in colours that colour-blind readers can tell apart (Okabe-Ito)."""
+"""The pictures of Figures 9 to 23 with our data, in the colours that estimators have everywhere."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.evaluation.metrics import position_error
 from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
+from studies.paper import published
 from studies.paper.comparison import spread
-from studies.paper.experiment import BURST_S, GRAVITY_M_S2, Experiment
+from studies.paper.experiment import BURST_S, GRAVITY_M_S2, A, B, Experiment
 from studies.paper.probes import RESIDUAL_ROWS, History, ResidualFit, TrustCurve
+from studies.paper.results import Results
+from studies.paper.schemes import DRAWN
 from studies.paper.step_time import StepTime
+from studies.pictures import STYLE, save, subplots
 
-COLOURS = {
-    "truth": "#8c8c8c",
-    "phy-ukf": "#0072B2",
-    "phy-ukf-tuned": "#56B4E9",
-    "physics-plus": "#CC79A7",
-    "pure-lstm": "#D55E00",
-    "pd-hef-paper": "#E69F00",
-    "pd-hef-fixed-r": "#000000",
-    "pd-hef-trust0": "#666666",
-    "pd-hef": "#009E73",
-}
+COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
 DASHES = {"phy-ukf": (0, (4, 1.5)), "pure-lstm": (0, (1.5, 1)), "pd-hef-paper": (0, (5, 1, 1, 1))}
-OTHERS = "#999999"
-#: The paper's three, drawn in this order in the time histories.
-DRAWN = ("phy-ukf", "pure-lstm", "pd-hef")
-#: Stands in for ``pd-hef`` where this version has none.
-STAND_IN = "pd-hef-fixed-r"
 BARS = ("phy-ukf", "phy-ukf-tuned", "physics-plus", "pure-lstm", "pd-hef-paper", "pd-hef-fixed-r", "pd-hef")
 
 #: Signal, factor to the unit drawn, label.
@@ -45,84 +35,41 @@ SIGNALS = {
 }
 
 
-def drawn(ran: Sequence[str]) -> tuple[str, ...]:
-    """Return the schemes of the time histories that ran."""
-    return tuple(n for n in (*DRAWN[:-1], hybrid_of(ran)) if n in ran)
-
-
-def hybrid_of(ran: Sequence[str]) -> str:
-    """Return the name of our hybrid filter among those that ran."""
-    return DRAWN[-1] if DRAWN[-1] in ran else STAND_IN
-
-
-def _axes(rows: int, columns: int, width: float, height: float, **options: Any) -> tuple[Any, Any]:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    plt.rcParams.update(
-        {
-            "font.size": 9,
-            "axes.grid": True,
-            "grid.alpha": 0.3,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "lines.linewidth": 1.3,
-            "legend.fontsize": 8,
-            "legend.frameon": False,
-            "axes.titlesize": 9.5,
-        }
-    )
-    return plt.subplots(rows, columns, figsize=(width, height), squeeze=False, layout="constrained", **options)
-
-
-def _save(fig: Any, folder: Path, name: str) -> None:
-    """Write a small PNG without a time in it, so that the same figure is the same file."""
-    import matplotlib.pyplot as plt
-
-    fig.savefig(folder / f"{name}.png", dpi=100, metadata={"Software": None})
-    plt.close(fig)
+_STYLE = {**STYLE, "axes.spines.top": False, "axes.spines.right": False, "lines.linewidth": 1.3,
+          "legend.frameon": False, "axes.titlesize": 9.5}  # fmt: skip
 
 
 def _style(name: str) -> dict[str, Any]:
-    return {"color": COLOURS.get(name, OTHERS), "linestyle": DASHES.get(name, "-"), "label": name}
+    return {"color": COLOURS[name], "linestyle": DASHES.get(name, "-"), "label": name}
 
 
 def _thin(name: str) -> dict[str, Any]:
     """Style of errors: noise in dashes cannot be read."""
-    return {"color": COLOURS.get(name, OTHERS), "linewidth": 0.9, "label": name}
+    return {"color": COLOURS[name], "linewidth": 0.9, "label": name}
 
 
 def _time_s(track: StateTrack) -> FloatArray:
     return np.asarray((track.stamps_ns - track.stamps_ns[0]) * 1e-9)
 
 
-def convergence(folder: Path, histories: dict[int, History]) -> None:
+def convergence(folder: Path, histories: Mapping[int, History]) -> None:
     """Figure 9: loss over epochs, each training seed."""
-    fig, axes = _axes(1, 1, 7.4, 3.2)
+    fig, axes = subplots(1, 1, 7.4, 3.2, _STYLE)
     ax = axes[0, 0]
     for number, (seed, history) in enumerate(sorted(histories.items())):
         shade = {"alpha": 1.0 if number == 0 else 0.45}
         mark = {} if len(history.epoch) > 1 else {"marker": "o"}
         ax.plot(history.epoch, history.train_loss, color="#0072B2", **shade, **mark, label=f"training, seed {seed}")
-        ax.plot(
-            history.epoch,
-            history.validation_loss,
-            color="#D55E00",
-            linestyle=DASHES["phy-ukf"],
-            **shade,
-            **mark,
-            label=f"validation, seed {seed}",
-        )
+        second = {"color": "#D55E00", "linestyle": DASHES["phy-ukf"], "label": f"validation, seed {seed}"}
+        ax.plot(history.epoch, history.validation_loss, **shade, **mark, **second)
     ax.set(yscale="log", xlabel="epoch", ylabel="mean square error,\nshare of the residual's mean square")
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    _save(fig, folder, "figure09_convergence")
+    save(fig, folder / "figure09_convergence.png")
 
 
 def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
     """Figures 10 and 19: residual and network over time, and one over the other."""
-    fig, axes = _axes(2, 2, 8.6, 4.6, width_ratios=(2.6, 1.0))
+    fig, axes = subplots(2, 2, 8.6, 4.6, _STYLE, width_ratios=(2.6, 1.0))
     for row, (what, unit) in enumerate(RESIDUAL_ROWS):
         target, output = fit.target[:, row], fit.output[:, row]
         ax = axes[row, 0]
@@ -137,7 +84,7 @@ def residuals(folder: Path, name: str, fit: ResidualFit, title: str) -> None:
     axes[0, 1].set_title(title)
     _legend_above(axes[0, 0])
     axes[1, 0].set_xlabel("time, s")
-    _save(fig, folder, name)
+    save(fig, folder / f"{name}.png")
 
 
 def history(
@@ -147,7 +94,7 @@ def history(
     attribute, factor, label = SIGNALS[signal]
     truth = experiment.drives[scenario].truth
     time_s, real = _time_s(truth), factor * getattr(truth, attribute)
-    fig, axes = _axes(2, 1, 7.4, 4.4, sharex=True)
+    fig, axes = subplots(2, 1, 7.4, 4.4, _STYLE, sharex=True)
     axes[0, 0].plot(time_s, real, color=COLOURS["truth"], linewidth=3.0, label="truth")
     for scheme in schemes:
         track = experiment.tracks[scenario, scheme]
@@ -160,7 +107,7 @@ def history(
     axes[0, 0].set(ylabel=label)
     axes[1, 0].set(ylabel=f"absolute error, {label.rsplit(', ', 1)[1]}", xlabel="time, s", ylim=(0.0, None))
     _legend_above(axes[0, 0])
-    _save(fig, folder, name)
+    save(fig, folder / f"{name}.png")
 
 
 def _legend_above(ax: Any) -> None:
@@ -170,7 +117,7 @@ def _legend_above(ax: Any) -> None:
 def position(folder: Path, name: str, experiment: Experiment, scenario: str, schemes: Sequence[str]) -> None:
     """Figures 11 and 15: dead-reckoned trajectory beside the true one, and the distance between them over time."""
     truth = experiment.drives[scenario].truth
-    fig, axes = _axes(2, 1, 7.4, 4.6)
+    fig, axes = subplots(2, 1, 7.4, 4.6, _STYLE)
     axes[0, 0].plot(truth.x_m, truth.y_m, color=COLOURS["truth"], linewidth=3.0, label="truth")
     for scheme in schemes:
         track = experiment.tracks[scenario, scheme]
@@ -186,7 +133,7 @@ def position(folder: Path, name: str, experiment: Experiment, scenario: str, sch
     axes[0, 0].set(xlabel="x, m", ylabel="y, m (axes not equal)")
     axes[1, 0].set(xlabel="time, s", ylabel="distance to truth, m", ylim=(0.0, None))
     _legend_above(axes[0, 0])
-    _save(fig, folder, name)
+    save(fig, folder / f"{name}.png")
 
 
 def noise_adaptation(folder: Path, experiment: Experiment, adaptive: Sequence[str], compared: Sequence[str]) -> None:
@@ -194,7 +141,7 @@ def noise_adaptation(folder: Path, experiment: Experiment, adaptive: Sequence[st
     drive = experiment.drives["A-burst"]
     truth, signals = drive.truth, drive.signals
     time_s = _time_s(truth)
-    fig, axes = _axes(3, 1, 7.4, 5.8, sharex=True)
+    fig, axes = subplots(3, 1, 7.4, 5.8, _STYLE, sharex=True)
     axes[0, 0].plot(time_s, signals.yaw_rate_rad_s, color="#56B4E9", linewidth=0.7, label="measured")
     axes[0, 0].plot(time_s, truth.yaw_rate_rad_s, color="#000000", linewidth=1.6, label="truth")
     axes[0, 0].set(ylabel="yaw rate, rad/s")
@@ -211,26 +158,24 @@ def noise_adaptation(folder: Path, experiment: Experiment, adaptive: Sequence[st
         ax.axvspan(*BURST_S, color="#F0E442", alpha=0.25, linewidth=0)
         if ax.get_legend_handles_labels()[0]:
             _legend_above(ax)
-    _save(fig, folder, "figure20_noise_adaptation")
+    save(fig, folder / "figure20_noise_adaptation.png")
 
 
-def trust(folder: Path, curves: dict[str, dict[str, TrustCurve]]) -> None:
+def trust(folder: Path, curves: Mapping[str, Mapping[str, TrustCurve]]) -> None:
     """Figure 21: β over |a_y|, a column each scenario, schemes one over the other; the paper's end points dashed."""
-    from studies.paper.published import TRUST
-
-    fig, axes = _axes(1, len(curves), 7.4, 3.3, sharey=True)
+    fig, axes = subplots(1, len(curves), 7.4, 3.3, _STYLE, sharey=True)
     for ax, (scenario, by_scheme) in zip(axes[0], curves.items(), strict=True):
         for scheme, curve in by_scheme.items():
-            colour = COLOURS.get(scheme, OTHERS)
+            colour = COLOURS[scheme]
             ax.plot(curve.ay_g, curve.trust, ".", markersize=2.0, alpha=0.35, color=colour)
             ax.fill_between(curve.centre_g, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
             ax.plot(curve.centre_g, curve.median, "o-", markersize=4, color=colour, label=f"{scheme}, median of a bin")
-        for level in TRUST:
+        for level in published.TRUST:
             ax.axhline(level, color=COLOURS["truth"], linestyle="--", linewidth=1.0)
         ax.set(xlabel="true |lateral acceleration|, g", ylim=(0.0, 1.0), title=f"scenario {scenario}")
     axes[0, 0].set(ylabel="β")
     axes[0, -1].legend(loc="upper left", bbox_to_anchor=(0.0, 0.87))
-    _save(fig, folder, "figure21_trust")
+    save(fig, folder / "figure21_trust.png")
 
 
 #: Figure of the tables, axis label, for the bars of Figure 22.
@@ -244,12 +189,9 @@ BAR_FIGURES = {
 
 def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenarios: Sequence[str]) -> None:
     """Figure 22: median RMSE with smallest and largest over the seeds; the paper's value of its PD-HEF as a line."""
-    from studies.paper.published import RMSE
-
     names = [n for n in BARS if n in ran][::-1]
-    fig, axes = _axes(
-        len(scenarios), len(BAR_FIGURES), 9.4, 0.6 + len(scenarios) * (0.7 + 0.26 * len(names)), sharey=True
-    )
+    height = 0.6 + len(scenarios) * (0.7 + 0.26 * len(names))
+    fig, axes = subplots(len(scenarios), len(BAR_FIGURES), 9.4, height, _STYLE, sharey=True)
     for i, scenario in enumerate(scenarios):
         for j, (figure, label) in enumerate(BAR_FIGURES.items()):
             ax = axes[i, j]
@@ -257,34 +199,53 @@ def rmse_bars(folder: Path, experiment: Experiment, ran: Sequence[str], scenario
             for k, name, s in spreads:
                 if s is None:
                     continue
-                ax.barh(k, s.median, color=COLOURS.get(name, OTHERS), height=0.72)
-                ax.plot([s.low, s.high], [k, k], color="#222222" if name != STAND_IN else "#bbbbbb", linewidth=1.1)
-            published = RMSE.get((scenario, figure))
-            if published is not None:
-                ax.axvline(published, color="#222222", linestyle=":", linewidth=1.4)
+                ax.barh(k, s.median, color=COLOURS[name], height=0.72)
+                ax.plot([s.low, s.high], [k, k], color="#222222", linewidth=1.1)
+            theirs = published.RMSE.get((scenario, figure))
+            if theirs is not None:
+                ax.axvline(theirs, color="#222222", linestyle=":", linewidth=1.4)
             ax.set_yticks(range(len(names)), names)
             ax.grid(axis="y", visible=False)
             ax.set_xlim(left=0.0)
             if i == len(scenarios) - 1:
                 ax.set_xlabel(f"RMSE of {label}" if j < 3 else f"RMSE, {label}")
         axes[i, 0].set_title(f"scenario {scenario}", loc="left")
-    _save(fig, folder, "figure22_rmse")
+    save(fig, folder / "figure22_rmse.png")
 
 
-def step_time_bars(folder: Path, times: dict[str, StepTime]) -> None:
+def step_time_bars(folder: Path, times: Mapping[str, StepTime]) -> None:
     """Figure 23: processor time a step, beside the paper's and the 10 ms cycle."""
-    from studies.paper.published import CYCLE_MS, STEP_MS
-
     names = list(times)[::-1]
-    fig, axes = _axes(1, 1, 7.0, 0.9 + 0.26 * len(names))
+    fig, axes = subplots(1, 1, 7.0, 0.9 + 0.26 * len(names), _STYLE)
     ax = axes[0, 0]
     for k, name in enumerate(names):
-        ax.barh(k, times[name].median_us, color=COLOURS.get(name, OTHERS), height=0.72)
-    for scheme, value in STEP_MS.items():
+        ax.barh(k, times[name].median_us, color=COLOURS[name], height=0.72)
+    for scheme, value in published.STEP_MS.items():
         ax.axvline(1e3 * value, color=COLOURS[scheme], linestyle=":", linewidth=1.5, label=f"paper, {scheme}")
-    ax.axvline(1e3 * CYCLE_MS, color="#222222", linestyle="--", linewidth=1.2, label=f"{CYCLE_MS:g} ms cycle")
+    cycle = {"color": "#222222", "linestyle": "--", "linewidth": 1.2, "label": f"{published.CYCLE_MS:g} ms cycle"}
+    ax.axvline(1e3 * published.CYCLE_MS, **cycle)
     ax.set(xscale="log", xlabel="processor time a step, µs (log scale)")
     ax.set_yticks(range(len(names)), names)
     ax.grid(axis="y", visible=False)
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, borderaxespad=0.1)
-    _save(fig, folder, "figure23_step_time")
+    save(fig, folder / "figure23_step_time.png")
+
+
+def draw(r: Results, folder: Path) -> None:
+    """Write the PNGs of Figures 9 to 23 into a folder, under the names that the page uses."""
+    schemes = [n for n in DRAWN if n in r.ran]
+    if r.histories:
+        convergence(folder, r.histories)
+    seed = r.first_seed
+    residuals(folder, "figure10_residual_fit", r.fits[A.name][0], f"scenario A, training seed {seed}")
+    residuals(folder, "figure19_residual_verification", r.fits[B.name][0], f"scenario B, training seed {seed}")
+    for scenario, letter, first in ((A.name, "a", 11), (B.name, "b", 15)):
+        position(folder, f"figure{first}_position_{letter}", r.experiment, scenario, schemes)
+        for i, signal in enumerate(SIGNALS, start=1):
+            history(folder, f"figure{first + i}_{signal}_{letter}", r.experiment, scenario, signal, schemes)
+    compared = [n for n in ("phy-ukf", "pd-hef-fixed-r", "pd-hef-paper", "pd-hef") if n in r.ran]
+    noise_adaptation(folder, r.experiment, list(r.inflations), compared)
+    if any(r.curves.values()):
+        trust(folder, {s: c for s, c in r.curves.items() if c})
+    rmse_bars(folder, r.experiment, r.ran, (A.name, B.name))
+    step_time_bars(folder, r.times)

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 
+from studies.pages import table
 from studies.paper import published
 from studies.paper.comparison import BOOTSTRAP_DRAWS, LEVEL, Improvement, Spread
 from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B
-from studies.paper.figures import drawn
 from studies.paper.results import BASELINES, SCENARIOS, Results
-from studies.paper.schemes import SCHEMES
+from studies.paper.schemes import DRAWN, HYBRID, SCHEMES
 from truthsim.manoeuvres import PATH_STEP_M, iso_3888_2_line_m
 from truthsim.sensors import SensorNoise
 from truthsim.suite import is_held_out
@@ -91,25 +91,36 @@ def beside(ours: float, theirs: float) -> tuple[bool, str]:
     return False, f"{times} the paper's {theirs:.3g}"
 
 
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a Markdown table."""
-    lines = [list(head)]
-    lines += [["---"] * len(lines[0]), *(list(row) for row in rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+class Findings:
+    """What one of the paper's figures agrees with here, and what does not or cannot."""
+
+    def __init__(self) -> None:
+        self.agrees: list[str] = []
+        self.cannot: list[str] = []
+
+    def say(self, agrees: bool, text: str) -> None:
+        """Put a sentence on the side where it belongs."""
+        (self.agrees if agrees else self.cannot).append(text)
+
+    def gain(self, gain: Improvement | None, text: str) -> None:
+        """Put an improvement, if there is one, on the side that its bounds prove."""
+        if gain is not None:
+            self.say(gain.proven, f"{text} {gain_text(gain)} ({judged(gain)})")
+
+    def part(self, title: str, picture: str | None, facts: str) -> str:
+        """Return a figure's section: picture, what we find, what agrees, what does not or cannot."""
+        image = "" if picture is None else f"\n![{title}](paper/{picture}.png)\n"
+        return (
+            f"### {title}\n{image}\n{facts}\n\n"
+            f"- *Agrees with the paper:* {'; '.join(self.agrees) or 'nothing that can be compared'}.\n"
+            f"- *Does not, or cannot:* {'; '.join(self.cannot) or 'nothing found'}.\n"
+        )
 
 
-def _joined(lines: list[str], empty: str) -> str:
-    return "; ".join(lines) if lines else empty
-
-
-def _part(title: str, picture: str | None, facts: str, agrees: list[str], cannot: list[str]) -> str:
-    """One figure's section: picture, what we find, what agrees, what does not or cannot."""
-    image = "" if picture is None else f"\n![{title}](paper/{picture}.png)\n"
-    return (
-        f"### {title}\n{image}\n{facts}\n\n"
-        f"- *Agrees with the paper:* {_joined(agrees, 'nothing that can be compared')}.\n"
-        f"- *Does not, or cannot:* {_joined(cannot, 'nothing found')}.\n"
-    )
+def _nothing(title: str, facts: str, cannot: str) -> str:
+    findings = Findings()
+    findings.say(False, cannot)
+    return findings.part(title, None, facts)
 
 
 # ---- the figures ----
@@ -118,8 +129,8 @@ def _part(title: str, picture: str | None, facts: str, agrees: list[str], cannot
 def _figure_9(r: Results) -> str:
     title = "Figure 9: convergence of the training"
     if not r.histories:
-        return _part(title, None, "The model folders hold no training history.", [], ["no history to compare"])
-    facts, agrees, cannot = [], [], []
+        return _nothing(title, "The model folders hold no training history.", "no history to compare")
+    facts, found = [], Findings()
     ends = []
     for seed, h in sorted(r.histories.items()):
         best, last = float(h.validation_loss.min()), float(h.validation_loss[-1])
@@ -127,22 +138,22 @@ def _figure_9(r: Results) -> str:
         facts.append(
             f"seed {seed}: {len(h.epoch)} epochs, training {number(ends[-1][0])}, smallest validation {number(best)}"
         )
-    if max(e[2] for e in ends) <= DIVERGED:
-        agrees.append(
-            "the validation loss falls with the training loss and does not diverge (it ends at "
-            f"{number(max(e[2] for e in ends))} times its smallest, at most)"
-        )
+    worst = max(e[2] for e in ends)
+    if worst <= DIVERGED:
+        falls = "the validation loss falls with the training loss and does not diverge"
+        found.say(True, f"{falls} (it ends at {number(worst)} times its smallest, at most)")
     else:
-        cannot.append(f"the validation loss ends at up to {number(max(e[2] for e in ends))} times its smallest")
+        found.say(False, f"the validation loss ends at up to {number(worst)} times its smallest")
     theirs = published.VALIDATION_LOSS / published.TRAIN_LOSS
     ours = [e[1] / e[0] for e in ends]
-    cannot.append(
+    found.say(
+        False,
         f"the level: the paper does not say what its loss is normalised by; its validation loss of "
         f"{published.VALIDATION_LOSS:g} is {number(theirs)} times its training loss of {published.TRAIN_LOSS:g}, which "
-        f"its text calls no overfitting; ours at most {number(max(ours))} times"
+        f"its text calls no overfitting; ours at most {number(max(ours))} times",
     )
-    return _part(title, "figure09_convergence", "Mean square error over the residual's: " + "; ".join(facts) + ".",
-                 agrees, cannot)  # fmt: skip
+    told = "Mean square error over the residual's: " + "; ".join(facts) + "."
+    return found.part(title, "figure09_convergence", told)
 
 
 def _explained(r: Results, scenario: str) -> str:
@@ -158,7 +169,7 @@ def _figure_10(r: Results) -> str:
     fit = r.fits[A.name][0]
     (target_v, output_v), (target_r, output_r) = fit.noise(0), fit.noise(1)
     facts = (
-        f"Scenario A, training seed {r.models[0].seed}: the residual is what the nominal model misses at the true "
+        f"Scenario A, training seed {r.first_seed}: the residual is what the nominal model misses at the true "
         f"state with the measured steering, bias and noise included (Eq 10). The networks explain "
         f"{_explained(r, A.name)} (1 − error over residual, mean squares)."
     )
@@ -166,128 +177,120 @@ def _figure_10(r: Results) -> str:
         f"sample-to-sample noise {number(target_v)} → {number(output_v)} m/s² in v_y, "
         f"{number(target_r)} → {number(output_r)} rad/s² in yaw rate"
     )
-    agrees, cannot = [], []
+    found = Findings()
     if output_v < target_v and output_r < target_r:
-        agrees.append(f"the network follows the trend and not the noise ({smooth})")
+        found.say(True, f"the network follows the trend and not the noise ({smooth})")
     else:
-        cannot.append(f"the network, whose inputs are noisy, is not smoother than the residual ({smooth})")
-    if min(fit.explained(0), fit.explained(1)) > FOLLOWED:
-        agrees.append("it finds the trend of the residual")
-    if fit.explained(0) <= 0.0 or fit.explained(1) <= 0.0:
-        cannot.append("a negative share means that the network is worse than none in this drive")
-    cannot.append("the paper gives no number here")
-    return _part("Figure 10: fit of the residual", "figure10_residual_fit", facts, agrees, cannot)
+        found.say(False, f"the network, whose inputs are noisy, is not smoother than the residual ({smooth})")
+    least = min(fit.explained(0), fit.explained(1))
+    if least > FOLLOWED:
+        found.say(True, "it finds the trend of the residual")
+    if least <= 0.0:
+        found.say(False, "a negative share means that the network is worse than none in this drive")
+    found.say(False, "the paper gives no number here")
+    return found.part("Figure 10: fit of the residual", "figure10_residual_fit", facts)
 
 
 def _figure_position(r: Results, scenario: str, title: str, picture: str) -> str:
-    hybrid = r.hybrid
     lines = []
-    for name in drawn(r.ran):
+    for name in DRAWN:
         drift, side = r.spread(scenario, name, "position_m"), r.spread(scenario, name, "lateral_1s_m")
         if drift and side:
             lines.append(f"`{name}` {ranged(drift)} m, after 1 s {ranged(side)} m to the side")
     facts = f"Dead reckoning from the true pose at the start, RMSE of the distance: {'; '.join(lines)}."
-    agrees, cannot = [], []
-    gain = r.improvement(scenario, hybrid, "phy-ukf", "lateral_1s_m")
-    if gain is not None:
-        text = f"the lateral error after 1 s against `phy-ukf`: {gain_text(gain)}"
-        (agrees if gain.proven else cannot).append(f"{text} ({judged(gain)})")
+    found = Findings()
+    gain = r.improvement(scenario, HYBRID, "phy-ukf", "lateral_1s_m")
+    found.gain(gain, "the lateral error after 1 s against `phy-ukf`:")
     if scenario == A.name:
         phy, paper = published.PHY_RMSE[scenario, "position_m"], published.RMSE[scenario, "position_m"]
         truth = r.experiment.drives[scenario].truth
         seconds = float(truth.stamps_ns[-1] - truth.stamps_ns[0]) * 1e-9
         bias = SensorNoise().yaw_rate_bias_rad_s
         drift_m = 0.5 * float(np.nanmean(truth.vx_m_s)) * bias * seconds**2
-        cannot += [
+        found.say(
+            False,
             f"{phy:g} → {paper:g} m cannot be dead reckoning with this class of gyro: its 1-sigma bias of "
             f"{bias:g} rad/s alone moves the car by {number(drift_m)} m to the side in {number(seconds)} s, which no "
             "filter without a position sensor sees",
-            f"the paper's own two figures make {percent(1.0 - paper / phy)}, not the "
-            f"{percent(published.POSITION_IMPROVEMENT)} in its text",
-        ]
+        )
+        text, own = f"{percent(published.POSITION_IMPROVEMENT)} in its text", percent(1.0 - paper / phy)
+        found.say(False, f"the paper's own two figures make {own}, not the {text}")
     else:
-        cannot.append("the paper gives no number for the sweep")
-    return _part(title, picture, facts, agrees, cannot)
+        found.say(False, "the paper gives no number for the sweep")
+    return found.part(title, picture, facts)
 
 
-def _against_paper(r: Results, scenario: str, figure: str, unit: str, agrees: list[str], cannot: list[str]) -> None:
+def _against_paper(r: Results, scenario: str, figure: str, unit: str, found: Findings) -> None:
     """Compare our hybrid and ``phy-ukf`` with what the paper says of its own."""
-    for name, values in ((r.hybrid, published.RMSE), ("phy-ukf", published.PHY_RMSE)):
+    for name, values in ((HYBRID, published.RMSE), ("phy-ukf", published.PHY_RMSE)):
         s, theirs = r.spread(scenario, name, figure), values.get((scenario, figure))
         if s is None or theirs is None:
             continue
         near, words = beside(s.median, theirs)
-        (agrees if near else cannot).append(f"`{name}` {number(s.median)} {unit} is {words}")
+        found.say(near, f"`{name}` {number(s.median)} {unit} is {words}")
 
 
 def _figure_state(
     r: Results, scenario: str, figure: str, unit: str, title: str, picture: str,
-    more: Callable[[Results, str, list[str], list[str]], None] | None = None,
+    more: Callable[[Results, str, Findings], None],
 ) -> str:  # fmt: skip
-    lines = [f"`{n}` {ranged(s)} {unit}" for n in drawn(r.ran) if (s := r.spread(scenario, n, figure))]
+    lines = [f"`{n}` {ranged(s)} {unit}" for n in DRAWN if (s := r.spread(scenario, n, figure))]
     seed = r.experiment.drives[scenario].noise_seed
-    facts = f"RMSE: {'; '.join(lines)}. Drawn: noise seed {seed}, training seed {r.models[0].seed}."
-    agrees: list[str] = []
-    cannot: list[str] = []
-    gain = r.improvement(scenario, r.hybrid, "phy-ukf", figure)
-    if gain is not None:
-        text = f"`{r.hybrid}` against `phy-ukf` {gain_text(gain)} ({judged(gain)})"
-        (agrees if gain.proven else cannot).append(text)
-    _against_paper(r, scenario, figure, unit, agrees, cannot)
-    if more is not None:
-        more(r, scenario, agrees, cannot)
-    return _part(title, picture, facts, agrees, cannot)
+    facts = f"RMSE: {'; '.join(lines)}. Drawn: noise seed {seed}, training seed {r.first_seed}."
+    found = Findings()
+    found.gain(r.improvement(scenario, HYBRID, "phy-ukf", figure), f"`{HYBRID}` against `phy-ukf`")
+    _against_paper(r, scenario, figure, unit, found)
+    more(r, scenario, found)
+    return found.part(title, picture, facts)
 
 
 def _lags(r: Results, scenario: str, figure: str) -> str:
-    return ", ".join(f"`{n}` {ranged(s)} ms" for n in drawn(r.ran) if (s := r.spread(scenario, n, figure)))
+    return ", ".join(f"`{n}` {ranged(s)} ms" for n in DRAWN if (s := r.spread(scenario, n, figure)))
 
 
-def _sideslip_notes(r: Results, scenario: str, agrees: list[str], cannot: list[str]) -> None:
-    phy, ours = (r.spread(scenario, n, "sideslip_lag_ms") for n in ("phy-ukf", r.hybrid))
-    if phy and ours and scenario == A.name:
-        later = abs(phy.median) - abs(ours.median) >= LATER_MS
-        (agrees if later else cannot).append(
-            f"the sideslip of `phy-ukf` lags {'' if later else 'hardly '}more: {_lags(r, scenario, 'sideslip_lag_ms')}"
-        )
+def _later(r: Results, scenario: str, figure: str) -> bool | None:
+    """Tell whether ``phy-ukf`` lags more than our hybrid; None where one of them has no lag."""
+    phy, ours = (r.spread(scenario, n, figure) for n in ("phy-ukf", HYBRID))
+    return None if phy is None or ours is None else abs(phy.median) - abs(ours.median) >= LATER_MS
+
+
+def _sideslip_notes(r: Results, scenario: str, found: Findings) -> None:
+    later = _later(r, scenario, "sideslip_lag_ms")
+    if later is not None and scenario == A.name:
+        lags = _lags(r, scenario, "sideslip_lag_ms")
+        found.say(later, f"the sideslip of `phy-ukf` lags {'' if later else 'hardly '}more: {lags}")
     over = r.spread(scenario, "phy-ukf", "sideslip_overshoot")
     if over and scenario == B.name:
-        text = f"the largest sideslip of `phy-ukf` is {percent(over.median)} above the true one"
-        if over.median > OVERSHOT:
-            agrees.append(text)
-        else:
-            cannot.append(text.replace("above", "from") + ": no overshoot")
+        is_one = over.median > OVERSHOT
+        words = "above the true one" if is_one else "from the true one: no overshoot"
+        found.say(is_one, f"the largest sideslip of `phy-ukf` is {percent(over.median)} {words}")
 
 
-def _yaw_rate_notes(r: Results, scenario: str, agrees: list[str], cannot: list[str]) -> None:
+def _yaw_rate_notes(r: Results, scenario: str, found: Findings) -> None:
     gyro = r.spread(scenario, "gyro", "yaw_rate_rad_s")
     if gyro is not None and scenario == A.name:
         phy, paper = published.PHY_RMSE[scenario, "yaw_rate_rad_s"], published.RMSE[scenario, "yaw_rate_rad_s"]
         if gyro.high < min(phy, paper):
-            cannot.append(
-                f"{phy:g} → {paper:g} rad/s is implausible: the gyro passed through, delay and all, has "
-                f"{ranged(gyro)} rad/s"
-            )
-    own = r.spread(scenario, r.hybrid, "yaw_rate_rad_s")
+            whole = f"the gyro passed through, delay and all, has {ranged(gyro)} rad/s"
+            found.say(False, f"{phy:g} → {paper:g} rad/s is implausible: {whole}")
+    own = r.spread(scenario, HYBRID, "yaw_rate_rad_s")
     if gyro is not None and own is not None:
-        better = "is better than the gyro" if own.median < gyro.median else "is no better than the gyro"
-        text = f"`{r.hybrid}` {better} ({number(own.median)} and {number(gyro.median)} rad/s)"
-        (agrees if own.median < gyro.median else cannot).append(text)
+        better = own.median < gyro.median
+        both = f"({number(own.median)} and {number(gyro.median)} rad/s)"
+        found.say(better, f"`{HYBRID}` is {'' if better else 'no '}better than the gyro {both}")
     if scenario == A.name:
-        phy, ours = (r.spread(scenario, n, "yaw_rate_lag_ms") for n in ("phy-ukf", r.hybrid))
-        if phy and ours:
-            later = abs(phy.median) - abs(ours.median) >= LATER_MS
-            (agrees if later else cannot).append(
-                f"the paper sees severe hysteresis in Phy-UKF; lag of yaw rate: {_lags(r, scenario, 'yaw_rate_lag_ms')}"
-            )
+        later = _later(r, scenario, "yaw_rate_lag_ms")
+        if later is not None:
+            lags = _lags(r, scenario, "yaw_rate_lag_ms")
+            found.say(later, f"the paper sees severe hysteresis in Phy-UKF; lag of yaw rate: {lags}")
 
 
-def _ay_notes(r: Results, scenario: str, agrees: list[str], cannot: list[str]) -> None:
+def _ay_notes(r: Results, scenario: str, found: Findings) -> None:
     if scenario == A.name:
         lstm = r.spread(scenario, "pure-lstm", "ay_overshoot")
         if lstm is not None:
             text = f"the largest a_y of `pure-lstm` is {percent(lstm.median)} from the true one"
-            (agrees if lstm.median < -OVERSHOT else cannot).append(text)
+            found.say(lstm.median < -OVERSHOT, text)
         return
     over, size = r.spread(scenario, "open-loop", "ay_overshoot"), r.spread(scenario, "open-loop", "ay_relative")
     if over is not None and size is not None:
@@ -296,10 +299,10 @@ def _ay_notes(r: Results, scenario: str, agrees: list[str], cannot: list[str]) -
             f"{percent(size.median)} of the true RMS, where the paper claims offsets above "
             f"{percent(published.OPEN_LOOP_AY_OFFSET)}"
         )
-        (agrees if max(abs(over.median), size.median) > published.OPEN_LOOP_AY_OFFSET else cannot).append(text)
+        found.say(max(abs(over.median), size.median) > published.OPEN_LOOP_AY_OFFSET, text)
     gyro = r.spread(scenario, "gyro", "ay_g")
     if gyro is not None:
-        cannot.append(f"the accelerometer passed through, which reads body roll too, has {ranged(gyro)} g")
+        found.say(False, f"the accelerometer passed through, which reads body roll too, has {ranged(gyro)} g")
 
 
 def _figure_19(r: Results) -> str:
@@ -312,34 +315,31 @@ def _figure_19(r: Results) -> str:
     largest = float(np.nanmax(np.abs(np.gradient(truth.yaw_rate_rad_s, truth.stamps_ns * 1e-9))))
     asked = max(abs(v) for v in published.NETWORK_OUTPUT_RAD_S) / step
     facts = (
-        f"Scenario B, training seed {r.models[0].seed}; the networks explain {_explained(r, B.name)}, and in A "
+        f"Scenario B, training seed {r.first_seed}; the networks explain {_explained(r, B.name)}, and in A "
         f"{_explained(r, A.name)}. Increments of yaw rate over a {1e3 * step:.0f} ms step: {signed(low)} … "
         f"{signed(high)} rad/s in B, {signed(low_a)} … {signed(high_a)} rad/s in A; as rates "
         f"{signed(low_a / step)} … {signed(high_a / step)} rad/s² in A."
     )
     lags = [f.lag_ms(1) for f in fits if math.isfinite(f.lag_ms(1))]
-    agrees, cannot = [], []
+    found = Findings()
     if min(f.explained(1) for f in fits) > FOLLOWED:
-        agrees.append("the output is no random noise but follows the residual")
+        found.say(True, "the output is no random noise but follows the residual")
     else:
-        cannot.append("the output explains less than half of the yaw-rate residual")
+        found.say(False, "the output explains less than half of the yaw-rate residual")
     if lags:
-        (agrees if max(map(abs, lags)) <= 1e3 * step else cannot).append(
-            f"its lag behind the residual is {signed(float(np.median(lags)))} ms (median over the networks)"
-        )
+        middle = f"its lag behind the residual is {signed(float(np.median(lags)))} ms (median over the networks)"
+        found.say(max(map(abs, lags)) <= 1e3 * step, middle)
     theirs_low, theirs_high = published.NETWORK_OUTPUT_RAD_S
     text = (
         f"−{-theirs_low:g} … {theirs_high:g} rad/s as an increment of one step would be a missing yaw "
         f"acceleration of {number(asked)} rad/s²; the largest true yaw acceleration in A is {number(largest)} rad/s²"
     )
-    cannot.append(text if asked > 0.5 * largest else text.replace("; the", ", possible as the"))
-    return _part("Figure 19: verification of the learned residual", "figure19_residual_verification", facts, agrees,
-                 cannot)  # fmt: skip
+    found.say(False, text if asked > 0.5 * largest else text.replace("; the", ", possible as the"))
+    return found.part("Figure 19: verification of the learned residual", "figure19_residual_verification", facts)
 
 
 def _figure_20(r: Results) -> str:
     title = "Figure 20: bottom layer, adaptation of R in a noise burst"
-    hybrid = r.hybrid
     shown = [n for n in ("phy-ukf", "pd-hef-fixed-r", "pd-hef-paper", "pd-hef") if n in r.ran]
     pairs = [
         f"`{n}` {ranged(clean)} → {ranged(burst)}"
@@ -351,32 +351,28 @@ def _figure_20(r: Results) -> str:
         f"{BURST_S[0]:g} to {BURST_S[1]:g} s. Sideslip RMSE without → with the burst, deg: {'; '.join(pairs)}."
     )
     theirs = published.R_NORM[1] / published.R_NORM[0]
-    agrees, cannot = [], []
+    found = Findings()
     for name, i in r.inflations.items():
         rise = i.within / i.before
         text = f"R of a_y in `{name}` rises by a factor of {number(rise)} (paper: {number(theirs)})"
-        (agrees if rise > 3.0 else cannot).append(text)
+        found.say(rise > 3.0, text)
         rest = f"at the same time of the drive without a burst it reaches {number(i.without_burst)} times R_0"
-        if i.without_burst > 1.5:
-            cannot.append(f"{rest}: model error is read as noise")
-        else:
-            agrees.append(f"{rest}, quiet where there is no noise")
-    for name in (n for n in ("pd-hef-paper", hybrid) if n in r.inflations):
+        quiet = i.without_burst <= 1.5
+        found.say(quiet, rest + (", quiet where there is no noise" if quiet else ": model error is read as noise"))
+    for name in (n for n in ("pd-hef-paper", HYBRID) if n in r.inflations):
         gain = r.improvement(BURST.name, name, "pd-hef-fixed-r")
-        if gain is not None:
-            text = f"sideslip of `{name}` in the burst against fixed R: {gain_text(gain)} ({judged(gain)})"
-            (agrees if gain.proven else cannot).append(text)
+        found.gain(gain, f"sideslip of `{name}` in the burst against fixed R:")
     if not r.inflations:
-        cannot.append("no scheme of this run adapts R")
-    return _part(title, "figure20_noise_adaptation", facts, agrees, cannot)
+        found.say(False, "no scheme of this run adapts R")
+    return found.part(title, "figure20_noise_adaptation", facts)
 
 
 def _figure_21(r: Results) -> str:
     title = "Figure 21: top layer, trust in the network over |a_y|"
     if not any(r.curves.values()):
-        return _part(title, None, "No scheme of this run moves its trust.", [], ["nothing to compare"])
+        return _nothing(title, "No scheme of this run moves its trust.", "nothing to compare")
     low, high = published.TRUST
-    facts, agrees, cannot = [], [], []
+    facts, found = [], Findings()
     for scenario, curves in r.curves.items():
         for name, c in curves.items():
             facts.append(
@@ -388,63 +384,56 @@ def _figure_21(r: Results) -> str:
                 continue
             bottom, top = float(c.median[0]), float(c.median[-1])
             rises = top > bottom
-            (agrees if rises else cannot).append(
-                f"β {'rises' if rises else 'does not rise'} with |a_y| in {scenario} ({number(bottom)} → {number(top)})"
-            )
+            rising = f"β {'rises' if rises else 'does not rise'} with |a_y|"
+            found.say(rises, f"{rising} in {scenario} ({number(bottom)} → {number(top)})")
             if top < high - 0.1:
                 rule = published.TRUST_BY_INTENSITY
                 why = f"; {rule:g} is Table 2's for a large I_dyn with a small E_ay" if abs(top - rule) < 0.05 else ""
-                cannot.append(f"it does not come to {high:g} in {scenario}{why}")
-    cannot.append(f"the paper shows {low:g} → {high:g} without saying where its membership functions lie")
-    return _part(title, "figure21_trust", "; ".join(facts) + ".", agrees, cannot)
+                found.say(False, f"it does not come to {high:g} in {scenario}{why}")
+    found.say(False, f"the paper shows {low:g} → {high:g} without saying where its membership functions lie")
+    return found.part(title, "figure21_trust", "; ".join(facts) + ".")
 
 
 def _figure_22(r: Results) -> str:
-    agrees, cannot = [], []
+    found = Findings()
     for scenario in (A.name, B.name):
         for baseline in ("phy-ukf", "phy-ukf-tuned", "physics-plus"):
-            gain = r.improvement(scenario, r.hybrid, baseline)
-            if gain is None:
-                continue
-            text = f"sideslip in {scenario} against `{baseline}` {gain_text(gain)}"
-            claimed = gain.low > published.IMPROVEMENT
-            (agrees if claimed else cannot).append(text)
+            gain = r.improvement(scenario, HYBRID, baseline)
+            if gain is not None:
+                text = f"sideslip in {scenario} against `{baseline}` {gain_text(gain)}"
+                found.say(gain.low > published.IMPROVEMENT, text)
     facts = (
         "Bars: median over all seeds; thin lines: smallest and largest; dotted: the paper's PD-HEF where it gives one. "
         f"The paper claims more than {percent(published.IMPROVEMENT)} against traditional observers; here that counts "
         "as met only where the lower bound is above it."
     )
-    return _part("Figure 22: RMSE", "figure22_rmse", facts, agrees, cannot)
+    return found.part("Figure 22: RMSE", "figure22_rmse", facts)
 
 
 def _figure_23(r: Results) -> str:
     title = "Figure 23: time of a step"
-    if not r.times:
-        return _part(title, None, "Not measured in this run.", [], ["nothing measured"])
     head = ("scheme", "µs a step, median", "fastest … slowest round")
     rows = [(f"`{n}`", number(t.median_us), f"{number(t.low_us)} … {number(t.high_us)}") for n, t in r.times.items()]
-    agrees, cannot = [], []
-    own, phy = r.times.get(r.hybrid), r.times.get("phy-ukf")
+    found = Findings()
+    own, phy = r.times.get(HYBRID), r.times.get("phy-ukf")
     if own is not None:
-        inside = own.median_us < 1e3 * published.CYCLE_MS
-        (agrees if inside else cannot).append(
-            f"`{r.hybrid}` takes {percent(own.median_us / (1e3 * published.CYCLE_MS))} of a {published.CYCLE_MS:g} ms "
-            "cycle"
-        )
+        share = own.median_us / (1e3 * published.CYCLE_MS)
+        found.say(share < 1.0, f"`{HYBRID}` takes {percent(share)} of a {published.CYCLE_MS:g} ms cycle")
     if own is not None and phy is not None:
         theirs = published.STEP_MS["pd-hef"] / published.STEP_MS["phy-ukf"]
         near, words = beside(own.median_us / phy.median_us, theirs)
         text = f"the hybrid costs {number(own.median_us / phy.median_us)} times `phy-ukf`, {words}"
-        (agrees if near else cannot).append(text)
-    cannot.append(
+        found.say(near, text)
+    found.say(
+        False,
         f"{published.STEP_MS['phy-ukf']:g} and {published.STEP_MS['pd-hef']:g} ms are MATLAB on another processor, one "
-        "step at a time; ours is compiled code over a whole log, the network in one pass"
+        "step at a time; ours is compiled code over a whole log, the network in one pass",
     )
     facts = (
         "Processor seconds of one thread over the steps of scenario B, all schemes in turns in one run. These numbers "
         "are the only ones in this page that change when it is made again.\n\n" + table(head, rows)
     )
-    return _part(title, "figure23_step_time", facts, agrees, cannot)
+    return found.part(title, "figure23_step_time", facts)
 
 
 # ---- the page ----
@@ -467,11 +456,9 @@ def _gain_table(r: Results) -> str:
     for scenario in SCENARIOS:
         for baseline in BASELINES:
             cells = [scenario.name, f"`{baseline}`"]
-            gains = [
-                r.improvement(scenario.name, r.hybrid, baseline, f)
-                for f in ("sideslip_deg", "yaw_rate_rad_s", "ay_g", "lateral_1s_m")
-            ]
-            if baseline != r.hybrid and any(gains):
+            wanted = ("sideslip_deg", "yaw_rate_rad_s", "ay_g", "lateral_1s_m")
+            gains = [r.improvement(scenario.name, HYBRID, baseline, f) for f in wanted]
+            if baseline != HYBRID and any(gains):
                 rows.append([*cells, *("–" if g is None else f"{gain_text(g)} · {judged(g)}" for g in gains)])
     return table(("scenario", "against", "sideslip", "yaw rate", "a_y", "lateral 1 s"), rows)
 
@@ -516,39 +503,31 @@ def _sensors() -> str:
     )
 
 
+#: Figure of the tables, unit, name, part of the picture's file name, and what else there is to say.
+_STATES = (
+    ("sideslip_deg", "deg", "sideslip", "sideslip", _sideslip_notes),
+    ("yaw_rate_rad_s", "rad/s", "yaw rate", "yaw_rate", _yaw_rate_notes),
+    ("ay_g", "g", "lateral acceleration", "ay", _ay_notes),
+)
+
+
 def write_page(r: Results) -> str:
     """Return the whole page."""
     seeds = sorted({run.noise_seed for run in r.experiment.runs})
     latency = max(abs(float(str(f["truth_latency_ms"]))) for f in r.experiment.facts)
     missing = [f"- `{name}`: {reason}." for name, reason in r.experiment.missing.items()]
     networks = "; ".join(
-        f"seed {m.seed} `{m.bundle.sha256[:12]}` ({len(m.bundle.feature_names)} features, {m.bundle.layers} × "
-        f"{m.bundle.hidden})"
-        for m in r.models
+        f"seed {seed} `{n.sha256[:12]}` ({len(n.feature_names)} features, {n.layers} × {n.hidden})"
+        for seed, n in r.networks.items()
     )
-    figures = [
-        _figure_9(r),
-        _figure_10(r),
-        _figure_position(r, A.name, "Figure 11: position, double lane change", "figure11_position_a"),
-        _figure_state(r, A.name, "sideslip_deg", "deg", "Figure 12: sideslip, double lane change",
-                      "figure12_sideslip_a", _sideslip_notes),
-        _figure_state(r, A.name, "yaw_rate_rad_s", "rad/s", "Figure 13: yaw rate, double lane change",
-                      "figure13_yaw_rate_a", _yaw_rate_notes),
-        _figure_state(r, A.name, "ay_g", "g", "Figure 14: lateral acceleration, double lane change", "figure14_ay_a",
-                      _ay_notes),
-        _figure_position(r, B.name, "Figure 15: position, sine sweep", "figure15_position_b"),
-        _figure_state(r, B.name, "sideslip_deg", "deg", "Figure 16: sideslip, sine sweep", "figure16_sideslip_b",
-                      _sideslip_notes),
-        _figure_state(r, B.name, "yaw_rate_rad_s", "rad/s", "Figure 17: yaw rate, sine sweep", "figure17_yaw_rate_b",
-                      _yaw_rate_notes),
-        _figure_state(r, B.name, "ay_g", "g", "Figure 18: lateral acceleration, sine sweep", "figure18_ay_b",
-                      _ay_notes),
-        _figure_19(r),
-        _figure_20(r),
-        _figure_21(r),
-        _figure_22(r),
-        _figure_23(r),
-    ]  # fmt: skip
+    figures = [_figure_9(r), _figure_10(r)]
+    for scenario, letter, first, words in ((A.name, "a", 11, "double lane change"), (B.name, "b", 15, "sine sweep")):
+        place = f"figure{first}_position_{letter}"
+        figures.append(_figure_position(r, scenario, f"Figure {first}: position, {words}", place))
+        for i, (figure, unit, name, file, notes) in enumerate(_STATES, start=first + 1):
+            title, place = f"Figure {i}: {name}, {words}", f"figure{i}_{file}_{letter}"
+            figures.append(_figure_state(r, scenario, figure, unit, title, place, notes))
+    figures += [_figure_19(r), _figure_20(r), _figure_21(r), _figure_22(r), _figure_23(r)]
     what = "\n".join(f"- `{n}`: {SCHEMES[n]}." for n in r.ran)
     left_out = "\nNot in this run:\n\n" + "\n".join(missing) + "\n" if missing else ""
     return f"""# The paper's experiment, run again
@@ -567,10 +546,10 @@ through the lanes asks for {_impossible_course()} g, so A is the ISO 3888-1 cour
 {published.DLC_PEAK_G:g} g.
 
 Sensors: {_sensors()} {len(seeds)} noise {"seed" if len(seeds) == 1 else "seeds"} ({seeds[0]} to {seeds[-1]}),
-{len(r.models)} training {"seed" if len(r.models) == 1 else "seeds"}. The latency taken off the truth is what the gyro
+{len(r.cars)} training {"seed" if len(r.cars) == 1 else "seeds"}. The latency taken off the truth is what the gyro
 says: at most {number(latency)} ms.
 
-**Friction is known**: each scheme gets the friction of the drive through the vehicle file. Vehicle: {r.vehicle.name}.
+**Friction is known**: each scheme gets the friction of the drive through the car's file. Vehicle: {r.car.vehicle.name}.
 Networks: {networks}.
 
 Schemes:
@@ -597,7 +576,7 @@ after the true pose; a lag above 0 is late.
 
 {_result_table(r, BURST.name)}
 
-### `{r.hybrid}` against the others
+### `{HYBRID}` against the others
 
 By how much its RMSE, pooled over the seeds, is lower; in brackets the {percent(LEVEL)} bounds of a bootstrap that
 draws noise seeds in pairs ({BOOTSTRAP_DRAWS} draws of {len(seeds)}; so few make the bounds rather too narrow). Each
@@ -607,7 +586,7 @@ scenario is one manoeuvre with other sensor errors: this says nothing about othe
 
 ## The paper's figures
 
-Time histories show `phy-ukf`, `pure-lstm` and `{r.hybrid}`, where this version has them. A figure counts as the paper's
+Time histories show `phy-ukf`, `pure-lstm` and `{HYBRID}`, where this version has them. A figure counts as the paper's
 where it lies within {percent(NEAR[0])} and {percent(NEAR[1])} of it; a scheme as better where both bounds say so.
 
 {chr(10).join(figures)}"""

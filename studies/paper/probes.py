@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.evaluation.metrics import lag_s
 from pdhef_logtool.learning.network.residuals import join_rows, residual_windows
 from pdhef_logtool.learning.network.train_command import HISTORY_FILE
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.residual_model.service import NetworkService
 from studies.paper.experiment import GRAVITY_M_S2, Experiment, ReadDrive
 
@@ -28,11 +27,12 @@ class History:
     validation_loss: FloatArray
 
 
-def read_history(folder: Path) -> History | None:
-    """Return the training history of a model folder; None where it has none."""
+def read_history(car: Car) -> History | None:
+    """Return the training history of a car's network; None where it has none."""
     import polars as pl
 
-    path = folder / HISTORY_FILE
+    assert car.network_folder is not None
+    path = car.network_folder / HISTORY_FILE
     if not path.is_file():
         return None
     table = pl.read_parquet(path)
@@ -74,11 +74,13 @@ class ResidualFit:
         return float(np.sqrt(np.mean(third[0] ** 2) / 20.0)), float(np.sqrt(np.mean(third[1] ** 2) / 20.0))
 
 
-def residual_fit(drive: ReadDrive, bundle: ModelBundle) -> ResidualFit:
+def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     """Compare the residual of a drive with the network's output, features as in service."""
-    rows = join_rows(residual_windows(drive.windows, drive.vehicle, period_s=drive.period_s))
+    whole = drive.whole
+    rows = join_rows(residual_windows(whole.windows(), whole.plan.vehicle, period_s=whole.plan.alignment.grid_period_s))
     starts = np.concatenate([[True], np.diff(rows.segment) != 0])
-    output, _ = NetworkService(bundle).run(rows.features, starts, None)
+    assert car.network is not None
+    output, _ = NetworkService(car.network).run(rows.features, starts, None)
     use = rows.weight > 0.0
     time_s = (rows.stamps_ns[use] - rows.stamps_ns[0]) * 1e-9
     target = rows.targets[use] / rows.step_s[use, None]

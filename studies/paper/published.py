@@ -11,11 +11,7 @@ RMSE = {
     ("B", "ay_g"): 0.025,
 }
 #: RMSE of the paper's Phy-UKF (section 5.5.1).
-PHY_RMSE = {
-    ("A", "yaw_rate_rad_s"): 0.068,
-    ("A", "position_m"): 0.025,
-    ("B", "sideslip_deg"): 0.26,
-}
+PHY_RMSE = {("A", "yaw_rate_rad_s"): 0.068, ("A", "position_m"): 0.025, ("B", "sideslip_deg"): 0.26}
 #: "reduces the root mean square error by over 60 % compared to traditional observers" (abstract).
 IMPROVEMENT = 0.60
 #: "position ... 0.008 m (reduced by 60 %)" (section 5.5.1).
@@ -37,5 +33,3 @@ TRAIN_LOSS, TRAIN_LOSS_EPOCHS, VALIDATION_LOSS = 1e-3, 150, 0.05
 OPEN_LOOP_AY_OFFSET = 0.80
 #: Peak |a_y| of the double lane change (section 5.3.1), and its speed.
 DLC_PEAK_G, DLC_SPEED_KM_H = 0.7, 100.0
-#: Network training (Table 1, section 3.1.3).
-TRAINING_SAMPLES, TRAINING_EPOCHS = 250_000, 200

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
-from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_sha256
-from pdhef_logtool.residual_model.bundle import load_bundle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.sinks.report import tool_versions
 from studies.paper.comparison import Improvement, Spread, improvement, spread
 from studies.paper.experiment import (
@@ -20,11 +20,10 @@ from studies.paper.experiment import (
     A,
     B,
     Experiment,
-    Model,
     Scenario,
+    on_the_road,
     run_experiment,
 )
-from studies.paper.figures import hybrid_of
 from studies.paper.probes import (
     History,
     Inflation,
@@ -35,15 +34,15 @@ from studies.paper.probes import (
     residual_fit,
     trust_curve,
 )
-from studies.paper.schemes import SCHEMES
+from studies.paper.schemes import HYBRID, SCHEMES
 from studies.paper.step_time import StepTime, step_times
 from truthsim.suite import is_held_out
 
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
-#: Beside a model: the vehicle file that its filter noise and the evidence about it stand in.
-VEHICLE_FILE = "vehicle.toml"
 #: Schemes whose trust or factor on R may move.
 ADAPTIVE = ("pd-hef-paper", "pd-hef")
+#: What improvements are about where nothing else is said.
+FIGURE = "sideslip_deg"
 BASELINES = ("phy-ukf", "phy-ukf-tuned", "physics-plus", "linear-regression", "pure-lstm", "pd-hef-paper")
 
 
@@ -53,19 +52,33 @@ class Results:
 
     Attributes
     ----------
-    ran : schemes in the order of the tables. hybrid : the name of our hybrid filter among them.
-    histories : by training seed. fits : residual fits by scenario, one a model.
+    ran : schemes in the order of the tables.
+    cars, histories : by training seed. fits : residual fits by scenario, one a car.
     curves : β over |a_y| by scenario and scheme. inflations : of R by scheme.
     """
 
     experiment: Experiment
-    vehicle: VehicleParameters
-    models: tuple[Model, ...]
+    cars: Mapping[int, Car]
     histories: Mapping[int, History]
     fits: Mapping[str, tuple[ResidualFit, ...]]
     curves: Mapping[str, Mapping[str, TrustCurve]]
     inflations: Mapping[str, Inflation]
-    times: Mapping[str, StepTime] = field(default_factory=dict)
+    times: Mapping[str, StepTime]
+
+    @property
+    def networks(self) -> dict[int, ModelBundle]:
+        """The cars' networks by training seed."""
+        return {seed: c.network for seed, c in self.cars.items() if c.network is not None}
+
+    @property
+    def first_seed(self) -> int:
+        """Training seed of the network that the pictures show."""
+        return next(iter(self.cars))
+
+    @property
+    def car(self) -> Car:
+        """The car with that network."""
+        return self.cars[self.first_seed]
 
     @property
     def ran(self) -> tuple[str, ...]:
@@ -73,58 +86,33 @@ class Results:
         there = {r.scheme for r in self.experiment.runs}
         return tuple(n for n in SCHEMES if n in there)
 
-    @property
-    def hybrid(self) -> str:
-        """Our hybrid filter: ``pd-hef`` if this version has it."""
-        return hybrid_of(self.ran)
-
     def spread(self, scenario: str, scheme: str, figure: str) -> Spread | None:
         """See :func:`~studies.paper.comparison.spread`."""
         return spread(self.experiment, scenario, scheme, figure)
 
-    def improvement(
-        self, scenario: str, scheme: str, baseline: str, figure: str = "sideslip_deg"
-    ) -> Improvement | None:
+    def improvement(self, scenario: str, scheme: str, baseline: str, figure: str = FIGURE) -> Improvement | None:
         """See :func:`~studies.paper.comparison.improvement`."""
         return improvement(self.experiment, scenario, scheme, baseline, figure)
 
 
-def load_models(folders: Mapping[int, Path]) -> tuple[Model, ...]:
-    """Load model folders by training seed, in the order given."""
-
-    def trust(folder: Path) -> Network | None:
-        beside = folder / VEHICLE_FILE
-        return load_vehicle(beside).network if beside.is_file() else None
-
-    return tuple(Model(seed, load_bundle(folder), trust(folder)) for seed, folder in folders.items())
-
-
 def gather(
-    nominal: VehicleParameters,
-    folders: Mapping[int, Path],
-    *,
-    noise_seeds: Sequence[int],
-    with_times: bool = True,
-    progress: Callable[[str], None] = lambda _text: None,
+    cars: Mapping[int, Car], *, noise_seeds: Sequence[int], progress: Callable[[str], None] = lambda _text: None
 ) -> Results:
     """Run the whole experiment.
 
     Parameters
     ----------
-    folders : model folders by training seed; the first is the one that the pictures show.
+    cars : by the training seed of their networks; the first is the one that the pictures show.
     """
-    models = load_models(folders)
-    experiment = run_experiment(nominal, models, scenarios=SCENARIOS, noise_seeds=noise_seeds, progress=progress)
-    histories = {seed: h for seed, folder in folders.items() if (h := read_history(folder)) is not None}
-    fits = {s.name: tuple(residual_fit(experiment.drives[s.name], m.bundle) for m in models) for s in (A, B)}
+    experiment = run_experiment(cars, scenarios=SCENARIOS, noise_seeds=noise_seeds, progress=progress)
+    histories = {seed: h for seed, car in cars.items() if (h := read_history(car)) is not None}
+    fits = {s.name: tuple(residual_fit(experiment.drives[s.name], c) for c in cars.values()) for s in (A, B)}
     curves = {s.name: {n: c for n in ADAPTIVE if (c := trust_curve(experiment, s.name, n)) is not None} for s in (A, B)}
     inflations = {n: i for n in ADAPTIVE if (i := inflation(experiment, n, BURST_S)) is not None}
-    times: dict[str, StepTime] = {}
-    if with_times:
-        progress("step times")
-        names = [n for n in SCHEMES if n not in experiment.missing]
-        times = step_times(experiment.drives[B.name], models[0].bundle, names)
-    return Results(experiment, nominal, models, histories, fits, curves, inflations, times)
+    progress("step times")
+    names = [n for n in SCHEMES if n not in experiment.missing]
+    times = step_times(experiment.drives[B.name], on_the_road(next(iter(cars.values())), B.friction), names)
+    return Results(experiment, cars, histories, fits, curves, inflations, times)
 
 
 def _plain(value: Any) -> Any:
@@ -140,7 +128,7 @@ def _plain(value: Any) -> Any:
 
 def document(results: Results) -> dict[str, Any]:
     """Return all results for ``results.json``; the same but for ``step_time_us`` when made again."""
-    r = results
+    r, car = results, results.car
     scenarios = [s.name for s in SCENARIOS]
     names = (*FIGURES, *OVERSHOOTS)
     summary = {
@@ -151,24 +139,24 @@ def document(results: Results) -> dict[str, Any]:
         for scenario in scenarios
     }
     gains = [
-        {"scenario": scenario, "scheme": r.hybrid, "baseline": b, "figure": f, **asdict(gain), "proven": gain.proven}
+        {"scenario": scenario, "scheme": HYBRID, "baseline": b, "figure": f, **asdict(gain), "proven": gain.proven}
         for scenario in scenarios
         for b in BASELINES
-        if b in r.ran and b != r.hybrid
+        if b in r.ran and b != HYBRID
         for f in FIGURES
         if not f.endswith(("_relative", "_ms")) and f != "diverged"
-        if (gain := r.improvement(scenario, r.hybrid, b, f)) is not None
+        if (gain := r.improvement(scenario, HYBRID, b, f)) is not None
     ]
     residuals = {
         scenario: [
             {
-                "training_seed": m.seed,
+                "training_seed": seed,
                 "explained": [fit.explained(0), fit.explained(1)],
                 "lag_ms": [fit.lag_ms(0), fit.lag_ms(1)],
                 "yaw_rate_increment_rad_s": list(fit.increments(1)),
                 "noise_of_target_and_output": [fit.noise(0), fit.noise(1)],
             }
-            for m, fit in zip(r.models, fits, strict=True)
+            for seed, fit in zip(r.cars, fits, strict=True)
         ]
         for scenario, fits in r.fits.items()
     }
@@ -198,14 +186,14 @@ def document(results: Results) -> dict[str, Any]:
                 for s in SCENARIOS
             ],
             "friction": "known: the vehicle file is told the friction of each drive",
-            "vehicle": {"name": r.vehicle.name, "sha256": vehicle_sha256(r.vehicle)},
+            "vehicle": {"name": car.vehicle.name, "sha256": car.physics_sha256},
             "models": [
-                {"training_seed": m.seed, "sha256": m.bundle.sha256, "provenance": m.bundle.provenance}
-                for m in r.models
+                {"training_seed": seed, "sha256": n.sha256, "provenance": n.provenance}
+                for seed, n in r.networks.items()
             ],
             "versions": tool_versions(),
             "missing": r.experiment.missing,
-            "network_schemes": sorted(r.experiment.networks),
+            "network_schemes": sorted(n for n in r.ran if spec_of(n).network),
             "summary": summary,
             "improvements": gains,
             "residuals": residuals,

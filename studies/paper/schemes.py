@@ -1,14 +1,6 @@
-"""The schemes of the comparison: which there are, what each is called in the page, and which this version can run."""
+"""The schemes of the comparison: which there are, what each is called in the page, and which are drawn."""
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
-
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.registry import ALIASES, DESCRIPTIONS, runnable
-from pdhef_logtool.residual_model.bundle import ModelBundle
 
 #: All schemes that belong in the tables (METHOD §10), with one line each for the page.
 SCHEMES: dict[str, str] = {
@@ -27,33 +19,6 @@ SCHEMES: dict[str, str] = {
     "pd-hef": "our hybrid filter with its adaptive mechanism",
 }
 
-
-@dataclass(frozen=True, slots=True)
-class Scheme:
-    """A scheme ready to run; ``uses_network`` where another network gives another result."""
-
-    name: str
-    estimator: Estimator
-    uses_network: bool
-
-
-def schemes_for(
-    names: Sequence[str], vehicle: VehicleParameters, available: frozenset[str], bundle: ModelBundle
-) -> tuple[list[Scheme], dict[str, str]]:
-    """Return the schemes that can run, and why the others cannot."""
-    ready: list[Scheme] = []
-    missing: dict[str, str] = {}
-    for name in names:
-        if name in ALIASES:
-            missing[name] = f"in this version the name stands for `{ALIASES[name]}`"
-            continue
-        if name not in DESCRIPTIONS:
-            missing[name] = "this version has no such estimator"
-            continue
-        estimators, skipped = runnable((name,), vehicle, available, model=bundle)
-        if skipped:
-            missing[name] = skipped[0].reason
-            continue
-        without, _ = runnable((name,), vehicle, available, model=None)
-        ready.append(Scheme(name, estimators[0], uses_network=not without))
-    return ready, missing
+#: Our hybrid filter, and the paper's three in the order in which the time histories draw them.
+HYBRID = "pd-hef"
+DRAWN = ("phy-ukf", "pure-lstm", HYBRID)

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.residual_model.bundle import ModelBundle
-from studies.paper.experiment import ReadDrive, estimate
-from studies.paper.schemes import schemes_for
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.table import make_estimator
+from studies.paper.experiment import ReadDrive, track_of
 
 ROUNDS = 15
 
@@ -24,17 +24,15 @@ class StepTime:
     high_us: float
 
 
-def step_times(
-    drive: ReadDrive, bundle: ModelBundle, names: Sequence[str], rounds: int = ROUNDS
-) -> dict[str, StepTime]:
+def step_times(drive: ReadDrive, car: Car, names: Sequence[str], rounds: int = ROUNDS) -> dict[str, StepTime]:
     """Time the schemes on a drive; the first round, which compiles and loads, does not count."""
-    schemes, _ = schemes_for(names, drive.vehicle, drive.available, bundle)
+    schemes = [make_estimator(name, car) for name in names]
     steps = len(drive.signals)
     seconds: dict[str, list[float]] = {s.name: [] for s in schemes}
     for number in range(rounds + 1):
         for scheme in schemes:
             start = time.process_time()
-            estimate(scheme.estimator, drive)
+            track_of(scheme, drive)
             if number:
                 seconds[scheme.name].append(time.process_time() - start)
     return {

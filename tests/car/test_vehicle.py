@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from pdhef_logtool.car.vehicle import default_vehicle, load_vehicle, vehicle_from_dict
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import load_vehicle, read_flat
+from pdhef_logtool.car.parts import Trust
+from pdhef_logtool.car.vehicle import default_vehicle, vehicle_from_dict
 from pdhef_logtool.records.errors import VehicleError
 
+FILES = Path(__file__).parents[1] / "reference" / "vehicles"
+SAMPLES = Path(__file__).parents[2] / "sample_logs"
 #: The example of the file format's documentation, entry for entry.
 EXAMPLE = """
 name = "sedan"
@@ -55,6 +61,11 @@ def as_plain(value):
     return [as_plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
+def physics_of(text: str) -> dict[str, Any]:
+    """The entries of a file that are a person's."""
+    return {k: v for k, v in tomllib.loads(text).items() if k not in ("filter", "network")}
+
+
 def write(tmp_path: Path, text: str | bytes) -> Path:
     path = tmp_path / "car.toml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
@@ -72,8 +83,10 @@ def problem(path: Path) -> str:
 
 
 def test_every_entry_of_the_example_is_read(tmp_path):
-    vehicle = load_vehicle(write(tmp_path, EXAMPLE))
-    raw = tomllib.loads(EXAMPLE)
+    flat = read_flat(write(tmp_path, EXAMPLE))
+    vehicle, raw = flat.vehicle, tomllib.loads(EXAMPLE)
+    assert as_plain({name: one.model_dump(exclude_unset=True) for name, one in flat.noise.items()}) == raw.pop("filter")
+    assert flat.trust == Trust(**raw.pop("network"))
     assert as_plain(vehicle.model_dump(exclude_unset=True)) == raw
     assert vehicle_from_dict(as_plain(vehicle.model_dump(exclude_none=True)), where="again") == vehicle
 
@@ -81,20 +94,22 @@ def test_every_entry_of_the_example_is_read(tmp_path):
 def test_defaults_of_what_the_file_leaves_out(tmp_path):
     lines = "mass_kg = 1000\nyaw_inertia_kg_m2 = 1200\ncg_to_front_axle_m = 1.2\ncg_to_rear_axle_m = 1.3\n"
     tyres = "".join(f"[tyres.{a}]\ncornering_stiffness_n_per_rad = 8e4\n" for a in ("front", "rear"))
-    vehicle = load_vehicle(write(tmp_path, lines + tyres))
+    flat = read_flat(write(tmp_path, lines + tyres))
+    vehicle = flat.vehicle
     assert vehicle.friction is None
     assert vehicle.assumed_friction == 1.0
     assert vehicle.imu_position_m == (0.0, 0.0, 0.0)
-    assert vehicle.network.trust_cap == 0.0
-    assert not vehicle.network.has_evidence
-    assert vehicle.filter == {}
+    assert flat.trust is None
+    assert Car.load(tmp_path / "car.toml", network="none").allowed_trust.cap == 0.0
+    assert flat.noise == {}
+    assert flat.learnt_on == ()
     assert vehicle.sensors.ay_std_m_s2 == 0.12
 
 
 def test_the_default_vehicle_is_the_published_one(tmp_path):
     published = EXAMPLE.replace("cornering_stiffness_n_per_rad = 108000.0", "B = 15.4\nC = 1.17\nD_n = 6110.0\nE = 0.2")
     vehicle = load_vehicle(write(tmp_path, published))
-    same = {"imu_position_m", "truth_position_m", "filter", "network", "sensors"}
+    same = {"imu_position_m", "truth_position_m", "sensors"}
     assert default_vehicle().model_dump(exclude=same) == vehicle.model_dump(exclude=same)
 
 
@@ -125,11 +140,152 @@ def test_all_problems_are_reported_together(tmp_path):
         ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02, -0.006]", "filter.phy-ukf-tuned.q_std.1"),
         ("trust_cap = 0.3", "trust_cap = 1.3", "network.trust_cap"),
         ("[tyres.rear]", "[tyres.back]", "tyres.back"),
+        ("q_std = [0.02, 0.006, 0.002]", "q_std = [0.02]", "filter.phy-ukf-tuned: q_std needs 3 or 4 entries"),
+        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 9}", "filter.phy-ukf-tuned: q_std needs 3 or 4 entries"),
+        ("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}", "filter: q_std of phy-ukf-tuned needs 3 or 4"),
+        ("r_std = { ay_m_s2", "r_std = { ay", "filter.phy-ukf-tuned.r_std.ay: unknown, did you mean"),
+        ("[filter.phy-ukf-tuned]", "[filter.phy_ukf_tuned]", "did you mean filter.phy-ukf-tuned?"),
+        ("mass_kg = 1440.0", 'mass_kg = "1440"', "mass_kg: should be a valid number, got '1440'"),
+        ("mass_kg = 1440.0", "mass_kg = true", "mass_kg: should be a valid number, got True"),
+        ("imu_position_m = [0.1, 0.0, 0.2]", 'imu_position_m = "100"', "imu_position_m: should be a list, got '100'"),
+        ("imu_position_m = [0.1, 0.0, 0.2]", "imu_position_m = [100.0, 0.0, 200.0]", "imu_position_m.0"),
+        ('name = "sedan"', "name = 3", "name: should be a valid string, got 3"),
+        ("friction = 0.85", "friction = 85.0", "friction"),
+        ("roll_gradient_rad_per_m_s2 = 0.0105", "roll_gradient_rad_per_m_s2 = 0.6", "roll_gradient_rad_per_m_s2"),
+        ("ay_std_m_s2 = 0.12", "ay_std_m_s2 = 120.0", "sensors.ay_std_m_s2"),
     ],
 )
 def test_a_wrong_entry_is_named(tmp_path, old, new, named):
     assert EXAMPLE.count(old) >= 1
     assert named in problem(write(tmp_path, EXAMPLE.replace(old, new, 1)))
+
+
+@pytest.mark.parametrize("entries", [[], [0.02, 0.006, 0.002], [0.02, 0.006, 0.002, 0.001]])
+def test_noise_of_three_or_four_states_is_read(tmp_path, entries):
+    text = EXAMPLE.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {entries}")
+    assert read_flat(write(tmp_path, text)).noise["phy-ukf-tuned"].q_std == tuple(entries)
+
+
+def test_physics_plus_has_two_states_more(tmp_path):
+    text = EXAMPLE.replace("filter.phy-ukf-tuned", "filter.physics-plus")
+    text = text.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}")
+    assert len(read_flat(write(tmp_path, text)).noise["physics-plus"].q_std) == 6
+
+
+def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):
+    said = problem(write(tmp_path, EXAMPLE.replace("mass_kg = 1440.0", "mass_kg = 1.44")))
+    assert "mass_kg, yaw_inertia_kg_m2, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said
+    assert "I_z / (m l_f l_r) is 533, plausible is 0.15 to 8" in said
+    assert "tyres.front.D_n, mass_kg, cg_to_front_axle_m, cg_to_rear_axle_m contradict one another" in said
+
+
+@pytest.mark.parametrize(
+    ("entry", "factor", "named"),
+    [
+        ("yaw_inertia_kg_m2", 20.0, "I_z / (m l_f l_r) is 10.7"),
+        ("yaw_inertia_kg_m2", 0.1, "I_z / (m l_f l_r) is 0.05"),
+        ("D_n", 10.0, "peak force over static load of the front axle is 9.0"),
+        ("D_n", 0.1, "peak force over static load of the front axle is 0.09"),
+        ("B", 10.0, "cornering stiffness over static load of the front axle in 1/rad is"),
+        ("cornering_stiffness_n_per_rad", 10.0, "cornering stiffness over static load of the rear axle in 1/rad is 18"),
+        # N per degree instead of N per radian
+        ("cornering_stiffness_n_per_rad", 0.0175, "cornering stiffness over static load of the rear axle in 1/rad"),
+        ("cg_to_front_axle_m", 10.0, "I_z / (m l_f l_r)"),
+        ("track_m", 0.1, "track over wheelbase"),
+        ("cg_height_m", 6.0, "height of the CG over wheelbase"),
+        ("relaxation_length_m", 20.0, "relaxation length over wheelbase"),
+        ("low_speed_blend_m_s", 6.0, "low-speed limit over sqrt(g wheelbase)"),
+    ],
+)
+def test_relations_find_a_slip_that_the_ranges_let_pass(tmp_path, entry, factor, named):
+    raw = physics_of(EXAMPLE)
+    raw["relaxation_length_m"] = 0.5
+    place = next(t for t in (raw, raw["tyres"]["front"], raw["tyres"]["rear"]) if entry in t)
+    place[entry] *= factor
+    with pytest.raises(VehicleError) as caught:
+        vehicle_from_dict(raw, where="car.toml")
+    assert named in str(caught.value)
+    assert entry in str(caught.value) or f"tyres.{'rear' if entry.startswith('corn') else 'front'}" in str(caught.value)
+
+
+def test_what_was_left_out_is_said_to_be_a_default(tmp_path):
+    """A 1:10 car without its height and track has a sedan's, which contradict its wheelbase."""
+    text = (FILES / "f1tenth.toml").read_text().replace("track_m", "# track_m").replace("cg_height_m", "# cg_height_m")
+    said = problem(write(tmp_path, text))
+    assert "track_m (left out: 1.55), cg_to_front_axle_m" in said
+    assert "cg_height_m (left out: 0.55), cg_to_front_axle_m" in said
+
+
+#: Published values: mass, yaw inertia, l_f, l_r, stiffness of the axles, what else is known.
+CARS = {
+    "GTI": (1926.2, 2763.49, 1.264, 1.367, 80e3, 120e3, {"steering_ratio": 1, "wheel_radius_m": 0.318}),
+    "TT-S": (1466.9, 2235, 1.018, 1.450, 200e3, 160e3, {"steering_ratio": 1, "friction": 1.2, "track_m": 1.554}),
+    "truck, 18 t": (18_000, 130_000, 3.4, 2.4, 350e3, 700e3, {"track_m": 2.05, "cg_height_m": 1.5}),
+    "truck, 40 t": (40_000, 420_000, 3.8, 2.7, 700e3, 1.5e6, {"track_m": 2.05, "cg_height_m": 2.1}),
+    "coach": (18_500, 210_000, 4.3, 2.6, 400e3, 800e3, {"track_m": 2.1, "cg_height_m": 1.3}),
+    "kart": (160, 20, 0.6, 0.45, 20e3, 25e3, {"track_m": 1.1, "cg_height_m": 0.25, "steering_ratio": 1.5}),
+    "1:10, light": (1.6, 0.02, 0.13, 0.13, 45, 50, {"track_m": 0.17, "cg_height_m": 0.03, "low_speed_blend_m_s": 0.3}),
+}
+
+
+@pytest.mark.parametrize("name", CARS)
+def test_real_vehicles_are_taken(name):
+    mass, inertia, front, rear, stiffness_front, stiffness_rear, more = CARS[name]
+    raw = {
+        "mass_kg": mass,
+        "yaw_inertia_kg_m2": inertia,
+        "cg_to_front_axle_m": front,
+        "cg_to_rear_axle_m": rear,
+        "tyres": {
+            "front": {"cornering_stiffness_n_per_rad": stiffness_front},
+            "rear": {"cornering_stiffness_n_per_rad": stiffness_rear},
+        },
+    }
+    assert vehicle_from_dict(raw | more, where=name).mass_kg == mass
+
+
+@pytest.mark.parametrize("path", [*sorted(FILES.glob("*.toml")), *sorted(SAMPLES.glob("vehicle*.toml"))], ids=str)
+def test_the_files_of_the_project_are_taken(path):
+    load_vehicle(path)
+
+
+@settings(derandomize=True, deadline=None, max_examples=200)
+@given(
+    size=st.floats(0.1, 2.6),
+    density=st.floats(0.6, 1.6),
+    balance=st.floats(0.3, 0.7),
+    inertia=st.floats(0.5, 2.0),
+    stiffness=st.floats(4.0, 40.0),
+    peak=st.floats(0.3, 2.0),
+    friction=st.floats(0.1, 1.5),
+    shape=st.floats(1.0, 2.0),
+    keeps=st.booleans(),
+)
+def test_plausible_vehicles_of_any_size_are_taken(
+    size, density, balance, inertia, stiffness, peak, friction, shape, keeps
+):
+    """A sedan of 1440 kg scaled like its volume: 1.4 kg at 1:10, 25 t and, dense, 40 t at 2.6:1."""
+    mass, wheelbase = 1440.0 * size**3 * density, 2.7 * size
+    front, rear = wheelbase * (1.0 - balance), wheelbase * balance
+
+    def tyre(load):
+        curve = {"B": stiffness / (shape * peak), "C": shape, "D_n": peak * load, "E": -0.5}
+        return curve | ({"reference_friction": 1.0} if keeps else {})
+
+    raw = {
+        "mass_kg": mass,
+        "yaw_inertia_kg_m2": inertia * mass * front * rear,
+        "cg_to_front_axle_m": front,
+        "cg_to_rear_axle_m": rear,
+        "track_m": 1.5 * size**0.8,
+        "cg_height_m": 0.6 * size,
+        "low_speed_blend_m_s": 3.0 * size**0.5,
+        "friction": friction,
+        "tyres": {"front": tyre(mass * 9.81 * balance), "rear": tyre(mass * 9.81 * (1.0 - balance))},
+    }
+    vehicle = vehicle_from_dict(raw, where="scaled")
+    again = vehicle_from_dict(as_plain(vehicle.model_dump(exclude_none=True)), where="again")
+    assert again == vehicle
 
 
 def test_a_missing_file_is_said_to_be_missing(tmp_path):
@@ -148,7 +304,7 @@ def test_a_folder_is_no_vehicle_file(tmp_path):
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.floats(0.05, 2.0))
 def test_axle_quantities(friction):
-    vehicle = vehicle_from_dict(tomllib.loads(EXAMPLE), where="example")
+    vehicle = vehicle_from_dict(physics_of(EXAMPLE), where="example")
     assert vehicle.wheelbase_m == pytest.approx(2.87)
     weight = 1440.0 * 9.80665
     assert vehicle.axle_load_n(True) + vehicle.axle_load_n(False) == pytest.approx(weight)

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 ESTIMATE = ("--estimate", "/pdhef/phy_ukf/state")
 LIMITS = """
@@ -38,7 +40,16 @@ def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -
     out = tmp_path_factory.mktemp("annotated")
     vehicle = str(sample_logs_dir / "vehicle.toml")
     made = _pdhef(
-        "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(out), "-e", "phy-ukf", "--annotate", "full", "-v", vehicle
+        "run",
+        str(sample_logs_dir / "dlc.mcap"),
+        "-o",
+        str(out),
+        "-e",
+        "phy-ukf",
+        "--annotate",
+        "full",
+        "--car",
+        vehicle,
     )
     assert made.returncode == 0, made.stderr
     return str(out / "logs/dlc/annotated.mcap")
@@ -54,7 +65,7 @@ def test_table_goes_to_stdout_and_assumptions_to_stderr(annotated: str) -> None:
     result = _pdhef("metrics", annotated, *ESTIMATE)
     assert result.returncode == 0
     assert "phy-ukf" in result.stdout
-    assert "no --vehicle" in result.stderr
+    assert "no --car" in result.stderr
     assert "outputs in" not in result.stdout
     assert all(len(line) <= 100 for line in result.stdout.splitlines())
 

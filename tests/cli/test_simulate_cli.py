@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from pathlib import Path
 import pytest
 
 from truthsim.manoeuvres import MANOEUVRES
+
+pytestmark = pytest.mark.slow
 
 
 def pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -82,11 +85,48 @@ def test_all_manoeuvres_are_listed_and_the_help_tells_of_faults() -> None:
 
 
 @pytest.mark.parametrize(
+    ("command", "own"),
+    [
+        ("suite", {"--output", "--count", "--seed", "--duration", "--vehicles", "--jobs", "--json", "--help"}),
+        ("conditions", {"--output", "--drives", "--rows", "--seed", "--jobs", "--json", "--help"}),
+    ],
+)
+def test_sets_have_a_help_of_their_own(command: str, own: set[str]) -> None:
+    text = pdhef("simulate", command, "--help").stdout
+    options = text[text.index("Options:") : text.index("Examples:")]
+    assert set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", options, re.MULTILINE)) == own
+    assert f"pdhef simulate {command}" in pdhef("simulate", "--help").stdout
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("simulate", "-o", "suite", "--seed", "5", "suite", "--count", "0"),
+        ("simulate", "--count", "0", "suite", "-osuite"),
+        ("simulate", "--json", "suite", "--count=0", "--output=suite"),
+    ],
+)
+def test_the_name_of_a_set_may_stand_behind_options(arguments: tuple[str, ...], tmp_path: Path) -> None:
+    result = subprocess.run(
+        [sys.executable, "-m", "pdhef_logtool", *arguments], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+    assert result.returncode == 2
+    assert "count 0" in result.stderr
+
+
+def test_a_file_may_be_called_as_a_set(tmp_path: Path) -> None:
+    asked = [sys.executable, "-m", "pdhef_logtool", "simulate", "-o", "suite", "moose"]
+    result = subprocess.run(asked, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert result.returncode == 2
+    assert "got 'moose'" in result.stderr
+
+
+@pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
         (("suite", "--mu", "0.5"), 2, ("--mu", "suite")),
         (("conditions", "--count", "5"), 2, ("--count", "conditions")),
-        (("dlc", "--jobs", "2"), 2, ("--jobs", "dlc")),
+        (("dlc", "--jobs", "2"), 2, ("--jobs", "pdhef simulate: No such option")),
         (("suite", "--count", "0"), 2, ("count 0",)),
         (("conditions", "--rows", "hail"), 2, ("hail", "in-domain")),
         (("dlc", "--sensor", "jitter_s"), 2, ("NAME=NUMBER",)),

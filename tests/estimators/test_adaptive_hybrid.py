@@ -12,7 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.car.vehicle import FilterTuning, default_vehicle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_hybrid import (
     SIDESLIP_TO_RAD,
     AdaptiveHybridUkf,
@@ -20,12 +22,15 @@ from pdhef_logtool.estimators.adaptive_hybrid import (
     mix,
 )
 from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
+
+pytestmark = pytest.mark.slow
 
 #: The reference car does not roll.
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
@@ -238,9 +243,11 @@ def test_trust_scales_the_network_in_both_filters(made):
     assert not same(adaptive(wrong).run(signals, None)[0], b)
 
 
-def test_its_noise_comes_from_the_vehicle_file():
-    tuned = VEHICLE.model_copy(update={"filter": {"pd-hef": FilterTuning(r_std={"ay_m_s2": 2.0})}})
-    assert adaptive_hybrid_ukf(tuned, SILENT).r_std[0] == 2.0
+def test_its_noise_comes_from_the_car():
+    tuned = Car.of(VEHICLE, network=SILENT.bundle, noise={"pd-hef": FilterNoise(r_std={"ay_m_s2": 2.0})})
+    estimator = make_estimator("pd-hef", tuned, Options(trust=1.0))
+    assert isinstance(estimator, AdaptiveHybridUkf)
+    assert estimator.r_std[0] == 2.0
 
 
 # --- windows, causality, symmetry ------------------------------------------------------------------------------------

@@ -12,20 +12,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, slalom, with_noise
 
-from pdhef_logtool.car.vehicle import FilterTuning, default_vehicle
-from pdhef_logtool.estimators.cautious import CautiousPhysics, smoothed_at_trust, strongest_physics
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
+from pdhef_logtool.estimators.pd_hef import build_smoothed
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
+from pdhef_logtool.estimators.smoothed import SmoothedHybrid
+from pdhef_logtool.estimators.table import Options
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.residual_model.service import NetworkService
+
+pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
-TABLES = {n: FilterTuning(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics-plus")}
+TABLES = {n: FilterNoise(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics-plus")}
 COLUMNS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "covariance", "nis", "valid", "reason")
 
 
@@ -45,8 +51,8 @@ def faulty() -> Signals:
 
 def test_without_faults_it_is_the_filter_on_physics() -> None:
     signals = noisy(stuck=False)
-    ours, _ = CautiousPhysics(physics_plus(VEHICLE)).run(signals, None)
-    plain, _ = physics_plus(VEHICLE).run(signals, None)
+    ours, _ = CautiousPhysics(physics_plus(VEHICLE, None)).run(signals, None)
+    plain, _ = physics_plus(VEHICLE, None).run(signals, None)
     quiet = np.cumsum(ours.reason != 0) == 0  # until the detector's first false alarm, if any
     assert quiet.sum() > 300
     np.testing.assert_array_equal(ours.vy_m_s[quiet], plain.vy_m_s[quiet])
@@ -56,9 +62,9 @@ def test_without_faults_it_is_the_filter_on_physics() -> None:
 
 def test_a_stuck_gyro_is_left_out_and_said(faulty: Signals) -> None:
     truth = drive(slalom(0.035, 0.5), 10.0, speed=22.0)
-    ours, _ = CautiousPhysics(physics_plus(VEHICLE)).run(faulty, None)
-    plain, _ = physics_plus(VEHICLE).run(faulty, None)
-    healthy, _ = physics_plus(VEHICLE).run(noisy(stuck=False), None)
+    ours, _ = CautiousPhysics(physics_plus(VEHICLE, None)).run(faulty, None)
+    plain, _ = physics_plus(VEHICLE, None).run(faulty, None)
+    healthy, _ = physics_plus(VEHICLE, None).run(noisy(stuck=False), None)
     assert len(truth.signals) == len(faulty)
     hurt, heeded = (np.nanmax(np.abs(t.sideslip_rad - healthy.sideslip_rad)) for t in (plain, ours))
     assert heeded < 0.5 * hurt
@@ -68,7 +74,7 @@ def test_a_stuck_gyro_is_left_out_and_said(faulty: Signals) -> None:
 @settings(derandomize=True, deadline=None, max_examples=10)
 @given(st.lists(st.integers(0, 1001), max_size=6))
 def test_windows_of_any_cut_join_bit_for_bit(faulty: Signals, inner: list[int]) -> None:
-    estimator = CautiousPhysics(physics_plus(VEHICLE))
+    estimator = CautiousPhysics(physics_plus(VEHICLE, None))
     whole, _ = estimator.run(faulty, None)
     parts, carry = [], None
     for first, end in pairwise([0, *sorted(min(i, len(faulty)) for i in inner), len(faulty)]):
@@ -90,25 +96,27 @@ def test_windows_of_any_cut_join_bit_for_bit(faulty: Signals, inner: list[int]) 
     ],
 )
 def test_drives_with_truth_choose_the_filter(tables: tuple[str, ...], scores: list[float], name: str) -> None:
-    listed = [f"{n}: {s:.4f} deg at trial 3" for n, s in zip(("phy-ukf-tuned", "physics-plus"), scores, strict=False)]
-    vehicle = VEHICLE.model_copy(
-        update={"filter": {n: TABLES[n] for n in tables}, "identification": {"tuning_scores": listed} if listed else {}}
-    )
-    chosen = strongest_physics(vehicle)
+    told = scores or [None] * len(tables)
+    noise = {n: TABLES[n].model_copy(update={"score_deg": s}) for n, s in zip(tables, told, strict=True)}
+    chosen = strongest_physics(Car.of(VEHICLE, noise=noise))
     assert chosen.name == name
     assert isinstance(chosen, PhysicsPlusUkf) == (name == "physics-plus")
 
 
 def test_the_smoothed_one_has_the_noise_of_the_tuned_filter(faulty: Signals) -> None:
-    tuned = VEHICLE.model_copy(update={"filter": {"phy-ukf-tuned": TABLES["phy-ukf-tuned"]}})
-    model = bundle()
-    smoothed = smoothed_at_trust(tuned, NetworkService(model), 0.0)
+    bare = Car.of(VEHICLE, network=bundle())
+    tuned = bare.with_noise("phy-ukf-tuned", TABLES["phy-ukf-tuned"])
+
+    def smoother(car: Car, trust: float) -> SmoothedHybrid:
+        return build_smoothed("pd-hef-smoothed", car, Options(trust=trust))
+
+    smoothed = smoother(tuned, 0.0)
     forward = smoothed.filter
     filtered = strongest_physics(tuned)
     assert isinstance(filtered, PhysicsUkf)
     assert (forward.q_std, forward.r_std, forward.bias_states) == (filtered.q_std, filtered.r_std, False)
-    assert smoothed_at_trust(tuned, NetworkService(model), 1.0).filter.r_std != filtered.r_std
-    assert smoothed_at_trust(VEHICLE, NetworkService(model), 0.0).filter.r_std != filtered.r_std
+    assert smoother(tuned, 1.0).filter.r_std != filtered.r_std
+    assert smoother(bare, 0.0).filter.r_std != filtered.r_std
     track, _ = smoothed.run(faulty, None)
     assert np.isfinite(track.sideslip_rad[track.valid]).all()
 

@@ -12,20 +12,24 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, keep, make_signals, rolling_drive, slalom, tanh_tyre, with_noise
 
-from pdhef_logtool.car.vehicle import AxleTyre, FilterTuning, Tyres, default_vehicle
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, MODEL_ESTIMATORS, check_names, make_estimator, runnable
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.table import SPECS, Options, check_names, make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, TRUTH_UNITS, Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
-#: With the noise that ``phy-ukf-tuned`` looks for in the vehicle file.
-TUNING = FilterTuning(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
-VEHICLE = default_vehicle().model_copy(update={"filter": {"phy-ukf-tuned": TUNING}})
-NAMES = tuple(n for n in DESCRIPTIONS if n not in MODEL_ESTIMATORS)
+pytestmark = pytest.mark.slow
+
+#: With the noise that ``phy-ukf-tuned`` looks for in the car.
+NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
+VEHICLE = default_vehicle()
+NAMES = tuple(s.name for s in SPECS if not s.network)
 #: Those that claim a lateral velocity by a model or by integration.
-FILTERS = ("phy-ukf", "phy-ukf-tuned", "physics-plus")
+FILTERS = ("phy-ukf", "physics-plus", "phy-ukf-tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
     update={
@@ -39,8 +43,12 @@ SIGNS = {"steer_rad": -1, "ay_m_s2": -1, "yaw_rate_rad_s": -1}
 MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
 
 
+def car_of(vehicle: VehicleParameters = VEHICLE) -> Car:
+    return Car.of(vehicle, noise={"phy-ukf-tuned": NOISE})
+
+
 def run(name: str, signals: Signals, **options) -> StateTrack:
-    return make_estimator(name, VEHICLE, **options).run(signals, None)[0]
+    return make_estimator(name, car_of(), Options(**options)).run(signals, None)[0]
 
 
 def same_bits(a: StateTrack, b: StateTrack, upto: int | None = None) -> None:
@@ -77,7 +85,7 @@ def rough() -> Signals:
 @given(data=st.data())
 def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
     inner = data.draw(st.lists(st.integers(0, len(rough)), max_size=12))
-    estimator = make_estimator(name, VEHICLE)
+    estimator = make_estimator(name, car_of())
     whole, _ = estimator.run(rough, None)
     edges = [0, *sorted(inner), len(rough)]
     parts, carry = [], None
@@ -91,7 +99,7 @@ def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_carry_can_be_used_twice(name, rough):
     """An estimator is immutable: what it handed out is not changed by running on."""
-    estimator = make_estimator(name, VEHICLE)
+    estimator = make_estimator(name, car_of())
     _, carry = estimator.run(cut(rough, 0, 100), None)
     first, _ = estimator.run(cut(rough, 100, 300), carry)
     again, _ = estimator.run(cut(rough, 100, 300), carry)
@@ -281,7 +289,7 @@ def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
         np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
         assert (np.linalg.eigvalsh(P) > 0).all()
         assert np.isfinite(track.sideslip_std_rad[ok]).all()
-        steps, _ = make_estimator(name, VEHICLE).filter_steps(signals, None)
+        steps, _ = make_estimator(name, car_of()).filter_steps(signals, None)
         full = steps.P[steps.valid]
         np.testing.assert_array_equal(full, np.swapaxes(full, 1, 2))
         # scaled to correlations, so that 1e6 m/s beside 1 mrad/s is no matter of rounding
@@ -303,7 +311,7 @@ def plain() -> Signals:
 def test_no_fault_breaks_an_estimator(name, fault, plain):
     faulty = FAULTS[fault](plain)
     for vehicle in (VEHICLE, STIFFNESS_VEHICLE):
-        track, _ = make_estimator(name, vehicle).run(faulty, None)
+        track, _ = make_estimator(name, car_of(vehicle)).run(faulty, None)
         assert len(track) == len(faulty)
         check_sane(track, name, faulty)
     if len(faulty) > 1:
@@ -339,7 +347,9 @@ def test_a_vehicle_that_no_step_can_follow_claims_nothing_infinite(name, delay_s
     """A yaw inertia in the wrong unit makes the model faster than any step: the state runs away, and is dropped."""
     toy = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 0.001})
     sparse = keep(plain, np.arange(len(plain)) % 20 == 0)
-    track, _ = make_estimator(name, toy).run(replace(sparse, ready_ns=sparse.stamps_ns + round(delay_s * 1e9)), None)
+    track, _ = make_estimator(name, car_of(toy)).run(
+        replace(sparse, ready_ns=sparse.stamps_ns + round(delay_s * 1e9)), None
+    )
     assert not track.valid[5:].all()
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"):
         assert np.isfinite(getattr(track, column)[track.valid]).all()
@@ -388,16 +398,16 @@ def test_reverse_and_manoeuvring_are_finite_and_signed(name):
         assert worst(track.vy_m_s - made.vy, moving & (np.abs(made.vx) < 1.4)) < 0.3
 
 
-# --- the registry ----------------------------------------------------------------------------------------------------
+# --- the table -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
-    estimator = make_estimator(name, VEHICLE)
+    estimator = make_estimator(name, car_of())
     assert estimator.name == name
     assert estimator.causal
     dt = np.diff(plain.stamps_ns) * 1e-9
-    bare = make_signals(dt, **{c: getattr(plain, c) for c in estimator.needs})
+    bare = make_signals(dt, **{c: getattr(plain, c) for c in spec_of(name).needs})
     track, _ = estimator.run(bare, None)
     assert track.valid[5:].all()
     assert np.isfinite(track.vx_m_s[5:]).all()
@@ -405,19 +415,19 @@ def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
 
 
 def test_what_cannot_run_is_skipped_with_the_reason():
-    estimators, skipped = runnable(NAMES, VEHICLE, frozenset({"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"}))
+    estimators, skipped = runnable(NAMES, car_of(), frozenset({"speed_m_s", "yaw_rate_rad_s", "ay_m_s2"}))
     assert [e.name for e in estimators] == ["zero", "gyro", "kinematic"]
     assert [s.name for s in skipped] == ["open-loop", *FILTERS]
     assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
-    assert runnable(NAMES, VEHICLE, frozenset(ALIGNED_SIGNALS))[1] == []
-    skipped = runnable(NAMES, default_vehicle(), frozenset(ALIGNED_SIGNALS))[1]
+    assert runnable(NAMES, car_of(), frozenset(ALIGNED_SIGNALS))[1] == []
+    skipped = runnable(NAMES, Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))[1]
     assert [s.name for s in skipped] == ["phy-ukf-tuned"]
-    assert "[filter.phy-ukf-tuned]" in skipped[0].reason
+    assert "no noise for phy-ukf-tuned; pdhef identify" in skipped[0].reason
 
 
-def test_the_tuned_filter_takes_its_noise_from_the_vehicle_file():
-    tuned, plain_filter = make_estimator("phy-ukf-tuned", VEHICLE), make_estimator("phy-ukf", VEHICLE)
-    assert tuned.q_std == (0.05, 0.02, 0.02, plain_filter.q_std[3])  # what the file leaves out stays
+def test_the_tuned_filter_takes_its_noise_from_the_car():
+    tuned, plain_filter = make_estimator("phy-ukf-tuned", car_of()), make_estimator("phy-ukf", car_of())
+    assert tuned.q_std == (0.05, 0.02, 0.02, plain_filter.q_std[3])  # what the car leaves out stays
     assert tuned.measurement_std.tolist() == [0.8, *plain_filter.measurement_std[1:]]
     assert tuned.roll_correction
     assert not plain_filter.roll_correction

@@ -18,6 +18,8 @@ from pdhef_logtool.estimators.friction_bank import BOUND_SHARE, FORGETTING_S, Fr
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 
+pytestmark = pytest.mark.slow
+
 G = 9.80665
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
 NO_FRICTION = VEHICLE.model_copy(update={"friction": None})

@@ -11,10 +11,12 @@ import polars as pl
 import pytest
 import torch
 
-from pdhef_logtool.car.vehicle import FilterTuning, default_vehicle
-from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.registry import make_estimator, runnable
+from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
@@ -22,8 +24,10 @@ from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+
+pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 COMPARED = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "covariance", "nis", "valid")
@@ -156,16 +160,16 @@ def test_a_dead_accelerometer_and_gaps_stay_finite() -> None:
 
 
 def test_it_needs_a_model_and_says_so() -> None:
-    with pytest.raises(UsageError, match="--model"):
-        make_estimator("pd-hef-fixed-r", VEHICLE)
-    _, skipped = runnable(("zero", "pd-hef-fixed-r"), VEHICLE, frozenset(ALIGNED_SIGNALS))
+    with pytest.raises(UsageError, match="--network"):
+        make_estimator("pd-hef-fixed-r", Car.of(VEHICLE))
+    _, skipped = runnable(("zero", "pd-hef-fixed-r"), Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))
     assert [s.name for s in skipped] == ["pd-hef-fixed-r"]
 
 
 def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Path, tmp_path: Path) -> None:
     bundle = _bundle((0.0, 0.0))
     bundle.save(tmp_path / "model")
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=tmp_path / "model", annotate="none")
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=tmp_path / "model", annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     assert bundle.sha256 in (tmp_path / "out" / "run.json").read_text()
@@ -174,11 +178,13 @@ def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Pat
     assert trust.unique().to_list() == [1.0]
 
 
-def test_the_noise_is_the_vehicle_files_where_it_has_one() -> None:
-    network = NetworkService(_bundle())
-    plain = hybrid_ukf(VEHICLE, network)
+def test_the_noise_is_the_cars_where_it_has_some() -> None:
+    car = Car.of(VEHICLE, network=_bundle())
+    plain = make_estimator("pd-hef-fixed-r", car)
+    assert isinstance(plain, HybridUkf)
     assert (plain.q_std, plain.r_std) == (HYBRID_Q_STD, HYBRID_R_STD)
-    table = FilterTuning(q_std=(0.1, 0.2), r_std={"ay_m_s2": 0.7})
-    tuned = hybrid_ukf(VEHICLE.model_copy(update={"filter": {"pd-hef": table}}), network)
-    assert tuned.q_std == (0.1, 0.2, *HYBRID_Q_STD[2:])
+    noise = FilterNoise(q_std=(0.1, 0.2, 0.04), r_std={"ay_m_s2": 0.7})
+    tuned = make_estimator("pd-hef-fixed-r", car.with_noise("pd-hef", noise))
+    assert isinstance(tuned, HybridUkf)
+    assert tuned.q_std == (0.1, 0.2, 0.04, *HYBRID_Q_STD[3:])
     assert tuned.r_std == (0.7, HYBRID_R_STD[1])

@@ -13,11 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference_car import cut, drive, forces, runge_kutta, slalom, with_noise
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
 from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf, adapted_noise
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.registry import check_names, runnable
+from pdhef_logtool.estimators.table import check_names, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
@@ -26,6 +27,8 @@ from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
+
+pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 GRAVITY = 9.80665
@@ -260,17 +263,17 @@ def test_a_missing_accelerometer_leaves_trust_where_it_was(weaving):
     assert np.isfinite(track.vy_m_s[200:]).all()
 
 
-# --- the registry ----------------------------------------------------------------------------------------------------
+# --- the table -------------------------------------------------------------------------------------------------------
 
 
-def test_the_registry_makes_it_with_a_model_and_skips_it_without():
+def test_the_table_makes_it_with_a_network_and_skips_it_without():
     names = ("pd-hef-paper", "pd-hef-trust1", "pd-hef")
     available = frozenset(ALIGNED_SIGNALS)
-    estimators, skipped = runnable(names, VEHICLE, available, model=make_bundle())
+    estimators, skipped = runnable(names, Car.of(VEHICLE, network=make_bundle()), available)
     assert [e.name for e in estimators] == ["pd-hef-paper", "pd-hef-trust1", "pd-hef"]
     assert skipped == []
-    estimators, skipped = runnable(names, VEHICLE, available)
+    estimators, skipped = runnable(names, Car.of(VEHICLE), available)
     assert estimators == []
-    assert all("--model" in s.reason for s in skipped)
+    assert all("--network" in s.reason for s in skipped)
     with pytest.raises(UsageError, match="pd-hef-paper"):
         check_names(("pd-hef-paper", "pd-hef", "pd-hef-paper"))

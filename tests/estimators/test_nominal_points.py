@@ -30,7 +30,10 @@ from pdhef_logtool.car.nominal_points import (
     work_size,
 )
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators import physics
+
+pytestmark = pytest.mark.slow
 
 FORMULA_CAR = default_vehicle().model_copy(
     update={"imu_position_m": (0.4, -0.3), "roll_gradient_rad_per_m_s2": 0.009, "low_speed_blend_m_s": 4.0}
@@ -56,9 +59,9 @@ CARS = {
 }
 LAYOUTS = {
     "no optional state": physics.StateLayout(-1, -1),
-    "biases": physics.StateLayout(physics.STATES, -1),
-    "force scale": physics.StateLayout(-1, physics.STATES),
-    "biases and force scale": physics.StateLayout(physics.STATES, physics.STATES + physics.BIAS_STATES),
+    "biases": physics.StateLayout(shell.STATES, -1),
+    "force scale": physics.StateLayout(-1, shell.STATES),
+    "biases and force scale": physics.StateLayout(shell.STATES, shell.STATES + physics.BIAS_STATES),
 }
 STATES = {"no optional state": 4, "biases": 7, "force scale": 5, "biases and force scale": 8}
 TOLERANCE = 1e-11
@@ -165,7 +168,7 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
     n = nominal_model.substeps(chi[0, 0], dt, mu, p)
     points = np.full(work_size(len(chi)), np.nan)
 
-    zeta = np.empty((len(chi), physics.MEASUREMENTS))
+    zeta = np.empty((len(chi), shell.MEASUREMENTS))
     physics._measure(chi, steer, mu, rate_vy, layout, p, points, zeta)
     want_zeta, want = np.empty_like(zeta), chi.copy()
     for i, state in enumerate(chi):
@@ -182,7 +185,8 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
             want[i, layout.force_scale] *= math.exp(-dt / physics.FORCE_SCALE_TIME_S)
     np.testing.assert_allclose(zeta, want_zeta, rtol=TOLERANCE, atol=TOLERANCE)
 
-    physics._propagate(chi, steer, ax, mu, rate_vy, rate_r, dt, layout, p, points)
+    over = shell.Meanwhile(steer, ax, ax_known=True, friction=mu)
+    physics._propagate(chi, over, (rate_vy, rate_r), dt, layout, p, points)
     np.testing.assert_allclose(chi, want, rtol=TOLERANCE, atol=TOLERANCE)
 
 

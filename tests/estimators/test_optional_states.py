@@ -12,6 +12,8 @@ from reference_car import drive, magic_tyre, slalom, with_noise
 from pdhef_logtool.car.vehicle import AxleTyre, Sensors, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.physics import FORCE_SCALE_STD, PhysicsUkf
 
+pytestmark = pytest.mark.slow
+
 VEHICLE = default_vehicle()
 Q_STD = (0.089, 0.06, 0.03, 0.021)
 

@@ -22,10 +22,12 @@ from reference_car import (
     with_noise,
 )
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood, sideslip_std
+from pdhef_logtool.estimators.filter_shell import sideslip_std
+from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood
 from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
-from pdhef_logtool.estimators.registry import make_estimator
+from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
 
 VEHICLE = default_vehicle()
@@ -308,7 +310,7 @@ def test_a_prediction_without_acceleration_is_as_uncertain_as_its_random_walk(go
 
 
 def test_esp_suite_ignores_the_speed_after_the_start(good):
-    esp = make_estimator("phy-ukf", VEHICLE, use_speed=False)
+    esp = make_estimator("phy-ukf", Car.of(VEHICLE), Options(use_speed=False))
     garbled = edited(good.signals, "speed_m_s", slice(1, None), 3.0)
     a, b = esp.run(good.signals, None)[0], esp.run(garbled, None)[0]
     np.testing.assert_array_equal(a.vx_m_s, b.vx_m_s)
@@ -317,7 +319,8 @@ def test_esp_suite_ignores_the_speed_after_the_start(good):
     other_start = edited(good.signals, "speed_m_s", 0, 20.0)
     assert abs(esp.run(other_start, None)[0].vx_m_s[5] - 20.0) < 0.5
     assert np.abs(a.vx_m_s - good.vx).max() < 3.0
-    assert a.vx_std_m_s[-1] > 3 * make_estimator("phy-ukf", VEHICLE).run(good.signals, None)[0].vx_std_m_s[-1]
+    full, _ = make_estimator("phy-ukf", Car.of(VEHICLE)).run(good.signals, None)
+    assert a.vx_std_m_s[-1] > 3 * full.vx_std_m_s[-1]
 
 
 def test_friction_comes_from_the_log_where_it_is_known():

@@ -24,8 +24,10 @@ from reference_car import (
     with_noise,
 )
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step
-from pdhef_logtool.car.vehicle import AxleTyre, FilterTuning, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.lagged_forces import (
     force_parameters,
     lagged_measured_ay,
@@ -45,8 +47,10 @@ from pdhef_logtool.estimators.physics_plus import (
     PhysicsPlusUkf,
     physics_plus,
 )
-from pdhef_logtool.estimators.registry import DEFAULT_ESTIMATORS, make_estimator
+from pdhef_logtool.estimators.table import Options, default_names, make_estimator
 from pdhef_logtool.records.signals import Signals
+
+pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 TRACK_M, CG_HEIGHT_M, G = 1.57, 0.64, 9.80665
@@ -362,16 +366,16 @@ def test_without_lag_and_load_transfer_the_filter_is_the_tuned_kind_of_phy_ukf()
         np.testing.assert_allclose(plus.log_likelihood.sum(), static.log_likelihood.sum(), rtol=1e-3)
 
 
-# --- the vehicle file ------------------------------------------------------------------------------------------------
+# --- the car's noise -------------------------------------------------------------------------------------------------
 
 
-def test_its_noise_comes_from_the_vehicle_file_where_it_has_some():
-    bare = make_estimator(NAME, VEHICLE)
-    assert NAME in DEFAULT_ESTIMATORS
+def test_its_noise_comes_from_the_car_where_it_has_some():
+    bare = make_estimator(NAME, Car.of(VEHICLE))
+    assert NAME in default_names(Car.of(VEHICLE))
     assert bare.q_std == PHYSICS_PLUS_Q_STD
     assert bare.measurement_std.tolist() == [0.12, 0.004, 0.08]
-    tuning = FilterTuning(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
-    tuned = make_estimator(NAME, vehicle(filter={NAME: tuning}))
+    noise = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
+    tuned = make_estimator(NAME, Car.of(VEHICLE, noise={NAME: noise}))
     assert tuned.q_std == (0.05, 0.02, 0.02, *PHYSICS_PLUS_Q_STD[3:])
     assert tuned.measurement_std.tolist() == [0.8, 0.004, 0.08]
-    assert not make_estimator(NAME, VEHICLE, use_speed=False).use_speed
+    assert not make_estimator(NAME, Car.of(VEHICLE), Options(use_speed=False)).use_speed

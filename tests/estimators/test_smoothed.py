@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,25 +20,21 @@ from hypothesis import strategies as st
 from reference_car import REAR_M, cut, drive, forces, keep, rolling_drive, runge_kutta, slalom, with_noise
 from rich.console import Console
 
-from pdhef_logtool.car.vehicle import FilterTuning, Network, default_vehicle
-from pdhef_logtool.cli.summary import render_run
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FilterNoise, Trust
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
 from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of, run_window
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, check_inputs
+from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf
-from pdhef_logtool.estimators.physics import (
-    AX_BIAS,
-    LINK_BIASES,
-    LINK_NONE,
-    LINK_WHOLE,
-    PhysicsUkf,
-    PosteriorSteps,
-    StepLinks,
-)
-from pdhef_logtool.estimators.registry import MODEL_ESTIMATORS, NOT_CAUSAL, make_estimator
+from pdhef_logtool.estimators.pd_hef import build_smoothed
+from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, LINK_WHOLE, PhysicsUkf, StepLinks
 from pdhef_logtool.estimators.smoothed import SMOOTHED_Q_STD, SmoothedHybrid, smooth_steps, smoothed_hybrid
+from pdhef_logtool.estimators.table import SPECS, Options, make_estimator
 from pdhef_logtool.records.reasons import (
     BURST_AY,
     BURST_YAW_RATE,
@@ -54,9 +50,11 @@ from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 from pdhef_logtool.sinks.report import report_markdown
+
+pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle()
 ALL = 10**6  # seconds: a block that holds every drive
@@ -491,27 +489,28 @@ def test_it_starts_from_what_the_adaptive_filter_starts_from(faulty):
 def test_links_cost_the_filter_no_bit(rough):
     plain, after = PhysicsUkf(VEHICLE).filter_steps(rough, None)
     steps, again, links = PhysicsUkf(VEHICLE).linked_steps(rough, None)
-    for name in PosteriorSteps.__slots__:
+    for name in (f.name for f in fields(PosteriorSteps)):
         np.testing.assert_array_equal(getattr(plain, name), getattr(steps, name))
-    np.testing.assert_array_equal(after.P, again.P)
+    np.testing.assert_array_equal(after.belief.P, again.belief.P)
     starts = ~np.isfinite(steps.prior[:, 0])
     np.testing.assert_array_equal(links.kind == LINK_NONE, starts)
     assert starts.sum() == 2
 
 
 def test_what_it_says_of_itself(rough):
-    trusted = VEHICLE.model_copy(update={"network": Network(trust_cap=0.6, evidence="a drive of 300 s")})
-    estimator = make_estimator("pd-hef-smoothed", trusted, model=BUNDLE)
+    trusted = Car.of(VEHICLE, network=BUNDLE, trust=Trust(trust_cap=0.6, evidence="a drive of 300 s"))
+    estimator = make_estimator("pd-hef-smoothed", trusted)
     assert estimator.hybrid.trust == 0.6
     assert "a drive of 300 s" in estimator.notes[1]
     assert isinstance(estimator, LookingAhead)
     assert (estimator.name, estimator.causal) == ("pd-hef-smoothed", False)
-    for name in MODEL_ESTIMATORS:
-        if name not in ("pure-lstm", "linear-regression"):
-            assert make_estimator(name, VEHICLE, model=BUNDLE).causal == (name not in NOT_CAUSAL)
+    assert [s.name for s in SPECS if not s.causal] == ["pd-hef-smoothed"]
+    for spec in SPECS:
+        if spec.network == "residual":
+            assert make_estimator(spec.name, trusted).causal == spec.causal
     assert "not causal" in estimator.notes[0]
     assert look_ahead_of(estimator) == 240.0
-    assert look_ahead_of(make_estimator("phy-ukf", VEHICLE)) == 0.0
+    assert look_ahead_of(make_estimator("phy-ukf", trusted)) == 0.0
     track, _ = run_window(estimator, rough, None, None)
     assert track.valid[0], "it needs no arrival"
     assert np.isnan(track.nis).all()
@@ -522,16 +521,17 @@ def test_what_it_says_of_itself(rough):
 
 def test_the_noise_is_its_own_tables_then_the_filters():
     network = NetworkService(BUNDLE)
-    filters = {"pd-hef": FilterTuning(q_std=(0.1, 0.2), r_std={"ay_m_s2": 0.7})}
-    own = {"pd-hef-smoothed": FilterTuning(q_std=(0.1, 0.05), r_std={"yaw_rate_rad_s": 0.002})}
+    filters = {"pd-hef": FilterNoise(q_std=(0.1, 0.2, 0.04), r_std={"ay_m_s2": 0.7})}
+    own = {"pd-hef-smoothed": FilterNoise(q_std=(0.1, 0.05, 0.02), r_std={"yaw_rate_rad_s": 0.002})}
 
-    def noise(tables: dict[str, FilterTuning]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        hybrid = smoothed_hybrid(VEHICLE.model_copy(update={"filter": tables}), network).hybrid
+    def noise(tables: dict[str, FilterNoise]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        car = Car.of(VEHICLE, network=BUNDLE, noise=tables)
+        hybrid = build_smoothed("pd-hef-smoothed", car, Options(trust=1.0)).hybrid
         return hybrid.q_std, hybrid.r_std
 
     assert noise({}) == (SMOOTHED_Q_STD, HYBRID_R_STD)
-    assert noise(filters) == ((0.1, 0.2, *HYBRID_Q_STD[2:]), (0.7, HYBRID_R_STD[1]))
-    assert noise(filters | own) == ((0.1, 0.05, *SMOOTHED_Q_STD[2:]), (HYBRID_R_STD[0], 0.002))
+    assert noise(filters) == ((0.1, 0.2, 0.04, *HYBRID_Q_STD[3:]), (0.7, HYBRID_R_STD[1]))
+    assert noise(filters | own) == ((0.1, 0.05, 0.02, *SMOOTHED_Q_STD[3:]), (HYBRID_R_STD[0], 0.002))
     assert smoothed_hybrid(VEHICLE, network, trust=0.3).hybrid.trust == 0.3
 
 
@@ -563,8 +563,8 @@ def test_a_run_is_the_same_whatever_its_windows_and_marks_it(sample_logs_dir: Pa
     tables = []
     for window_s in (600.0, 37.0):
         config = RunConfig(
-            vehicle=sample_logs_dir / "vehicle.toml",
-            model=tmp_path / "model",
+            car=sample_logs_dir / "vehicle.toml",
+            network=tmp_path / "model",
             annotate="none",
             estimators=("pd-hef-smoothed", "zero"),
             window_s=window_s,

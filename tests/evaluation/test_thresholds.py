@@ -114,13 +114,13 @@ def test_all_problems_come_at_once() -> None:
         thresholds_from_dict({"threshold": tables, "treshold": []}, where="t.toml")
     text = str(caught.value)
     for said in (
-        "treshold: unknown table (did you mean threshold?)",
-        "threshold[0].signal: unknown signal 'sideslip' (did you mean sideslip_rad?)",
-        "threshold[0].metric: unknown metric 'rsme'",
-        "threshold[0].segment: unknown segment 'al' (did you mean all?)",
+        "treshold: unknown, did you mean threshold?",
+        "threshold[0].signal = sideslip: unknown, did you mean sideslip_rad?",
+        "threshold[0].metric = rsme: unknown, did you mean rmse?",
+        "threshold[0].segment = al: unknown, did you mean all?",
         "threshold[1]: give min, max or both",
         "threshold[2].unit: sideslip_rad rmse is in rad or deg, not 'm'",
-        "threshold[3].maxx: unknown entry (did you mean max?)",
+        "threshold[3].maxx: unknown, did you mean threshold[3].max?",
         "threshold[4].max:",
         "threshold[5]: min must not be above max",
         "threshold[6].signal: is missing",

@@ -11,7 +11,9 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.car.car import Car, load_intervals
+from pdhef_logtool.car.parts import Inflation
+from pdhef_logtool.learning.drives import choose_drives
 from pdhef_logtool.learning.evidence.calibrate import (
     COVERED_WRONG,
     FOLDS,
@@ -25,13 +27,23 @@ from pdhef_logtool.learning.evidence.calibrate import (
     folds,
     share_for,
 )
-from pdhef_logtool.learning.evidence.calibrate_command import REFUSED, CalibrateSettings, run_calibration
+from pdhef_logtool.learning.evidence.calibrate_command import REFUSED, CalibrateSettings, calibrate
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
-from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, combined, load_calibration
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined
+
+pytestmark = pytest.mark.slow
+
+
+def _sideslip(inflation: Inflation) -> tuple[float, ...]:
+    return tuple(getattr(inflation.sideslip, term) for term in SIDESLIP_TERMS)
+
+
+def _yaw_rate(inflation: Inflation) -> tuple[float, ...]:
+    return tuple(getattr(inflation.yaw_rate, term) for term in YAW_RATE_TERMS)
 
 
 def _samples(rng: np.random.Generator, std: FloatArray, terms: FloatArray, drives: int = 30) -> Samples:
@@ -89,14 +101,14 @@ def test_new_drives_are_covered_where_errors_are_small_and_where_they_are_large(
     fresh_terms = _terms(rng, 60_000)
     fresh_std = np.hypot(1.5 * fresh_terms[:, 1], 0.6 * fresh_terms[:, 2])
     fresh = _samples(rng, fresh_std, fresh_terms, drives=200)
-    interval = 1.96 * combined(fresh_terms, fitted.inflation.sideslip)
+    interval = 1.96 * combined(fresh_terms, _sideslip(fitted.inflation))
     order = np.argsort(fresh_std)
     for part in np.array_split(order, 4):
         covered = np.mean(np.abs(fresh.sideslip_error[part]) <= interval[part])
         assert covered == pytest.approx(0.95, abs=0.015)
     # Before, a single drive in the least favourable part was covered far less.
     assert np.mean(np.abs(fresh.sideslip_error) <= 1.96 * fresh.own_std) < 0.8
-    rate = combined(fresh.yaw_rate_terms, fitted.inflation.yaw_rate)
+    rate = combined(fresh.yaw_rate_terms, _yaw_rate(fitted.inflation))
     assert np.mean(np.abs(fresh.yaw_rate_error) <= 1.96 * rate) == pytest.approx(0.95, abs=0.01)
     assert fitted.inflation.vy_factor == pytest.approx(1.0, abs=1e-9)
 
@@ -117,14 +129,14 @@ def test_a_wrong_vehicle_widens_by_what_it_asks_for() -> None:
     fresh = drives(60_000, 300)
     covered = {}
     for name, one in (("both", fitted), ("given", narrow)):
-        inside = np.abs(fresh.sideslip_error) <= 1.96 * combined(fresh.terms, one.inflation.sideslip)
+        inside = np.abs(fresh.sideslip_error) <= 1.96 * combined(fresh.terms, _sideslip(one.inflation))
         covered[name] = [np.mean(inside[fresh.wrong == wrong]) for wrong in (False, True)]
     assert covered["given"][0] == pytest.approx(0.95, abs=0.015)
     assert covered["given"][1] < 0.7
     assert covered["both"][1] == pytest.approx(COVERED_WRONG, abs=0.02)
     assert narrow.wrong_factor == 0.0
     assert fitted.unseen_factor == pytest.approx(narrow.unseen_factor, rel=0.1)
-    k, given = np.array(fitted.inflation.sideslip), np.array(narrow.inflation.sideslip)
+    k, given = np.array(_sideslip(fitted.inflation)), np.array(_sideslip(narrow.inflation))
     assert int(np.argmax(k - given)) == 2
 
 
@@ -202,8 +214,9 @@ def test_few_drives_are_refused() -> None:
 
 
 def _settings(sample_logs_dir: Path, estimators: tuple[str, ...] = ("phy-ukf", "zero")) -> CalibrateSettings:
-    config = RunConfig(estimators=estimators, vehicle=sample_logs_dir / "vehicle.toml", model=Path("none"), end="+6s")
-    return CalibrateSettings(config, spread=0.1)
+    car = sample_logs_dir / "vehicle.toml"
+    config = RunConfig(estimators=estimators, car=car, network=Path("none"), end="+6s")
+    return CalibrateSettings(config=config, spread=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -211,25 +224,30 @@ def calibration(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory)
     folder = tmp_path_factory.mktemp("calibration")
     logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "fishhook", "sweep", "road", "no_truth")]
     told: list[str] = []
-    result = run_calibration(logs, folder, _settings(sample_logs_dir), warn=told.append)
+    result = calibrate(logs, folder / "mycar", _settings(sample_logs_dir), warn=told.append)
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
+    assert [r.counts for r in result.drives] == [
+        {"scored_stamps": r.counts["scored_stamps"], "runs": 3} for r in result.drives
+    ]
     assert any("no_truth" in t for t in told)
-    again = run_calibration(logs[:5], folder / "again.json", _settings(sample_logs_dir))
-    assert json.loads(again.file.read_text())["estimators"] == json.loads(result.file.read_text())["estimators"]
+    again = calibrate(logs[:5], folder / "again.json", _settings(sample_logs_dir))
+    assert again.exit_code == 0
+    assert again.file.read_bytes() == result.file.read_bytes()
     return result.file
 
 
-def test_the_file_says_where_it_is_from(calibration: Path) -> None:
-    assert calibration.name == "calibration.json"
+def test_the_file_says_where_it_is_from(calibration: Path, sample_logs_dir: Path) -> None:
+    assert calibration.name == "intervals.json"
     document = json.loads(calibration.read_text())
-    assert list(document["estimators"]) == ["phy-ukf"]  # zero claims no interval
+    assert [e["estimator"] for e in document["entries"]] == ["phy-ukf"]  # zero claims no interval
+    assert document["entries"][0]["algorithm"]["algorithm"] == "physics-ukf"
     assert len(document["drives"]) == 5
-    assert document["settings"]["vary"] == 0.1
-    assert document["vehicle"]["file"] == "vehicle.toml"
+    assert document["spread"] == document["settings"]["spread"] == 0.1
+    assert document["settings"]["estimators"] == ["phy-ukf", "zero"]
+    assert document["physics_sha256"] == Car.load(sample_logs_dir / "vehicle.toml").physics_sha256
     assert str(calibration.parent) not in calibration.read_text()
-    assert {c["wrong_vehicle"] for c in document["estimators"]["phy-ukf"]["coverage"]} == {False, True}
-    assert [d["runs"] for d in document["drives"]] == [3] * 5
+    assert {c["wrong_vehicle"] for c in document["entries"][0]["coverage"]} == {False, True}
 
 
 def test_a_run_uses_it_says_so_and_windows_change_nothing(
@@ -243,9 +261,9 @@ def test_a_run_uses_it_says_so_and_windows_change_nothing(
     ):
         config = RunConfig(
             estimators=("phy-ukf", "zero"),
-            vehicle=sample_logs_dir / "vehicle.toml",
-            model=Path("none"),
-            calibration=made,
+            car=sample_logs_dir / "vehicle.toml",
+            network=Path("none"),
+            intervals=made,
             annotate="none",
             window_s=window_s,
         )
@@ -253,9 +271,9 @@ def test_a_run_uses_it_says_so_and_windows_change_nothing(
         report = result.results[0].report
         assert report is not None
         notes = {e["name"]: "; ".join(e["notes"]) for e in report["estimators"]}
-        assert ("intervals not calibrated" if name == "plain" else "calibrated by calibration.json") in notes["phy-ukf"]
+        assert ("intervals not calibrated" if name == "plain" else "calibrated on truthsim saloon") in notes["phy-ukf"]
         assert "calibrated" not in notes["zero"]
-        assert "another vehicle" not in notes["phy-ukf"]
+        assert "other physics" not in notes["phy-ukf"]
         tables[name] = pl.read_parquet(tmp_path / name / "logs" / "dlc" / "estimates.parquet")
         metrics = pl.read_parquet(tmp_path / name / "metrics.parquet").filter(pl.col("estimator") == "phy-ukf")
         figures[name] = {
@@ -274,12 +292,14 @@ def test_a_run_uses_it_says_so_and_windows_change_nothing(
     same = [c for c in tables["whole"].columns if c not in ("vy_std_m_s", "yaw_rate_std_rad_s", "sideslip_std_rad")]
     assert tables["whole"].select(same).equals(tables["plain"].select(same))
     assert not tables["whole"]["sideslip_std_rad"].equals(tables["plain"]["sideslip_std_rad"])
-    assert load_calibration(calibration).inflations["phy-ukf"].sideslip[0] > 0.0
+    (entry,) = load_intervals(calibration).entries
+    assert entry.inflation.sideslip.floor > 0.0
+    assert Car.load(calibration.parent).intervals == load_intervals(calibration)
 
 
 def test_too_few_drives_with_truth(sample_logs_dir: Path, tmp_path: Path) -> None:
     with pytest.raises(EstimatorError, match="5 drives"):
-        run_calibration([str(sample_logs_dir / "step.mcap")], tmp_path / "c.json", _settings(sample_logs_dir))
+        calibrate([str(sample_logs_dir / "step.mcap")], tmp_path / "c.json", _settings(sample_logs_dir))
     assert not (tmp_path / "c.json").exists()
 
 
@@ -305,8 +325,11 @@ def test_wrong_options(sample_logs_dir: Path, tmp_path: Path) -> None:
     settings = _settings(sample_logs_dir)
     log = [str(sample_logs_dir / "step.mcap")]
     with pytest.raises(UsageError, match="--output"):
-        run_calibration(log, tmp_path / "nowhere", settings)
+        calibrate(log, tmp_path / "nowhere.toml", settings)
     with pytest.raises(UsageError, match="--vary"):
-        run_calibration(log, tmp_path, replace(settings, spread=0.5))
-    with pytest.raises(UsageError, match="--vehicle"):
-        run_calibration(log, tmp_path, replace(settings, config=replace(settings.config, vehicle=None)))
+        calibrate(log, tmp_path, replace(settings, spread=0.5))
+    (tmp_path / "notes.txt").write_text("no car")
+    with pytest.raises(UsageError, match="--output"):
+        calibrate(log, tmp_path, settings)
+    with pytest.raises(UsageError, match="--car"):
+        calibrate(log, tmp_path, replace(settings, config=replace(settings.config, car=None)))

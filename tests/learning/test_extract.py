@@ -18,14 +18,15 @@ import pytest
 from fake_drive_log import FakeLog, FakeTopic
 from residual_car import CAR, Motion, Wave, drive
 
-from pdhef_logtool.car.vehicle import VehicleParameters, vehicle_to_toml
-from pdhef_logtool.learning.network import extract_command
+from pdhef_logtool.car.flat import vehicle_toml
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive import reading
 from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_dataset
-from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, run_extraction
+from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "schemas/dataset.schema.json").read_text(encoding="utf-8"))
 MAPPING = """
@@ -109,15 +110,15 @@ def _extract(
 ) -> ExtractResult:
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
-    (tmp_path / "v.toml").write_text(vehicle_to_toml(car))
-    monkeypatch.setattr(extract_command, "open_log", lambda _path: log)
-    config = RunConfig(vehicle=tmp_path / "v.toml", mapping=tmp_path / "m.toml", window_s=settings.pop("window_s", 7.0))
-    return run_extraction([str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **settings))
+    (tmp_path / "v.toml").write_text(vehicle_toml(car))
+    monkeypatch.setattr(reading, "open_log", lambda _path: log)
+    config = RunConfig(car=tmp_path / "v.toml", mapping=tmp_path / "m.toml", window_s=settings.pop("window_s", 7.0))
+    return extract([str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **settings))
 
 
 def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Usable rows: errors of the residual rates, and indices."""
-    (found,) = read_dataset(result.output).drives
+    (found,) = (d.arrays for d in read_dataset(result.output).drives)
     index = np.round((found.stamps_ns - motion.stamps_ns[0]) / 1e7).astype(int)
     use = found.weight > 0
     error = found.targets[use] / found.step_s[use, None] - motion.residual[index[use]] / 0.01
@@ -186,7 +187,7 @@ def test_windows_of_reading_change_no_byte(motion: Motion, tmp_path: Path, monke
 def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> ExtractResult:
     out = tmp_path_factory.mktemp("dataset")
     logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
-    return run_extraction(logs, out, ExtractSettings(RunConfig(), seed=4))
+    return extract(logs, out, ExtractSettings(RunConfig(), seed=4))
 
 
 def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Path) -> None:
@@ -227,15 +228,16 @@ def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
     data = read_dataset(dataset.output)
     assert data.features == FEATURES
     assert data.period_s == pytest.approx(0.01)
-    for found in data.drives:
-        frame = pl.read_parquet(found.path).filter(pl.col(FEATURES[0]).is_not_null())
+    for one in data.drives:
+        found = one.arrays
+        frame = pl.read_parquet(one.path).filter(pl.col(FEATURES[0]).is_not_null())
         np.testing.assert_array_equal(found.features, frame.select(FEATURES).to_numpy())
         assert found.features.dtype == found.targets.dtype == found.weight.dtype == np.float32
         assert np.isfinite(found.features).all() and np.isfinite(found.targets).all()
         np.testing.assert_allclose(found.step_s, 0.01, atol=1e-9)
         assert not found.targets[found.weight == 0].any()
-        assert data.vehicle(found).name == next(
-            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == found.entry["vehicle_sha256"]
+        assert data.vehicle(one).name == next(
+            v["name"] for v in data.manifest["vehicles"] if v["sha256"] == one.entry["vehicle_sha256"]
         )
 
 
@@ -255,9 +257,10 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
         read_dataset(copy)
 
 
+@pytest.mark.slow
 def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
     logs = [str(sample_logs_dir / name) for name in ("sweep.mcap", "dlc.mcap")]
-    again = run_extraction(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=4), jobs=2)
+    again = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=4), jobs=2)
     assert again.manifest == dataset.manifest
     for name in ("dlc", "sweep"):
         assert (tmp_path / f"out/drives/{name}.parquet").read_bytes() == (
@@ -265,6 +268,7 @@ def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_
         ).read_bytes()
 
 
+@pytest.mark.slow
 def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(dataset.output, out)
@@ -272,12 +276,12 @@ def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir:
     (out / "drives/sweep.parquet").write_bytes(b"PAR1 torn")
     logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
     settings = ExtractSettings(RunConfig(), seed=4)
-    resumed = run_extraction(logs, out, settings, resume=True)
+    resumed = extract(logs, out, settings, resume=True)
     assert [r.kept for r in resumed.results] == [True, False]
     assert resumed.manifest == dataset.manifest
-    other = run_extraction(logs, out, replace(settings, truth_smoothing="0.1"), resume=True)
+    other = extract(logs, out, replace(settings, truth_smoothing="0.1"), resume=True)
     assert not any(r.kept for r in other.results)
-    afresh = run_extraction(logs, out, replace(settings, truth_smoothing="0.1"))
+    afresh = extract(logs, out, replace(settings, truth_smoothing="0.1"))
     assert not any(r.kept for r in afresh.results)
 
 
@@ -287,14 +291,14 @@ def test_one_bad_log_stops_no_other(sample_logs_dir: Path, tmp_path: Path) -> No
     shutil.copy(sample_logs_dir / "dlc.mcap", logs / "good.mcap")
     (logs / "bad.mcap").write_bytes(b"this is no log")
     told: list[str] = []
-    result = run_extraction([str(logs)], tmp_path / "out", ExtractSettings(RunConfig()), warn=told.append)
+    result = extract([str(logs)], tmp_path / "out", ExtractSettings(RunConfig()), warn=told.append)
     assert result.exit_code == 3
     jsonschema.validate(result.manifest, SCHEMA)
     assert [f["log"] for f in result.manifest["failed"]] == ["bad"]
-    assert any(t.startswith("bad: ") for t in told)
+    assert any(t.startswith("bad is left out: ") for t in told)
     assert [d.name for d in read_dataset(tmp_path / "out").drives] == ["good"]
     with pytest.raises(LogError):
-        run_extraction([str(logs / "bad.mcap")], tmp_path / "alone", ExtractSettings(RunConfig()))
+        extract([str(logs / "bad.mcap")], tmp_path / "alone", ExtractSettings(RunConfig()))
 
 
 # ---- split ----
@@ -317,12 +321,12 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
     suite = {"format": 1, "drives": [{"file": "a.mcap", "split": "extrapolation"}, {"file": "c.mcap", "split": "test"}]}
     (tmp_path / "manifest.json").write_text(json.dumps(suite))
     logs = [str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")]
-    result = run_extraction(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=3))
+    result = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=3))
     found = {d["log"]: (d["split"], d["split_from"]) for d in result.manifest["drives"]}
     assert found["a"] == ("extrapolation", "manifest")
     assert found["b"] == choose_split(hash_log(tmp_path / "b.mcap"), 3)
     jsonschema.validate(result.manifest, SCHEMA)
-    chosen = run_extraction(logs, tmp_path / "out", ExtractSettings(RunConfig(), split="validation"))
+    chosen = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), split="validation"))
     assert {(d["split"], d["split_from"]) for d in chosen.manifest["drives"]} == {("validation", "option")}
 
 
@@ -331,7 +335,7 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
 )
 def test_wrong_settings_are_told_before_any_log_is_read(tmp_path: Path, wrong: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
-        run_extraction([str(tmp_path / "none.mcap")], tmp_path / "out", ExtractSettings(RunConfig(), **wrong))
+        extract([str(tmp_path / "none.mcap")], tmp_path / "out", ExtractSettings(RunConfig(), **wrong))
     assert not (tmp_path / "out").exists()
 
 
@@ -339,7 +343,7 @@ def test_another_manifest_is_not_overwritten(sample_logs_dir: Path, tmp_path: Pa
     shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
     (tmp_path / "manifest.json").write_text('{"format": 1, "drives": []}')
     with pytest.raises(UsageError, match="another manifest"):
-        run_extraction([str(tmp_path / "a.mcap")], tmp_path, ExtractSettings(RunConfig()))
+        extract([str(tmp_path / "a.mcap")], tmp_path, ExtractSettings(RunConfig()))
     assert (tmp_path / "manifest.json").read_text() == '{"format": 1, "drives": []}'
 
 
@@ -352,15 +356,16 @@ def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
 
+@pytest.mark.slow
 def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     out = tmp_path / "residuals"
     log = str(sample_logs_dir / "dlc.mcap")
-    result = _pdhef("extract", log, "-o", str(out), "-v", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
+    result = _pdhef("extract", log, "-o", str(out), "--car", str(sample_logs_dir / "vehicle.toml"), "--split", "train")
     assert result.returncode == 0, result.stderr
     assert "dlc" in result.stdout and "train: 1 drives" in result.stdout
-    assert result.stderr == ""
-    (found,) = read_dataset(out).drives
-    assert found.usable_rows > 0.99 * found.rows
+    assert result.stderr.splitlines() == ["warning: dlc: perfect truth taken; /rtk/fix, /rtk/odometry not used"]
+    (drive,) = read_dataset(out).drives
+    assert drive.usable_rows > 0.99 * drive.rows
     rtk = _pdhef("extract", log, "-o", str(tmp_path / "rtk"), "--prefer-truth", "rtk", "--split", "train", "--json")
     assert rtk.returncode == 0, rtk.stderr
     document = json.loads(rtk.stdout)
@@ -368,12 +373,14 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     (entry,) = document["manifest"]["drives"]
     assert entry["truth"]["kind"] == "recorded" and entry["truth"]["smoothing_half_s"] > 0
     # The two truths of one drive tell of the same residual.
-    (other,) = read_dataset(tmp_path / "rtk").drives
+    found = drive.arrays
+    (other,) = (d.arrays for d in read_dataset(tmp_path / "rtk").drives)
     both = (found.weight > 0) & (other.weight > 0)
     for i in range(2):
         assert np.corrcoef(found.targets[both, i], other.targets[both, i])[0, 1] > 0.95
 
 
+@pytest.mark.slow
 def test_errors_are_one_line(tmp_path: Path) -> None:
     result = _pdhef("extract", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
     assert result.returncode != 0

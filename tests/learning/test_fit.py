@@ -25,6 +25,8 @@ from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkService
 
+pytestmark = pytest.mark.slow
+
 SMALL = Recipe(FEATURES[:8], hidden=12, layers=1, head=(8,), epochs=6, batch=4, learning_rate=2e-2)
 
 

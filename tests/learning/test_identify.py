@@ -10,17 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.vehicle import AxleTyre, Network, Tyres, VehicleParameters, load_vehicle, vehicle_to_toml
-from pdhef_logtool.estimators.physics_tuned import NAME, physics_ukf_tuned
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.estimators.physics_tuned import NAME
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, axle_samples, fit_axle
 from pdhef_logtool.learning.car.fit_data import GUARD_S, FitDrive, split_drive
-from pdhef_logtool.learning.car.identify import _projected_levenberg_marquardt, identify
-from pdhef_logtool.learning.car.identify_command import run_identification
+from pdhef_logtool.learning.car.identify import _projected_levenberg_marquardt, fit_car
+from pdhef_logtool.learning.car.identify_command import identify
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+
+pytestmark = pytest.mark.slow
 
 CAR = VehicleParameters(
     name="test car",
@@ -125,7 +129,7 @@ def test_axle_fit_stays_at_its_prior_without_data() -> None:
 
 
 def test_stiffness_and_steering_offset_are_found_from_a_wrong_start(drives: tuple[FitDrive, FitDrive]) -> None:
-    found = identify([drives[0]], [drives[1]], _wrong_start(75_000.0, 180_000.0))
+    found = fit_car([drives[0]], [drives[1]], _wrong_start(75_000.0, 180_000.0))
     by_name = {p.name: p for p in found.parameters}
     assert by_name["front cornering stiffness"].value == pytest.approx(10.0 * 1.35 * 8300 * 0.9, rel=0.10)
     assert by_name["rear cornering stiffness"].value == pytest.approx(16.0 * 1.35 * 6700 * 0.9, rel=0.10)
@@ -134,12 +138,13 @@ def test_stiffness_and_steering_offset_are_found_from_a_wrong_start(drives: tupl
     fit, held_out = found.scores
     assert held_out.identified_deg < 0.5 * held_out.start_file_deg
     assert fit.seconds == pytest.approx(60.0, abs=0.1)
-    assert NAME in found.vehicle.filter
+    assert len(found.noise.q_std) == 4
+    assert found.noise.physics_sha256 is None  # whose it is, is for the car to say
 
 
 def test_what_straight_driving_does_not_excite_is_said_and_kept() -> None:
     straight = _drive(CAR, seed=5, seconds=40.0, amplitude=0.0003)
-    found = identify([straight], [], CAR)
+    found = fit_car([straight], [], CAR)
     by_name = {p.name: p for p in found.parameters}
     for name in ("front peak force", "rear peak force", "front shape", "rear shape", "yaw inertia"):
         assert not by_name[name].excited, name
@@ -149,7 +154,7 @@ def test_what_straight_driving_does_not_excite_is_said_and_kept() -> None:
 
 def test_too_little_driving_is_one_clear_error() -> None:
     with pytest.raises(EstimatorError, match=r"20 s.*holdout"):
-        identify([_drive(CAR, seed=1, seconds=12.0)], [], CAR)
+        fit_car([_drive(CAR, seed=1, seconds=12.0)], [], CAR)
 
 
 def test_fit_and_held_out_parts_share_no_stamp_and_keep_a_guard(drives: tuple[FitDrive, FitDrive]) -> None:
@@ -166,43 +171,53 @@ def test_held_out_part_changes_nothing_in_the_fit(drives: tuple[FitDrive, FitDri
     fit, held_out = split_drive(drives[0], 0.3)
     assert held_out is not None
     spoiled = replace(held_out, truth=replace(held_out.truth, sideslip_rad=held_out.truth.sideslip_rad + 0.1))
-    assert identify([fit], [held_out], start).vehicle == identify([fit], [spoiled], start).vehicle
+    assert fit_car([fit], [held_out], start).vehicle == fit_car([fit], [spoiled], start).vehicle
 
 
 def test_command_writes_a_file_that_runs_and_says_where_its_numbers_come_from(
     sample_logs_dir: Path, tmp_path: Path
 ) -> None:
-    given = load_vehicle(sample_logs_dir / "vehicle.toml")
-    found_with_other_tyres = Network(trust_cap=1.0, evidence="a gain", model_sha256="0" * 64)
     guess = tmp_path / "guess.toml"
-    guess.write_text(vehicle_to_toml(given.model_copy(update={"network": found_with_other_tyres})))
-    config = RunConfig(vehicle=guess, end="80")
-    out = tmp_path / "car.toml"
-    result = run_identification([str(sample_logs_dir / "road.mcap")], out, config, holdout=0.25)
-    vehicle = load_vehicle(out)
-    assert vehicle == result.identification.vehicle.model_copy(
-        update={"name": vehicle.name, "identification": vehicle.identification, "network": vehicle.network}
-    )
-    assert vehicle.network == Network(trust_cap=0.0, evidence="no network was tried on this vehicle")
-    assert "road: 0.0" in str(vehicle.identification["drives"])
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    assert "trust_cap = 1.0" in text  # found with other tyres
+    guess.write_text(text)
+    config = RunConfig(car=guess, end="80")
+    log = [str(sample_logs_dir / "road.mcap")]
+    out, folder = tmp_path / "car.toml", tmp_path / "mycar"
+    result = identify(log, out, config, holdout=0.25)
+    car, found = Car.load(out), result.identification
+    assert car.vehicle == found.vehicle.model_copy(update={"name": car.vehicle.name})
+    assert car.noise == {NAME: found.noise}
+    assert car.allowed_trust.cap == 0.0 and "no evidence" in car.allowed_trust.reason
+    (drive,) = car.learnt_on
+    assert (drive.name, drive.start_s) == ("road", 0.0)
     assert "95 %" in out.read_text()
-    assert (tmp_path / "car.png").read_bytes().startswith(b"\x89PNG")
+    assert text.splitlines()[0] in out.read_text()  # a person's comments stay
+    assert (tmp_path / "car.fit.png").read_bytes().startswith(b"\x89PNG")
     json.dumps(result.to_dict(), allow_nan=False)
-    physics_ukf_tuned(vehicle)
-    again = tmp_path / "again" / "car.toml"
-    run_identification([str(sample_logs_dir / "road.mcap")], again, config, holdout=0.25)
-    assert again.read_bytes() == out.read_bytes()
+    make_estimator(NAME, car)
+
+    identify(log, folder, config, holdout=0.25)
+    same = Car.load(folder)
+    assert (same.vehicle, same.learnt_on) == (car.vehicle, car.learnt_on)
+    assert same.noise[NAME].model_copy(update={"physics_sha256": None}) == car.noise[NAME]
+    assert same.allowed_trust.cap == 0.0
+    assert (folder / "vehicle.toml").read_text() == text
+    assert "95 %" in (folder / "fit.toml").read_text()
+    assert (folder / "fit.png").read_bytes() == (tmp_path / "car.fit.png").read_bytes()
 
 
 def test_command_refuses_what_it_cannot_use(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = [str(sample_logs_dir / "dlc.mcap")]
     with pytest.raises(UsageError, match="holdout"):
-        run_identification(log, tmp_path / "car.toml", RunConfig(), holdout=1.0)
+        identify(log, tmp_path / "car.toml", RunConfig(), holdout=1.0)
+    (tmp_path / "car.json").write_text("{}")
     with pytest.raises(UsageError, match=r"\.toml"):
-        run_identification(log, tmp_path / "car.json", RunConfig())
-    with pytest.raises(EstimatorError, match="20 s"):
-        run_identification(log, tmp_path / "car.toml", RunConfig())
-    assert list(tmp_path.iterdir()) == []
+        identify(log, tmp_path / "car.json", RunConfig())
+    for name in ("car.toml", "mycar"):
+        with pytest.raises(EstimatorError, match="20 s"):
+            identify(log, tmp_path / name, RunConfig())
+    assert [p.name for p in tmp_path.iterdir()] == ["car.json"]
 
 
 def test_250_lm_identified_on_its_first_half_is_good_on_its_second(shared_dir: Path, tmp_path: Path) -> None:
@@ -210,9 +225,9 @@ def test_250_lm_identified_on_its_first_half_is_good_on_its_second(shared_dir: P
     reference = Path(__file__).resolve().parents[1] / "reference"
     mapping = reference / "mappings" / "revs_250lm.toml"
     log = [str(shared_dir / "data/drives/revs_250lm_a.mcap")]
-    first = RunConfig(vehicle=reference / "vehicles" / "revs_250lm.toml", mapping=mapping, end="150")
-    run_identification(log, tmp_path / "car.toml", first, holdout=0.0)
-    second = RunConfig(vehicle=tmp_path / "car.toml", mapping=mapping, start="155", annotate="none")
+    first = RunConfig(car=reference / "vehicles" / "revs_250lm.toml", mapping=mapping, end="150")
+    identify(log, tmp_path / "car.toml", first, holdout=0.0)
+    second = RunConfig(car=tmp_path / "car.toml", mapping=mapping, start="155", annotate="none")
     result = run_logs(log, tmp_path / "out", second)
     rmse = {
         row.estimator: math.degrees(row.value)
@@ -239,5 +254,5 @@ def test_projected_steps_find_the_bounded_minimum_also_from_a_start_at_the_bound
 def test_command_says_which_truth_it_took(sample_logs_dir: Path, tmp_path: Path) -> None:
     said: list[str] = []
     with pytest.raises(EstimatorError):
-        run_identification([str(sample_logs_dir / "dlc.mcap")], tmp_path / "car.toml", RunConfig(), warn=said.append)
+        identify([str(sample_logs_dir / "dlc.mcap")], tmp_path / "car.toml", RunConfig(), warn=said.append)
     assert any(text.startswith("dlc: ") and "/rtk/odometry" in text for text in said)

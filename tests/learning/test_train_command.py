@@ -11,12 +11,14 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.learning.network.train_command import run_training
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+
+pytestmark = pytest.mark.slow
 
 
 def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -32,7 +34,7 @@ def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
         # One drive gives three parts only because there are no other sample drives of this length.
         part = folder / split
         done = _pdhef(
-            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(part), "--vehicle", vehicle, "--split", split,
+            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(part), "--car", vehicle, "--split", split,
             "--start", start, "--end", end,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
@@ -52,7 +54,7 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     }  # fmt: skip
     assert pl.read_parquet(tmp_path / "model" / "history.parquet").height == 2
     assert bundle.provenance["dataset_sha256"]
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=tmp_path / "model", annotate="none")
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=tmp_path / "model", annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef-trust0"}
     again = run_training(joined, tmp_path / "again", epochs=2)
@@ -81,7 +83,7 @@ def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_
     errors = bundle.linear_regression.provenance["sideslip_rmse_deg"]
     assert 0.0 < errors["train"] < 1.0
     assert errors["test"] is not None
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=folder / "model", annotate="none")
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=folder / "model", annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression", "pd-hef-paper"}
     both = _pdhef("train", str(dataset), "-o", str(folder / "m"), "--baselines", "--init", str(folder / "model"))

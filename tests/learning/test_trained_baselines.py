@@ -25,6 +25,8 @@ from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_m
 from pdhef_logtool.residual_model.low_pass import low_pass
 from pdhef_logtool.residual_model.service import NetworkService
 
+pytestmark = pytest.mark.slow
+
 SMALL = Recipe(hidden=8, layers=1, head=(8,), epochs=8, batch=4, learning_rate=2e-2)
 NAMES = ("vx_m_s", "ay_m_s2", "steer_rad", "friction")
 

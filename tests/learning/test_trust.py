@@ -17,12 +17,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.parts import LearntOn
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
 from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.learning.drives import LearnSettings, choose_drives, load_drive
 from pdhef_logtool.learning.evidence.trust import (
     MIN_BLOCKS,
     MIN_EXCITED_S,
@@ -34,20 +37,19 @@ from pdhef_logtool.learning.evidence.trust import (
 )
 from pdhef_logtool.learning.evidence.trust_command import (
     REFUSED,
-    RepeatedNetwork,
-    TrustSettings,
     errors_by_trust,
-    run_trust,
     seen_by_identification,
+    trust,
 )
-from pdhef_logtool.learning.noise.tune_drives import MAX_BYTES, DriveBench, TuneSetup
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig
+from pdhef_logtool.runs.config import RunConfig
+
+pytestmark = pytest.mark.slow
 
 PERIOD_NS = 10_000_000
 
@@ -215,25 +217,26 @@ def _bundle(seed: int = 0) -> ModelBundle:
     return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
 
 
-def _settings(sample_logs_dir: Path, folder: Path, **changes: object) -> TrustSettings:
+def _settings(sample_logs_dir: Path, folder: Path, **changes: object) -> LearnSettings:
     _bundle().save(folder / "model")
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml", model=folder / "model")
-    return replace(TrustSettings(config), **changes)  # type: ignore[arg-type]
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=folder / "model")
+    return replace(LearnSettings(config=config), **changes)  # type: ignore[arg-type]
 
 
 def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vehicle, bundle = load_vehicle(sample_logs_dir / "vehicle.toml"), _bundle()
-    bench = DriveBench(TuneSetup(RunConfig(), vehicle, None, bundle, ()))
-    bench.load(0, find_logs([str(sample_logs_dir / "dlc.mcap")])[0], MAX_BYTES)
-    signals, truth = bench.take(0)
+    car = Car.of(vehicle, network=bundle)
+    drive = load_drive(find_logs([str(sample_logs_dir / "dlc.mcap")])[0], car, None, ReadOptions())[1]
+    assert drive is not None and drive.truth is not None
+    signals, truth = drive.signals, drive.truth
     passes = []
     run = NetworkService.run
     monkeypatch.setattr(NetworkService, "run", lambda *a: passes.append(1) or run(*a))
-    blocks = errors_by_trust(vehicle, RepeatedNetwork(bundle, {}), signals, truth, use_speed=True)
+    blocks = errors_by_trust(car, drive, use_speed=True)
     assert len(passes) == 1
-    for row, trust in zip(blocks.squares, TRUSTS, strict=True):
-        hybrid = adaptive_hybrid_ukf(vehicle, NetworkService(bundle), trust=trust)
-        estimator = hybrid if trust > 0.0 else CautiousPhysics(strongest_physics(vehicle))
+    for row, share in zip(blocks.squares, TRUSTS, strict=True):
+        hybrid = adaptive_hybrid_ukf(vehicle, NetworkService(bundle), trust=share)
+        estimator = hybrid if share > 0.0 else CautiousPhysics(strongest_physics(car))
         track = estimator.run(signals, None)[0]
         error = signal_error(track, truth, "sideslip_rad", vehicle.low_speed_blend_m_s)
         assert row.sum() == pytest.approx(np.nansum(error**2), rel=1e-12)
@@ -247,32 +250,48 @@ def test_the_file_is_the_one_that_was_given_but_for_the_network(sample_logs_dir:
     source.write_text("# A head.\n" + text.replace("track_m = 1.57", "track_m = 1.57  # measured"))
     assert "# measured" in source.read_text()
     options = _settings(sample_logs_dir, tmp_path)
-    options = replace(options, config=replace(options.config, vehicle=source))
+    options = replace(options, config=replace(options.config, car=source))
     logs = [str(sample_logs_dir / f"{n}.mcap") for n in ("dlc", "step", "no_truth")]
     told: list[str] = []
-    result = run_trust(logs, tmp_path / "trusted.toml", options, warn=told.append)
+    result = trust(logs, tmp_path / "trusted.toml", options, warn=told.append)
     assert result.exit_code == 3
     assert any(line.startswith("no_truth is left out") for line in told)
-    before, after = load_vehicle(source), load_vehicle(tmp_path / "trusted.toml")
-    assert after.model_copy(update={"network": before.network}) == before
-    assert after.network == result.network
-    assert after.network.model_sha256 == _bundle().sha256
-    assert after.network.trust_cap == result.decision.cap
-    assert after.network.has_evidence
+    before, after = Car.load(source), Car.load(tmp_path / "trusted.toml", network=tmp_path / "model")
+    assert (after.vehicle, after.noise, after.learnt_on) == (before.vehicle, before.noise, before.learnt_on)
+    found = result.trust
+    assert after.trust is not None
+    assert (after.trust.trust_cap, after.trust.evidence) == (found.trust_cap, found.evidence)
+    assert after.trust.network_sha256 == found.network_sha256 == _bundle().sha256
+    assert after.allowed_trust.cap == result.decision.cap
+    assert after.trust.has_evidence
     for figure in (f"{result.decision.rmse_deg[0]:.3f}°", f"{result.decision.rmse_deg[4]:.3f}°", "2 drives"):
-        assert figure in after.network.evidence
+        assert figure in after.trust.evidence
     written = (tmp_path / "trusted.toml").read_text()
     assert written.startswith("# A head.")
     assert "# measured" in written
-    record = json.loads((tmp_path / "trusted.trust.json").read_text())
+    record = json.loads((tmp_path / "trusted.network.record.json").read_text())
     assert record["trust_cap"] == result.decision.cap
     assert [d["name"] for d in record["drives"]] == ["dlc", "step"]
     assert record["drives"][0]["sha256"]
-    assert record["model_sha256"] == _bundle().sha256
+    assert record["network_sha256"] == _bundle().sha256
     # Once more, onto itself: the old evidence is replaced.
-    again = replace(options, config=replace(options.config, vehicle=tmp_path / "trusted.toml"))
-    run_trust(logs[:2], tmp_path / "trusted.toml", again)
+    again = replace(options, config=replace(options.config, car=tmp_path / "trusted.toml"))
+    trust(logs[:2], tmp_path / "trusted.toml", again)
     assert (tmp_path / "trusted.toml").read_text() == written
+
+
+def test_a_folder_gets_a_copy_of_the_network_that_was_tried(sample_logs_dir: Path, tmp_path: Path) -> None:
+    options = _settings(sample_logs_dir, tmp_path)
+    result = trust([str(sample_logs_dir / "dlc.mcap")], tmp_path / "mycar", options)
+    shutil.rmtree(tmp_path / "model")
+    car = Car.load(tmp_path / "mycar")
+    assert car.network is not None and car.network.sha256 == _bundle().sha256
+    assert car.trust == result.trust
+    assert car.trust.physics_sha256 == car.physics_sha256
+    assert car.allowed_trust.reason == result.trust.evidence
+    # Another network may be taken, but not on this evidence.
+    other = Car.load(tmp_path / "mycar", network="default")
+    assert other.allowed_trust.cap == 0.0 and "pdhef trust tries it" in other.allowed_trust.reason
 
 
 def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -283,7 +302,7 @@ def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path,
         entries.append({"file": f"{name}.mcap", "split": split})
     (tmp_path / "set" / "manifest.json").write_text(json.dumps({"drives": entries}))
     logs = find_logs([str(tmp_path / "set")])
-    options = TrustSettings(RunConfig())
+    options = LearnSettings(config=RunConfig())
     with pytest.raises(UsageError, match=r"dlc \(train\).*--split test"):
         choose_drives(logs, options, REFUSED)
     with pytest.raises(UsageError, match="drives of split extrapolation, got drives of test, train"):
@@ -293,41 +312,49 @@ def test_drives_that_a_network_was_trained_on_are_refused(sample_logs_dir: Path,
 
 
 def test_a_drive_of_the_identification_is_told(sample_logs_dir: Path) -> None:
-    vehicle = load_vehicle(sample_logs_dir / "vehicle.toml")
-    bench = DriveBench(TuneSetup(RunConfig(), vehicle, None, None, ()))
-    facts = bench.load(0, find_logs([str(sample_logs_dir / "dlc.mcap")])[0], MAX_BYTES)
-    spans: dict[str, str | float | int | list[str]] = {"drives": ["dlc: 0.00 to 7.00 s", "dlc_2: 0.00 to 7.00 s"]}
-    assert seen_by_identification(vehicle, [facts]) == []
-    identified = vehicle.model_copy(update={"identification": spans})
-    told = seen_by_identification(identified, [facts])
-    assert len(told) == 1
-    assert "dlc: 0.00 to 7.00 s" in told[0]
-    assert len(seen_by_identification(identified, [facts], 6.9)) == 1
-    assert seen_by_identification(identified, [facts], 7.0) == []
+    car = Car.load(sample_logs_dir / "vehicle.toml")
+    log = find_logs([str(sample_logs_dir / "dlc.mcap")])[0]
+    facts, _ = load_drive(log, car, None, ReadOptions())
+    assert seen_by_identification(car, [facts]) == []
+    # By its content where it is known, by its name in older files.
+    same = LearntOn(name="dlc", end_s=7.0)
+    renamed = LearntOn(name="renamed", sha256=facts.sha256, end_s=7.0)
+    others = (LearntOn(name="dlc_2", end_s=7.0), LearntOn(name="dlc", sha256="0" * 64, end_s=7.0))
+    for seen in (same, renamed):
+        identified = replace(car, learnt_on=(seen, *others))
+        told = seen_by_identification(identified, [facts])
+        assert len(told) == 1
+        assert f"{seen.name}, 0.00 to 7.00 s" in told[0]
+    later, _ = load_drive(log, car, None, ReadOptions(start="6.9"))
+    assert len(seen_by_identification(identified, [later])) == 1
+    after, _ = load_drive(log, car, None, ReadOptions(start="7.0"))
+    assert seen_by_identification(identified, [after]) == []
 
 
 def test_wrong_options_are_usage_errors(sample_logs_dir: Path, tmp_path: Path) -> None:
     options = _settings(sample_logs_dir, tmp_path)
     log = [str(sample_logs_dir / "dlc.mcap")]
     wrong = [
-        (replace(options, config=replace(options.config, vehicle=None)), "a vehicle file"),
-        (replace(options, config=replace(options.config, model=Path("none"))), "a model bundle"),
-        (replace(options, seed=-1), "seed"),
+        (replace(options, config=replace(options.config, car=None)), "a car"),
+        (replace(options, config=replace(options.config, network=Path("none"))), "a network"),
     ]
+    with pytest.raises(UsageError, match="seed"):
+        replace(options, seed=-1)
     for one, message in wrong:
         with pytest.raises(UsageError, match=message):
-            run_trust(log, tmp_path / "out.toml", one)
+            trust(log, tmp_path / "out.toml", one)
+    (tmp_path / "out.txt").write_text("no folder")
     with pytest.raises(UsageError, match=r"\.toml"):
-        run_trust(log, tmp_path / "out.txt", options)
+        trust(log, tmp_path / "out.txt", options)
     with pytest.raises(EstimatorError, match="at least one drive with a true sideslip"):
-        run_trust([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "out.toml", options)
+        trust([str(sample_logs_dir / "no_truth.mcap")], tmp_path / "out.toml", options)
     assert not (tmp_path / "out.toml").exists()
 
 
 def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Path) -> None:
     _bundle().save(tmp_path / "model")
     words = [sys.executable, "-m", "pdhef_logtool", "trust", str(sample_logs_dir / "dlc.mcap"),
-             "-v", str(sample_logs_dir / "vehicle.toml"), "--model", str(tmp_path / "model"),
+             "--car", str(sample_logs_dir / "vehicle.toml"), "--network", str(tmp_path / "model"),
              "-o", str(tmp_path / "car.toml")]  # fmt: skip
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     shown = subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
@@ -339,4 +366,5 @@ def test_the_command_prints_a_table_or_json(sample_logs_dir: Path, tmp_path: Pat
     assert document["trust_cap"] == 0.0
     assert document["trusts"] == list(TRUSTS)
     assert document["against_trust_0"][4]["low_deg2"] is None
-    assert load_vehicle(tmp_path / "car.toml").network.evidence == document["evidence"]
+    found = Car.load(tmp_path / "car.toml").trust
+    assert found is not None and found.evidence == document["evidence"]

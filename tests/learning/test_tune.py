@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,10 +17,12 @@ import numpy as np
 import pytest
 import torch
 
-from pdhef_logtool.car.vehicle import Network, default_vehicle, load_vehicle, vehicle_to_toml
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.hybrid import hybrid_ukf
+from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.evaluation.metrics import score_track
-from pdhef_logtool.learning.choosing_drives import choose_drives
+from pdhef_logtool.learning.drives import choose_drives
 from pdhef_logtool.learning.noise import tune_drives
 from pdhef_logtool.learning.noise.search import (
     FACTORS,
@@ -33,19 +36,20 @@ from pdhef_logtool.learning.noise.search import (
     filter_tuning,
     score_drives,
     search,
-    tuned_vehicle,
 )
-from pdhef_logtool.learning.noise.tune_command import REFUSED, TuneSettings, read_comments, run_tuning
-from pdhef_logtool.learning.noise.tune_drives import Hybrid, TuneSetup, choose_names
+from pdhef_logtool.learning.noise.tune_command import REFUSED, TuneSettings, tune
+from pdhef_logtool.learning.noise.tune_drives import choose_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.residual_model.service import NetworkService, RememberingNetwork
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+
+pytestmark = pytest.mark.slow
 
 OPTIMA = {"a": (0.3, 0.05, 1.5, 0.004), "b": (0.02, 0.4, 0.2, 0.02)}
 
@@ -153,7 +157,7 @@ def _bundle() -> ModelBundle:
     return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
 
 
-def test_the_network_runs_once_and_the_hybrid_filter_is_the_same() -> None:
+def test_the_network_runs_once_and_the_hybrid_filter_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     count = 700
     rng = np.random.default_rng(0)
     stamps = 10**18 + np.arange(count, dtype=np.int64) * 10_000_000
@@ -169,18 +173,23 @@ def test_the_network_runs_once_and_the_hybrid_filter_is_the_same() -> None:
         wheel_speed_m_s=np.full((count, 4), np.nan),
         available=frozenset(ALIGNED_SIGNALS),
     )
-    vehicle = default_vehicle()
-    setup = TuneSetup(RunConfig(), vehicle, None, _bundle(), ("pd-hef",))
-    hybrid = Hybrid("pd-hef")
-    rate = hybrid.prepare(setup, signals)
-    assert np.any(rate != 0.0)
+    vehicle, network = default_vehicle(), RememberingNetwork(_bundle())
+    spec = spec_of(spec_of("pd-hef").tuned_as)
+    passes = []
+    run = NetworkService.run
+    monkeypatch.setattr(NetworkService, "run", lambda *a: passes.append(1) or run(*a))
     tracks = []
     for values in ((0.5, 0.05, 0.5, 0.01), (0.05, 0.5, 2.0, 0.001)):
-        tuning = filter_tuning(values)
-        tracks.append(hybrid.run(setup, tuning, signals, rate))
-        whole = hybrid_ukf(tuned_vehicle(vehicle, "pd-hef", tuning), NetworkService(_bundle())).run(signals, None)[0]
-        assert np.array_equal(tracks[-1].sideslip_rad, whole.sideslip_rad, equal_nan=True)
-    assert not np.array_equal(tracks[0].sideslip_rad, tracks[1].sideslip_rad, equal_nan=True)
+        noise = filter_tuning(values)
+        car = Car.of(vehicle, network=_bundle()).with_noise("pd-hef", noise)
+        tracks.append(spec.make(car, Options(trust=1.0, network=network)).run(signals, None)[0])
+    assert len(passes) == 1
+    for values, track in zip(((0.5, 0.05, 0.5, 0.01), (0.05, 0.5, 2.0, 0.001)), tracks, strict=True):
+        whole = hybrid_ukf(vehicle, NetworkService(_bundle()), filter_tuning(values)).run(signals, None)[0]
+        assert np.array_equal(track.sideslip_rad, whole.sideslip_rad, equal_nan=True)
+    without = hybrid_ukf(vehicle, NetworkService(_bundle()), filter_tuning(values), trust=0.0).run(signals, None)[0]
+    assert not np.array_equal(track.sideslip_rad, without.sideslip_rad, equal_nan=True)
+    assert not np.array_equal(tracks[-1].sideslip_rad, tracks[0].sideslip_rad, equal_nan=True)
 
 
 # ---- the command ----
@@ -204,8 +213,8 @@ def drives(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 def _settings(sample_logs_dir: Path, **changes: object) -> TuneSettings:
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle.toml")
-    return replace(TuneSettings(config, trials=4, split="validation"), **changes)  # type: ignore[arg-type]
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=Path("none"))
+    return replace(TuneSettings(config=config, trials=4, split="validation"), **changes)  # type: ignore[arg-type]
 
 
 def test_what_is_written_runs_with_the_scores_that_are_recorded(
@@ -213,19 +222,20 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
 ) -> None:
     _bundle().save(tmp_path / "model")
     settings = _settings(sample_logs_dir)
-    settings = replace(settings, config=replace(settings.config, model=tmp_path / "model"))
-    result = run_tuning([str(drives)], tmp_path / "car.toml", settings)
+    settings = replace(settings, config=replace(settings.config, network=tmp_path / "model"))
+    result = tune([str(drives)], tmp_path / "mycar", settings)
     assert result.exit_code == 0
     assert [d.name for d in result.drives] == ["dlc", "step"]
 
-    before, after = load_vehicle(sample_logs_dir / "vehicle.toml"), load_vehicle(tmp_path / "car.toml")
-    assert after.model_copy(update={"filter": before.filter, "identification": before.identification}) == before
-    record = json.loads((tmp_path / "car.tuning.json").read_text())
-    assert after.identification["tuning_drives_sha256"] == record["drives_sha256"]
-    assert after.identification["tuning_trials"] == record["search"]["trials"] == 4
-    assert (tmp_path / "car.tuning.png").read_bytes().startswith(b"\x89PNG")
+    before, after = Car.load(sample_logs_dir / "vehicle.toml"), Car.load(tmp_path / "mycar", network=tmp_path / "model")
+    assert (after.vehicle, after.trust, after.learnt_on) == (before.vehicle, before.trust, before.learnt_on)
+    record = json.loads((tmp_path / "mycar/noise.record.json").read_text())
+    part = tomllib.loads((tmp_path / "mycar/noise.toml").read_text())
+    assert part["search"]["drives_sha256"] == record["drives_sha256"]
+    assert part["search"]["trials"] == record["search"]["trials"] == 4
+    assert (tmp_path / "mycar/noise.png").read_bytes().startswith(b"\x89PNG")
 
-    names = choose_names(None, _bundle())
+    names = choose_names(None, Car.of(before.vehicle, network=_bundle()), with_network=True)
     assert {"phy-ukf-tuned", "pd-hef"} <= set(names)
     assert set(record["estimators"]) == set(names)
     explored = {n: [t["values"] for t in e["trials"] if t["stage"] == "sobol"] for n, e in record["estimators"].items()}
@@ -233,7 +243,10 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
     for name in names:
         best = record["estimators"][name]["trials"][record["estimators"][name]["best_trial"]]
         assert best["objective_deg"] == min(t["objective_deg"] for t in record["estimators"][name]["trials"])
-        assert after.filter[name] == filter_tuning(tuple(best["values"].values()))
+        told = {"score_deg": round(best["objective_deg"], 4), "trial": best["trial"]}
+        told |= {"physics_sha256": after.physics_sha256}
+        told |= {"network_sha256": _bundle().sha256} if name == "pd-hef" else {}
+        assert after.noise[name] == filter_tuning(tuple(best["values"].values())).model_copy(update=told)
         errors = record["estimators"][name]["rmse_deg"]
         assert best["objective_deg"] == pytest.approx(
             math.sqrt(math.hypot(errors["dlc"], 0.05) * math.hypot(errors["step"], 0.05)), rel=1e-9
@@ -241,7 +254,7 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
 
     runnable = {"phy-ukf-tuned": "phy-ukf-tuned", "physics-plus": "physics-plus", "pd-hef": "pd-hef-fixed-r"}
     shown = tuple(runnable[n] for n in names)
-    config = RunConfig(vehicle=tmp_path / "car.toml", model=tmp_path / "model", estimators=shown, annotate="none")
+    config = RunConfig(car=tmp_path / "mycar", network=tmp_path / "model", estimators=shown, annotate="none")
     rows = run_logs([str(drives / "dlc.mcap")], tmp_path / "out", config).results[0].rows
     rmse = {r.estimator: r.value for r in rows if (r.signal, r.segment, r.metric) == ("sideslip_rad", "all", "rmse")}
     for name in names:
@@ -253,26 +266,27 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
 def test_the_smoother_is_tuned_only_when_it_is_named_and_by_its_own_error(
     sample_logs_dir: Path, drives: Path, tmp_path: Path
 ) -> None:
-    bundle = _bundle()
-    assert "pd-hef-smoothed" not in choose_names(None, bundle)
-    with pytest.raises(UsageError, match="a model bundle"):
-        choose_names(("pd-hef-smoothed",), None)
-    bundle.save(tmp_path / "model")
-    vehicle = load_vehicle(sample_logs_dir / "vehicle.toml")
-    trusted = vehicle.model_copy(update={"network": Network(trust_cap=1.0, evidence="a test")})
-    (tmp_path / "trusted.toml").write_text(vehicle_to_toml(trusted, {}))
+    plain = Car.load(sample_logs_dir / "vehicle.toml", network="none")
+    assert "pd-hef-smoothed" not in choose_names(None, replace(plain, network=_bundle()), with_network=True)
+    with pytest.raises(UsageError, match="a network"):
+        choose_names(("pd-hef-smoothed",), plain, with_network=True)
+    _bundle().save(tmp_path / "model")
     names = ("pd-hef", "pd-hef-smoothed")
-    config = RunConfig(vehicle=tmp_path / "trusted.toml", model=tmp_path / "model")
-    run_tuning([str(drives)], tmp_path / "car.toml", TuneSettings(config, names, trials=4, split="validation"))
-    record = json.loads((tmp_path / "car.tuning.json").read_text())["estimators"]
+    # The network is trusted by hand, at 1: for any network.
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=tmp_path / "model")
+    assert Car.load(config.car, network=config.network).allowed_trust.cap == 1.0
+    settings = TuneSettings(config=config, names=names, trials=4, split="validation")
+    tune([str(drives)], tmp_path / "car.toml", settings)
+    record = json.loads((tmp_path / "car.noise.record.json").read_text())["estimators"]
     explored = {n: [t["values"] for t in record[n]["trials"] if t["stage"] == "sobol"] for n in names}
     assert explored["pd-hef"] == explored["pd-hef-smoothed"]
     assert [len(record[n]["trials"]) for n in names] == [4, 4]
-    tuned = load_vehicle(tmp_path / "car.toml").filter
+    tuned = Car.load(tmp_path / "car.toml").noise
     best = record["pd-hef-smoothed"]["trials"][record["pd-hef-smoothed"]["best_trial"]]
-    assert tuned["pd-hef-smoothed"] == filter_tuning(tuple(best["values"].values()))
+    found = filter_tuning(tuple(best["values"].values()))
+    assert (tuned["pd-hef-smoothed"].q_std, tuned["pd-hef-smoothed"].r_std) == (found.q_std, found.r_std)
 
-    config = replace(config, vehicle=tmp_path / "car.toml", estimators=("pd-hef-smoothed",), annotate="none")
+    config = replace(config, car=tmp_path / "car.toml", estimators=("pd-hef-smoothed",), annotate="none")
     rows = run_logs([str(drives / "dlc.mcap")], tmp_path / "out", config).results[0].rows
     (rmse,) = [r.value for r in rows if (r.signal, r.segment, r.metric) == ("sideslip_rad", "all", "rmse")]
     assert math.degrees(rmse) == pytest.approx(record["pd-hef-smoothed"]["rmse_deg"]["dlc"], rel=1e-12)
@@ -287,14 +301,14 @@ def test_processes_change_nothing_and_the_command_prints_json(
     for jobs in ("1", "2"):
         output = tmp_path / jobs / "car.toml"
         done = subprocess.run(
-            [sys.executable, "-m", "pdhef_logtool", "tune", str(drives), "--split", "validation", "-v", vehicle,
-             "-o", str(output), "-e", "phy-ukf-tuned", "--trials", "4", "--jobs", jobs, "--json"],
+            [sys.executable, "-m", "pdhef_logtool", "tune", str(drives), "--split", "validation", "--car", vehicle,
+             "--network", "none", "-o", str(output), "-e", "phy-ukf-tuned", "--trials", "4", "--jobs", jobs, "--json"],
             capture_output=True, text=True, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"},
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
         document = json.loads(done.stdout)
         assert document["estimators"]["phy-ukf-tuned"]["trials"] == 4
-        texts.append((output.read_text(), output.with_suffix(".tuning.json").read_text()))
+        texts.append((output.read_text(), output.with_name("car.noise.record.json").read_text()))
     assert texts[0] == texts[1]
 
 
@@ -302,7 +316,7 @@ def test_held_out_drives_are_refused(sample_logs_dir: Path, drives: Path, tmp_pa
     from pdhef_logtool.logs.discovery import find_logs
 
     with pytest.raises(UsageError, match=r"fishhook \(test\), sweep \(extrapolation\).*--any-split"):
-        run_tuning([str(drives)], tmp_path / "car.toml", _settings(sample_logs_dir, split=None))
+        tune([str(drives)], tmp_path / "car.toml", _settings(sample_logs_dir, split=None))
     assert not list(tmp_path.iterdir())
     logs = find_logs([str(drives)])
     with pytest.raises(UsageError, match=r"fishhook \(test\)"):
@@ -317,14 +331,14 @@ def test_held_out_drives_are_refused(sample_logs_dir: Path, drives: Path, tmp_pa
 def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_path: Path) -> None:
     logs = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "no_truth.mcap")]
     told: list[str] = []
-    result = run_tuning(
+    result = tune(
         logs, tmp_path / "car.toml", _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",)), warn=told.append
     )
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
     assert any("no_truth is left out" in line for line in told)
     with pytest.raises(EstimatorError, match="at least one drive with a true sideslip"):
-        run_tuning(logs[1:], tmp_path / "none.toml", _settings(sample_logs_dir, split=None))
+        tune(logs[1:], tmp_path / "none.toml", _settings(sample_logs_dir, split=None))
 
 
 def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: Path, tmp_path: Path) -> None:
@@ -333,7 +347,7 @@ def test_an_unreadable_log_stops_the_command_from_any_process(sample_logs_dir: P
     settings = _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",))
     for jobs in (1, 2):
         with pytest.raises(LogError, match=r"bad\.mcap"):
-            run_tuning(logs, tmp_path / "car.toml", settings, jobs=jobs)
+            tune(logs, tmp_path / "car.toml", settings, jobs=jobs)
     assert not (tmp_path / "car.toml").exists()
 
 
@@ -341,37 +355,63 @@ def test_drives_that_do_not_fit_are_refused(
     sample_logs_dir: Path, drives: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = _settings(sample_logs_dir, names=("phy-ukf-tuned",))
-    facts = run_tuning([str(drives)], tmp_path / "car.toml", settings).drives
-    assert all(f.bytes_held > 100 * f.scored_stamps for f in facts)
+    facts = tune([str(drives)], tmp_path / "car.toml", settings).drives
+    assert all(f.bytes_held > 100 * f.counts["scored_stamps"] for f in facts)
     monkeypatch.setattr(tune_drives, "MAX_BYTES", sum(f.bytes_held for f in facts) - 1)
     with pytest.raises(EstimatorError, match="--start and --end"):
-        run_tuning([str(drives)], tmp_path / "again.toml", settings)
+        tune([str(drives)], tmp_path / "again.toml", settings)
 
 
 def test_wrong_options_are_usage_errors(sample_logs_dir: Path, drives: Path, tmp_path: Path) -> None:
     settings = _settings(sample_logs_dir)
     wrong = [
         (replace(settings, trials=3), "at least 4 trials"),
-        (replace(settings, seed=-1), "seed"),
-        (replace(settings, config=RunConfig()), "a vehicle file"),
+        (replace(settings, config=RunConfig()), "a car"),
         (replace(settings, names=("zero",)), "estimators out of"),
-        (replace(settings, names=("pd-hef",)), "a model bundle"),
+        (replace(settings, names=("pd-hef",)), "a network"),
     ]
+    with pytest.raises(UsageError, match="seed"):
+        replace(settings, seed=-1)
     for one, message in wrong:
         with pytest.raises(UsageError, match=message):
-            run_tuning([str(drives)], tmp_path / "car.toml", one)
+            tune([str(drives)], tmp_path / "car.toml", one)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/notes.txt").write_text("no car")
     with pytest.raises(UsageError, match=r"ends in \.toml"):
-        run_tuning([str(drives)], tmp_path / "car", settings)
+        tune([str(drives)], tmp_path / "other", settings)
     with pytest.raises(UsageError, match="at least one process"):
-        run_tuning([str(drives)], tmp_path / "car.toml", settings, jobs=0)
+        tune([str(drives)], tmp_path / "car.toml", settings, jobs=0)
 
 
-def test_comments_of_the_vehicle_file_are_kept() -> None:
-    comments = {
-        "": "Written by hand.\nUnderstood by few.",
-        "mass_kg": "weighed # twice",
-        "tyres.front.B": "95 %: 1 to 2",
-        "sensors.ay_std_m_s2": "data sheet",
-    }
-    vehicle = default_vehicle().model_copy(update={"name": "a # b"})
-    assert read_comments(vehicle_to_toml(vehicle, comments)) == comments
+def test_noise_of_an_earlier_search_stays_without_its_score(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = [str(sample_logs_dir / "dlc.mcap")]
+    settings = _settings(sample_logs_dir, split=None)
+    tune(log, tmp_path / "mycar", replace(settings, names=("physics-plus",)))
+    first = Car.load(tmp_path / "mycar").noise["physics-plus"]
+    assert first.score_deg is not None
+    again = replace(settings, config=replace(settings.config, car=tmp_path / "mycar"), names=("phy-ukf-tuned",))
+    tune(log, tmp_path / "mycar", again)
+    noise = Car.load(tmp_path / "mycar").noise
+    # It is as good as it was, but was not compared with the other on the same drives.
+    assert noise["physics-plus"] == first.model_copy(update={"score_deg": None})
+    assert noise["phy-ukf-tuned"].score_deg is not None
+    tune(log, tmp_path / "mycar", again)
+    assert Car.load(tmp_path / "mycar").noise == noise
+
+
+def test_comments_of_the_vehicle_file_are_kept(sample_logs_dir: Path, tmp_path: Path) -> None:
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    text = text.replace("mass_kg = 1440.0", "mass_kg = 1440.0  # weighed # twice")
+    text = text.replace('name = "truthsim saloon"', 'name = "a # b"').replace(
+        "\n[sensors]", "\n# data sheet\n[sensors]"
+    )
+    (tmp_path / "guess.toml").write_text("# Written by hand.\n# Understood by few.\n" + text)
+    settings = _settings(sample_logs_dir, split=None, names=("phy-ukf-tuned",))
+    config = replace(settings.config, car=tmp_path / "guess.toml")
+    for output in ("car.toml", "mycar"):
+        tune([str(sample_logs_dir / "dlc.mcap")], tmp_path / output, replace(settings, config=config))
+    given = (tmp_path / "guess.toml").read_text()
+    assert (tmp_path / "mycar/vehicle.toml").read_text() == given
+    written = (tmp_path / "car.toml").read_text().splitlines()
+    assert [line for line in given.splitlines() if line not in written] == []
+    assert written[:2] == ["# Written by hand.", "# Understood by few."]

@@ -21,6 +21,8 @@ from pdhef_logtool.logs.source_copy import iterate_copy, register_channels, sour
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import OutputError
 
+pytestmark = pytest.mark.slow
+
 T0 = 1_700_000_000_000_000_000
 TEXT = b"float64 x\n"
 

@@ -12,6 +12,8 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import LogError, MappingError
 
+pytestmark = pytest.mark.slow
+
 # Their test fixtures carry a definition that is not the one the payloads were written with, or align a double to 4.
 _WRONG_DEFINITIONS = {
     ("ros2_rosbag2/rosbag2_py/test/resources/sqlite3/talker/talker.db3", "/rosout"),

@@ -12,6 +12,8 @@ from recorded import attribute, decoded_by_rosbags
 from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.open_log import open_log
 
+pytestmark = pytest.mark.slow
+
 REVS = "data/drives/revs_250lm_a.mcap"
 FAULTY = "data/drives/faulty"
 

@@ -13,6 +13,8 @@ import pytest
 
 from pdhef_logtool.logs.schema_files import message_definition, schema_file
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 OWN_MESSAGE = "pdhef_msgs/msg/VehicleStateEstimate"
 

@@ -21,6 +21,8 @@ from pdhef_logtool.logs.source_copy import (
 )
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 
+pytestmark = pytest.mark.slow
+
 T0 = 1_700_000_000_000_000_000
 
 

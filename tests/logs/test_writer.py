@@ -20,6 +20,8 @@ from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import LIBRARY, McapLogWriter, RawMessage, TopicBatch
 from pdhef_logtool.records.errors import MappingError, OutputError
 
+pytestmark = pytest.mark.slow
+
 ESTIMATE = "pdhef_msgs/msg/VehicleStateEstimate"
 T0 = 1_700_000_000_000_000_000
 

@@ -384,7 +384,7 @@ def test_frames_that_are_not_recognised_ask_for_the_field(tmp_path: Path, row: d
         ('[signals.speed_m_s]\ntopic = "/c"\nfield = "can:A.b"', r"needs \[can\]"),
         ('[can]\ndbc = "a.dbc"\n[signals.speed_m_s]\ntopic = "/c"\nfield = "can:A"', "can:<message>.<signal>"),
         ('[can]\ndbc = []', "can.dbc"),
-        ('[can]\ndbcs = "a.dbc"', "did you mean dbc"),
+        ('[can]\ndbcs = "a.dbc"', "did you mean can.dbc?"),
         ('[can]\ndbc = "a.dbc"\nbus = 1', "belong together"),
         ('[can]\ndbc = "a.dbc"\n[truth.quat_wxyz]\ntopic = "/c"\nfield = "can:A.b"', "is a vector"),
     ],

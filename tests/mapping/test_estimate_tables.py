@@ -49,10 +49,13 @@ def test_tables_are_read_and_written_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ('[estimates.a.sideslip]\ntopic = "/a"\nfield = "b"', "estimates.a.sideslip: unknown name"),
+        (
+            '[estimates.a.sideslip]\ntopic = "/a"\nfield = "b"',
+            "estimates.a.sideslip: unknown, did you mean estimates.a.sideslip_rad?",
+        ),
         ('[estimates.sideslip_rad]\ntopic = "/a"\nfield = "b"', "[estimates.NAME.sideslip_rad]"),
         ('[estimates.truth.vx_m_s]\ntopic = "/a"\nfield = "b"', "may not be called 'truth'"),
-        ('[estimates.a.vx_m_s]\ntopic = "/a"\nfeld = "b"', "feld: unknown entry"),
+        ('[estimates.a.vx_m_s]\ntopic = "/a"\nfeld = "b"', "feld: unknown, did you mean estimates.a.vx_m_s.field?"),
         ("estimates = 3", "estimates: must be"),
     ],
 )

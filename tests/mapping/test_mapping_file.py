@@ -82,13 +82,13 @@ def test_all_problems_come_in_one_line(tmp_path: Path) -> None:
     line = str(caught.value)
     assert "\n" not in line
     for part in (
-        "signals.yaw_rate_rads: unknown name (did you mean yaw_rate_rad_s?)",
+        "signals.yaw_rate_rads: unknown, did you mean signals.yaw_rate_rad_s?",
         "signals.vy_m_s: belongs under [truth.vy_m_s]",
         "signals.ax_m_s2.field: is missing",
-        "signals.ax_m_s2.fields: unknown entry (did you mean field?)",
+        "signals.ax_m_s2.fields: unknown, did you mean signals.ax_m_s2.field?",
         "signals.ax_m_s2.scale: ",
         "signals.ay_m_s2.stamp_unit: ",
-        "signal: unknown table (did you mean signals?)",
+        "signal: unknown, did you mean signals?",
     ):
         assert part in line, part
 

@@ -89,6 +89,7 @@ def test_wrong_bundles_are_one_clear_error(tmp_path: Path, damage: str) -> None:
         load_bundle(tmp_path)
 
 
+@pytest.mark.slow
 def test_service_equals_the_network_step_by_step() -> None:
     """The oracle runs PyTorch's own cell one step at a time."""
     bundle = make_bundle(hidden=12)

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.car.car import NO_INTERVALS, UNSURE, Car
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.table import default_names, make_estimator
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, model_folder, open_model
 from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES
-from pdhef_logtool.watches.intervals import find_calibration
 
 
 def test_models_are_found_by_name() -> None:
@@ -26,19 +27,32 @@ def test_models_are_found_by_name() -> None:
 
 
 def test_all_of_it_is_below_three_megabytes() -> None:
-    folder = SHIPPED_FOLDERS["default"].parent
+    folder = SHIPPED_FOLDERS["many-cars"].parent
+    assert SHIPPED_FOLDERS["default"].is_relative_to(folder)
     assert sum(f.stat().st_size for f in folder.rglob("*") if f.is_file()) < 3_000_000
 
 
 def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
-    model, folder = open_model(None), SHIPPED_FOLDERS["default"]
+    model, car = open_model(None), Car.load("saloon")
     assert model is not None
-    vehicle = load_vehicle(folder / "vehicle.toml")
-    assert vehicle.network.model_sha256 == model.sha256
-    assert vehicle.network.trust_cap == 1.0
-    assert {"phy-ukf-tuned", "physics-plus", "pd-hef"} <= set(vehicle.filter)
-    for chosen in (None, Path("unsure")):
-        calibration = find_calibration(chosen, None)
-        assert calibration is not None
-        assert calibration.model_sha256 == model.sha256
-        assert "pd-hef" in calibration.inflations
+    assert car.network is not None and car.network.sha256 == model.sha256
+    assert car.trust is not None and car.trust.network_sha256 == model.sha256
+    assert car.allowed_trust.cap == 1.0
+    assert car.notes == ()
+    assert {"phy-ukf-tuned", "physics-plus", "pd-hef"} <= set(car.noise)
+    assert {n.network_sha256 for n in car.noise.values()} == {None, model.sha256}
+    for chosen in (None, UNSURE):
+        intervals = Car.load("saloon", intervals=chosen).intervals
+        assert intervals is not None
+        by_name = {e.estimator: e.algorithm for e in intervals.entries}
+        assert by_name["pd-hef"].network_sha256 == model.sha256
+        assert by_name["pd-hef"].physics_sha256 == intervals.physics_sha256 == car.physics_sha256
+    assert Car.load("saloon", intervals=NO_INTERVALS).intervals is None
+
+
+def test_every_shipped_interval_is_of_what_runs_on_the_shipped_car() -> None:
+    car = Car.load("saloon")
+    assert car.intervals is not None
+    ran = {name: resolve(make_estimator(name, car)) for name in default_names(car)}
+    for entry in car.intervals.entries:
+        assert entry.algorithm == ran[entry.estimator], entry.estimator

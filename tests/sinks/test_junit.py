@@ -60,3 +60,16 @@ def test_file_appears_under_its_name_alone(tmp_path: Path) -> None:
     write_junit(tmp_path / "deep" / "gate.xml", VERDICTS)
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["gate.xml"]
     assert (tmp_path / "deep" / "gate.xml").read_bytes() == junit_bytes(VERDICTS)
+
+
+def test_the_figure_is_there_with_its_remark_and_a_failure_s_reason_is_not_said_twice() -> None:
+    remarked = Verdict("c", "ekf", LIMIT, "pass", 0.25, 0.25, 7, reason="few samples")
+    cases = ET.fromstring(junit_bytes({**VERDICTS, "c": [remarked]})).findall(".//testcase")
+    said = [case.findtext("system-out") for case in cases]
+    assert said == [
+        "value 0.4 deg, margin 0.1, n=10",
+        "value 2 deg, margin -1.5, n=10",
+        None,
+        None,
+        "value 0.25 deg, margin 0.25, n=7, few samples",
+    ]

@@ -37,10 +37,12 @@ OUR_TOPICS = {
 TOPICS = SOURCE_TOPICS | OUR_TOPICS
 NAMES = {"phy_ukf": "phy-ukf", "zero": "zero", "truth": "truth"}
 
+ALGORITHM = {"algorithm": "physics-ukf", "sha256": "ab" * 32, "options": {"slip_gate": True}}
 REPORT = {
     "format": "pdhef.report",
     "log": {"name": "drive", "end_ns": 1_700_000_006_000_000_123},
     "truth": {"available": True},
+    "estimators": [{"name": "phy-ukf", "algorithm": ALGORITHM}, {"name": "zero", "algorithm": None}],
     "metrics": [
         {
             "estimator": "phy-ukf",
@@ -65,6 +67,7 @@ REPORT = {
 METRICS = {
     "log": "drive",
     "truth": "available",
+    "phy-ukf/algorithm": json.dumps(ALGORITHM, sort_keys=True),
     "phy-ukf/sideslip_rad/all/rmse": "0.0125 rad n=588",
     "zero/sideslip_rad/nonlinear/rmse": "null rad n=0",
 }

@@ -74,6 +74,7 @@ METRIC_COLUMNS = {
     "value": pl.Float64,
     "unit": pl.String,
     "n": pl.Int64,
+    "algorithm": pl.String,
 }
 NAMES = ("phy-ukf", "zero", "truth")
 
@@ -297,7 +298,7 @@ def test_empty_log_gives_an_empty_table(tmp_path):
 
 
 ROWS = [
-    MetricRow("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600),
+    MetricRow("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600, algorithm="0123456789ab"),
     MetricRow("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", float("nan"), "rad", 0),
 ]
 
@@ -308,10 +309,20 @@ def test_polars_reads_the_metrics(tmp_path):
     frame = pl.read_parquet(path)
     assert list(frame.schema.items()) == list(METRIC_COLUMNS.items())
     assert frame.rows() == [
-        ("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600),
-        ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0),
+        ("drive", "phy-ukf", "sideslip_rad", "all", "rmse", 0.0123, "rad", 600, "0123456789ab"),
+        ("drive", "phy-ukf", "sideslip_rad", "nonlinear", "rmse", None, "rad", 0, ""),
     ]
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.parquet"]
+
+
+def test_metrics_of_an_older_version_name_no_algorithm(tmp_path):
+    path = tmp_path / "metrics.parquet"
+    write_metrics(path, ROWS)
+    pl.read_parquet(path).drop("algorithm").write_parquet(path)
+    assert [r.algorithm for r in read_metrics(path)] == ["", ""]
+    pl.read_parquet(path).drop("unit").write_parquet(path)
+    with pytest.raises(OutputError, match="without unit"):
+        read_metrics(path)
 
 
 def test_metrics_come_back(tmp_path):

@@ -20,6 +20,8 @@ from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.rerun import LONGEST_BRIDGE_NS, RerunSink, _Line, _Trajectory
 
 HASH = "0123456789abcdef" * 4
+#: Of one track only: the others have those of the palette.
+COLOURS = {"phy-ukf": 0x123456}
 START_NS = 1_700_000_000_000_000_123
 REPORT = {
     "log": {"name": "drive", "file": "drive.mcap", "kind": "mcap", "duration_s": 6.0, "sha256": HASH},
@@ -80,7 +82,7 @@ STATIC = {
 
 
 def write(path: Path, circle, circle_signals, events=EVENTS) -> None:
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
     for k in range(2):
         sink.append_signals(circle_signals(300 * k, 300))
         for name in ("phy-ukf", "truth", "zero"):
@@ -203,7 +205,8 @@ def test_values_stamps_bands_and_errors(recording, circle):
 def test_colours_are_the_same_in_every_plot(recording):
     _, static = tables(recording)
     for name in ("phy-ukf", "zero", "truth"):
-        r, g, b = colour_rgb(name)
+        r, g, b = colour_rgb(name, COLOURS)
+        assert name not in COLOURS or (r << 16) | (g << 8) | b == COLOURS[name]
         packed = (r << 24) | (g << 16) | (b << 8)
         for entity in (f"/sideslip_deg/{name}", f"/vx_m_s/{name}"):
             (batch,) = static[entity]
@@ -235,7 +238,7 @@ def test_events_and_report_are_text(recording):
 
 def test_weights_and_reasons_are_drawn_over_windows(tmp_path, circle):
     path = tmp_path / "recording.rrd"
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
     for k in range(5):
         sink.append(circle("pd-hef", 120 * k, 120, adaptive=True))  # the gyro is stuck over the first cut
         sink.append(circle("zero", 120 * k, 120))
@@ -282,7 +285,7 @@ def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
     track, truth = circle("zero", 0, 40), circle("truth", 5, 40)
     track.valid[20] = False
     truth.valid[25] = False  # stamp 30 of the track
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
     sink.append(track)
     sink.append(truth)
     sink.finish(REPORT)
@@ -296,18 +299,18 @@ def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
 
 def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
     path = tmp_path / "out" / "recording.rrd"
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
     sink.append(circle("zero"))
     assert not path.exists()
     sink.abort()
     sink.abort()
     assert list(path.parent.iterdir()) == []
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
     sink.append(circle("zero"))
     with pytest.raises(KeyError):
         sink.finish({})
     assert list(path.parent.iterdir()) == []
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
     sink.finish(REPORT)
     sink.abort()
     assert [p.name for p in path.parent.iterdir()] == ["recording.rrd"]
@@ -394,3 +397,16 @@ def test_a_trajectory_stays_small_and_evenly_spaced(lengths):
         assert strip[0, 0] == 0
         assert len(set(np.diff(strip[:, 0]))) == 1
         assert total - strip[-1, 0] <= np.diff(strip[:, 0])[0]
+
+
+def test_the_truth_stands_out_and_bands_stay_behind_the_lines(recording: Path) -> None:
+    _, static = tables(recording)
+
+    def widths(entity: str) -> list[float]:
+        (batch,) = static[entity]
+        (column,) = [n for n in batch.schema.names if n.endswith("widths")]
+        return list(batch.column(column).to_pylist()[0])
+
+    assert widths("/sideslip_deg/truth") == [2.0]
+    assert widths("/sideslip_deg/phy-ukf") == [1.5]
+    assert widths("/sideslip_deg/phy-ukf/band95") == [0.75, 0.75]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,9 @@ import polars as pl
 import pytest
 import torch
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle
-from pdhef_logtool.estimators.registry import make_estimator
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
@@ -25,13 +26,20 @@ from studies.conditions_page import choose_fixed
 from studies.error_budget import causes_of, drive_again, fit_vehicle, without
 from truthsim.vehicle_choice import choose_vehicle
 
+pytestmark = pytest.mark.slow
+
 NAMES = "zero,phy-ukf,pd-hef-fixed-r"
 ROWS = ("in-domain", "friction-plus-20", "gyro-dropped")
 
 
 @pytest.fixture(scope="module")
-def vehicle(sample_logs_dir: Path) -> VehicleParameters:
-    return load_vehicle(sample_logs_dir / "vehicle.toml")
+def car(sample_logs_dir: Path) -> Car:
+    return replace(Car.load(sample_logs_dir / "vehicle.toml", network="none"), network=_bundle())
+
+
+@pytest.fixture(scope="module")
+def vehicle(car: Car) -> VehicleParameters:
+    return car.vehicle
 
 
 def _bundle() -> ModelBundle:
@@ -45,14 +53,15 @@ def _bundle() -> ModelBundle:
 
 def _make(work: Path) -> int:
     arguments = ["--drives", "2", "--rows", ",".join(ROWS), "--jobs", "1", "--calibration-drives", "1"]
-    arguments += ["--budget-drives", "1", "--estimators", NAMES, "--model", str(work / "model")]
+    arguments += ["--budget-drives", "1", "--estimators", NAMES, "--car", "sample_logs/vehicle.toml"]
+    arguments += ["--network", str(work / "network")]
     return conditions.main([*arguments, "--work", str(work / "work"), "--out", str(work / "docs")])
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     work = tmp_path_factory.mktemp("conditions")
-    _bundle().save(work / "model")
+    _bundle().save(work / "network")
     assert _make(work) == 0
     return work
 
@@ -62,7 +71,7 @@ def _drives(folder: Path) -> tuple[Path, dict[str, Any]]:
     return found, json.loads((found / "manifest.json").read_text(encoding="utf-8"))
 
 
-def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(made, vehicle):
+def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(made, car, vehicle):
     page = (made / "docs" / "conditions.md").read_text(encoding="utf-8")
     assert all(f"| {row} |" in page for row in ROWS)
     assert "nan" not in page
@@ -70,8 +79,8 @@ def test_the_page_has_every_row_and_its_pooled_figure_is_that_of_the_samples(mad
     squares, count = 0.0, 0
     for entry in manifest["drives"]:
         if entry["row"] == "in-domain":
-            drive = read_drive(folder / entry["file"], vehicle, "x")
-            track, _ = make_estimator("zero", vehicle).run(drive.signals, None)
+            drive = read_drive(folder / entry["file"], car)
+            track, _ = make_estimator("zero", car).run(drive.signals, None)
             truth = drive.truth
             scored = track.valid & (np.hypot(truth.vx_m_s, truth.vy_m_s) > vehicle.low_speed_blend_m_s)
             squares += float(np.sum(truth.sideslip_rad[scored] ** 2))  # the error of sideslip 0
@@ -102,12 +111,12 @@ def test_a_second_call_computes_nothing_and_writes_the_same(made, monkeypatch):
     assert (made / "docs" / "conditions.md").read_bytes() == page
 
 
-def test_a_drive_made_again_is_that_of_the_log(made, vehicle):
+def test_a_drive_made_again_is_that_of_the_log(made, car, vehicle):
     folder, manifest = _drives(made)
     for entry in manifest["drives"][::2]:
         run = drive_again(entry)
         case = without(run, None, vehicle, {}, vehicle)
-        logged = read_drive(folder / entry["file"], vehicle, "x")
+        logged = read_drive(folder / entry["file"], car)
         for f in fields(Signals):
             ours, theirs = getattr(case.signals, f.name), getattr(logged.signals, f.name)
             if f.name == "available":
@@ -159,21 +168,21 @@ def test_a_fitted_file_has_the_mass_and_the_stiffness_of_the_car(made, vehicle):
     assert soft / stiff == pytest.approx(0.85, rel=0.08)
 
 
-def test_told_and_bins(made, vehicle):
+def test_told_and_bins(made, car):
     folder, manifest = _drives(made)
-    drive = read_drive(folder / manifest["drives"][0]["file"], vehicle, "x")
+    drive = read_drive(folder / manifest["drives"][0]["file"], car)
     assert np.isnan(told(drive, {"friction": "unknown"}).friction).all()
-    np.testing.assert_allclose(told(drive, {"friction_factor": 0.8}).friction, 0.8 * drive.friction)
+    np.testing.assert_allclose(told(drive, {"friction_factor": 0.8}).friction, 0.8 * drive.signals.friction)
     with pytest.raises(ValueError, match="expected"):
         told(drive, {"weather": "rain"})
     masks = bin_masks(drive)
     assert (sum(masks[b].astype(int) for b in ("low", "middle", "high")) == 1).all()
 
 
-def test_a_point_of_the_grid_is_the_estimator_with_that_setting(made, vehicle):
+def test_a_point_of_the_grid_is_the_estimator_with_that_setting(made, car):
     folder, manifest = _drives(made)
-    drive = read_drive(folder / manifest["drives"][0]["file"], vehicle, "x")
-    base = make_estimator(fixed_grid.BASE, vehicle, model=_bundle())
+    drive = read_drive(folder / manifest["drives"][0]["file"], car)
+    base = make_estimator(fixed_grid.BASE, car)
     whole, _ = base.run(drive.signals, None)
     rate, _, _ = base.residual_rate(drive.signals, None)
     shared, _ = fixed_grid.at(base, fixed_grid.Setting(1.0, 1.0, 1.0)).filter.run(drive.signals, None, rate)

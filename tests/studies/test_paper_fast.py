@@ -10,12 +10,13 @@ import math
 import numpy as np
 import pytest
 
-from pdhef_logtool.car.vehicle import default_vehicle, load_vehicle
-from studies.paper.__main__ import SHIPPED, is_model, vehicle_file
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import default_vehicle
 from studies.paper.comparison import improvement, spread
 from studies.paper.experiment import FIRST_NOISE_SEED, A, B, Experiment, Run, run_experiment
 from studies.paper.page import number, percent
-from studies.paper.results import load_models
+
+pytestmark = pytest.mark.slow
 
 #: Largest sideslip RMSE in degrees by scenario and scheme.
 SIDESLIP_BOUNDS_DEG: dict[tuple[str, str], float] = {
@@ -38,15 +39,8 @@ SCHEMES = ("zero", "gyro", "phy-ukf", "phy-ukf-tuned", "pd-hef-fixed-r", "pd-hef
 
 @pytest.fixture(scope="module")
 def shipped() -> Experiment:
-    if not is_model(SHIPPED):
-        pytest.skip("this version ships no network (pdhef_logtool/models/default)")
-    return run_experiment(
-        load_vehicle(vehicle_file(SHIPPED)),
-        load_models({0: SHIPPED}),
-        scenarios=(A, B),
-        noise_seeds=(FIRST_NOISE_SEED,),
-        names=SCHEMES,
-    )
+    cars = {0: Car.load("saloon")}
+    return run_experiment(cars, scenarios=(A, B), noise_seeds=(FIRST_NOISE_SEED,), names=SCHEMES)
 
 
 def test_sideslip_stays_below_its_bounds(shipped: Experiment) -> None:
@@ -65,7 +59,7 @@ def test_the_hybrid_filter_keeps_its_gain(shipped: Experiment, key: tuple[str, s
 
 def test_drives_are_the_papers() -> None:
     """A scenario is judged on its own truth: 0.7 g in A, at least 0.9 μ g in B, the sensors differ by seed alone."""
-    drives = run_experiment(default_vehicle(), (), noise_seeds=(1, 2), scenarios=(A, B)).facts
+    drives = run_experiment({0: Car.of(default_vehicle())}, noise_seeds=(1, 2), scenarios=(A, B), names=()).facts
     a, b = ([f for f in drives if f["scenario"] == s] for s in ("A", "B"))
     assert [f["peak_ay_g"] for f in a] == [pytest.approx(0.7, abs=0.01)] * 2
     assert all(float(str(f["peak_ay_g"])) >= 0.9 * 0.3 for f in b)
@@ -76,7 +70,7 @@ def test_drives_are_the_papers() -> None:
 def _experiment(ours: dict[tuple[int, int | None], float], theirs: dict[int, float]) -> Experiment:
     runs = [Run("A", noise, "ours", seed, {"sideslip_deg": v}) for (noise, seed), v in ours.items()]
     runs += [Run("A", noise, "theirs", None, {"sideslip_deg": v}) for noise, v in theirs.items()]
-    return Experiment(tuple(runs), {}, frozenset({"ours"}), {}, {}, ())
+    return Experiment(tuple(runs), {}, {}, {}, ())
 
 
 def test_improvement_is_that_of_pooled_errors_and_pairs_the_noise_seeds() -> None:

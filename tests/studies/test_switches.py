@@ -39,7 +39,7 @@ def drive() -> ConditionDrive:
         "truth", stamps, vx_m_s=np.full(COUNT, 20.0), vy_m_s=20.0 * np.tan(beta),
         yaw_rate_rad_s=signals.yaw_rate_rad_s, ay_m_s2=signals.ay_m_s2, valid=np.ones(COUNT, dtype=np.bool_),
     )  # fmt: skip
-    return ConditionDrive("weave", signals, truth, signals.friction)
+    return ConditionDrive("weave", signals, truth, 3.0)
 
 
 def line(on: list[float], off: list[float], *, default: bool = True) -> switches.Line:
@@ -86,11 +86,11 @@ def test_options_reach_both_filters_of_the_hybrid() -> None:
 def test_both_sides_are_scored_where_both_say_something(drive: ConditionDrive) -> None:
     ukf = PhysicsUkf(VEHICLE)
     switch = switches.Switch("x", "stops", switches.run_plain, switches.run_unpredicted, {})
-    on, off, samples = switches.compare(switch, ukf, drive, 3.0)
+    on, off, samples = switches.compare(switch, ukf, drive)
     assert samples == switches.run_unpredicted(ukf, drive).valid.sum()
     assert on != off
     same = switches.Switch("x", "stops", switches.run_plain, switches.run_plain, {})
-    assert switches.compare(same, ukf, drive, 3.0)[0] == switches.compare(same, ukf, drive, 3.0)[1]
+    assert switches.compare(same, ukf, drive)[0] == switches.compare(same, ukf, drive)[1]
 
 
 def test_harm_is_said_and_so_is_a_better_setting_than_the_shipped_one(monkeypatch: pytest.MonkeyPatch) -> None:

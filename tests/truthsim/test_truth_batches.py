@@ -18,6 +18,8 @@ from truthsim.vehicle import Vehicle
 from truthsim.vehicle_choice import choose_vehicle
 from truthsim.vehicle_files import load_vehicle
 
+pytestmark = pytest.mark.slow
+
 
 def digests(folder: Path) -> dict[str, str]:
     return {

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shutil
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from studies import truthsim_docs
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "truthsim.md").read_text(encoding="utf-8")
@@ -22,13 +24,8 @@ def blocks(page: str) -> dict[str, str]:
 
 @pytest.fixture
 def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location("truthsim_docs", ROOT / "studies" / "truthsim_docs.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "truthsim_docs", module)
-    spec.loader.exec_module(module)
-    monkeypatch.setattr(module, "INDEPENDENT", tmp_path / "absent")
-    return module
+    monkeypatch.setattr(truthsim_docs, "INDEPENDENT", tmp_path / "absent")
+    return truthsim_docs
 
 
 def test_the_page_is_what_the_command_makes(command: ModuleType, tmp_path: Path) -> None:
@@ -49,4 +46,4 @@ def test_the_page_is_what_the_command_makes(command: ModuleType, tmp_path: Path)
 
 def test_a_block_without_its_place_is_an_error(command: ModuleType) -> None:
     with pytest.raises(SystemExit, match="gradients"):
-        command.fill("no comments here", {"gradients": "x"})
+        command.fill("no comments here", {"gradients": "x"}, "page.md")

@@ -52,6 +52,7 @@ def test_the_catalogue_has_every_manoeuvre() -> None:
     assert all(m.name == name and m.description and m.duration_s > 0.0 for name, m in MANOEUVRES.items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MANOEUVRES)
 def test_every_manoeuvre_reaches_what_it_is_for_without_a_spin(name: str) -> None:
     manoeuvre = MANOEUVRES[name]
@@ -265,6 +266,7 @@ def test_the_driver_keeps_to_the_road() -> None:
         assert gap.min() < 0.6
 
 
+@pytest.mark.slow
 def test_seeds_make_other_roads_and_other_noise_and_repeat(road: Drive) -> None:
     again = simulate_drive("road", seed=3, duration_s=120.0)
     other = simulate_drive("road", seed=4, duration_s=120.0)

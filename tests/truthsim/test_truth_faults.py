@@ -20,6 +20,8 @@ from truthsim.recording import PARTS
 from truthsim.sensors import STEER_PHASE_S, WHEEL_PHASE_S, SensorChannel, SensorNoise, sense
 from truthsim.vehicle import Vehicle
 
+pytestmark = pytest.mark.slow
+
 DURATION_S = 30.0
 
 

@@ -28,6 +28,8 @@ from truthsim.manoeuvres import MANOEUVRES, Plan, Request
 from truthsim.motion import Motion, simulate_motion
 from truthsim.vehicle import OBSERVED, Vehicle
 
+pytestmark = pytest.mark.slow
+
 G = 9.80665
 CAR = Vehicle()
 LF, LR, L, M, TRACK, H_CG, RADIUS = 1.16, 1.71, 2.87, 1440.0, 1.57, 0.64, 0.30  # the paper's Table 3

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
-import sys
 import tomllib
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,10 +13,13 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pdhef_logtool.car.vehicle import load_vehicle
+from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.records.errors import OutputError
+from studies.defaults import fit_nominal_tyres
 from truthsim.drive import START_NS, Drive, simulate_drive, write_drive
 from truthsim.samples import SAMPLES, write_sample, write_samples
+
+pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[2]
 TYPES = {
@@ -259,18 +259,8 @@ def test_write_samples_repeats_itself_bit_for_bit(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "a" / "manifest.toml").read_bytes() == manifests[0]
 
 
-@pytest.fixture(scope="module")
-def fitting() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fit_nominal_tyres", ROOT / "studies" / "defaults" / "fit_nominal_tyres.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_vehicle_files_are_the_fit_to_the_truth_vehicle(fitting: ModuleType, tmp_path: Path) -> None:
-    fitting.main(tmp_path)
+def test_vehicle_files_are_the_fit_to_the_truth_vehicle(tmp_path: Path) -> None:
+    fit_nominal_tyres.main(tmp_path)
     for name, friction in (("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)):
         old, new = load_vehicle(ROOT / "sample_logs" / name), load_vehicle(tmp_path / name)
         assert old.friction == new.friction == friction
@@ -280,11 +270,9 @@ def test_vehicle_files_are_the_fit_to_the_truth_vehicle(fitting: ModuleType, tmp
 
 
 @pytest.mark.parametrize(("name", "friction"), [("vehicle.toml", 0.85), ("vehicle_mu03.toml", 0.3)])
-def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(
-    fitting: ModuleType, name: str, friction: float
-) -> None:
+def test_vehicle_file_gives_the_truth_s_axle_forces_and_understeer(name: str, friction: float) -> None:
     vehicle = load_vehicle(ROOT / "sample_logs" / name)
-    for axle, (alpha, force) in fitting.axle_curves(fitting.ramp(friction)).items():
+    for axle, (alpha, force) in fit_nominal_tyres.axle_curves(fit_nominal_tyres.ramp(friction)).items():
         b, c, d, e = vehicle.magic_formula(axle == "front", friction)
         x = b * alpha
         model = d * np.sin(c * np.arctan(x - e * (x - np.arctan(x))))

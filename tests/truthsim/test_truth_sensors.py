@@ -52,6 +52,7 @@ def test_noise_is_student_t_with_four_degrees_of_freedom_scaled_to_sigma() -> No
     assert stats.kurtosis(noise) > 3.0  # a normal distribution has 0
 
 
+@pytest.mark.slow
 def test_white_noise_of_each_channel_has_the_stated_sigma(straight: Motion) -> None:
     clean, noisy = (sense(straight, Vehicle(), n, 5, 100) for n in (NO_NOISE, WHITE_ONLY))
     for channel, field, sigma in (
@@ -250,6 +251,7 @@ def test_the_bus_loses_its_share_of_messages(straight: Motion) -> None:
     assert np.array_equal(lossy["rtk"].times_s, usual["rtk"].times_s)
 
 
+@pytest.mark.slow
 def test_the_steering_ratio_is_known_to_its_share(lane_change: Motion) -> None:
     clean = lane_change.column("steer_rad", 1)
     gains = [

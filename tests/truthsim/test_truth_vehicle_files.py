@@ -46,13 +46,13 @@ def test_vehicles_differ_in_what_they_are() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("mass_kg = 1440.0\n", "", ("mass_kg", "nothing", "required")),
+        ("mass_kg = 1440.0\n", "", ("mass_kg: is missing",)),
         ("mass_kg = 1440.0", "mass_kg = -1.0", ("mass_kg", "-1.0", "greater than 0")),
         ("mass_kg = 1440.0", 'mass_kg = "heavy"', ("mass_kg", "heavy", "number")),
         ("mass_kg = 1440.0", "mass_kg = nan", ("mass_kg", "nan", "finite")),
-        ("track_m = ", "trakc_m = ", ("track_m",)),
+        ("track_m = ", "trakc_m = ", ("track_m: is missing", "trakc_m: unknown, did you mean track_m?")),
         ("ackermann = 0.5", "ackermann = 1.5", ("ackermann", "1.5")),
-        ("[rear_tyre]", "[rear_tire]", ("rear_tyre",)),
+        ("[rear_tyre]", "[rear_tire]", ("rear_tire: unknown, did you mean rear_tyre?",)),
         ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 400.0", ("unsprung",)),
         ("front_unsprung_mass_kg = 35.0", "front_unsprung_mass_kg = 1.0", ("300 rad/s",)),
         ("cg_height_m = 0.64", "cg_height_m = 6.4", ("upright",)),

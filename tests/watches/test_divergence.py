@@ -18,19 +18,23 @@ from hypothesis import strategies as st
 from reference_car import cut, make_signals
 from rich.console import Console
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle, load_vehicle
-from pdhef_logtool.cli.summary import render_run
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
+from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveReader, plan_drive
-from pdhef_logtool.estimators.registry import make_estimator
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.run.pipeline import run_logs
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
 from pdhef_logtool.sinks.report import diverged_line, report_markdown
 from pdhef_logtool.watches.divergence import DivergenceCarry, DivergenceWatch, wrong_branch
 from truthsim.drive import simulate_drive, write_drive
+
+pytestmark = pytest.mark.slow
 
 IMU_X_M, IMU_Y_M = 0.8, -0.3
 VEHICLE = default_vehicle().model_copy(update={"imu_position_m": (IMU_X_M, IMU_Y_M, 0.0)})
@@ -227,7 +231,7 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
     sweep: Path, sample_logs_dir: Path, tmp_path: Path
 ) -> None:
     names = ("phy-ukf", "physics-plus", "zero")
-    config = RunConfig(vehicle=sample_logs_dir / "vehicle_mu03.toml", estimators=names, annotate="none")
+    config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, annotate="none")
     result = run_logs([str(sweep)], tmp_path, config)
     folder = tmp_path / "logs" / "sweep"
     table = pl.read_parquet(folder / "estimates.parquet")
@@ -268,7 +272,7 @@ def test_the_filter_itself_sees_it_later(sweep: Path, sample_logs_dir: Path) -> 
     """What the watch adds: its flag stands before that of the filter's own innovations."""
     vehicle = load_vehicle(sample_logs_dir / "vehicle_mu03.toml")
     signals = read_signals(sweep, vehicle)
-    track, _ = make_estimator("phy-ukf", vehicle).run(signals, None)
+    track, _ = make_estimator("phy-ukf", Car.of(vehicle)).run(signals, None)
     own, seen = (int(np.flatnonzero(f)[0]) for f in (track.diverged, flags(track, signals, vehicle)))
     assert (signals.stamps_ns[own] - signals.stamps_ns[seen]) * 1e-9 > 0.3
 

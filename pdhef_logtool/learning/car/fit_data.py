@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.learning.drives import DriveRecord, load_drive
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.signals import Signals, cut_signals
+from pdhef_logtool.records.tracks import StateTrack
 
 #: Between the fit part and the held-out part: filter states and slow disturbances must have forgotten the former.
 GUARD_S = 5.0
@@ -23,7 +23,8 @@ class FitDrive:
     """One drive, or a part of it: signals [N] and truth [N] at the same stamps.
 
     ``signals`` are as measured: no bias and no offset of a vehicle file is taken off.
-    ``independent_yaw_rate`` tells that the truth's yaw rate is not the gyro itself.
+    ``independent_yaw_rate`` tells that the truth's yaw rate is not the gyro itself, ``steering_wheel`` that the log
+    has the steering wheel's angle in place of the road wheels'.
     """
 
     name: str
@@ -31,6 +32,7 @@ class FitDrive:
     truth: StateTrack
     independent_yaw_rate: bool
     log_start_ns: int
+    steering_wheel: bool = False
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -46,35 +48,21 @@ class FitDrive:
 
 
 def load_fit_drive(
-    name: str,
-    log: DriveLog,
-    mapping: Mapping,
-    vehicle: VehicleParameters,
-    start_ns: int,
-    end_ns: int,
-    progress: Callable[[float], None] = lambda _share: None,
-) -> FitDrive | None:
-    """Read a slice of a log; None when it has no truth from which a sideslip follows.
+    log_input: LogInput, car: Car, mapping: Mapping | None, options: ReadOptions
+) -> tuple[DriveRecord, FitDrive | None]:
+    """Read a slice of a log; None, and the reason in the record, when it has no true sideslip.
 
-    The vehicle gives geometry only (lever arms, steering ratio, wheel radius).
+    The car gives geometry only (lever arms, steering ratio, wheel radius).
     """
+    vehicle = car.vehicle
     sensors = vehicle.sensors.model_copy(update={"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0})
     as_measured = vehicle.model_copy(update={"steer_offset_rad": 0.0, "sensors": sensors})
-    plan = plan_drive(log, mapping, as_measured, start_ns, end_ns)
-    if plan.truth is None:
-        return None
-    signals, truth = [], []
-    for window in DriveReader(log, plan, 600.0).windows():
-        if len(window.signals) and window.truth is not None:
-            signals.append(window.signals)
-            truth.append(window.truth)
-        progress(window.share_done)
-    if not signals:
-        return None
-    joined = concatenate(truth)
-    if not np.isfinite(joined.sideslip_rad).any():
-        return None
-    return FitDrive(name, join_signals(signals), joined, "yaw_rate_rad_s" not in plan.dependent, log.start_ns)
+    record, whole = load_drive(log_input, car.with_vehicle(as_measured), mapping, replace(options, friction=None))
+    if whole is None or whole.truth is None:
+        return record, None
+    independent = "yaw_rate_rad_s" not in whole.plan.dependent
+    by_wheel = "steer_rad" not in whole.plan.mapping.signals
+    return record, FitDrive(record.name, whole.signals, whole.truth, independent, whole.log_start_ns, by_wheel)
 
 
 def split_drive(drive: FitDrive, holdout: float) -> tuple[FitDrive, FitDrive | None]:
@@ -89,12 +77,8 @@ def split_drive(drive: FitDrive, holdout: float) -> tuple[FitDrive, FitDrive | N
 
 
 def _part(drive: FitDrive, a: int, b: int) -> FitDrive:
-    signals = Signals(
-        **{f.name: getattr(drive.signals, f.name)[a:b] for f in fields(Signals) if f.name != "available"},
-        available=drive.signals.available,
-    )
     columns = {}
     for f in fields(StateTrack):
         value = getattr(drive.truth, f.name)
         columns[f.name] = value if f.name == "name" or value.shape[0] != len(drive.truth) else value[a:b]
-    return FitDrive(drive.name, signals, StateTrack(**columns), drive.independent_yaw_rate, drive.log_start_ns)
+    return replace(drive, signals=cut_signals(drive.signals, a, b), truth=StateTrack(**columns))

@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, FilterTuning, Tyres, VehicleParameters, correct_signals
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, Tyres, VehicleParameters, correct_signals
 from pdhef_logtool.estimators.pass_through import PassThrough
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
-from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.axle_forces import (
@@ -110,12 +110,19 @@ class PartScore:
     start_file_deg: float
     identified_deg: float
 
+    def to_dict(self) -> dict[str, float]:
+        """Return the figures as they stand with the car."""
+        figures = {"seconds": self.seconds, "zero_deg": self.zero_deg}
+        figures |= {"starting_car_deg": self.start_file_deg, "identified_deg": self.identified_deg}
+        return {name: round(value, 4) for name, value in figures.items()}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
-    """Everything that identification found."""
+    """Everything that identification found; ``noise`` is that of ``phy-ukf-tuned``."""
 
     vehicle: VehicleParameters
+    noise: FilterNoise
     parameters: tuple[Identified, ...]
     scores: tuple[PartScore, ...]
     samples: AxleSamples
@@ -125,7 +132,7 @@ class Identification:
 Progress = Callable[[str, float], None]
 
 
-def identify(
+def fit_car(
     fit: Sequence[FitDrive],
     held_out: Sequence[FitDrive],
     start: VehicleParameters,
@@ -170,11 +177,11 @@ def identify(
             if excited.all():
                 break
             active, theta = excited, np.where(excited, theta, np.clip(0.0, _low_theta(priors), None))
-    vehicle = build_vehicle(start, priors, theta, digits=6)
+    vehicle, noise = build_vehicle(start, priors, theta, digits=6)
     progress("scoring", 0.95)
-    scores = [_score("fit", fit, start, vehicle)]
+    scores = [_score("fit", fit, start, vehicle, noise)]
     if held_out:
-        scores.append(_score("held out", held_out, start, vehicle))
+        scores.append(_score("held out", held_out, start, vehicle, noise))
     parameters = tuple(
         Identified(
             name=p.name,
@@ -188,7 +195,7 @@ def identify(
         )
         for p, t, s, a in zip(priors, theta, std, active, strict=True)
     )
-    return Identification(vehicle, parameters, tuple(scores), samples, _notes(parameters, fit, usable_s))
+    return Identification(vehicle, noise, parameters, tuple(scores), samples, _notes(parameters, fit, usable_s))
 
 
 def make_priors(
@@ -242,8 +249,8 @@ def make_priors(
 
 def build_vehicle(
     start: VehicleParameters, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
-) -> VehicleParameters:
-    """Return the starting file with the parameters at ``theta`` and the filter tuning that belongs to them.
+) -> tuple[VehicleParameters, FilterNoise]:
+    """Return the starting file with the parameters at ``theta``, and the filter noise that belongs to them.
 
     ``digits`` : significant digits of every number that is written.
     """
@@ -263,7 +270,7 @@ def build_vehicle(
     sensors = start.sensors.model_copy(
         update={"ay_bias_m_s2": v["a_y bias"], "yaw_rate_bias_rad_s": v["yaw rate bias"]}
     )
-    tuning = FilterTuning(
+    noise = FilterNoise(
         q_std=(PHY_UKF_Q_STD[0], v["q v_y"], v["q yaw rate"], PHY_UKF_Q_STD[3]),
         r_std={
             "ay_m_s2": v["r a_y"],
@@ -271,7 +278,7 @@ def build_vehicle(
             "speed_m_s": start.sensors.speed_std_m_s,
         },
     )
-    return start.model_copy(
+    vehicle = start.model_copy(
         update={
             "yaw_inertia_kg_m2": v["yaw inertia"],
             "steer_offset_rad": v["steering offset"],
@@ -280,9 +287,9 @@ def build_vehicle(
             "friction": friction,
             "sensors": sensors,
             "tyres": Tyres(front=tyre("front"), rear=tyre("rear")),
-            "filter": {**start.filter, TUNED: tuning},
         }
     )
+    return vehicle, noise
 
 
 # ---- the fit ----
@@ -394,8 +401,8 @@ def _sideslip_errors(
     drives: Sequence[FitDrive], start: VehicleParameters, priors: Sequence[Prior], theta: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
     """Return by drive the filter's sideslip errors in rad at ``FIT_RATE_HZ`` and their weights, 0 = does not count."""
-    vehicle = build_vehicle(start, priors, theta)
-    estimator = physics_ukf_tuned(vehicle)
+    vehicle, noise = build_vehicle(start, priors, theta)
+    estimator = physics_ukf_tuned(vehicle, noise)
     parts = []
     for drive in drives:
         steps, _ = estimator.filter_steps(_signals_of(drive, start, vehicle), None)
@@ -420,7 +427,13 @@ def _signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParam
 # ---- the verdict ----
 
 
-def _score(part: str, drives: Sequence[FitDrive], start: VehicleParameters, identified: VehicleParameters) -> PartScore:
+def _score(
+    part: str,
+    drives: Sequence[FitDrive],
+    start: VehicleParameters,
+    identified: VehicleParameters,
+    noise: FilterNoise,
+) -> PartScore:
     """Score β = 0, the frozen filter with the starting file, and the tuned filter with the identified one."""
     squares = np.zeros(3)
     counts = np.zeros(3)
@@ -430,7 +443,7 @@ def _score(part: str, drives: Sequence[FitDrive], start: VehicleParameters, iden
         tracks = (
             PassThrough("zero", claims_zero_sideslip=True).run(before, None)[0],
             PhysicsUkf(start).run(before, None)[0],
-            physics_ukf_tuned(identified).run(_signals_of(drive, start, identified), None)[0],
+            physics_ukf_tuned(identified, noise).run(_signals_of(drive, start, identified), None)[0],
         )
         for i, track in enumerate(tracks):
             error = signal_error(track, drive.truth, "sideslip_rad", slow)

@@ -7,19 +7,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.car.vehicle import Network, VehicleParameters, default_vehicle, load_vehicle, vehicle_to_toml
+from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.store import Change, Content, check_output, write_change
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
-from pdhef_logtool.learning.car.identify import Identification, Identified, identify, understeer_deg_per_g
+from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    LearnResult,
+    config_document,
+    no_drive,
+    open_mapping,
+    tell_drive,
+)
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.logs.open_log import open_log
-from pdhef_logtool.mapping import choose_mapping, load_mapping
-from pdhef_logtool.records.errors import EstimatorError, OutputError, UsageError
-from pdhef_logtool.run.config import RunConfig, time_slice
-from pdhef_logtool.sinks.base import write_bytes
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.residual_model.bundle import NO_MODEL
+from pdhef_logtool.runs.config import RunConfig
 
-#: Other tyres, another nominal model: what was found with those of the starting file counts no more.
-NO_NETWORK_TRIED = "no network was tried on this vehicle"
 #: Entry of vehicle.toml that a parameter's interval is written beside.
 _ENTRIES = {
     "yaw inertia": "yaw_inertia_kg_m2",
@@ -33,20 +40,17 @@ _ENTRIES = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class IdentifyResult:
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class IdentifyResult(LearnResult):
     """What the command found and wrote."""
 
     identification: Identification
-    vehicle_file: Path
-    plot_file: Path
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         found = self.identification
         return {
-            "vehicle": str(self.vehicle_file),
-            "plot": str(self.plot_file),
+            **super(IdentifyResult, self).to_dict(),
             "parameters": [
                 {
                     "name": p.name,
@@ -74,7 +78,7 @@ class IdentifyResult:
         }
 
 
-def run_identification(
+def identify(
     arguments: Sequence[str],
     output: Path,
     config: RunConfig,
@@ -83,7 +87,7 @@ def run_identification(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> IdentifyResult:
-    """Identify a vehicle on logs with truth; write ``output`` (vehicle.toml) and a plot beside it.
+    """Identify a car on logs with truth; write ``output`` (its folder, or a flat .toml) with a plot of the fit.
 
     Parameters
     ----------
@@ -99,92 +103,70 @@ def run_identification(
     """
     if not 0.0 <= holdout < 0.9:
         raise UsageError(expected="a share from 0 to 0.9", got=f"{holdout:g}", where="--holdout")
-    if output.suffix != ".toml":
-        raise UsageError(expected="a file name that ends in .toml", got=output.name, where="--output")
-    start = default_vehicle() if config.vehicle is None else load_vehicle(config.vehicle)
-    if config.vehicle is None:
-        warn(f"no --vehicle: mass, geometry and priors are those of the default {start.name}")
-    given = None if config.mapping is None else load_mapping(config.mapping)
+    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    start = car.own
+    check_output(car, output)
+    if config.car is None:
+        warn(f"no --car: mass, geometry and priors are those of the default {start.name}")
+    given = open_mapping(config)
     fit: list[FitDrive] = []
     held_out: list[FitDrive] = []
-    steering_wheel = False
+    records: list[DriveRecord] = []
     logs = find_logs(arguments)
     for number, log_input in enumerate(logs):
         progress(f"reading {log_input.stem}", 0.2 * number / len(logs))
-
-        def tell(text: str, name: str = log_input.stem) -> None:
-            warn(f"{name}: {text}")
-
-        log = open_log(log_input.path)
-        try:
-            mapping, _ = choose_mapping(
-                log,
-                given,
-                tell,
-                prefer_truth=config.prefer_truth,
-            )
-            drive = load_fit_drive(log_input.stem, log, mapping, start, *time_slice(config, log.start_ns, log.end_ns))
-            steering_wheel = steering_wheel or "steer_rad" not in mapping.signals
-            for loss in log.lost:
-                tell(f"{loss.what} ({loss.where})")
-        finally:
-            log.close()
+        record, drive = load_fit_drive(log_input, Car.of(start), given, config.read_options)
+        records.append(record)
+        tell_drive(record, warn)
         if drive is None:
-            tell("no truth from which a sideslip follows; not used")
             continue
         kept, scored = split_drive(drive, holdout)
         fit.append(kept)
         if scored is not None:
             held_out.append(scored)
     if not fit:
-        raise EstimatorError(
-            expected="at least one drive with truth velocities",
-            got="none",
-            where="identify",
-            remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-        )
-    found = identify(
+        raise no_drive("truth velocities", "identify")
+    found = fit_car(
         fit,
         held_out,
         start,
-        steering_wheel=steering_wheel,
+        steering_wheel=any(drive.steering_wheel for drive in fit),
         progress=lambda text, share: progress(text, 0.2 + 0.8 * share),
     )
-    name = f"{start.name} (identified)" if not start.name.endswith("(identified)") else start.name
-    vehicle = found.vehicle.model_copy(
-        update={
-            "name": name,
-            "network": Network(trust_cap=0.0, evidence=NO_NETWORK_TRIED),
-            "identification": _provenance(found, fit, holdout, start),
-        }
+    fitted = found.vehicle
+    drives = tuple(
+        LearntOn(name=d.name, sha256=r.sha256, start_s=round(d.span_s[0], 2), end_s=round(d.span_s[1], 2))
+        for d, r in zip(fit, (r for r in records if not r.left_out), strict=True)
     )
-    write_bytes(output, vehicle_to_toml(vehicle, _comments(found)).encode())
-    plot = output.with_suffix(".png")
-    from pdhef_logtool.learning.car.identify_plot import plot_identification
+    part = Fit(
+        physics_sha256=physics_sha256(start),
+        values=FittedValues.between(start, fitted),
+        filter={TUNED: found.noise.model_copy(update={"physics_sha256": physics_sha256(fitted)})},
+        drives=drives,
+        scores={s.part: s.to_dict() for s in found.scores},
+        notes=found.notes,
+    )
+    head = (
+        "Written by pdhef identify. Values and filter noise belong together: use neither with another car's.\n"
+        f"Understeer {understeer_deg_per_g(fitted):.2f} deg/g."
+    )
+    comments = _comments(found)
+    text = part_toml(part, head, {f"values.{k}": v for k, v in comments.items()})
+    files: dict[str, Content] = {FIT_FILE: text.encode(), "fit.png": _plot(found)}
+    settings = {**config_document(config), "holdout": holdout}
+    told = {"holdout_share": holdout, "notes": list(found.notes)}
+    change = Change("identify", FIT_FILE, files, settings=settings, drives=drives, told=told)
+    write_change(car, car.with_fit(part), output, change, comments)
+    return IdentifyResult(car=output, records=tuple(records), identification=found)
 
-    try:
-        plot_identification(found, plot)
-    except OSError as error:
-        raise OutputError(expected="a place to write to", got=error.strerror or str(error), where=str(plot)) from None
-    return IdentifyResult(found, output, plot)
 
+def _plot(found: Identification) -> Callable[[Path], None]:
+    def draw(path: Path) -> None:
+        from pdhef_logtool.learning.car.identify_plot import plot_identification
 
-def _provenance(
-    found: Identification, fit: Sequence[FitDrive], holdout: float, start: VehicleParameters
-) -> dict[str, str | float | int | list[str]]:
-    document: dict[str, str | float | int | list[str]] = {
-        "starting_vehicle": start.name,
-        "drives": ["{}: {:.2f} to {:.2f} s".format(d.name, *d.span_s) for d in fit],
-        "holdout_share": holdout,
-        "notes": list(found.notes),
-    }
-    for score in found.scores:
-        key = score.part.replace(" ", "_")
-        document[f"{key}_seconds"] = round(score.seconds, 2)
-        document[f"{key}_sideslip_rmse_deg"] = round(score.identified_deg, 4)
-        document[f"{key}_sideslip_rmse_deg_starting_vehicle"] = round(score.start_file_deg, 4)
-        document[f"{key}_sideslip_rmse_deg_zero"] = round(score.zero_deg, 4)
-    return document
+        plot_identification(found, path)
+
+    return draw
 
 
 def describe(parameter: Identified) -> str:
@@ -204,8 +186,4 @@ def _comments(found: Identification) -> dict[str, str]:
         stiffness, peak = by_name[f"{axle} cornering stiffness"], by_name[f"{axle} peak force"]
         comments[f"tyres.{axle}.B"] = f"cornering stiffness {stiffness.value:.0f} N/rad, {describe(stiffness)}"
         comments[f"tyres.{axle}.D_n"] = f"peak {peak.value:.0f} N at the friction above, {describe(peak)}"
-    comments[""] = (
-        "Written by pdhef identify. The tyres and the filter noise belong together: use neither with another file's.\n"
-        f"Understeer {understeer_deg_per_g(found.vehicle):.2f} deg/g."
-    )
     return comments

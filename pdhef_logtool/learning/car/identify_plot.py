@@ -10,8 +10,8 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.car.identify import Identification
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.sinks.base import PendingFile
 
 _POINTS = 6000
 

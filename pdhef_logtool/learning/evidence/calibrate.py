@@ -23,8 +23,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from pdhef_logtool.car.parts import Inflation
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.watches.intervals import Inflation, combined
+from pdhef_logtool.watches.intervals import combined, make_inflation
 
 #: Share inside with the vehicle file as given, and at least with one that is wrong.
 COVERED = 0.95
@@ -137,10 +138,10 @@ def fit_inflation(samples: Samples) -> Fitted:
     vy_factor = covering_factor(
         samples.vy_error[given], (right.unseen * samples.vy_per_sideslip)[given], bin_weights(samples.bin[given]), share
     )
-    inflation = Inflation(
-        sideslip=_joined(right.coefficients, added.coefficients),
-        yaw_rate=_joined(right_rate.coefficients, added_rate.coefficients),
-        vy_factor=vy_factor,
+    inflation = make_inflation(
+        _joined(right.coefficients, added.coefficients),
+        _joined(right_rate.coefficients, added_rate.coefficients),
+        vy_factor,
     )
     rows = coverage_rows(samples, np.hypot(right.unseen, added.unseen))
     return Fitted(inflation, right.factor, added.factor, tuple(rows))

@@ -1,25 +1,35 @@
-"""``pdhef calibrate`` from drives with truth to ``calibration.json`` beside a model."""
+"""``pdhef calibrate`` from drives with truth to the intervals of a car, filed by what ran."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, load_vehicle, vehicle_sha256
-from pdhef_logtool.drive.friction import friction_source, friction_topic
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
-from pdhef_logtool.estimators.base import run_window
-from pdhef_logtool.estimators.registry import default_names, runnable
+from pdhef_logtool.car.car import INTERVALS_FILE, Car
+from pdhef_logtool.car.parts import Algorithm, IntervalEntry, Intervals
+from pdhef_logtool.car.store import Change, update_car
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.drive.reading import friction_of
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.table import Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
-from pdhef_logtool.learning.choosing_drives import Refusal, choose_drives
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    LearnResult,
+    LearnSettings,
+    Refusal,
+    choose_drives,
+    load_drive,
+    open_car,
+    open_mapping,
+    tell_drive,
+)
 from pdhef_logtool.learning.evidence.calibrate import (
     COVERED,
     COVERED_WRONG,
@@ -34,24 +44,16 @@ from pdhef_logtool.learning.evidence.calibrate import (
 from pdhef_logtool.learning.network.extract_command import MAX_VARIATION
 from pdhef_logtool.learning.noise.tune_command import HELD_OUT
 from pdhef_logtool.learning.variation import Variation, vary
-from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
-from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.discovery import LogInput, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import choose_mapping, load_mapping
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
-from pdhef_logtool.run.config import RunConfig, time_slice
-from pdhef_logtool.sinks.report import tool_versions, write_json
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.estimating import estimate_windows
+from pdhef_logtool.sinks.report import json_bytes, tool_versions
 from pdhef_logtool.watches.error_features import error_terms
-from pdhef_logtool.watches.intervals import (
-    FILE,
-    FORMAT,
-    FORMAT_VERSION,
-    inflations_document,
-    yaw_rate_terms,
-)
+from pdhef_logtool.watches.intervals import yaw_rate_terms
 
 DEFAULT_SPREAD = 0.1
 #: Neighbouring errors are alike: one sample in this time is kept.
@@ -73,58 +75,27 @@ REFUSED = Refusal(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class CalibrateSettings:
-    """What decides the result, beside the logs.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrateSettings(LearnSettings):
+    """With the ``spread`` by which friction and vehicle are made wrong in further runs of every drive; 0 = none."""
 
-    Attributes
-    ----------
-    config : vehicle, mapping, model, estimators, slice, sensors, which truth; the other entries are not used.
-    spread : by which friction and vehicle are made wrong in further runs of every drive; 0 = none.
-    seed : of that. split : only drives that their set's manifest puts into this split.
-    any_split : do not refuse held-out drives.
-    """
-
-    config: RunConfig
     spread: float = DEFAULT_SPREAD
-    seed: int = 0
-    split: str | None = None
-    any_split: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class DriveEntry:
-    """What is recorded of a drive; ``left_out`` says why it is not used, empty if it is."""
-
-    name: str
-    file: str
-    sha256: str
-    split: str
-    runs: int
-    left_out: str = ""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibrateResult:
-    """What the command found and wrote."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class CalibrateResult(LearnResult):
+    """What the command found and wrote; ``file`` holds the intervals."""
 
     file: Path
-    fitted: Mapping[str, Fitted]
-    drives: tuple[DriveEntry, ...]
-    left_out: tuple[DriveEntry, ...]
-    document: Mapping[str, Any]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part, 3 if some did not."""
-        return EXIT_PARTIAL if self.left_out else EXIT_OK
+    intervals: Intervals
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
-        return {"calibration": str(self.file), "exit_code": self.exit_code, **self.document}
+        intervals = self.intervals.model_dump(mode="json")
+        return {**intervals, **super(CalibrateResult, self).to_dict(), "file": str(self.file)}
 
 
-def run_calibration(
+def calibrate(
     arguments: Sequence[str],
     output: Path,
     settings: CalibrateSettings,
@@ -132,11 +103,11 @@ def run_calibration(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Warn = lambda _text: None,
 ) -> CalibrateResult:
-    """Fit the calibration of every estimator that gives an interval; write it to ``output``.
+    """Fit the intervals of every algorithm that gives one; write them to the car ``output``.
 
     Parameters
     ----------
-    arguments : logs, folders, glob patterns. output : a .json file, or the folder of a model.
+    arguments : logs, folders, glob patterns. output : a car's folder, or a .json file for the intervals alone.
 
     Raises
     ------
@@ -148,70 +119,56 @@ def run_calibration(
         There are too few drives with truth.
     """
     config = settings.config
-    file = _output_file(output)
-    _check(settings)
-    assert config.vehicle is not None
-    vehicle = load_vehicle(config.vehicle)
-    model = open_model(config.model)
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    if not 0.0 <= settings.spread <= MAX_VARIATION:
+        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.spread), where="--vary")
+    if output.suffix == ".toml":
+        raise UsageError(
+            expected="a car's folder, or a file name that ends in .json", got=output.name, where="--output",
+            remedy="intervals have no place in a vehicle.toml",
+        )  # fmt: skip
+    alone = output.suffix == ".json"
+    car = open_car(config, None if alone else output, warn)
+    mapping = open_mapping(config)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
-    if model is not None and "train" in splits.values():
+    if car.network is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")
     samples: dict[str, list[Samples]] = {}
-    drives: list[DriveEntry] = []
+    ran: dict[str, tuple[str, Algorithm]] = {}
+    records: list[DriveRecord] = []
     for number, log_input in enumerate(inputs):
         progress(log_input.stem, RUNNING * number / len(inputs))
-        entry, found = _run_drive(log_input, number, settings, vehicle, mapping, model)
-        entry = replace(entry, split=splits.get(log_input.stem, ""))
-        if entry.left_out:
-            warn(f"{entry.name} is left out: {entry.left_out}")
-        drives.append(entry)
-        for name, part in found:
-            samples.setdefault(name, []).append(part)
-    used = tuple(d for d in drives if not d.left_out)
-    fitted: dict[str, Fitted] = {}
-    for number, (name, parts) in enumerate(samples.items()):
+        record, found = _run_drive(log_input, number, settings, car, mapping)
+        records.append(replace(record, split=splits.get(log_input.stem)))
+        tell_drive(record, warn)
+        for name, algorithm, part in found:
+            ran.setdefault(algorithm.structure, (name, algorithm))
+            samples.setdefault(algorithm.structure, []).append(part)
+    entries: list[IntervalEntry] = []
+    for number, (structure, parts) in enumerate(samples.items()):
+        name, algorithm = ran[structure]
         progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
         joined = join_samples(parts)
         count = int(np.unique(joined.drive[~joined.wrong]).size)
         if count < MIN_DRIVES:
             warn(f"{name} is not calibrated: it has {count} drives, at least {MIN_DRIVES} are needed")
             continue
-        fitted[name] = fit_inflation(joined)
-    if not fitted:
+        entries.append(_entry(name, algorithm, fit_inflation(joined)))
+    if not entries:
         raise EstimatorError(
             expected=f"at least {MIN_DRIVES} drives with a true sideslip",
-            got=f"{len(used)}",
+            got=str(sum(not r.left_out for r in records)),
             where="calibrate",
             remedy="give more drives; the same number of short drives of many kinds is worth more than a long one",
         )
-    left_out = tuple(d for d in drives if d.left_out)
-    document = _document(settings, vehicle, model, fitted, used, left_out)
-    write_json(file, document)
-    return CalibrateResult(file, fitted, used, left_out, document)
-
-
-def _output_file(output: Path) -> Path:
-    if output.suffix == ".json":
-        return output
-    if not output.is_dir():
-        raise UsageError(
-            expected="the folder of a model, or a file name that ends in .json",
-            got=f"no folder {output.name}",
-            where="--output",
-        )
-    return output / FILE
-
-
-def _check(settings: CalibrateSettings) -> None:
-    if settings.config.vehicle is None:
-        raise UsageError(
-            expected="a vehicle file", got="none", where="--vehicle", remedy="pdhef identify writes one of your car"
-        )
-    if not 0.0 <= settings.spread <= MAX_VARIATION:
-        raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.spread), where="--vary")
-    if settings.seed < 0:
-        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
+    intervals = _intervals(settings, car, entries, records)
+    data = json_bytes(intervals.model_dump(mode="json"))
+    if alone:
+        file = output
+        write_bytes(file, data)
+    else:
+        change = Change("calibrate", INTERVALS_FILE, {INTERVALS_FILE: data}, {}, settings.to_dict(), intervals.drives)
+        file = update_car(car, output, change)
+    return CalibrateResult(car=output, records=tuple(records), file=file, intervals=intervals)
 
 
 def made_wrong(vehicle: VehicleParameters, spread: float, key: str) -> Iterator[Variation]:
@@ -224,60 +181,36 @@ def _run_drive(
     log_input: LogInput,
     number: int,
     settings: CalibrateSettings,
-    vehicle: VehicleParameters,
+    car: Car,
     mapping: SignalMapping | None,
-    model: ModelBundle | None,
-) -> tuple[DriveEntry, list[tuple[str, Samples]]]:
+) -> tuple[DriveRecord, list[tuple[str, Algorithm, Samples]]]:
     """Run the estimators on a drive, once as told and some times with a wrong vehicle; return errors and terms."""
-    config = settings.config
-    sha256 = hash_log(log_input.path) if log_input.path.exists() else ""
-    entry = DriveEntry(log_input.stem, log_input.path.name, sha256, "", 0)
-    with closing(open_log(log_input.path)) as log:
-        chosen, _ = choose_mapping(log, mapping, lambda _text: None, prefer_truth=config.prefer_truth, tell_notes=False)
-        plan = plan_drive(log, chosen, vehicle, *time_slice(config, log.start_ns, log.end_ns))
-        if plan.truth is None or "sideslip_rad" not in plan.derivation:
-            return replace(entry, left_out="no true sideslip"), []
-        if "sideslip_rad" in plan.dependent:
-            return replace(entry, left_out=f"its truth is no truth: {plan.dependent['sideslip_rad']}"), []
-        windows = [
-            w for w in DriveReader(log, plan, config.window_s).windows() if len(w.signals) and w.truth is not None
-        ]
-    if not windows:
-        return replace(entry, left_out="no stamps with truth"), []
-    signals = join_signals([w.signals for w in windows])
-    truth = concatenate([replace(w.truth, covariance=np.empty((0, 3, 3))) for w in windows if w.truth is not None])
+    config, vehicle = settings.config, car.vehicle
+    options = config.read_options
+    record, drive = load_drive(log_input, car, mapping, options, fill_friction=False)
+    if drive is None or drive.truth is None:
+        return record, []
+    signals = drive.signals
     runs = [(vehicle, 1.0, False)]
     if settings.spread > 0.0:
-        told = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{sha256}"), WRONG_RUNS)
+        told = itertools.islice(made_wrong(vehicle, settings.spread, f"{settings.seed}:{record.sha256}"), WRONG_RUNS)
         runs += [(one.vehicle, one.friction_factor, True) for one in told]
-    found: list[tuple[str, Samples]] = []
+    found: list[tuple[str, Algorithm, Samples]] = []
     for assumed, factor, wrong in runs:
-        friction = friction_source(
-            config.friction,
-            assumed,
-            plan.alignment.available,
-            friction_topic(chosen),
-            use_speed=config.sensors == "full",
-            factor=factor,
-        )
-        seen = friction.fill(signals)
-        if not found and "friction" not in plan.alignment.available:
+        seen = friction_of(drive.plan, assumed, options, factor).fill(drive.signals)
+        if not found and "friction" not in drive.plan.alignment.available:
             signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
-        estimators, _ = runnable(
-            config.estimators or default_names(assumed, model),
-            assumed,
-            plan.alignment.available,
-            use_speed=config.sensors == "full",
-            model=model,
-        )
-        for estimator in estimators:
-            track, _ = run_window(estimator, seen, None, None)
-            part = drive_samples(track, seen, signals, truth, vehicle, number, wrong=wrong)
-            if len(part) >= MIN_SAMPLES:
-                found.append((estimator.name, part))
+        presumed = car if assumed is vehicle else car.with_vehicle(assumed)
+        available = drive.plan.alignment.available
+        estimators, _ = runnable(config.estimators, presumed, available, Options(options.use_speed))
+        for window in estimate_windows(replace(drive, signals=seen), estimators, watched=False, drawn=False):
+            for estimator, track in zip(estimators, window.tracks, strict=True):
+                part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)
+                if len(part) >= MIN_SAMPLES:
+                    found.append((track.name, resolve(estimator), part))
     if not found:
-        return replace(entry, left_out="no estimate with an interval where the truth is known"), []
-    return replace(entry, runs=len(runs)), found
+        return replace(record, left_out="no estimate with an interval where the truth is known"), []
+    return replace(record, counts={**record.counts, "runs": len(runs)}), found
 
 
 def drive_samples(
@@ -326,55 +259,35 @@ def drive_samples(
     )
 
 
-def _document(
-    settings: CalibrateSettings,
-    vehicle: VehicleParameters,
-    model: ModelBundle | None,
-    fitted: Mapping[str, Fitted],
-    drives: Sequence[DriveEntry],
-    left_out: Sequence[DriveEntry],
-) -> dict[str, Any]:
-    """Return what is written; no date, so that the same command gives the same bytes."""
-    config = settings.config.to_dict()
-    coefficients = inflations_document({n: f.inflation for n, f in fitted.items()})
-    return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "versions": tool_versions(),
-        "settings": {
-            **{
-                k: config[k]
-                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
-            },
-            "split": settings.split,
-            "any_split": settings.any_split,
-            "vary": settings.spread,
-            "vary_seed": settings.seed,
-        },
-        "vehicle": {
-            "name": vehicle.name,
-            "file": config["vehicle"],
-            "sha256": vehicle_sha256(vehicle),
-            "roll_gradient_rad_per_m_s2": vehicle.roll_gradient_rad_per_m_s2,
-        },
-        "model_sha256": None if model is None else model.sha256,
-        "fit": {
+def _entry(name: str, algorithm: Algorithm, fitted: Fitted) -> IntervalEntry:
+    return IntervalEntry(
+        estimator=name,
+        algorithm=algorithm,
+        inflation=fitted.inflation,
+        unseen_factor=fitted.unseen_factor,
+        wrong_vehicle_factor=fitted.wrong_factor,
+        coverage=tuple(asdict(c) for c in fitted.coverage),
+    )
+
+
+def _intervals(
+    settings: CalibrateSettings, car: Car, entries: Sequence[IntervalEntry], records: Sequence[DriveRecord]
+) -> Intervals:
+    """Return the part that is written; no date, so that the same command gives the same bytes."""
+    return Intervals(
+        car=car.vehicle.name,
+        physics_sha256=car.physics_sha256,
+        roll_gradient_rad_per_m_s2=car.vehicle.roll_gradient_rad_per_m_s2,
+        spread=settings.spread,
+        entries=tuple(entries),
+        settings=settings.to_dict(),
+        fit={
             "covered": COVERED,
             "folds": FOLDS,
             "covered_with_wrong_vehicle": COVERED_WRONG,
             "wrong_runs": WRONG_RUNS,
             "sample_every_s": SAMPLE_EVERY_S,
         },
-        "drives_sha256": hashlib.sha256("".join(sorted(d.sha256 for d in drives)).encode()).hexdigest(),
-        "drives": [{k: v for k, v in asdict(d).items() if k != "left_out"} for d in drives],
-        "left_out": [{"name": d.name, "file": d.file, "reason": d.left_out} for d in left_out],
-        "estimators": {
-            name: {
-                **coefficients[name],
-                "unseen_factor": f.unseen_factor,
-                "wrong_vehicle_factor": f.wrong_factor,
-                "coverage": [asdict(c) for c in f.coverage],
-            }
-            for name, f in fitted.items()
-        },
-    }
+        drives=tuple(r.learnt_on for r in records if not r.left_out),
+        versions=tool_versions(),
+    )

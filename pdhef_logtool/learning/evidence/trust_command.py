@@ -1,23 +1,35 @@
-"""``pdhef trust`` from drives with truth to a vehicle file that says how far a network may be followed, and why."""
+"""``pdhef trust`` from drives with truth to a car that says how far a network may be followed, and why."""
 
 from __future__ import annotations
 
-import hashlib
-import math
-import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import Network, VehicleParameters, load_vehicle, vehicle_sha256, vehicle_to_toml
-from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
-from pdhef_logtool.estimators.cautious import at_trust
-from pdhef_logtool.estimators.trust_policy import SHOWN_DIGITS
+from pdhef_logtool.car.car import NETWORK_FILE, NETWORK_FOLDER, SHOWN_DIGITS, Car
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import LearntOn, Trust
+from pdhef_logtool.car.store import Change, write_change
+from pdhef_logtool.drive.reading import Drive, WholeDrive
+from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.evaluation.metrics import signal_error
-from pdhef_logtool.learning.choosing_drives import Refusal, choose_drives
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    LearnResult,
+    LearnSettings,
+    Refusal,
+    choose_drives,
+    drives_document,
+    load_drive,
+    no_drive,
+    open_car,
+    open_mapping,
+    record_head,
+    tell_drive,
+)
 from pdhef_logtool.learning.evidence.trust import (
     BLOCK_S,
     EXCITED_M_S2,
@@ -34,25 +46,20 @@ from pdhef_logtool.learning.evidence.trust import (
     decide_cap,
     join_blocks,
 )
-from pdhef_logtool.learning.noise.tune_command import read_comments
-from pdhef_logtool.learning.noise.tune_drives import MAX_BYTES, DriveBench, DriveFacts, TuneSetup
+from pdhef_logtool.learning.noise.tune_drives import MIN_SCORED_STAMPS
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import ModelBundle, open_model
-from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
-from pdhef_logtool.run.config import NANOSECONDS_FROM, RunConfig, parse_time
-from pdhef_logtool.sinks.base import write_bytes
-from pdhef_logtool.sinks.report import tool_versions, write_json
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import BoolArray
+from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
+from pdhef_logtool.residual_model.service import RememberingNetwork
+from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-trust"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 #: Splits of a set that a network is trained on and chosen by: it looks better there than in service.
 SEEN = ("train", "validation")
-#: A drive as ``pdhef identify`` names it in the vehicle file.
-_SPAN = re.compile(r"(?P<name>.+): (?P<start>-?[\d.]+) to (?P<end>-?[\d.]+) s")
+#: Two slices that meet share a sample or two.
+EDGE_S = 0.05
 
 Warn = Callable[[str], None]
 #: Drives that this command refuses.
@@ -64,87 +71,44 @@ REFUSED = Refusal(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class TrustSettings:
-    """What decides the cap, beside the logs.
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TrustResult(LearnResult):
+    """What the command decided and wrote; ``rmse_deg`` holds a row a drive that took part, a column a trust."""
 
-    Attributes
-    ----------
-    config : vehicle, mapping, model, slice, sensors, which truth; the other entries are not used.
-    seed : of the bootstrap. split : only drives that their set's manifest puts into this split.
-    any_split : do not refuse drives of the splits that networks are trained on.
-    """
-
-    config: RunConfig
-    seed: int = 0
-    split: str | None = None
-    any_split: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrustResult:
-    """What the command decided and wrote; ``rmse_deg`` holds a row a drive, a column a trust."""
-
-    vehicle_file: Path
-    record_file: Path
     decision: TrustDecision
-    network: Network
-    drives: tuple[DriveFacts, ...]
-    left_out: tuple[DriveFacts, ...]
+    trust: Trust
     rmse_deg: tuple[tuple[float, ...], ...]
 
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part, 3 if some did not."""
-        return EXIT_PARTIAL if self.left_out else EXIT_OK
+    def drives_document(self) -> dict[str, Any]:
+        """Return the drives with their errors at each trust, and those left out."""
+        document = drives_document(self.records)
+        for drive, rmse in zip(document["drives"], self.rmse_deg, strict=True):
+            drive["rmse_deg"] = list(rmse)
+        return document
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         d = self.decision
         return {
-            "vehicle": str(self.vehicle_file),
-            "record": str(self.record_file),
-            "exit_code": self.exit_code,
+            **super(TrustResult, self).to_dict(),
             "trust_cap": d.cap,
             "reason": d.reason,
-            "evidence": self.network.evidence,
-            "model_sha256": self.network.model_sha256,
+            "evidence": self.trust.evidence,
+            "network_sha256": self.trust.network_sha256,
             **_figures(d),
-            "drives": [
-                {"name": f.name, "rmse_deg": list(rmse)} for f, rmse in zip(self.drives, self.rmse_deg, strict=True)
-            ],
-            "left_out": [{"drive": f.name, "reason": f.left_out} for f in self.left_out],
+            **self.drives_document(),
         }
 
 
-@dataclass(frozen=True)
-class RepeatedNetwork(NetworkService):
-    """A network whose last answer is kept: trust is applied behind it, so that one pass serves all trusts."""
-
-    _last: dict[bytes, tuple[FloatArray, NetworkCarry]]
-
-    def run(
-        self, features: FloatArray, starts: BoolArray, carry: NetworkCarry | None
-    ) -> tuple[FloatArray, NetworkCarry]:
-        """Return what the network says; a whole drive only, from its start."""
-        if carry is not None:
-            return super().run(features, starts, carry)
-        key = hashlib.sha256(np.ascontiguousarray(features).tobytes() + starts.tobytes()).digest()
-        if key not in self._last:
-            self._last.clear()
-            self._last[key] = super().run(features, starts, None)
-        return self._last[key]
-
-
-def run_trust(
+def trust(
     arguments: Sequence[str],
     output: Path,
-    settings: TrustSettings,
+    settings: LearnSettings,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Warn = lambda _text: None,
 ) -> TrustResult:
-    """Try a network on drives with truth; write ``output``, the vehicle file with its cap, and ``<stem>.trust.json``.
+    """Try a network on drives with truth; write cap, evidence and a record of all figures to the car ``output``.
 
     Parameters
     ----------
@@ -160,113 +124,100 @@ def run_trust(
         No drive can be scored.
     """
     config = settings.config
-    source, model = _check(output, settings)
-    vehicle = load_vehicle(source)
+    car = open_car(config, output, warn)
+    if car.network is None:
+        raise UsageError(expected="a network", got="none", where="--network", remedy="give a folder of pdhef train")
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
-    bench = DriveBench(TuneSetup(config, vehicle, mapping, model, ()))
-    network = RepeatedNetwork(model, {})
-    loaded: list[DriveFacts] = []
+    mapping = open_mapping(config)
+
+    def lacking(drive: Drive) -> str:
+        missing = sorted(spec_of("pd-hef").needs - drive.available)
+        return f"pd-hef needs {', '.join(missing)}" if missing else ""
+
+    loaded: list[DriveRecord] = []
     scored: list[BlockErrors] = []
     for number, log_input in enumerate(inputs):
         progress(log_input.stem, number / len(inputs))
-        facts = bench.load(number, log_input, MAX_BYTES)
-        if not facts.left_out:
-            signals, truth = bench.take(number)
-            missing = sorted(adaptive_hybrid_ukf(vehicle, network).needs - signals.available)
-            if missing:
-                facts = replace(facts, left_out=f"pd-hef needs {', '.join(missing)}")
-            else:
-                scored.append(errors_by_trust(vehicle, network, signals, truth, use_speed=config.sensors == "full"))
-        for text in facts.warnings:
-            warn(f"{facts.name}: {text}")
-        if facts.left_out:
-            warn(f"{facts.name} is left out: {facts.left_out}")
-        loaded.append(facts)
+        record, drive = load_drive(
+            log_input,
+            car,
+            mapping,
+            config.read_options,
+            split=splits.get(log_input.stem),
+            refuse=lacking,
+            least_scored=MIN_SCORED_STAMPS,
+        )
+        tell_drive(record, warn)
+        loaded.append(record)
+        if drive is not None:
+            scored.append(errors_by_trust(car, drive, use_speed=config.read_options.use_speed))
     drives = tuple(f for f in loaded if not f.left_out)
     if not drives:
-        raise EstimatorError(
-            expected="at least one drive with a true sideslip and the signals of pd-hef",
-            got="none",
-            where="trust",
-            remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-        )
-    for text in seen_by_identification(vehicle, drives, *_slice_s(config)):
+        raise no_drive("a true sideslip and the signals of pd-hef", "trust")
+    for text in seen_by_identification(car, drives):
         warn(text)
     together = join_blocks(scored)
     if together.lost:
         warn(f"{together.lost} stamps without an estimate at some trust above 0 are charged to it")
     decision = decide_cap(together, seed=settings.seed)
-    found = Network(
-        trust_cap=decision.cap, evidence=evidence(decision, len(drives), model.sha256), model_sha256=model.sha256
+    shipped = car.network_name in SHIPPED_FOLDERS
+    found = Trust(
+        network=car.network_name if shipped else NETWORK_FOLDER,
+        network_sha256=car.network.sha256,
+        trust_cap=decision.cap,
+        evidence=evidence(decision, len(drives), car.network.sha256),
+        physics_sha256=car.physics_sha256,
+        noise_sha256=car.noise_sha256,
+        drives=tuple(d.learnt_on for d in drives),
     )
-    result = TrustResult(
-        vehicle_file=output,
-        record_file=output.with_suffix(".trust.json"),
-        decision=decision,
-        network=found,
-        drives=drives,
-        left_out=tuple(f for f in loaded if f.left_out),
-        rmse_deg=tuple(_rmse_deg(b) for b in scored),
-    )
-    record = _record(result, settings, vehicle, splits)
-    write_bytes(output, trusted_toml(source, vehicle, found).encode())
-    write_json(result.record_file, record)
+    rmse_deg = tuple(_rmse_deg(b) for b in scored)
+    result = TrustResult(car=output, records=tuple(loaded), decision=decision, trust=found, rmse_deg=rmse_deg)
+    head = "Written by pdhef trust: which network this car has, how far it is trusted, and why."
+    files = {
+        NETWORK_FILE: part_toml(found, head).encode(),
+        "network.record.json": json_bytes(_record(result, settings, car)),
+    }
+    folders = {} if shipped or car.network_folder is None else {NETWORK_FOLDER: car.network_folder}
+    change = Change("trust", NETWORK_FILE, files, folders, settings.to_dict(), found.drives)
+    write_change(car, replace(car, trust=found), output, change)
     progress("done", 1.0)
     return result
 
 
-def errors_by_trust(
-    vehicle: VehicleParameters, network: NetworkService, signals: Signals, truth: StateTrack, *, use_speed: bool
-) -> BlockErrors:
-    """Return the sideslip errors of ``pd-hef`` on a drive at every trust, in blocks.
+def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErrors:
+    """Return the sideslip errors of ``pd-hef`` on a drive with truth at every trust, in blocks.
 
     The truth's v_x times the gyro's yaw rate is the lateral acceleration that decides what counts as excited: no
     bank, bias or vibration is in it.
     """
-    slow = vehicle.low_speed_blend_m_s
-    errors = np.stack(
-        [
-            signal_error(
-                at_trust(vehicle, network, trust, use_speed=use_speed).run(signals, None)[0],
-                truth,
-                "sideslip_rad",
-                slow,
-            )
-            for trust in TRUSTS
-        ]
-    )
+    signals, truth = drive.signals, drive.truth
+    assert car.network is not None and truth is not None
+    network, slow = RememberingNetwork(car.network), car.vehicle.low_speed_blend_m_s
+    errors = []
+    for share in TRUSTS:
+        estimator = spec_of("pd-hef").make(car, Options(use_speed, share, network))
+        errors.append(signal_error(estimator.run(signals, None)[0], truth, "sideslip_rad", slow))
     excited: BoolArray = np.abs(truth.vx_m_s * signals.yaw_rate_rad_s) > EXCITED_M_S2
-    return block_errors(errors, truth.sideslip_rad, signals.stamps_ns, excited)
+    return block_errors(np.stack(errors), truth.sideslip_rad, signals.stamps_ns, excited)
 
 
-def seen_by_identification(
-    vehicle: VehicleParameters, drives: Sequence[DriveFacts], start_s: float = 0.0, end_s: float = math.inf
-) -> list[str]:
-    """Return a warning for each drive that the vehicle was identified on within [start_s, end_s) of the log."""
-    spans = vehicle.identification.get("drives", [])
-    told = []
-    for span in spans if isinstance(spans, list) else []:
-        found = _SPAN.fullmatch(span)
-        if found is None or found["name"] not in {d.name for d in drives}:
-            continue
-        if start_s < float(found["end"]) and end_s > float(found["start"]):
-            told.append(f"the vehicle was identified on {span}: score another part (--start, --end)")
-    return told
+def seen_by_identification(car: Car, drives: Sequence[DriveRecord]) -> list[str]:
+    """Return a warning for each drive that the car was identified on, as far as the spans overlap."""
 
+    def overlap(one: LearntOn, other: LearntOn) -> bool:
+        same = one.sha256 == other.sha256 if one.sha256 and other.sha256 else one.name == other.name
+        return same and min(one.end_s, other.end_s) - max(one.start_s, other.start_s) > EDGE_S
 
-def _slice_s(config: RunConfig) -> tuple[float, float]:
-    """Return the slice in seconds from a log's start as far as it is given so; else all of it."""
-    given = [
-        None if text is None else parse_time(text, 0, 0, option=option) * 1e-9
-        for text, option in ((config.start, "--start"), (config.end, "--end"))
+    return [
+        f"the car was identified on {seen.name}, {seen.start_s:.2f} to {seen.end_s:.2f} s: score another part "
+        "(--start, --end)"
+        for seen in car.learnt_on
+        if any(overlap(seen, d.learnt_on) for d in drives)
     ]
-    start, end = (None if v is None or not 0.0 <= v < NANOSECONDS_FROM * 1e-9 else v for v in given)
-    return 0.0 if start is None else start, math.inf if end is None else end
 
 
-def evidence(decision: TrustDecision, drives: int, model_sha256: str) -> str:
-    """Return the sentence of the vehicle file, with its figures."""
+def evidence(decision: TrustDecision, drives: int, network_sha256: str) -> str:
+    """Return the sentence that the car keeps, with its figures."""
     d = decision
     rmse = dict(zip(TRUSTS, d.rmse_deg, strict=True))
     shown = ", ".join(f"{rmse[t]:.3f}° at trust {t:g}" for t in sorted({0.0, 0.5, 1.0, d.cap}))
@@ -275,36 +226,8 @@ def evidence(decision: TrustDecision, drives: int, model_sha256: str) -> str:
     return (
         f"{d.reason}: {drives} {'drive' if drives == 1 else 'drives'} with truth, {d.scored_s:.0f} s scored, "
         f"{d.excited_s:.0f} s of them above {EXCITED_M_S2:g} m/s²; sideslip RMSE {shown}; squared error at 1 less "
-        f"that at 0 {gain.value_deg2:.3g}{bounds} deg² over {d.blocks} blocks; model {model_sha256[:SHOWN_DIGITS]}"
+        f"that at 0 {gain.value_deg2:.3g}{bounds} deg² over {d.blocks} blocks; network {network_sha256[:SHOWN_DIGITS]}"
     )
-
-
-def trusted_toml(source: Path, vehicle: VehicleParameters, network: Network) -> str:
-    """Return the vehicle file with the network's entries; its comments are kept."""
-    comments = {
-        entry: note
-        for entry, note in read_comments(source.read_text(encoding="utf-8")).items()
-        if not entry.startswith("network.")
-    }
-    return vehicle_to_toml(vehicle.model_copy(update={"network": network}), comments)
-
-
-def _check(output: Path, settings: TrustSettings) -> tuple[Path, ModelBundle]:
-    config = settings.config
-    if config.vehicle is None:
-        raise UsageError(
-            expected="a vehicle file", got="none", where="--vehicle", remedy="pdhef identify writes one of your car"
-        )
-    if output.suffix != ".toml":
-        raise UsageError(expected="a file name that ends in .toml", got=output.name, where="--output")
-    if settings.seed < 0:
-        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
-    model = open_model(config.model)
-    if model is None:
-        raise UsageError(
-            expected="a model bundle", got="none", where="--model", remedy="give --model DIR of pdhef train"
-        )
-    return config.vehicle, model
 
 
 def _rmse_deg(blocks: BlockErrors) -> tuple[float, ...]:
@@ -328,26 +251,10 @@ def _bound(bound: Any) -> dict[str, float | None]:
     return {name: None if np.isnan(value) else value for name, value in asdict(bound).items()}
 
 
-def _record(
-    result: TrustResult, settings: TrustSettings, vehicle: VehicleParameters, splits: Mapping[str, str]
-) -> dict[str, Any]:
-    """Return the document of ``<stem>.trust.json``."""
-    config = settings.config.to_dict()
+def _record(result: TrustResult, settings: LearnSettings, car: Car) -> dict[str, Any]:
+    """Return the document of ``network.record.json``."""
     return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "versions": tool_versions(),
-        "settings": {
-            **{
-                k: config[k]
-                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
-            },
-            "split": settings.split,
-            "any_split": settings.any_split,
-            "seed": settings.seed,
-        },
-        "vehicle": {"name": vehicle.name, "sha256": vehicle_sha256(vehicle)},
-        "model_sha256": result.network.model_sha256,
+        **record_head(FORMAT, FORMAT_VERSION, settings, car),
         "rule": {
             "block_s": BLOCK_S,
             "min_blocks": MIN_BLOCKS,
@@ -360,20 +267,7 @@ def _record(
         },
         "trust_cap": result.decision.cap,
         "reason": result.decision.reason,
-        "evidence": result.network.evidence,
+        "evidence": result.trust.evidence,
         **_figures(result.decision),
-        "drives": [
-            {
-                "name": f.name,
-                "file": f.file,
-                "sha256": f.sha256,
-                "split": splits.get(f.name),
-                "seconds": round(f.seconds, 3),
-                "truth": list(f.truth),
-                "friction_from": f.friction_from,
-                "rmse_deg": list(rmse),
-            }
-            for f, rmse in zip(result.drives, result.rmse_deg, strict=True)
-        ],
-        "left_out": [{"name": f.name, "file": f.file, "reason": f.left_out} for f in result.left_out],
+        **result.drives_document(),
     }

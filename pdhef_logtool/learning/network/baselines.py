@@ -17,12 +17,12 @@ import numpy as np
 from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
 from pdhef_logtool.learning.network.train_command import TrainResult, gap_free_runs, make_recipe, train_on
 from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
-from pdhef_logtool.sinks.base import write_bytes
 
 LOW_PASS_HZ = 2.0
 #: A feature that varies by less than this share of its size is a constant, which the intercept already is.
@@ -167,11 +167,12 @@ def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
         if drive.split != split:
             continue
         slowest = data.vehicle(drive).low_speed_blend_m_s
-        for part in gap_free_runs(drive):
-            vx, vy = np.asarray(drive.truth_velocity[part], dtype=np.float64).T
-            used = (drive.weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
+        rows = drive.arrays
+        for part in gap_free_runs(rows):
+            vx, vy = np.asarray(rows.truth_velocity[part], dtype=np.float64).T
+            used = (rows.weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
             yield SideslipSequence(
-                features=np.asarray(drive.features[part], dtype=np.float64),
-                dt_s=np.concatenate([[np.nan], np.diff(drive.stamps_ns[part]) * 1e-9]),
+                features=np.asarray(rows.features[part], dtype=np.float64),
+                dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),
                 sideslip_rad=np.where(used, np.arctan2(vy, vx), np.nan),
             )

@@ -25,7 +25,7 @@ from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
-from pdhef_logtool.sinks.base import PendingFile
+from pdhef_logtool.sinks.parquet import RowGroups
 from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.sinks.schema import arrow_schema
 
@@ -55,56 +55,23 @@ class DriveWriter:
     """
 
     def __init__(self, path: Path, split: str, rows_a_group: int = ROWS_A_GROUP) -> None:
-        self._schema = arrow_schema(_SCHEMA)
-        self._split = split
-        self._rows_a_group = rows_a_group
-        self._waiting: list[pa.Table] = []
-        self._pending = PendingFile(path)
-        try:
-            self._writer = pq.ParquetWriter(
-                self._pending.path, self._schema, compression="zstd", use_dictionary=["split", "segment"]
-            )
-        except OSError as error:
-            raise self._cannot_write(error) from error
+        def failed(error: OSError) -> OutputError:
+            return OutputError(expected="a place to write to", got=error.strerror or str(error), where=str(path))
+
+        self._schema, self._split = arrow_schema(_SCHEMA), split
+        self._file = RowGroups(path, self._schema, rows_a_group, ["split", "segment"], failed, joined=True)
 
     def append(self, rows: ResidualRows) -> None:
         """Take the next rows of the drive."""
-        self._waiting.append(_table(rows, self._split, self._schema))
-        if sum(t.num_rows for t in self._waiting) < self._rows_a_group:
-            return
-        joined = pa.concat_tables(self._waiting)
-        whole = joined.num_rows - joined.num_rows % self._rows_a_group
-        self._write(joined.slice(0, whole))
-        self._waiting = [joined.slice(whole)]
+        self._file.append(self._split, _table(rows, self._split, self._schema))
 
     def finish(self, entry: Mapping[str, Any]) -> None:
         """Write what waits and the drive's entry, and give the file its name."""
-        try:
-            if self._waiting:
-                self._write(pa.concat_tables(self._waiting))
-            self._writer.add_key_value_metadata({_ENTRY.decode(): json.dumps(entry, sort_keys=True)})
-            self._writer.close()
-        except BaseException:
-            self.abort()
-            raise
-        self._pending.commit()
+        self._file.finish({_ENTRY.decode(): json.dumps(entry, sort_keys=True)})
 
     def abort(self) -> None:
         """Remove what was written."""
-        self._waiting.clear()
-        self._writer.close()
-        self._pending.discard()
-
-    def _write(self, table: pa.Table) -> None:
-        try:
-            self._writer.write_table(table.combine_chunks(), row_group_size=self._rows_a_group)
-        except OSError as error:
-            raise self._cannot_write(error) from error
-
-    def _cannot_write(self, error: OSError) -> OutputError:
-        return OutputError(
-            expected="a place to write to", got=error.strerror or str(error), where=str(self._pending.target)
-        )
+        self._file.abort()
 
 
 def _table(rows: ResidualRows, split: str, schema: pa.Schema) -> pa.Table:
@@ -240,41 +207,6 @@ class DatasetDrive:
     def arrays(self) -> DriveArrays:
         """All arrays; see :meth:`load`."""
         return self.load()
-
-    @property
-    def stamps_ns(self) -> IntArray:
-        """See :class:`DriveArrays`, as for all that follow."""
-        return self.arrays.stamps_ns
-
-    @property
-    def features(self) -> FloatArray32:
-        """float32 [N, 17]."""
-        return self.arrays.features
-
-    @property
-    def targets(self) -> FloatArray32:
-        """float32 [N, 2]."""
-        return self.arrays.targets
-
-    @property
-    def step_s(self) -> FloatArray:
-        """float64 [N]."""
-        return self.arrays.step_s
-
-    @property
-    def weight(self) -> FloatArray32:
-        """float32 [N]."""
-        return self.arrays.weight
-
-    @property
-    def segment(self) -> IntArray:
-        """int64 [N]."""
-        return self.arrays.segment
-
-    @property
-    def truth_velocity(self) -> FloatArray32:
-        """float32 [N, 2]."""
-        return self.arrays.truth_velocity
 
     def load(self) -> DriveArrays:
         """Read the drive's file, without keeping anything.

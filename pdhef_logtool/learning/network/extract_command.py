@@ -5,11 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -17,12 +16,21 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle, load_vehicle, vehicle_sha256
-from pdhef_logtool.drive.friction import friction_source, friction_topic
+from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.drive.reading import friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.truth import derive_truth
-from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
-from pdhef_logtool.estimators.parallel_physics import parallel_filter
+from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    drives_document,
+    exit_code,
+    open_mapping,
+    record_of,
+    set_manifest,
+    tell_drive,
+)
 from pdhef_logtool.learning.network.dataset import (
     FORMAT,
     FORMAT_VERSION,
@@ -43,20 +51,12 @@ from pdhef_logtool.learning.network.residuals import (
 )
 from pdhef_logtool.learning.variation import vary
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
-from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import choose_mapping, load_mapping, merge_losses
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
-from pdhef_logtool.records.errors import (
-    EXIT_FAILURE,
-    EXIT_OK,
-    EXIT_PARTIAL,
-    EstimatorError,
-    OutputError,
-    PdhefError,
-    UsageError,
-)
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.residual_model.bundle import NO_MODEL
+from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
 
 #: Upper ends of the shares of train and validation in [0, 1); the rest is test.
@@ -108,7 +108,7 @@ class ExtractSettings:
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON-able values; files by name only."""
         config = self.config.to_dict()
-        used = ("vehicle", "mapping", "start", "end", "sensors", "prefer_truth")
+        used = ("car", "mapping", "start", "end", "sensors", "prefer_truth")
         return {
             **{k: config[k] for k in used},
             **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
@@ -120,19 +120,11 @@ class ExtractSettings:
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """What came of one log: its entry in the manifest, or why it has none. ``kept``: from an earlier command."""
+    """What came of one log: its entry in the manifest, None if it is left out. ``kept``: from an earlier command."""
 
-    log: str
-    file: str
+    record: DriveRecord
     entry: dict[str, Any] | None
-    reason: str = ""
     kept: bool = False
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def lost(self) -> bool:
-        """Whether some of the input was lost."""
-        return self.entry is not None and any(x["severity"] == "lost" for x in self.entry["losses"])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,18 +136,22 @@ class ExtractResult:
     results: tuple[DriveResult, ...]
 
     @property
+    def records(self) -> tuple[DriveRecord, ...]:
+        """Of all logs."""
+        return tuple(r.record for r in self.results)
+
+    @property
     def exit_code(self) -> int:
         """0 if all is well, 3 if input was lost or some logs gave nothing, 1 if all gave nothing."""
-        if all(r.entry is None for r in self.results):
-            return EXIT_FAILURE
-        return EXIT_PARTIAL if any(r.entry is None or r.lost for r in self.results) else EXIT_OK
+        return exit_code(self.records)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         return {
             "output": str(self.output),
             "exit_code": self.exit_code,
-            "kept": [r.log for r in self.results if r.kept],
+            "kept": [r.record.name for r in self.results if r.kept],
+            **drives_document(self.records),
             "manifest": self.manifest,
         }
 
@@ -167,13 +163,13 @@ class _Job:
     log_input: LogInput
     output: Path
     settings: ExtractSettings
-    vehicle: VehicleParameters
+    car: Car
     mapping: SignalMapping | None
     listed_split: str | None
     resume: bool
 
 
-def run_extraction(
+def extract(
     arguments: Sequence[str],
     output: Path,
     settings: ExtractSettings,
@@ -202,7 +198,7 @@ def run_extraction(
     settings.smoothing_half_s()
     _check_counts(jobs, settings)
     inputs = find_logs(arguments)
-    mapping = None if settings.config.mapping is None else load_mapping(settings.config.mapping)
+    mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
     _check_output(output)
     try:
@@ -215,19 +211,16 @@ def run_extraction(
         ) from None
     by_log: dict[str, DriveResult] = {}
     for done, result in enumerate(_run_jobs(work, jobs, progress), start=1):
-        by_log[result.log] = result
-        for text in result.warnings:
-            warn(f"{result.log}: {text}")
-        if result.entry is None:
-            warn(f"{result.log}: {result.reason}")
-        progress(result.log, done / len(work))
+        by_log[result.record.name] = result
+        tell_drive(result.record, warn)
+        progress(result.record.name, done / len(work))
     results = tuple(by_log[job.log_input.stem] for job in work)
     used = {r.entry["vehicle_sha256"] for r in results if r.entry is not None}
-    vehicles = {vehicle_sha256(job.vehicle): job.vehicle for job in work}
+    vehicles = {job.car.physics_sha256: job.car.vehicle for job in work}
     manifest = write_manifest(
         output,
         [r.entry for r in results if r.entry is not None],
-        [{"log": r.log, "file": r.file, "reason": r.reason} for r in results if r.entry is None],
+        [{"log": r.name, "file": r.file, "reason": r.left_out} for r in (x.record for x in results) if r.left_out],
         settings=settings.to_dict(),
         seed=settings.seed,
         vehicles=sorted((sha, v) for sha, v in vehicles.items() if sha in used),
@@ -275,20 +268,17 @@ def _plan_jobs(
     resume: bool,
     warn: Warn,
 ) -> Iterator[_Job]:
-    chosen = None if settings.config.vehicle is None else load_vehicle(settings.config.vehicle)
-    files, manifests = cache(load_vehicle), cache(set_manifest)
-    told = False
-    for log_input in inputs:
-        listed = _listed(log_input.path, manifests(log_input.path.parent))
-        vehicle = chosen
-        if vehicle is None and listed.vehicle is not None:
-            vehicle = files(listed.vehicle)
-        if vehicle is None:
-            vehicle = default_vehicle()
-            if not told:
-                warn(f"no --vehicle: residuals are those of the default {vehicle.name}")
-                told = True
-        yield _Job(log_input, output, settings, vehicle, mapping, listed.split, resume)
+    cars, manifests = cache(_car), cache(set_manifest)
+    listed = [_listed(i.path, manifests(i.path.parent)) for i in inputs]
+    for log_input, entry in zip(inputs, listed, strict=True):
+        car = cars(settings.config.car or entry.vehicle)
+        yield _Job(log_input, output, settings, car, mapping, entry.split, resume)
+    if settings.config.car is None and any(entry.vehicle is None for entry in listed):
+        warn(f"no --car: residuals are those of the default {cars(None).vehicle.name}")
+
+
+def _car(path: Path | None) -> Car:
+    return Car.load(path, network=NO_MODEL, intervals=NO_INTERVALS)
 
 
 def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[DriveResult]:
@@ -332,15 +322,13 @@ def _extract_guarded(job: _Job, progress: Callable[[float], None] = lambda _shar
 
 
 def _failure(job: _Job, reason: str) -> DriveResult:
-    return DriveResult(job.log_input.stem, job.log_input.path.name, None, reason)
+    return DriveResult(DriveRecord(job.log_input.stem, job.log_input.path.name, left_out=reason), None)
 
 
 def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
-    stem, name = job.log_input.stem, job.log_input.path.name
-    if not job.log_input.path.exists():
-        open_log(job.log_input.path)  # says what is wrong
+    stem, name, settings = job.log_input.stem, job.log_input.path.name, job.settings
     source = hash_log(job.log_input.path)
-    split, split_from = choose_split(source, job.settings.seed, chosen=job.settings.split, listed=job.listed_split)
+    split, split_from = choose_split(source, settings.seed, chosen=settings.split, listed=job.listed_split)
     fingerprint = _fingerprint(job, split)
     target = drive_file(job.output, stem)
     if job.resume:
@@ -350,30 +338,18 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             and entry.get("settings_sha256") == fingerprint
             and entry.get("source") == {"file": name, "sha256": source}
         ):
-            return DriveResult(stem, name, entry, kept=True)
-    warnings: list[str] = []
-    log = open_log(job.log_input.path)
-    try:
-        mapping, _ = choose_mapping(
-            log, job.mapping, warnings.append, prefer_truth=job.settings.config.prefer_truth, tell_notes=False
-        )
-        start_ns, end_ns = time_slice(job.settings.config, log.start_ns, log.end_ns)
-        plan = _strict_truth(plan_drive(log, mapping, job.vehicle, start_ns, end_ns))
+            losses = tuple(Loss(**x) for x in entry["losses"])
+            record = DriveRecord(stem, name, source, split, entry["duration_s"], losses=losses)
+            return DriveResult(record, entry, kept=True)
+    with read_drive(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
+        drive.plan = plan = _strict_truth(drive.plan)
         _check_plan(plan, job)
-        smoothing = _choose_smoothing(plan, job.settings)
-        reader = DriveReader(log, plan, job.settings.config.window_s)
-        told = vary(job.vehicle, job.settings.vary, f"{job.settings.seed}:{source}")
-        friction = friction_source(
-            job.settings.config.friction,
-            told.vehicle,
-            plan.alignment.available,
-            friction_topic(plan.mapping),
-            use_speed=job.settings.config.sensors == "full",
-            factor=told.friction_factor,
-        )
+        smoothing = _choose_smoothing(plan, settings)
+        told = vary(job.car.vehicle, settings.vary, f"{settings.seed}:{source}")
+        drive.friction = friction_of(plan, told.vehicle, drive.options, told.friction_factor)
 
         def windows() -> Iterator[Any]:
-            for window in friction.fill_windows(reader.windows()):
+            for window in drive.windows():
                 yield window
                 progress(window.share_done)
 
@@ -385,39 +361,35 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 told.vehicle,
                 period_s=plan.alignment.grid_period_s,
                 half_window=round(smoothing.half_s / plan.alignment.grid_period_s),
-                use_speed=job.settings.config.sensors == "full",
+                use_speed=drive.options.use_speed,
             ):
                 counts.add(rows)
                 writer.append(rows)
             if not counts.rows:
-                raise EstimatorError(expected="IMU samples in the slice", got="none", where=str(job.log_input.path))
-            losses = merge_losses([log.lost, reader.losses])
+                raise no_samples(job.log_input.path)
+            friction = drive.friction
             entry = {
                 "log": stem,
                 "source": {"file": name, "sha256": source},
                 "split": split,
                 "split_from": split_from,
-                "vehicle_sha256": vehicle_sha256(job.vehicle),
+                "vehicle_sha256": job.car.physics_sha256,
                 "settings_sha256": fingerprint,
                 "period_s": plan.alignment.grid_period_s,
                 **counts.to_dict(),
                 "truth": _truth_facts(plan, smoothing),
                 "friction_from": friction.label + (f", {friction.summary}" if friction.summary else ""),
-                **({"friction_factor": told.friction_factor} if job.settings.vary else {}),
-                "losses": [
-                    {"kind": x.kind, "what": x.what, "where": x.where, "count": x.count, "severity": x.severity}
-                    for x in losses
-                ],
+                **({"friction_factor": told.friction_factor} if settings.vary else {}),
+                "losses": [asdict(x) for x in drive.losses],
             }
         except BaseException:
             writer.abort()
             raise
         writer.finish(entry)
-    finally:
-        log.close()
-    if not entry["usable_rows"]:
-        warnings.append("not one usable target: no truth above the low-speed limit")
-    return DriveResult(stem, name, entry, warnings=tuple(warnings))
+        if not entry["usable_rows"]:
+            drive.tell("not one usable target: no truth above the low-speed limit")
+        record = record_of(drive, split=split)
+    return DriveResult(replace(record, seconds=entry["duration_s"]), entry)
 
 
 def choose_split(
@@ -453,22 +425,6 @@ def _listed(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
     )
 
 
-def set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
-    """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
-    documents: list[Any] = []
-    for name, parse in ((MANIFEST, json.loads), ("manifest.toml", tomllib.loads)):
-        try:
-            documents.append(parse((folder / name).read_text(encoding="utf-8")))
-        except (OSError, ValueError):
-            continue  # there is none, or it is somebody else's
-    entries = [e for d in documents if isinstance(d, dict) for key in ("drives", "log") for e in _entries(d.get(key))]
-    return {e["file"]: e for e in entries if isinstance(e.get("file"), str)}
-
-
-def _entries(value: Any) -> list[dict[str, Any]]:
-    return [e for e in value if isinstance(e, dict)] if isinstance(value, list) else []
-
-
 def _strict_truth(plan: DrivePlan) -> DrivePlan:
     """Bridge no truth gap: a line across a few lost samples is good enough to score on, not to differentiate."""
     if plan.truth is None:
@@ -487,7 +443,7 @@ def _check_plan(plan: DrivePlan, job: _Job) -> None:
             where=where,
             remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
         )
-    missing = sorted(parallel_filter(job.vehicle).needs - plan.alignment.available)
+    missing = sorted(spec_of("phy-ukf").needs - plan.alignment.available)
     if missing:
         raise EstimatorError(
             expected="the signals of the physics filter",
@@ -577,9 +533,9 @@ def _fingerprint(job: _Job, split: str) -> str:
     mapping = job.settings.config.mapping
     document = {
         "format": FORMAT_VERSION,
-        "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "vehicle", "mapping")},
+        "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
-        "vehicle": vehicle_sha256(job.vehicle),
+        "vehicle": job.car.physics_sha256,
         "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
         "versions": tool_versions(),
     }

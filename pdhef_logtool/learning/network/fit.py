@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
-from pdhef_logtool.sinks.base import write_bytes
 
 CHECKPOINT = "checkpoint.safetensors"
 
@@ -31,6 +31,8 @@ CHECKPOINT = "checkpoint.safetensors"
 #: Longer sequences are cut into pieces for training; validation runs over them whole.
 PIECE_STEPS = 1500
 GRADIENT_CLIP = 1.0
+#: What a recipe and the bundle made by it have in common.
+_SHAPE = ("feature_names", "hidden", "layers", "head")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,14 +143,7 @@ def train(
             remedy="extract more drives, so that every split has some",
         )
     if init is not None:
-        recipe = replace(
-            recipe,
-            feature_names=init.feature_names,
-            hidden=init.hidden,
-            layers=init.layers,
-            head=init.head,
-            target=init.target,
-        )
+        recipe = replace(recipe, **{name: getattr(init, name) for name in (*_SHAPE, "target")})
     normalisation = init.normalisation if init is not None else normalisation_of(training, recipe.feature_names)
     network = _new_network(recipe, init).to(device)
     optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
@@ -179,11 +174,7 @@ def train(
         _write_checkpoint(work, identity, history, network, optimiser, best)
         progress(history[-1], recipe.epochs)
     bundle = ModelBundle(
-        feature_names=recipe.feature_names,
-        hidden=recipe.hidden,
-        layers=recipe.layers,
-        head=recipe.head,
-        period_s=recipe.period_s,
+        **{name: getattr(recipe, name) for name in (*_SHAPE, "period_s")},
         normalisation=normalisation,
         weights=best,
         provenance={

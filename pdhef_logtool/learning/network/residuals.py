@@ -27,8 +27,9 @@ from numba import njit
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.estimators.filter_shell import U_FRICTION
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import U_FRICTION, FilterCarry
+from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 

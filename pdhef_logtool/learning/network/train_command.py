@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, read_dataset
+from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.residual_model.bundle import RESIDUAL, ModelBundle, open_model
-from pdhef_logtool.sinks.base import PendingFile
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"
@@ -150,7 +150,7 @@ def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> fl
     return total / weight
 
 
-def gap_free_runs(drive: DatasetDrive) -> Iterable[slice]:
+def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
     """Yield the runs of a drive that no restart of the parallel filter cuts and that are long enough to learn from."""
     edges = [0, *(np.flatnonzero(np.diff(drive.segment)) + 1).tolist(), drive.stamps_ns.shape[0]]
     for a, b in pairwise(edges):
@@ -162,13 +162,14 @@ def gap_free_runs(drive: DatasetDrive) -> Iterable[slice]:
 def _sequences(drives: Iterable[DatasetDrive], target: str = RESIDUAL) -> Iterable[FeatureSequence]:
     """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
     for drive in drives:
-        for part in gap_free_runs(drive):
-            weight = np.asarray(drive.weight[part], dtype=np.float64)
-            features = np.asarray(drive.features[part], dtype=np.float64)
+        rows = drive.arrays
+        for part in gap_free_runs(rows):
+            weight = np.asarray(rows.weight[part], dtype=np.float64)
+            features = np.asarray(rows.features[part], dtype=np.float64)
             if target == RESIDUAL:
-                values = np.asarray(drive.targets[part], dtype=np.float64) / drive.step_s[part, None]
+                values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None]
             else:
-                values = np.asarray(drive.truth_velocity[part, 1:2], dtype=np.float64)
+                values = np.asarray(rows.truth_velocity[part, 1:2], dtype=np.float64)
                 weight = weight * np.isfinite(values[:, 0])
             values[weight == 0.0] = 0.0
             if weight.sum() > 0.0:

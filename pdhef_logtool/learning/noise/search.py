@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import BoolArray, FloatArray
@@ -70,17 +70,12 @@ FACTORS = (
 )
 
 
-def filter_tuning(values: Sequence[float]) -> FilterTuning:
-    """Return the vehicle file's table for values in the order of :data:`FACTORS`."""
+def filter_tuning(values: Sequence[float]) -> FilterNoise:
+    """Return the noise for values in the order of :data:`FACTORS`."""
     q_vy, q_yaw_rate, r_ay, r_yaw_rate = values
-    return FilterTuning(
+    return FilterNoise(
         q_std=(PHY_UKF_Q_STD[0], q_vy, q_yaw_rate), r_std={"ay_m_s2": r_ay, "yaw_rate_rad_s": r_yaw_rate}
     )
-
-
-def tuned_vehicle(vehicle: VehicleParameters, name: str, tuning: FilterTuning) -> VehicleParameters:
-    """Return the vehicle with ``[filter.<name>]`` set, all else unchanged."""
-    return vehicle.model_copy(update={"filter": {**vehicle.filter, name: tuning}})
 
 
 @dataclass(frozen=True, slots=True)

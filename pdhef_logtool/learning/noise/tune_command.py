@@ -1,18 +1,33 @@
-"""``pdhef tune`` from logs to a vehicle file with tuned filter noise, the record of every trial, and a plot."""
+"""``pdhef tune`` from logs to a car with tuned filter noise, the record of every trial, and a plot."""
 
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, load_vehicle, vehicle_sha256, vehicle_to_toml
-from pdhef_logtool.learning.choosing_drives import Refusal, choose_drives
+from pdhef_logtool.car.car import NOISE_FILE, Car
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import FilterNoise, Noise
+from pdhef_logtool.car.store import Change, Content, write_change
+from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    LearnResult,
+    LearnSettings,
+    Refusal,
+    choose_drives,
+    drives_document,
+    no_drive,
+    open_car,
+    open_mapping,
+    record_head,
+    tell_drive,
+)
 from pdhef_logtool.learning.noise.search import (
     EXPLORING_SHARE,
     FACTORS,
@@ -29,19 +44,14 @@ from pdhef_logtool.learning.noise.search import (
     filter_tuning,
     score_drives,
     search,
-    tuned_vehicle,
 )
-from pdhef_logtool.learning.noise.tune_drives import Benches, DriveFacts, TuneSetup, choose_names
+from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
 from pdhef_logtool.logs.discovery import find_logs
-from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
-from pdhef_logtool.residual_model.bundle import open_model
-from pdhef_logtool.run.config import RunConfig
-from pdhef_logtool.sinks.base import PendingFile, write_bytes
-from pdhef_logtool.sinks.report import tool_versions, write_json
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 #: Splits of a set that figures are reported on: noise that was tuned there would make them worthless.
 HELD_OUT = ("test", "extrapolation")
 DEFAULT_TRIALS = 128
@@ -59,31 +69,19 @@ REFUSED = Refusal(
 )
 
 
-@dataclass(frozen=True, slots=True)
-class TuneSettings:
-    """What decides the result, beside the logs.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TuneSettings(LearnSettings):
+    """With ``names`` of the estimators (None = all that are usually tuned), and ``trials`` of each."""
 
-    Attributes
-    ----------
-    config : vehicle, mapping, model, slice, sensors, which truth; the other entries are not used.
-    names : estimators; None = all that can be tuned.
-    trials : of each estimator. seed : of the search.
-    split : only drives that their set's manifest puts into this split. any_split : do not refuse held-out drives.
-    """
-
-    config: RunConfig
     names: tuple[str, ...] | None = None
     trials: int = DEFAULT_TRIALS
-    seed: int = 0
-    split: str | None = None
-    any_split: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tuned:
     """What came out for one estimator.
 
-    ``before`` is the score of the noise that the vehicle file had, None if it had none; ``errors`` are the best
+    ``before`` is the score of the noise that the car had, None if it had none; ``errors`` are the best
     trial's by drive.
     """
 
@@ -94,36 +92,21 @@ class Tuned:
 
     @property
     def best(self) -> Trial:
-        """The trial that is written to the vehicle file."""
+        """The trial that the car gets."""
         return best_trial(self.trials)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TuneResult:
-    """What the command found and wrote; ``drives`` are those that were scored."""
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class TuneResult(LearnResult):
+    """What the command found and wrote."""
 
-    vehicle_file: Path
-    tuning_file: Path
-    plot_file: Path
     tuned: tuple[Tuned, ...]
-    drives: tuple[DriveFacts, ...]
-    left_out: tuple[DriveFacts, ...]
     notes: tuple[str, ...]
-
-    @property
-    def exit_code(self) -> int:
-        """0 if all drives took part, 3 if some did not."""
-        return EXIT_PARTIAL if self.left_out else EXIT_OK
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document."""
         return {
-            "vehicle": str(self.vehicle_file),
-            "tuning": str(self.tuning_file),
-            "plot": str(self.plot_file),
-            "exit_code": self.exit_code,
-            "drives": len(self.drives),
-            "left_out": [{"drive": d.name, "reason": d.left_out} for d in self.left_out],
+            **super(TuneResult, self).to_dict(),
             "estimators": {
                 t.name: {
                     "trials": len(t.trials),
@@ -138,7 +121,7 @@ class TuneResult:
         }
 
 
-def run_tuning(
+def tune(
     arguments: Sequence[str],
     output: Path,
     settings: TuneSettings,
@@ -147,7 +130,7 @@ def run_tuning(
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Warn = lambda _text: None,
 ) -> TuneResult:
-    """Tune the noise of estimators alike; write ``output`` (vehicle.toml), ``<stem>.tuning.json`` and its plot.
+    """Tune the noise of estimators alike; write them to the car ``output`` with a record of all trials and its plot.
 
     Parameters
     ----------
@@ -163,40 +146,32 @@ def run_tuning(
         No drive can be scored.
     """
     config = settings.config
-    _check(output, settings, jobs)
-    assert config.vehicle is not None
-    vehicle = load_vehicle(config.vehicle)
-    model = None if config.model is None else open_model(config.model)
-    names = choose_names(settings.names, model)
+    if settings.trials < MIN_TRIALS:
+        raise UsageError(expected=f"at least {MIN_TRIALS} trials", got=str(settings.trials), where="--trials")
+    if jobs < 1:
+        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
+    car = open_car(config, output, warn)
+    names = choose_names(settings.names, car, with_network=config.network is not None or car.trust is not None)
+    has_network = any(spec_of(n).network for n in names)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
-    if model is not None and "train" in splits.values():
+    if has_network and "train" in splits.values():
         warn(
             "drives of split train: a network is better there than in service, and its filter's noise is tuned to that"
         )
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
-    setup = TuneSetup(config, vehicle, mapping, model, names)
+    setup = TuneSetup(config, car, open_mapping(config), names)
     with Benches(setup, min(jobs, len(inputs))) as benches:
         done = 0
 
-        def told(facts: DriveFacts) -> None:
+        def told(record: DriveRecord) -> None:
             nonlocal done
             done += 1
-            progress(f"reading {facts.name}", READING * done / len(inputs))
-            for text in facts.warnings:
-                warn(f"{facts.name}: {text}")
-            if facts.left_out:
-                warn(f"{facts.name} is left out for all estimators: {facts.left_out}")
+            progress(f"reading {record.name}", READING * done / len(inputs))
+            tell_drive(record, warn)
 
-        loaded = benches.load(inputs, told)
-        drives = tuple(d for d in loaded if not d.left_out)
-        if not drives:
-            raise EstimatorError(
-                expected="at least one drive with a true sideslip and the signals of the estimators",
-                got="none",
-                where="tune",
-                remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
-            )
-        before = benches.score({n: vehicle.filter[n] for n in names if n in vehicle.filter})
+        loaded = benches.load(inputs, splits, told)
+        if all(d.left_out for d in loaded):
+            raise no_drive("a true sideslip and the signals of the estimators", "tune")
+        before = benches.score({n: car.noise[n] for n in names if n in car.noise})
 
         def tell(trial: int) -> None:
             progress(f"trial {trial} of {settings.trials}", READING + (1.0 - READING) * trial / settings.trials)
@@ -211,108 +186,50 @@ def run_tuning(
     notes = _notes(tuned)
     for note in notes:
         warn(note)
-    result = TuneResult(
-        vehicle_file=output,
-        tuning_file=output.with_suffix(".tuning.json"),
-        plot_file=output.with_suffix(".tuning.png"),
-        tuned=tuned,
-        drives=drives,
-        left_out=tuple(d for d in loaded if d.left_out),
-        notes=notes,
+    result = TuneResult(car=output, records=tuple(loaded), tuned=tuned, notes=notes)
+    record = _record(result, settings, car)
+    noise = {**_kept(car), **{t.name: _noise(t, car) for t in tuned}}
+    part = Noise(
+        filter=noise,
+        search={**_summary(settings), "drives_sha256": record["drives_sha256"]},
+        drives=tuple(d.learnt_on for d in result.drives),
     )
-    record = _record(result, settings, vehicle, splits, None if model is None else model.sha256)
-    write_bytes(output, tuned_toml(config.vehicle, vehicle, tuned, record).encode())
-    write_json(result.tuning_file, record)
-    _plot(result)
+    comments = {f"filter.{n}.q_std": "v_x, v_y, yaw rate" for n in noise}
+    head = "Written by pdhef tune. It belongs to the physics of this car: use it with no other."
+    files: dict[str, Content] = {
+        NOISE_FILE: part_toml(part, head, comments).encode(),
+        "noise.record.json": json_bytes(record),
+        "noise.png": lambda path: _plot(result, path),
+    }
+    in_words = {f"tuning_{k}": v for k, v in part.search.items()}
+    change = Change("tune", NOISE_FILE, files, settings=settings.to_dict(), drives=part.drives, told=in_words)
+    write_change(car, replace(car, noise={**car.noise, **noise}), output, change, comments)
     return result
 
 
-def tuned_toml(source: Path, vehicle: VehicleParameters, tuned: Sequence[Tuned], record: Mapping[str, Any]) -> str:
-    """Return the vehicle file with the best noise of each estimator and where it is from; comments are kept."""
-    provenance: dict[str, str | float | int | list[str]] = {
-        k: v for k, v in vehicle.identification.items() if not k.startswith("tuning_")
-    }
-    provenance |= {
-        "tuning_drives_sha256": record["drives_sha256"],
-        "tuning_drives": len(record["drives"]),
-        "tuning_trials": record["search"]["trials"],
-        "tuning_seed": record["search"]["seed"],
-        "tuning_space": [f"{f.name} {f.low:g} to {f.high:g} {f.unit}" for f in FACTORS],
-        "tuning_objective": record["search"]["objective"],
-        "tuning_scores": [f"{t.name}: {t.best.score.objective_deg:.4f} deg at trial {t.best.number}" for t in tuned],
-    }
-    comments = {
-        entry: note
-        for entry, note in read_comments(source.read_text(encoding="utf-8")).items()
-        if not any(entry.startswith(f"filter.{t.name}.") for t in tuned)
-    }
-    for t in tuned:
-        vehicle = tuned_vehicle(vehicle, t.name, filter_tuning(t.best.values))
-        comments[f"filter.{t.name}.q_std"] = "pdhef tune; v_x, v_y, yaw rate"
-    return vehicle_to_toml(vehicle.model_copy(update={"identification": provenance}), comments)
+def _noise(tuned: Tuned, car: Car) -> FilterNoise:
+    """Return the noise of the best trial with what it belongs to."""
+    network = car.network if spec_of(tuned.name).network else None
+    return filter_tuning(tuned.best.values).model_copy(
+        update={
+            "physics_sha256": car.physics_sha256,
+            "network_sha256": None if network is None else network.sha256,
+            "score_deg": round(tuned.best.score.objective_deg, 4),
+            "trial": tuned.best.number,
+        }
+    )
 
 
-def read_comments(text: str) -> dict[str, str]:
-    """Return the comments of a vehicle file as :func:`~pdhef_logtool.car.vehicle.vehicle_to_toml` takes them.
+def _kept(car: Car) -> dict[str, FilterNoise]:
+    """Return what an earlier search found for filters; its scores are not those of the same drives and count no more.
 
-    Those at the head stand under ``""``, those behind a value under its dotted entry; others are not kept.
+    Noise without a trial is the fit's or a person's: it stays where it is.
     """
-    found: dict[str, str] = {}
-    head: list[str] | None = []
-    table = ""
-    for line in (raw.strip() for raw in text.splitlines()):
-        if line.startswith("#"):
-            if head is not None:
-                head.append(line.lstrip("# "))
-            continue
-        if head is not None:
-            found |= {"": "\n".join(head)} if head else {}
-            head = None
-        at = line.find("#")
-        while at >= 0:
-            entry = _entry(line[:at])
-            if entry is not None:
-                if "=" in entry:
-                    found[table + entry.split("=")[0]] = line[at:].lstrip("# ")
-                break
-            at = line.find("#", at + 1)
-        name = _entry(line if at < 0 else line[:at]) or ""
-        if name and "=" not in name:
-            table = name + "."
-    return found
-
-
-def _entry(text: str) -> str | None:
-    """Return ``a.b`` of a table's line, ``key=`` of an entry's, None if the text is no whole line of TOML."""
-    try:
-        document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
-        return None
-    if not text.lstrip().startswith("["):
-        return f"{next(iter(document))}=" if document else None
-    keys = []
-    while isinstance(document, dict) and document:
-        key, document = next(iter(document.items()))
-        keys.append(key)
-    return ".".join(keys)
+    found = {n: one for n, one in car.noise.items() if one.trial is not None}
+    return {n: one.model_copy(update={"score_deg": None}) for n, one in found.items()}
 
 
 # ---- the record ----
-
-
-def _check(output: Path, settings: TuneSettings, jobs: int) -> None:
-    if settings.config.vehicle is None:
-        raise UsageError(
-            expected="a vehicle file", got="none", where="--vehicle", remedy="pdhef identify writes one of your car"
-        )
-    if output.suffix != ".toml":
-        raise UsageError(expected="a file name that ends in .toml", got=output.name, where="--output")
-    if settings.trials < MIN_TRIALS:
-        raise UsageError(expected=f"at least {MIN_TRIALS} trials", got=str(settings.trials), where="--trials")
-    if settings.seed < 0:
-        raise UsageError(expected="a seed of at least 0", got=str(settings.seed), where="--seed")
-    if jobs < 1:
-        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
 
 
 def _named(values: Sequence[float]) -> dict[str, float]:
@@ -327,62 +244,33 @@ def _notes(tuned: Sequence[Tuned]) -> tuple[str, ...]:
             notes.append(f"{t.name}: the best {', '.join(ends)} stands at an end of the search space")
         if t.before is not None and t.before.objective_deg < t.best.score.objective_deg:
             notes.append(
-                f"{t.name}: the noise that the vehicle file had is better on these drives "
+                f"{t.name}: the noise that the car had is better on these drives "
                 f"({t.before.objective_deg:.4f} deg) than all trials: give more --trials"
             )
     return tuple(notes)
 
 
-def _record(
-    result: TuneResult,
-    settings: TuneSettings,
-    vehicle: VehicleParameters,
-    splits: Mapping[str, str],
-    model_sha256: str | None,
-) -> dict[str, Any]:
-    """Return the document of ``<stem>.tuning.json``."""
-    config = settings.config.to_dict()
+def _summary(settings: TuneSettings) -> dict[str, Any]:
+    objective = "geometric mean over drives of the sideslip RMSE, each with the floor added as squares"
+    return {"trials": settings.trials, "seed": settings.seed, "objective": objective}
+
+
+def _record(result: TuneResult, settings: TuneSettings, car: Car) -> dict[str, Any]:
+    """Return the document of ``noise.record.json``."""
     together = hashlib.sha256("".join(sorted(d.sha256 for d in result.drives)).encode()).hexdigest()
     return {
-        "format": FORMAT,
-        "version": FORMAT_VERSION,
-        "versions": tool_versions(),
-        "settings": {
-            **{
-                k: config[k]
-                for k in ("vehicle", "mapping", "model", "start", "end", "sensors", "friction", "prefer_truth")
-            },
-            "split": settings.split,
-            "any_split": settings.any_split,
-        },
-        "vehicle": {"name": vehicle.name, "sha256": vehicle_sha256(vehicle)},
-        "model_sha256": model_sha256,
+        **record_head(FORMAT, FORMAT_VERSION, settings, car),
         "search": {
-            "trials": settings.trials,
-            "seed": settings.seed,
+            **_summary(settings),
             "space": [asdict(f) for f in FACTORS],
             "exploring_share": EXPLORING_SHARE,
             "step_shares": [STEP_FIRST, STEP_LAST],
-            "objective": "geometric mean over drives of the sideslip RMSE, each with the floor added as squares",
             "floor_deg": float(f"{np.degrees(FLOOR_RAD):.6g}"),
             "min_availability": MIN_AVAILABILITY,
-            "low_speed_m_s": vehicle.low_speed_blend_m_s,
+            "low_speed_m_s": car.vehicle.low_speed_blend_m_s,
         },
         "drives_sha256": together,
-        "drives": [
-            {
-                "name": d.name,
-                "file": d.file,
-                "sha256": d.sha256,
-                "split": splits.get(d.name),
-                "seconds": round(d.seconds, 3),
-                "scored_stamps": d.scored_stamps,
-                "truth": list(d.truth),
-                "friction_from": d.friction_from,
-            }
-            for d in result.drives
-        ],
-        "left_out": [{"name": d.name, "file": d.file, "reason": d.left_out} for d in result.left_out],
+        **drives_document(result.records),
         "estimators": {
             t.name: {
                 "best_trial": t.best.number,
@@ -402,7 +290,7 @@ def _record(
     }
 
 
-def _plot(result: TuneResult) -> None:
+def _plot(result: TuneResult, path: Path) -> None:
     """Draw the best objective so far over the trials, and every trial as a dot."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -421,11 +309,10 @@ def _plot(result: TuneResult) -> None:
     exploring = sum(x.stage == "sobol" for x in result.tuned[0].trials)
     axes.axvline(exploring + 0.5, color="0.5", lw=0.8)
     axes.set(
-        xlabel="trial (left of the line: Sobol points, right: refinement; dotted: the file's own noise)",
+        xlabel="trial (left of the line: Sobol points, right: refinement; dotted: the noise that the car had)",
         ylabel="objective (°): geometric mean of drives' sideslip RMSE",
         title=f"{len(result.drives)} drives",
     )
     axes.grid(alpha=0.3, which="both")
     axes.legend(frameon=False)
-    with PendingFile(result.plot_file) as pending:
-        figure.savefig(pending.path, format="png", metadata={"Software": None})
+    figure.savefig(path, format="png", metadata={"Software": None})

@@ -9,34 +9,26 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
-import numpy as np
-
-from pdhef_logtool.car.vehicle import FilterTuning, VehicleParameters
-from pdhef_logtool.drive.friction import friction_source, friction_topic
-from pdhef_logtool.drive.windows import DriveReader, plan_drive
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, check_inputs
-from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
-from pdhef_logtool.estimators.registry import DESCRIPTIONS, make_estimator
-from pdhef_logtool.estimators.smoothed import SmoothedHybrid, smoothed_hybrid
-from pdhef_logtool.learning.noise.search import DriveError, drive_error, scorable_stamps, tuned_vehicle
-from pdhef_logtool.logs.discovery import LogInput, hash_log
-from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.drive.reading import MAX_BYTES, too_big
+from pdhef_logtool.drive.reading import Drive as ReadDrive
+from pdhef_logtool.estimators.table import SPECS, Options, spec_of
+from pdhef_logtool.learning.drives import DriveRecord, load_drive
+from pdhef_logtool.learning.noise.search import DriveError, drive_error
+from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.mapping import choose_mapping
-from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
-from pdhef_logtool.records.signals import Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.residual_model.bundle import ModelBundle
-from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.run.config import RunConfig, time_slice
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.service import RememberingNetwork
+from pdhef_logtool.runs.config import RunConfig
 
-#: Signals, truth and network output of all drives together may take this much memory.
-MAX_BYTES = 2 << 30
 #: A drive with fewer scored stamps says nothing of its own.
 MIN_SCORED_STAMPS = 100
 
@@ -46,174 +38,41 @@ class TuneSetup:
     """What all drives are read and all filters are built with."""
 
     config: RunConfig
-    vehicle: VehicleParameters
+    car: Car
     mapping: SignalMapping | None
-    model: ModelBundle | None
     names: tuple[str, ...]
 
-    @property
-    def use_speed(self) -> bool:
-        """Whether the filters use the speed sensor after their start."""
-        return self.config.sensors == "full"
 
+def choose_names(names: Sequence[str] | None, car: Car, *, with_network: bool) -> tuple[str, ...]:
+    """Return the estimators to tune, in the order of the tables.
 
-class Tunable(Protocol):
-    """An estimator that reads its noise from ``[filter.<name>]`` of the vehicle file."""
-
-    @property
-    def needs_model(self) -> bool:
-        """Whether it runs a network."""
-        ...
-
-    def needs(self, setup: TuneSetup) -> frozenset[str]:
-        """Aligned signals without which it cannot run."""
-        ...
-
-    def prepare(self, setup: TuneSetup, signals: Signals) -> Any:
-        """Return what its noise does not change; it is computed once a drive and given to every run."""
-        ...
-
-    def run(self, setup: TuneSetup, tuning: FilterTuning, signals: Signals, prepared: Any) -> StateTrack:
-        """Return the estimate of a whole drive, bit-identical to ``pdhef run``'s."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class Registered:
-    """An estimator of the registry with nothing to prepare."""
-
-    name: str
-    needs_model: bool = False
-
-    def _make(self, setup: TuneSetup, tuning: FilterTuning) -> Any:
-        return make_estimator(self.name, tuned_vehicle(setup.vehicle, self.name, tuning), use_speed=setup.use_speed)
-
-    def needs(self, setup: TuneSetup) -> frozenset[str]:
-        """What the estimator says."""
-        needs: frozenset[str] = self._make(setup, FilterTuning()).needs
-        return needs
-
-    def prepare(self, setup: TuneSetup, signals: Signals) -> None:
-        """Nothing."""
-        del setup, signals
-
-    def run(self, setup: TuneSetup, tuning: FilterTuning, signals: Signals, prepared: None) -> StateTrack:
-        """Run the estimator as it is."""
-        del prepared
-        track: StateTrack = self._make(setup, tuning).run(signals, None)[0]
-        return track
-
-
-@dataclass(frozen=True, slots=True)
-class Hybrid:
-    """The hybrid filter, whose network runs once a drive."""
-
-    name: str
-    needs_model: bool = True
-
-    def _make(self, setup: TuneSetup, tuning: FilterTuning) -> HybridUkf:
-        assert setup.model is not None
-        vehicle = tuned_vehicle(setup.vehicle, self.name, tuning)
-        return hybrid_ukf(vehicle, NetworkService(setup.model), use_speed=setup.use_speed)
-
-    def needs(self, setup: TuneSetup) -> frozenset[str]:
-        """What the physics filter needs."""
-        return self._make(setup, FilterTuning()).needs
-
-    def prepare(self, setup: TuneSetup, signals: Signals) -> np.ndarray[Any, Any]:
-        """Return the network's residual rate [N, 2]."""
-        return self._make(setup, FilterTuning()).residual_rate(signals, None)[0]
-
-    def run(
-        self, setup: TuneSetup, tuning: FilterTuning, signals: Signals, prepared: np.ndarray[Any, Any]
-    ) -> StateTrack:
-        """Run the filter on a residual rate that is known."""
-        hybrid = self._make(setup, tuning)
-        return hybrid.filter.run(signals, None, hybrid.trust * prepared)[0]
-
-
-@dataclass(frozen=True, slots=True)
-class Smoothed:
-    """The smoother at trust 1 as the filter; its detector and network run once a drive."""
-
-    name: str
-    needs_model: bool = True
-
-    def _make(self, setup: TuneSetup, tuning: FilterTuning) -> SmoothedHybrid:
-        assert setup.model is not None
-        vehicle = tuned_vehicle(setup.vehicle, self.name, tuning)
-        return smoothed_hybrid(vehicle, NetworkService(setup.model), use_speed=setup.use_speed)
-
-    def needs(self, setup: TuneSetup) -> frozenset[str]:
-        """What the filter needs."""
-        return self._make(setup, FilterTuning()).needs
-
-    def prepare(self, setup: TuneSetup, signals: Signals) -> CheckedInputs:
-        """Return what the forward filter starts from."""
-        return check_inputs(self._make(setup, FilterTuning()).hybrid, signals, None)[0]
-
-    def run(self, setup: TuneSetup, tuning: FilterTuning, signals: Signals, prepared: CheckedInputs) -> StateTrack:
-        """Filter and smooth with inputs that are known."""
-        return self._make(setup, tuning).run(signals, None, known=prepared)[0]
-
-
-#: Every estimator that can be tuned, in the order of the tables.
-TUNABLE: dict[str, Tunable] = {
-    "phy-ukf-tuned": Registered("phy-ukf-tuned"),
-    "physics-plus": Registered("physics-plus"),
-    "pd-hef": Hybrid("pd-hef"),
-    "pd-hef-smoothed": Smoothed("pd-hef-smoothed"),
-}
-#: Tuned only where they are named: not causal, and a trial takes about twice as long as the filter's.
-ON_REQUEST = ("pd-hef-smoothed",)
-
-
-def choose_names(names: Sequence[str] | None, model: ModelBundle | None) -> tuple[str, ...]:
-    """Return the estimators to tune; None = all that the given model suits, but for those of :data:`ON_REQUEST`.
+    Parameters
+    ----------
+    names : None = every one that is always tuned and that the car suits. with_network : among them those with one.
 
     Raises
     ------
     UsageError
         A name is unknown or given twice, or its network is missing.
     """
-    here = [n for n, t in TUNABLE.items() if t.needs_model or n in DESCRIPTIONS]
+    tunable = {s.name: s for s in SPECS if s.tunable}
     if names is None:
-        suited = (n for n in here if model is not None or not TUNABLE[n].needs_model)
-        return tuple(n for n in suited if n not in ON_REQUEST)
-    wrong = sorted({n for n in names if n not in here or names.count(n) > 1})
+        usual = (s for s in tunable.values() if s.tunable == "always" and (with_network or not s.network))
+        return tuple(s.name for s in usual if not (s.network and car.network is None))
+    wrong = sorted({n for n in names if n not in tunable or names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
-            expected=f"estimators out of {', '.join(here)}", got=", ".join(wrong) or "none", where="--estimators"
+            expected=f"estimators out of {', '.join(tunable)}", got=", ".join(wrong) or "none", where="--estimators"
         )
-    without = [n for n in names if TUNABLE[n].needs_model and model is None]
-    if without:
-        raise UsageError(
-            expected="a model bundle", got="none", where=", ".join(without), remedy="give --model DIR of pdhef train"
-        )
-    return tuple(n for n in here if n in names)
-
-
-@dataclass(frozen=True, slots=True)
-class DriveFacts:
-    """What is recorded of a drive; ``left_out`` says why it is not scored, empty if it is."""
-
-    name: str
-    file: str
-    sha256: str
-    seconds: float
-    scored_stamps: int
-    truth: tuple[str, ...]
-    friction_from: str
-    bytes_held: int
-    warnings: tuple[str, ...]
-    left_out: str = ""
+    if car.network is None and (without := [n for n in names if tunable[n].network]):
+        raise UsageError(expected="a network", got="none", where=", ".join(without), remedy="give --network")
+    return tuple(n for n in tunable if n in names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Drive:
     signals: Signals
     truth: StateTrack
-    prepared: Mapping[str, Any]
 
 
 class DriveBench:
@@ -222,8 +81,11 @@ class DriveBench:
     def __init__(self, setup: TuneSetup) -> None:
         self._setup = setup
         self._drives: dict[int, _Drive] = {}
+        network = None if setup.car.network is None else RememberingNetwork(setup.car.network)
+        # Noise is chosen at full trust; what a car allows comes later, by evidence.
+        self._options = Options(setup.config.sensors == "full", trust=1.0, network=network)
 
-    def load(self, index: int, log_input: LogInput, max_bytes: int) -> DriveFacts:
+    def load(self, index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord:
         """Read a drive, run what its filters' noise does not change, and keep it under ``index``.
 
         Raises
@@ -231,99 +93,38 @@ class DriveBench:
         PdhefError
             The log cannot be read, or takes more than ``max_bytes``.
         """
-        setup, warnings = self._setup, list[str]()
-        sha256 = hash_log(log_input.path) if log_input.path.exists() else ""
-        log = open_log(log_input.path)
-        try:
-            mapping, _ = choose_mapping(
-                log, setup.mapping, warnings.append, prefer_truth=setup.config.prefer_truth, tell_notes=False
-            )
-            plan = plan_drive(log, mapping, setup.vehicle, *time_slice(setup.config, log.start_ns, log.end_ns))
+        setup = self._setup
 
-            friction = friction_source(
-                setup.config.friction,
-                setup.vehicle,
-                plan.alignment.available,
-                friction_topic(mapping),
-                use_speed=setup.use_speed,
-            )
+        def lacking(drive: ReadDrive) -> str:
+            missing = {name: sorted(spec_of(name).needs - drive.available) for name in setup.names}
+            return "; ".join(f"{name} needs {', '.join(what)}" for name, what in missing.items() if what)
 
-            def facts(held: int = 0, seconds: float = 0.0, scored: int = 0, left_out: str = "") -> DriveFacts:
-                return DriveFacts(
-                    name=log_input.stem,
-                    file=log_input.path.name,
-                    sha256=sha256,
-                    seconds=seconds,
-                    scored_stamps=scored,
-                    truth=tuple(sorted({source.label for source in mapping.truth.values()})),
-                    friction_from=friction.label,
-                    bytes_held=held,
-                    warnings=tuple(warnings),
-                    left_out=left_out,
-                )
+        record, whole = load_drive(
+            log_input,
+            setup.car,
+            setup.mapping,
+            setup.config.read_options,
+            split=split,
+            refuse=lacking,
+            least_scored=MIN_SCORED_STAMPS,
+            max_bytes=max_bytes,
+        )
+        if whole is not None and whole.truth is not None:
+            self._drives[index] = _Drive(whole.signals, whole.truth)
+        return record
 
-            if "sideslip_rad" in plan.dependent:
-                return facts(left_out=f"its truth is no truth: {plan.dependent['sideslip_rad']}")
-            missing = {name: sorted(TUNABLE[name].needs(setup) - plan.alignment.available) for name in setup.names}
-            lacking = "; ".join(f"{name} needs {', '.join(what)}" for name, what in missing.items() if what)
-            if plan.truth is None or lacking:
-                return facts(left_out=lacking or "no truth")
-            reader = DriveReader(log, plan, setup.config.window_s)
-            signals, truths, held = [], [], 0
-            for window in reader.windows():
-                if len(window.signals) == 0 or window.truth is None:
-                    continue
-                signals.append(window.signals)
-                truths.append(replace(window.truth, covariance=np.empty((0, 3, 3))))
-                held += _bytes(window.signals) + _bytes(window.truth)
-                if held > max_bytes:
-                    raise too_big(log_input.stem)
-            losses = [*log.lost, *reader.losses]
-            warnings += [f"{loss.what} ({loss.where})" for loss in losses if loss.severity == "lost"]
-        finally:
-            log.close()
-        low_speed = setup.vehicle.low_speed_blend_m_s
-        scored = sum(int(np.count_nonzero(scorable_stamps(t, low_speed))) for t in truths)
-        if scored < MIN_SCORED_STAMPS:
-            return facts(left_out=f"{scored} stamps with a true sideslip above {low_speed:g} m/s")
-        joined, truth = friction.fill(join_signals(signals)), concatenate(truths)
-        prepared = {name: TUNABLE[name].prepare(setup, joined) for name in setup.names}
-        held += sum(getattr(value, "nbytes", 0) for value in prepared.values())
-        self._drives[index] = _Drive(joined, truth, prepared)
-        seconds = float(joined.stamps_ns[-1] - joined.stamps_ns[0]) * 1e-9
-        return facts(held, seconds, scored)
-
-    def take(self, index: int) -> tuple[Signals, StateTrack]:
-        """Return signals [N] and truth [N] of a drive that was loaded, and keep it no longer."""
-        drive = self._drives.pop(index)
-        return drive.signals, drive.truth
-
-    def score(self, tunings: Mapping[str, FilterTuning]) -> dict[str, dict[int, DriveError]]:
+    def score(self, tunings: Mapping[str, FilterNoise]) -> dict[str, dict[int, DriveError]]:
         """Return the errors of each estimator by drive."""
-        slow = self._setup.vehicle.low_speed_blend_m_s
-        return {
-            name: {
-                index: drive_error(
-                    TUNABLE[name].run(self._setup, tuning, drive.signals, drive.prepared[name]), drive.truth, slow
-                )
+        slow = self._setup.car.vehicle.low_speed_blend_m_s
+        errors: dict[str, dict[int, DriveError]] = {}
+        for name, noise in tunings.items():
+            spec = spec_of(spec_of(name).tuned_as or name)
+            estimator = spec.make(self._setup.car.with_noise(name, noise), self._options)
+            errors[name] = {
+                index: drive_error(estimator.run(drive.signals, None)[0], drive.truth, slow)
                 for index, drive in self._drives.items()
             }
-            for name, tuning in tunings.items()
-        }
-
-
-def too_big(where: str) -> EstimatorError:
-    """Return the error for drives that do not fit."""
-    return EstimatorError(
-        expected=f"drives whose signals and truth fit in {MAX_BYTES >> 20} MiB together",
-        got="more",
-        where=where,
-        remedy="give fewer drives, or a slice of each with --start and --end",
-    )
-
-
-def _bytes(record: Signals | StateTrack) -> int:
-    return sum(getattr(getattr(record, f.name), "nbytes", 0) for f in fields(record))
+        return errors
 
 
 class Benches:
@@ -345,37 +146,36 @@ class Benches:
         for pool in self._pools:
             pool.shutdown(wait=error is None, cancel_futures=True)
 
-    def load(self, inputs: Sequence[LogInput], told: Callable[[DriveFacts], None]) -> list[DriveFacts]:
-        """Read all drives; ``told`` is called for each in order.
+    def load(
+        self, inputs: Sequence[LogInput], splits: Mapping[str, str], told: Callable[[DriveRecord], None]
+    ) -> list[DriveRecord]:
+        """Read all drives, whose splits are known by name; ``told`` is called for each in order.
 
         Raises
         ------
         PdhefError
             A log cannot be read, or all together are too big.
         """
-        loaded: list[DriveFacts] = []
+        loaded: list[DriveRecord] = []
         held = 0
-        under_way: deque[Future[DriveFacts | _Refusal]] = deque()
+        under_way: deque[Future[DriveRecord]] = deque()
         for index, log_input in enumerate(inputs):
+            what = (index, log_input, splits.get(log_input.stem), MAX_BYTES - held)
             if self._local is not None:
-                under_way.append(_done(self._local.load(index, log_input, MAX_BYTES - held)))
+                under_way.append(_done(self._local.load(*what)))
             else:
                 # No more than one a process ahead, so that the bound on the memory is kept.
-                under_way.append(
-                    self._pools[index % len(self._pools)].submit(_load, index, log_input, MAX_BYTES - held)
-                )
+                under_way.append(self._pools[index % len(self._pools)].submit(_load, *what))
             while len(under_way) > (len(self._pools) if index + 1 < len(inputs) else 0):
-                facts = _result(under_way.popleft())
-                if isinstance(facts, _Refusal):
-                    raise facts.error()
-                loaded.append(facts)
-                held += facts.bytes_held
+                record = _result(under_way.popleft())
+                loaded.append(record)
+                held += record.bytes_held
                 if held > MAX_BYTES:
-                    raise too_big(facts.name)
-                told(facts)
+                    raise too_big(record.name)
+                told(record)
         return loaded
 
-    def score(self, tunings: Mapping[str, FilterTuning]) -> dict[str, list[DriveError]]:
+    def score(self, tunings: Mapping[str, FilterNoise]) -> dict[str, list[DriveError]]:
         """Return the errors of each estimator in the order of the drives."""
         if self._local is not None:
             parts = [self._local.score(tunings)]
@@ -394,23 +194,9 @@ def _result(future: Future[Any]) -> Any:
         ) from None
 
 
-@dataclass(frozen=True, slots=True)
-class _Refusal:
-    """An error on its way between processes: exceptions with named arguments cannot be pickled."""
-
-    kind: type[PdhefError]
-    expected: str
-    got: str
-    where: str
-    remedy: str
-
-    def error(self) -> PdhefError:
-        return self.kind(expected=self.expected, got=self.got, where=self.where, remedy=self.remedy)
-
-
-def _done(facts: DriveFacts) -> Future[DriveFacts | _Refusal]:
-    future: Future[DriveFacts | _Refusal] = Future()
-    future.set_result(facts)
+def _done(record: DriveRecord) -> Future[DriveRecord]:
+    future: Future[DriveRecord] = Future()
+    future.set_result(record)
     return future
 
 
@@ -422,12 +208,9 @@ def _open_bench(setup: TuneSetup) -> None:
     _here["bench"] = DriveBench(setup)
 
 
-def _load(index: int, log_input: LogInput, max_bytes: int) -> DriveFacts | _Refusal:
-    try:
-        return _here["bench"].load(index, log_input, max_bytes)
-    except PdhefError as error:
-        return _Refusal(type(error), error.expected, error.got, error.where, error.remedy)
+def _load(index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord:
+    return _here["bench"].load(index, log_input, split, max_bytes)
 
 
-def _score(tunings: dict[str, FilterTuning]) -> dict[str, dict[int, DriveError]]:
+def _score(tunings: dict[str, FilterNoise]) -> dict[str, dict[int, DriveError]]:
     return _here["bench"].score(tunings)

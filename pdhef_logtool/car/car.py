@@ -1,0 +1,301 @@
+"""Everything that is known of one vehicle, as estimators and commands take it.
+
+A car is a folder: ``vehicle.toml`` is a person's and never rewritten; beside it stand the parts that commands write,
+each one its own (:mod:`~.parts`). A bare ``vehicle.toml`` is a car too, and may hold ``[filter.*]`` and ``[network]``
+of an older file or of an export (:mod:`~.flat`). A part whose basis has changed is stale: it is not taken, and the car
+says so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+from pdhef_logtool.car.flat import FlatCar, read_flat
+from pdhef_logtool.car.parts import (
+    FilterNoise,
+    Fit,
+    Intervals,
+    LearntOn,
+    Noise,
+    Trust,
+    noise_sha256,
+    physics_sha256,
+)
+from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
+from pdhef_logtool.records.documents import read_json, read_toml, validated
+from pdhef_logtool.records.errors import UsageError, VehicleError
+from pdhef_logtool.residual_model.bundle import (
+    DOCUMENT_FILE,
+    NO_MODEL,
+    SHIPPED,
+    SHIPPED_FOLDERS,
+    ModelBundle,
+    load_bundle,
+)
+
+VEHICLE_FILE, FIT_FILE, NOISE_FILE, NETWORK_FILE = "vehicle.toml", "fit.toml", "noise.toml", "network.toml"
+INTERVALS_FILE, UNSURE_FILE, HISTORY_FILE = "intervals.json", "intervals-unsure.json", "history.jsonl"
+NETWORK_FOLDER = "network"
+#: The car that comes with the package, by name.
+SHIPPED_CARS = {"saloon": Path(__file__).parents[1] / "models" / "default"}
+#: Instead of a file: intervals as the estimators give them; the wide ones, for a car that may not be as its file says.
+NO_INTERVALS, UNSURE = "none", "unsure"
+#: Digits of a hash that are shown.
+SHOWN_DIGITS = 12
+
+PartT = TypeVar("PartT", bound=Record)
+
+
+@dataclass(frozen=True, slots=True)
+class AllowedTrust:
+    """The cap in [0, 1], and the reason in words."""
+
+    cap: float
+    reason: str
+
+    @property
+    def note(self) -> str:
+        """What the report says."""
+        return f"network trust {self.cap:g}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Car:
+    """A vehicle with what was learnt of it.
+
+    Attributes
+    ----------
+    vehicle : physics and sensors, what identification found included.
+    own : physics and sensors as the person's file has them.
+    noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only what belongs to ``vehicle``.
+    network, network_name, network_folder : the residual network, None without; trust : what was found of it.
+    intervals : calibrated 95 % intervals, None without.
+    learnt_on : drives that ``vehicle`` was identified on.
+    source : folder or file, None for the default car. notes : what is stale, and why.
+    """
+
+    vehicle: VehicleParameters
+    own: VehicleParameters
+    noise: Mapping[str, FilterNoise] = field(default_factory=lambda: MappingProxyType({}))
+    network: ModelBundle | None = None
+    network_name: str = NO_MODEL
+    network_folder: Path | None = None
+    trust: Trust | None = None
+    intervals: Intervals | None = None
+    learnt_on: tuple[LearntOn, ...] = ()
+    source: Path | None = None
+    notes: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, vehicle: VehicleParameters, **parts: Any) -> Car:
+        """Return a car of a vehicle and the other attributes as they are given."""
+        return cls(vehicle, vehicle, **parts)
+
+    @classmethod
+    def load(
+        cls, path: Path | str | None = None, *, network: Path | str | None = None, intervals: Path | str | None = None
+    ) -> Car:
+        """Read a car.
+
+        Parameters
+        ----------
+        path : a car's folder, a vehicle.toml, ``saloon`` (the shipped car); None: the default sedan.
+        network : instead of the car's own: a shipped network's name, a folder, ``none``.
+        intervals : instead of the car's own: a file of ``pdhef calibrate``, ``unsure``, ``none``.
+
+        Raises
+        ------
+        VehicleError, ModelError
+            A file is missing or wrong; all that is wrong in it is named at once.
+        """
+        source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
+        folder = source if source is not None and source.is_dir() else None
+        if folder is not None:
+            if not (folder / VEHICLE_FILE).is_file():
+                what = "a network's" if (folder / DOCUMENT_FILE).is_file() else "another"
+                raise VehicleError(
+                    expected=f"a car: a folder with {VEHICLE_FILE}, or such a file",
+                    got=f"{what} folder",
+                    where=str(folder),
+                )
+            flat = read_flat(folder / VEHICLE_FILE)
+        else:
+            flat = FlatCar(default_vehicle()) if source is None else read_flat(source)
+        car = _with_parts(cls(flat.vehicle, flat.vehicle, source=source), flat, folder)
+        name, home = _network_of(car, folder, network)
+        bundle = None if home is None else load_bundle(home)
+        found = _intervals_of(folder, name, intervals)
+        car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=found)
+        stale = list(car.notes)
+        foreign = [n for n, one in car.noise.items() if bundle and one.network_sha256 not in (None, bundle.sha256)]
+        if foreign:
+            car = replace(car, noise={n: one for n, one in car.noise.items() if n not in foreign})
+            stale.append(_stale(f"noise of {', '.join(foreign)}", "it belongs to another network", "pdhef tune"))
+        elif other := car._other_than_tried:
+            stale.append(f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef trust makes it anew")
+        own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
+        if own and found is not None and found.physics_sha256 != car.physics_sha256:
+            stale.append(f"{INTERVALS_FILE} was made with other physics; pdhef calibrate makes it anew")
+        return replace(car, notes=tuple(stale))
+
+    @property
+    def physics_sha256(self) -> str:
+        """Digest of the physics that estimators run with."""
+        return physics_sha256(self.vehicle)
+
+    @property
+    def noise_sha256(self) -> str:
+        """Digest of the filters' noise."""
+        return noise_sha256(self.noise)
+
+    @property
+    def allowed_trust(self) -> AllowedTrust:
+        """How far ``pd-hef`` may follow the network on this car, and why (METHOD §14).
+
+        Innovations do not tell whether a network helps on a car that it has never seen: drives with truth do. Evidence
+        counts for the network, physics and noise that it was found with; a part written by hand names none of them.
+        """
+        found = self.trust
+        if found is None or not found.has_evidence:
+            why = f"no evidence that this network helps on {self.vehicle.name}"
+            return AllowedTrust(0.0, f"{why}; a drive with truth and pdhef trust give it")
+        here = "" if self.network is None else self.network.sha256
+        if found.network_sha256 is not None and found.network_sha256 != here:
+            return AllowedTrust(
+                0.0,
+                f"the car's evidence is about network {found.network_sha256[:SHOWN_DIGITS]}, this one is "
+                f"{here[:SHOWN_DIGITS]}; pdhef trust tries it",
+            )
+        if other := self._other_than_tried:
+            return AllowedTrust(0.0, f"the car's evidence was found with {other}; pdhef trust gives it anew")
+        return AllowedTrust(found.trust_cap, found.evidence)
+
+    @property
+    def _other_than_tried(self) -> str:
+        """What of the car is another than the network was tried with; empty if nothing is."""
+        found = self.trust
+        if found is not None and found.physics_sha256 not in (None, self.physics_sha256):
+            return "other physics"
+        return "other noise" if found is not None and found.noise_sha256 not in (None, self.noise_sha256) else ""
+
+    def with_fit(self, fit: Fit) -> Car:
+        """Return the car as identification found it; what was found of a network with other tyres counts no more."""
+        vehicle = fit.values.applied_to(self.own)
+        if not vehicle.name.endswith("(identified)"):
+            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
+        here = physics_sha256(vehicle)
+        noise = {n: one for n, one in self.noise.items() if one.physics_sha256 in (None, here)} | fit.filter
+        return replace(self, vehicle=vehicle, noise=noise, trust=None, learnt_on=fit.drives)
+
+    def with_noise(self, name: str, noise: FilterNoise) -> Car:
+        """Return the car with another noise of one filter."""
+        return replace(self, noise={**self.noise, name: noise})
+
+    def with_vehicle(self, vehicle: VehicleParameters) -> Car:
+        """Return the car with other physics, made wrong on purpose, and everything else as it is, its trust too."""
+        trust = self.trust
+        if trust is not None and trust.physics_sha256 == self.physics_sha256:
+            trust = trust.model_copy(update={"physics_sha256": None})
+        return replace(self, vehicle=vehicle, trust=trust)
+
+
+def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
+    """Return the car with fit, noise and trust: those of the file, then those of the folder that are not stale."""
+    notes: list[str] = []
+    noise, trust, learnt_on = dict(flat.noise), flat.trust, flat.learnt_on
+    vehicle = car.own
+    if folder is not None:
+        own = physics_sha256(vehicle)
+        fit = _part(folder / FIT_FILE, Fit)
+        if fit is not None and fit.physics_sha256 == own:
+            car = replace(car, noise=noise).with_fit(fit)
+            vehicle, noise, learnt_on, trust = car.vehicle, dict(car.noise), car.learnt_on, None
+        elif fit is not None:
+            notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "pdhef identify"))
+        tuned, stale = _part(folder / NOISE_FILE, Noise), list[str]()
+        here = physics_sha256(vehicle)
+        for name, one in ({} if tuned is None else tuned.filter).items():
+            if one.physics_sha256 in (None, here):
+                noise[name] = one
+            else:
+                stale.append(name)
+        if stale:
+            notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "pdhef tune"))
+        trust = _part(folder / NETWORK_FILE, Trust) or trust
+    return replace(car, vehicle=vehicle, noise=noise, trust=trust, learnt_on=learnt_on, notes=tuple(notes))
+
+
+def _stale(what: str, why: str, command: str) -> str:
+    return f"{what} is not used: {why}; {command} makes it anew"
+
+
+def _part(path: Path, kind: type[PartT]) -> PartT | None:
+    """Return a part of a folder, None if there is none; raises VehicleError."""
+    if not path.exists():
+        return None
+    what = f"a car's {path.name}"
+    raw = read_json(path, what, VehicleError) if path.suffix == ".json" else read_toml(path, what, VehicleError)
+    return validated(kind, raw, str(path), VehicleError, expected=f"the entries of {what}")
+
+
+def _network_of(car: Car, folder: Path | None, chosen: Path | str | None) -> tuple[str, Path | None]:
+    """Return name and folder of the network in force; the folder is None without one."""
+    name = str(chosen) if chosen is not None else (SHIPPED if car.trust is None else car.trust.network)
+    if name == NO_MODEL:
+        return NO_MODEL, None
+    if name in SHIPPED_FOLDERS:
+        home = SHIPPED_FOLDERS[name]
+        # A source tree without shipped networks still runs what needs none.
+        return (NO_MODEL, None) if chosen is None and not (home / DOCUMENT_FILE).is_file() else (name, home)
+    if chosen is None and folder is not None:
+        return name, folder / name
+    home = Path(name)
+    # A car's folder may be named where its network is meant.
+    return name, home / NETWORK_FOLDER if (home / NETWORK_FOLDER / DOCUMENT_FILE).is_file() else home
+
+
+def _intervals_of(folder: Path | None, network: str, chosen: Path | str | None) -> Intervals | None:
+    """Return the intervals in force: the chosen ones, else the car's own, else those of the shipped network."""
+    if chosen is not None and str(chosen) == NO_INTERVALS:
+        return None
+    file = UNSURE_FILE if str(chosen) == UNSURE else INTERVALS_FILE
+    if chosen is not None and str(chosen) != UNSURE:
+        return load_intervals(Path(chosen))
+    shipped = SHIPPED_CARS.values() if network == SHIPPED else ()
+    homes = [h for h in (folder, *shipped) if h is not None and (h / file).is_file()]
+    if not homes and chosen is not None:
+        raise UsageError(expected=f"a car with {file}", got="none", where=f"--intervals {UNSURE}")
+    return load_intervals(homes[0] / file) if homes else None
+
+
+def load_intervals(path: Path) -> Intervals:
+    """Read the intervals of a file, or those in a car's folder.
+
+    Raises
+    ------
+    VehicleError
+        The file is missing or wrong, or of an older format that filed intervals under names.
+    """
+    file = path / INTERVALS_FILE if path.is_dir() else path
+    raw = read_json(file, "a file of pdhef calibrate", VehicleError)
+    if isinstance(raw, dict) and raw.get("format") == "pdhef-calibration":
+        raise VehicleError(
+            expected="intervals filed by algorithm (pdhef-intervals 1)",
+            got="a calibration filed by name, which does not say what ran",
+            where=str(file),
+            remedy="pdhef calibrate makes it anew",
+        )
+    return validated(Intervals, raw, str(file), VehicleError, expected="the entries of a file of pdhef calibrate")
+
+
+def read_history(folder: Path) -> list[dict[str, Any]]:
+    """Return the lines of a car's history, oldest first; none without."""
+    path = folder / HISTORY_FILE
+    if not path.is_file():
+        return []
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]

@@ -1,0 +1,278 @@
+"""What commands learn about a car, one part a command: fit, noise, network and its trust, intervals.
+
+Every part names what it depends on by the digest of just that, so that a part whose basis has changed is known to be
+stale and is not taken, however the files came together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from pdhef_logtool.car.vehicle import NonNegative, Positive, Record, Tyres, VehicleParameters
+from pdhef_logtool.records.documents import one_of
+
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+
+#: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
+NOISY_FILTERS = ("phy-ukf-tuned", "physics-plus", "pd-hef", "pd-hef-smoothed")
+#: Measurements that ``r_std`` is about.
+MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+
+#: Entries of a vehicle file that change no estimate.
+_NOT_PHYSICS = {"name", "truth_position_m"}
+
+
+def digest(document: Any) -> str:
+    """Return the sha256 of a JSON-able value, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+
+
+def physics_sha256(vehicle: VehicleParameters) -> str:
+    """Return the digest of what a vehicle file says of physics and sensors, whatever its name, layout and comments.
+
+    Entries at their defaults count as absent: one that a later version adds makes no car stale.
+    """
+    return digest(vehicle.model_dump(mode="json", exclude=_NOT_PHYSICS, exclude_defaults=True))
+
+
+class LearntOn(Record):
+    """A drive that something was learnt on, with the span in seconds from the start of its log."""
+
+    name: str
+    sha256: str = ""
+    start_s: float = 0.0
+    end_s: float = 0.0
+
+
+class FittedSensors(Record):
+    """Constant biases that identification found."""
+
+    ay_bias_m_s2: float
+    yaw_rate_bias_rad_s: float
+
+
+class FittedValues(Record):
+    """Entries of the vehicle file that identification found better values for; absent ones stay the file's."""
+
+    yaw_inertia_kg_m2: Positive | None = None
+    steer_offset_rad: float | None = None
+    steering_ratio: Positive | None = None
+    roll_gradient_rad_per_m_s2: float | None = None
+    friction: Positive | None = None
+    sensors: FittedSensors | None = None
+    tyres: Tyres | None = None
+
+    @classmethod
+    def between(cls, own: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
+        """Return the entries of ``fitted`` that are another vehicle's than ``own``."""
+        found = {k: getattr(fitted, k) for k in cls.model_fields if getattr(fitted, k) != getattr(own, k)}
+        if "sensors" in found:
+            found["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
+        return cls(**found)
+
+    def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
+        """Return the vehicle with these values in place of its own."""
+        update: dict[str, Any] = {k: v for k in type(self).model_fields if (v := getattr(self, k)) is not None}
+        if self.sensors is not None:
+            update["sensors"] = vehicle.sensors.model_copy(update=self.sensors.model_dump())
+        return vehicle.model_copy(update=update)
+
+
+class FilterNoise(Record):
+    """Process and measurement 1-sigma of one filter, and what they were chosen with.
+
+    Attributes
+    ----------
+    q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
+        ``physics-plus`` also of the two axle forces. Empty: the filter's own.
+    r_std : by measurement; what is left out is the filter's own.
+    physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, for filters that have one.
+    score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
+    """
+
+    q_std: Annotated[tuple[NonNegative, ...], Field(strict=False)] = ()
+    r_std: dict[Annotated[str, one_of(MEASUREMENTS), Field(json_schema_extra={"enum": [*MEASUREMENTS]})], Positive] = (
+        Field(default_factory=dict)
+    )
+    physics_sha256: Sha256 | None = None
+    network_sha256: Sha256 | None = None
+    score_deg: Positive | None = None
+    trial: int | None = None
+
+    @model_validator(mode="after")
+    def _one_entry_a_state(self) -> FilterNoise:
+        if len(self.q_std) not in (0, 3, 4, 6):
+            raise ValueError(f"q_std needs 3 or 4 entries (v_x, v_y, yaw rate, a_x bias), got {len(self.q_std)}")
+        return self
+
+
+def _axle_forces_belong_to_physics_plus(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
+    for name, table in tables.items():
+        if len(table.q_std) == 6 and name != "physics-plus":
+            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics-plus's")
+    return tables
+
+
+#: Noise by filter.
+FilterTables = Annotated[
+    dict[Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise],
+    AfterValidator(_axle_forces_belong_to_physics_plus),
+]
+
+
+class Fit(Record):
+    """``fit.toml``, written by ``pdhef identify``: the car's physics as the drives show it.
+
+    The noise in ``filter`` was found together with the values and belongs to them (METHOD §14).
+    """
+
+    format: Literal["pdhef-fit"] = "pdhef-fit"
+    version: Literal[1] = 1
+    physics_sha256: Sha256
+    values: FittedValues
+    filter: FilterTables = Field(default_factory=dict)
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
+    scores: dict[str, dict[str, float]] = Field(default_factory=dict)
+    notes: Annotated[tuple[str, ...], Field(strict=False)] = ()
+
+
+class Noise(Record):
+    """``noise.toml``, written by ``pdhef tune``: filter noise by filter, and how it was searched for."""
+
+    format: Literal["pdhef-noise"] = "pdhef-noise"
+    version: Literal[1] = 1
+    filter: FilterTables
+    search: dict[str, Any] = Field(default_factory=dict)
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
+
+
+class Trust(Record):
+    """``network.toml``, written by ``pdhef trust``: which network this car has, how far it is trusted, and why.
+
+    Attributes
+    ----------
+    network : a shipped network's name, or the folder ``network`` of the car. network_sha256 : of it.
+    trust_cap : share of its residual that ``pd-hef`` takes, in [0, 1]. evidence : in words, with its figures.
+    physics_sha256, noise_sha256 : of what it was tried with; None: written by hand, holds for any.
+    """
+
+    format: Literal["pdhef-network"] = "pdhef-network"
+    version: Literal[1] = 1
+    network: str = "default"
+    network_sha256: Sha256 | None = None
+    trust_cap: Annotated[float, Field(ge=0, le=1)] = 0.0
+    evidence: str = "none"
+    physics_sha256: Sha256 | None = None
+    noise_sha256: Sha256 | None = None
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
+    figures: dict[str, Any] = Field(default_factory=dict)
+
+    @property
+    def has_evidence(self) -> bool:
+        """Whether the part says why; without, its cap counts for nothing."""
+        return self.evidence.strip().lower() not in ("", "none")
+
+
+class YawRateCoefficients(Record):
+    """By term of the yaw rate's variance, where ``filter`` is its own 1-sigma."""
+
+    floor: NonNegative
+    filter: NonNegative
+    yaw_rate: NonNegative
+
+
+class SideslipCoefficients(YawRateCoefficients):
+    """By term of the sideslip's variance."""
+
+    sideslip: NonNegative
+    grip: NonNegative
+    grip2: NonNegative
+    kinematic: NonNegative
+
+
+class Inflation(Record):
+    """Coefficients of the calibrated 1-sigmas of one algorithm (:mod:`pdhef_logtool.watches.intervals`)."""
+
+    sideslip: SideslipCoefficients
+    yaw_rate: YawRateCoefficients
+    vy_factor: NonNegative = 1.0
+
+
+class Algorithm(Record):
+    """What really runs under a name; names are presets, and may stand for another algorithm on another car.
+
+    Attributes
+    ----------
+    algorithm : for example ``adaptive-hybrid-ukf``. options : that change its structure.
+    noise : process and measurement 1-sigma. use_speed : whether the speed sensor enters after the start.
+    physics_sha256, network_sha256 : of what of the car it uses; None: nothing.
+    """
+
+    algorithm: str
+    options: dict[str, Any] = Field(default_factory=dict)
+    noise: dict[str, Any] = Field(default_factory=dict)
+    use_speed: bool = True
+    physics_sha256: Sha256 | None = None
+    network_sha256: Sha256 | None = None
+
+    @property
+    def sha256(self) -> str:
+        """Digest of all of it."""
+        return digest(self.model_dump(mode="json"))
+
+    @property
+    def structure(self) -> str:
+        """Digest of algorithm and options: what intervals are filed under; the rest is their basis."""
+        return digest([self.algorithm, self.options])
+
+
+class IntervalEntry(Record):
+    """Intervals of one algorithm; ``estimator`` is the name under which it ran, for people."""
+
+    estimator: str
+    algorithm: Algorithm
+    inflation: Inflation
+    unseen_factor: float = 1.0
+    wrong_vehicle_factor: float | None = None
+    coverage: Annotated[tuple[dict[str, Any], ...], Field(strict=False)] = ()
+
+
+class Intervals(Record):
+    """``intervals.json``, written by ``pdhef calibrate``: 95 % intervals by resolved algorithm.
+
+    ``spread`` is by how much friction and vehicle were made wrong too; 0: not at all.
+    """
+
+    format: Literal["pdhef-intervals"] = "pdhef-intervals"
+    version: Literal[1] = 1
+    car: str
+    physics_sha256: Sha256
+    roll_gradient_rad_per_m_s2: float
+    spread: Annotated[float, Field(ge=0)] = 0.0
+    entries: Annotated[tuple[IntervalEntry, ...], Field(strict=False)]
+    settings: dict[str, Any] = Field(default_factory=dict)
+    fit: dict[str, Any] = Field(default_factory=dict)
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
+    versions: dict[str, str] = Field(default_factory=dict)
+
+
+class HistoryLine(Record):
+    """A line of ``history.jsonl``: which command wrote which part from which drives, with which options."""
+
+    command: str
+    part: str
+    sha256: Sha256
+    version: str
+    settings: dict[str, Any] = Field(default_factory=dict)
+    drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
+
+
+def noise_sha256(noise: Mapping[str, FilterNoise]) -> str:
+    """Return the digest of the noise values alone, by filter."""
+    values = {name: [list(n.q_std), dict(n.r_std)] for name, n in noise.items()}
+    return digest(values)

@@ -1,0 +1,209 @@
+"""Writing what a command learnt of a car: into its folder, as one change that is there whole or not at all, or flat.
+
+The folder is made beside the old one and takes its place by exchange, so that whoever reads sees one of the two.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.car.car import HISTORY_FILE, VEHICLE_FILE, Car
+from pdhef_logtool.car.flat import flat_toml, vehicle_toml
+from pdhef_logtool.car.parts import HistoryLine, LearntOn, digest
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.files import PendingFile, cannot_write, write_bytes
+from pdhef_logtool.records.version import __version__
+
+#: Writes one file at the path that it is given, or is its content.
+Content = bytes | Callable[[Path], object]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What one command adds to a car.
+
+    Attributes
+    ----------
+    command : its name. part : the file of the part that it wrote, by name in the folder.
+    files : the part's file and what goes with it (records, plots), by name in the folder.
+    folders : copied whole into the car's folder, by name.
+    settings, drives : of the command, for the history.
+    told : of it in a flat file, under ``[identification]``.
+    """
+
+    command: str
+    part: str
+    files: Mapping[str, Content]
+    folders: Mapping[str, Path] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    drives: Iterable[LearntOn] = ()
+    told: Mapping[str, Any] = field(default_factory=dict)
+
+
+def check_output(source: Car, output: Path) -> None:
+    """Refuse an output that is no place for this car before anything is computed.
+
+    Raises
+    ------
+    UsageError
+        The folder is neither new nor this car's.
+    """
+    if output.suffix == ".toml" or not output.exists():
+        return
+    theirs = output / VEHICLE_FILE
+    if not output.is_dir() or (any(output.iterdir()) and not theirs.is_file()):
+        raise UsageError(
+            expected="a new folder, a car's folder, or a file name that ends in .toml",
+            got=output.name,
+            where="--output",
+        )
+    if theirs.is_file() and theirs.read_bytes() != vehicle_file(source):
+        raise UsageError(
+            expected="a new folder, or that of the same car",
+            got=f"{output.name}, whose {VEHICLE_FILE} is another",
+            where="--output",
+            remedy=f"name another folder, or give --car {output}",
+        )
+
+
+def vehicle_file(car: Car) -> bytes:
+    """Return the bytes of a car's vehicle.toml; the default car has none, so that one is made."""
+    if car.source is None:
+        return vehicle_toml(car.own, "The default car of pdhef.").encode()
+    return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
+
+
+def update_car(source: Car, output: Path, change: Change) -> Path:
+    """Write a change into the car's folder ``output``; return the path of the part.
+
+    A new folder holds the source's vehicle.toml and parts as well. ``output`` may be the source itself.
+
+    Raises
+    ------
+    OutputError
+        The folder cannot be written; the old one then stands as it was.
+    UsageError
+        See :func:`check_output`.
+    """
+    check_output(source, output)
+    base = output if (output / VEHICLE_FILE).is_file() else source.source
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".partial", dir=output.parent))
+        try:
+            if base is not None and base.is_dir():
+                shutil.copytree(base, fresh, dirs_exist_ok=True)
+            else:
+                (fresh / VEHICLE_FILE).write_bytes(vehicle_file(source))
+            for name, folder in change.folders.items():
+                if (fresh / name).exists() and folder.resolve() != (output / name).resolve():
+                    shutil.rmtree(fresh / name)
+                shutil.copytree(folder, fresh / name, dirs_exist_ok=True)
+            for name, content in change.files.items():
+                _write(fresh / name, content)
+            _log(fresh, change)
+            fresh.chmod(0o777 & ~_umask())
+            _take_place(fresh, output)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+    except OSError as error:
+        raise cannot_write(output, error) from error
+    return output / change.part
+
+
+def write_change(
+    source: Car, after: Car, output: Path, change: Change, comments: Mapping[str, str] | None = None
+) -> Path:
+    """Write what a command learnt to a car's folder, or flat where ``output`` ends in ``.toml``; return where.
+
+    Parameters
+    ----------
+    after : the car with the change. comments : beside entries of the flat file, by dotted name.
+
+    Raises
+    ------
+    OutputError, UsageError
+        See :func:`update_car`.
+    """
+    if output.suffix != ".toml":
+        return update_car(source, output, change)
+    text = vehicle_file(source).decode("utf-8")
+    provenance = dict(change.told)
+    if after.learnt_on:
+        provenance["drives"] = [d.model_dump(mode="json") for d in after.learnt_on]
+    flat = flat_toml(text, source.own, after.vehicle, after.noise, after.trust, provenance, comments)
+    write_bytes(output, flat.encode())
+    for name, content in change.files.items():
+        if name != change.part:
+            with PendingFile(output.with_name(f"{output.stem}.{name}")) as pending:
+                _write(pending.path, content)
+    return output
+
+
+def _write(path: Path, content: Content) -> None:
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        content(path)
+
+
+def _log(folder: Path, change: Change) -> None:
+    line = HistoryLine(
+        command=change.command,
+        part=change.part,
+        sha256=digest((folder / change.part).read_text(encoding="utf-8")),
+        version=__version__,
+        settings=dict(change.settings),
+        drives=tuple(change.drives),
+    )
+    with (folder / HISTORY_FILE).open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line.model_dump(mode="json"), sort_keys=True, ensure_ascii=False) + "\n")
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _take_place(fresh: Path, target: Path) -> None:
+    """Give ``fresh`` the target's name; what stood there is at ``fresh`` afterwards."""
+    for path in fresh.rglob("*"):
+        if path.is_file():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+    if not target.exists():
+        fresh.rename(target)
+        return
+    if not _exchanged(fresh, target):
+        # A file system without exchange: for a moment nothing stands under the car's name.
+        old = fresh.with_suffix(".old")
+        target.rename(old)
+        try:
+            fresh.rename(target)
+        except BaseException:
+            old.rename(target)
+            raise
+        old.rename(fresh)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Exchange two names at once where system and file system can (Linux renameat2); False where they cannot."""
+    at_cwd, exchange = -100, 2
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    if rename(at_cwd, os.fsencode(one), at_cwd, os.fsencode(other), exchange) == 0:
+        return True
+    if ctypes.get_errno() in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
+        return False
+    raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(other))

@@ -1,0 +1,104 @@
+"""What reaches the user: results on stdout, everything else on stderr."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
+
+import typer
+
+from pdhef_logtool.records.errors import EXIT_OK
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+
+class _Result(Protocol):
+    def to_dict(self) -> dict[str, Any]: ...
+
+
+_Shown = TypeVar("_Shown", bound=_Result)
+
+
+def stdout() -> Console:
+    """Return a console of stdout."""
+    from rich.console import Console
+
+    # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS says otherwise.
+    return Console(highlight=False, width=None if sys.stdout.isatty() or os.environ.get("COLUMNS") else 160)
+
+
+def table(*heads: str, fold: int = 0) -> Table:
+    """Return a table without a box; a head that begins with ``>`` is that of a column of numbers.
+
+    ``fold`` is how many columns from the left break their text rather than cut it.
+    """
+    from rich.table import Table
+
+    made = Table(box=None, header_style="bold")
+    for number, head in enumerate(heads):
+        side: Literal["left", "right"] = "right" if head.startswith(">") else "left"
+        made.add_column(head.removeprefix(">"), justify=side, overflow="fold" if number < fold else "ellipsis")
+    return made
+
+
+def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
+    """Return a number for a table, a dash where there is none."""
+    return "-" if value is None else f"{value * factor:.{digits}f}"
+
+
+def say(text: str) -> None:
+    """Print a line on stderr."""
+    print(text, file=sys.stderr)  # noqa: T201
+
+
+def warn(text: str) -> None:
+    """Print a warning on stderr."""
+    say(f"warning: {text}")
+
+
+def print_json(document: Any) -> None:
+    """Print one JSON document."""
+    print(json.dumps(document, indent=2, sort_keys=False, ensure_ascii=False, allow_nan=False))  # noqa: T201
+
+
+def print_facts(facts: dict[str, Any]) -> None:
+    """Print one fact a line."""
+    for key, value in facts.items():
+        print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}")  # noqa: T201
+
+
+def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool) -> None:
+    """Print a result, as its JSON document or as its tables."""
+    if as_json:
+        print_json(result.to_dict())
+    else:
+        render(result, stdout())
+
+
+def finish(
+    result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool, *, exit_code: int | None = None
+) -> NoReturn:
+    """Print a result and leave with ``exit_code``, or else with the result's own; a result without one is whole."""
+    show(result, render, as_json)
+    raise typer.Exit(getattr(result, "exit_code", EXIT_OK) if exit_code is None else exit_code)
+
+
+@contextmanager
+def progress() -> Iterator[Callable[[str, float], None]]:
+    """Yield ``update(text, share)``: a bar on a terminal's stderr, silence elsewhere."""
+    if not sys.stderr.isatty():
+        yield lambda _text, _share: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=1.0)
+        yield lambda text, share: bar.update(task, description=text, completed=share)

@@ -1,0 +1,208 @@
+"""``pdhef identify``, ``extract``, ``train``, ``tune``, ``trust`` and ``calibrate``: what is learnt from drives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer import Argument, Option
+
+from pdhef_logtool.cli import console, learning_tables, options
+from pdhef_logtool.records.errors import UsageError
+
+if TYPE_CHECKING:
+    from pdhef_logtool.runs.config import RunConfig
+
+commands = typer.Typer()
+
+
+@options.command(
+    commands,
+    "pdhef identify drives/ --car guess.toml -o mycar",
+    "pdhef identify drive.mcap --car guess.toml -o mycar --end 150 --holdout 0",
+    car="Where the fit starts (mass, geometry, sensor noise, priors)",
+)
+def identify(
+    logs: options.TruthLogs,
+    output: options.CarOutput,
+    config: RunConfig,
+    holdout: Annotated[float, Option(help="Share at the end of each slice that is only scored, once.")] = 0.25,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Fit a car's tyres, steering and biases to its drives. Roll gradient and filter noise are fitted too."""
+    from pdhef_logtool.learning.car.identify_command import identify as fit
+
+    with console.progress() as bar:
+        result = fit(logs, output, config, holdout=holdout, progress=bar, warn=console.warn)
+    console.finish(result, learning_tables.render_identification, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef extract logs/ -o residuals --car mycar --jobs 2",
+    "pdhef extract drive.mcap -o residuals --car mycar --prefer-truth rtk \\",
+    "  --truth-smoothing 0.15",
+    "pdhef extract 'held_out/*.mcap' -o residuals_test --split test --resume",
+    notes="Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set "
+    "beside them has a split, or --split puts all of them into one.",
+    shared="sensors friction",
+    car="The nominal car (default: what a set's manifest names)",
+)
+def extract(
+    *,
+    logs: options.TruthLogs,
+    output: Annotated[Path, Option("--output", "-o", help="Folder of the dataset.")],
+    config: RunConfig,
+    truth_smoothing: Annotated[str, Option(help="auto (by its noise), none, or seconds to either side.")] = "auto",
+    split: Annotated[str | None, Option(help="train, validation or test for all drives of this command.")] = None,
+    seed: Annotated[int, Option(help="Seed of the split by drive.")] = 0,
+    vary: Annotated[float, Option(help="Make friction and car wrong by this spread for a part of the drives.")] = 0.0,
+    jobs: options.Jobs = 1,
+    resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings are as they were.")] = False,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Write the residual dataset that train learns from. A residual is what a car's physics leave unexplained."""
+    from pdhef_logtool.learning.network.extract_command import ExtractSettings
+    from pdhef_logtool.learning.network.extract_command import extract as write_residuals
+
+    settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed, vary=vary)
+    with console.progress() as bar:
+        result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, progress=bar, warn=console.warn)
+    console.finish(result, learning_tables.render_extraction, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef train residuals/ -o model",
+    "pdhef train mycar/ -o mycar_model --init model --epochs 10",
+    "pdhef train residuals/ -o model --baselines",
+    notes="An interrupted training goes on from its last whole epoch when the same command is given again.",
+)
+def train(
+    *,
+    dataset: Annotated[Path, Argument(metavar="DATASET", help="Folder that pdhef extract wrote.")],
+    output: Annotated[Path, Option("--output", "-o", help="Folder of the model bundle to write.")],
+    init: Annotated[Path | None, Option(help="Model bundle to fine-tune, or many-cars, or default.")] = None,
+    baselines: Annotated[bool, Option("--baselines", help="Train pure-lstm and linear-regression instead.")] = False,
+    paper: Annotated[bool, Option("--paper", help="The paper's Table 1 instead of the default recipe.")] = False,
+    seed: Annotated[int, Option(help="Seed of weights, order and dropout.")] = 0,
+    epochs: Annotated[int | None, Option(help="Default: the recipe's.")] = None,
+    device: Annotated[str, Option(help="PyTorch device: cpu or cuda.")] = "cpu",
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Train the residual network on a dataset of extract. Writes weights, loss history and plot."""
+    from pdhef_logtool.learning.network.train_command import run_training
+
+    if baselines:
+        from pdhef_logtool.learning.network.baselines import run_baselines
+
+        if init is not None:
+            raise UsageError(expected="--baselines or --init", got="both", where="train")
+        with console.progress() as bar:
+            both = run_baselines(dataset, output, paper=paper, seed=seed, epochs=epochs, device=device, progress=bar)
+        console.finish(both, learning_tables.render_baselines, as_json)
+    with console.progress() as bar:
+        result = run_training(
+            dataset, output, init=init, paper=paper, seed=seed, epochs=epochs, device=device, progress=bar
+        )
+    console.finish(result, learning_tables.render_training, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef tune logs/ --split validation --car mycar -o mycar --jobs 2",
+    "pdhef tune logs/ --split validation --car mycar -o mycar --trials 256",
+    notes="Every estimator gets the same search space, drives and number of trials. All trials and a plot of them "
+    "are kept with the car. Drives that a set's manifest marks test or extrapolation are refused (docs/tune.md).",
+    shared="sensors friction network model signal_map",
+    car="The car whose filter noise is tuned",
+)
+def tune(
+    *,
+    logs: options.TruthLogs,
+    output: options.CarOutput,
+    config: RunConfig,
+    estimators: Annotated[
+        str | None,
+        Option(
+            "--estimators",
+            "-e",
+            help="Out of phy-ukf-tuned, physics-plus, pd-hef, pd-hef-smoothed. Default: the first two, and pd-hef "
+            "where the car has a network of its own or --network names one.",
+        ),
+    ] = None,
+    trials: Annotated[int, Option(help="Of each estimator.")] = 128,
+    seed: Annotated[int, Option(help="Seed of the search.")] = 0,
+    split: options.Split = None,
+    any_split: options.AnySplit = False,
+    jobs: options.Jobs = 1,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Tune the noise of a car's filters for sideslip. All filters are searched alike."""
+    from pdhef_logtool.learning.noise.tune_command import TuneSettings
+    from pdhef_logtool.learning.noise.tune_command import tune as search_noise
+
+    names = None if estimators is None else options.split_names(estimators)
+    settings = TuneSettings(config=config, names=names, trials=trials, seed=seed, split=split, any_split=any_split)
+    with console.progress() as bar:
+        result = search_noise(logs, output, settings, jobs=jobs, progress=bar, warn=console.warn)
+    console.finish(result, learning_tables.render_tuning, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef trust drive.mcap --car mycar --start 155 -o mycar",
+    "pdhef trust logs/ --split test --car mycar -o mycar",
+    notes="Give driving that neither the network nor the car was fitted to; drives that a manifest marks train or "
+    "validation are refused. The filter runs at trust 0, 0.25, 0.5, 0.75 and 1. The cap is 1 only if a bootstrap of "
+    "blocks confirms the gain, at most 0.5 on a mean gain, else 0 (docs/trust.md). All figures are kept with the car.",
+    shared="sensors friction network model",
+    car="The car of the drives",
+)
+def trust(
+    logs: options.TruthLogs,
+    output: options.CarOutput,
+    config: RunConfig,
+    split: options.Split = None,
+    any_split: options.AnySplit = False,
+    seed: Annotated[int, Option(help="Seed of the bootstrap.")] = 0,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Find how far the network may be trusted on a car. Without truth in the drives it cannot be told."""
+    from pdhef_logtool.learning.drives import LearnSettings
+    from pdhef_logtool.learning.evidence.trust_command import trust as try_network
+
+    settings = LearnSettings(config=config, seed=seed, split=split, any_split=any_split)
+    with console.progress() as bar:
+        result = try_network(logs, output, settings, progress=bar, warn=console.warn)
+    console.finish(result, learning_tables.render_trust, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef calibrate logs/ --split validation --car mycar -o mycar",
+    "pdhef calibrate logs/ --car mycar --vary 0 -o mycar",
+    notes="Give drives of many kinds that neither network nor filter noise was fitted to; drives that a set's "
+    "manifest marks test or extrapolation are refused (docs/calibrate.md).",
+    shared="estimators sensors friction network model",
+    car="The car that the estimators run with",
+)
+def calibrate(
+    logs: options.TruthLogs,
+    output: options.CarOutput,
+    config: RunConfig,
+    vary: Annotated[float, Option(help="Run each drive twice more with friction and car wrong by this spread.")] = 0.1,
+    seed: Annotated[int, Option(help="Seed of --vary.")] = 0,
+    split: options.Split = None,
+    any_split: options.AnySplit = False,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Fit the 95 % intervals of a car's estimators. Each regime of driving has its own."""
+    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings
+    from pdhef_logtool.learning.evidence.calibrate_command import calibrate as fit_intervals
+
+    settings = CalibrateSettings(config=config, spread=vary, seed=seed, split=split, any_split=any_split)
+    with console.progress() as bar:
+        result = fit_intervals(logs, output, settings, progress=bar, warn=console.warn)
+    console.finish(result, learning_tables.render_calibration, as_json)

@@ -1,0 +1,136 @@
+"""What the learning commands print on the terminal."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from pdhef_logtool.cli.console import cell, table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pdhef_logtool.learning.car.identify_command import IdentifyResult
+    from pdhef_logtool.learning.evidence.calibrate_command import CalibrateResult
+    from pdhef_logtool.learning.evidence.trust_command import TrustResult
+    from pdhef_logtool.learning.network.baselines import BaselinesResult
+    from pdhef_logtool.learning.network.extract_command import ExtractResult
+    from pdhef_logtool.learning.network.train_command import TrainResult
+    from pdhef_logtool.learning.noise.tune_command import TuneResult
+
+
+def render_identification(result: IdentifyResult, console: Console) -> None:
+    """Print what was identified, how well it is known, and how well the filter then does."""
+    found = result.identification
+    parameters = table("parameter", ">value", ">95 % interval", ">prior", "unit", "")
+    for p in found.parameters:
+        interval = f"{p.low:.4g} to {p.high:.4g}" if p.excited else "-"
+        remark = "filter noise" if p.tuning else "" if p.excited else "kept: not excited further"
+        parameters.add_row(p.name, f"{p.value:.5g}", interval, f"{p.prior:.4g}", p.unit, remark)
+    scores = table("part", ">seconds", ">β = 0", ">phy-ukf, starting car", ">phy-ukf-tuned, identified")
+    for s in found.scores:
+        errors = (f"{value:.3f}°" for value in (s.zero_deg, s.start_file_deg, s.identified_deg))
+        scores.add_row(s.part, f"{s.seconds:.1f}", *errors)
+    console.print(parameters)
+    console.print()
+    console.print("sideslip RMSE")
+    console.print(scores)
+    for note in found.notes:
+        console.print(f"  {note}")
+    console.print(f"car in {result.car}", soft_wrap=True)
+
+
+def render_extraction(result: ExtractResult, console: Console) -> None:
+    """Print what each drive gave, and the dataset as a whole."""
+    residuals = (">v̇_y residual\nRMS m/s²", ">ṙ residual\nRMS rad/s²")
+    drives = table("drive", ">seconds", ">usable", *residuals, "split", "truth", fold=1)
+    for drive in result.results:
+        if drive.entry is None:
+            drives.add_row(drive.record.name, "-", "-", "-", "-", "-", "failed")
+            continue
+        e, truth, rms = drive.entry, drive.entry["truth"], drive.entry["residual_rms"]
+        half_s = truth["smoothing_half_s"]
+        drives.add_row(
+            drive.record.name,
+            f"{e['duration_s']:.1f}",
+            f"{100.0 * e['usable_rows'] / max(e['rows'], 1):.1f} %",
+            cell(rms["vy_dot_m_s2"], digits=3),
+            cell(rms["yaw_acceleration_rad_s2"], digits=3),
+            e["split"],
+            truth["kind"] + (f", ±{half_s:g} s" if half_s else "") + (", kept" if drive.kept else ""),
+        )
+    console.print(drives)
+    splits = result.manifest["splits"].items()
+    told = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
+    console.print(", ".join(told))
+    console.print(f"dataset in {result.output}", soft_wrap=True)
+
+
+def render_training(result: TrainResult, console: Console) -> None:
+    """Print how the training went; losses are shares of the target's own mean square."""
+    best = min(result.history, key=lambda e: e.validation_loss)
+    seconds = sum(e.seconds for e in result.history)
+    losses = f"training {best.train_loss:.4f}, validation {best.validation_loss:.4f} of the target's mean square"
+    console.print(f"{len(result.history)} epochs in {seconds:.0f} s; best epoch {best.epoch}: {losses}")
+    if result.test_loss is not None:
+        console.print(f"test drives: {result.test_loss:.4f}")
+    console.print(f"model in {result.model} ({result.bundle.sha256[:12]})", soft_wrap=True)
+
+
+def render_baselines(result: BaselinesResult, console: Console) -> None:
+    """Print how both baselines came out."""
+    render_training(result.pure_lstm, console)
+    errors = result.regression.provenance["sideslip_rmse_deg"]
+    shown = ", ".join(f"{split} {value:.3f}" for split, value in errors.items() if value is not None)
+    console.print(f"linear regression, sideslip RMSE in degrees: {shown}")
+    console.print(f"coefficients in {result.regression_file}", soft_wrap=True)
+
+
+def render_tuning(result: TuneResult, console: Console) -> None:
+    """Print the best noise of each estimator and its sideslip error; all had the same drives and trials."""
+    from pdhef_logtool.learning.noise.search import FACTORS
+
+    errors = (">\nobjective °", ">\nmedian °", ">\npooled °", ">car's own\nobjective °")
+    tuned = table("\nestimator", *(f">{f.name}\n{f.unit}" for f in FACTORS), *errors)
+    for t in result.tuned:
+        best, before = t.best.score, None if t.before is None else t.before.objective_deg
+        scores = (best.objective_deg, best.median_deg, best.pooled_deg, before)
+        tuned.add_row(t.name, *(f"{v:g}" for v in t.best.values), *(cell(v, digits=4) for v in scores))
+    console.print("sideslip RMSE over drives")
+    console.print(tuned)
+    trials = len(result.tuned[0].trials)
+    console.print(f"{len(result.drives)} drives, {trials} trials of each estimator")
+    console.print(f"car in {result.car}", soft_wrap=True)
+
+
+def render_trust(result: TrustResult, console: Console) -> None:
+    """Print the sideslip error at each trust, its difference to trust 0 with bounds, and the cap with its reason."""
+    from pdhef_logtool.learning.evidence.trust import TRUSTS
+
+    d = result.decision
+    errors = table(">\ntrust", ">sideslip\nRMSE °", ">squared error less\nthat at 0, deg²", ">\n95 % bounds")
+    for trust, rmse, b in zip(TRUSTS, d.rmse_deg, d.against_zero, strict=True):
+        known = trust > 0.0 and not math.isnan(b.low_deg2)
+        bounds = f"{b.low_deg2:.4f} to {b.high_deg2:.4f}" if known else "-"
+        errors.add_row(f"{trust:g}", f"{rmse:.4f}", f"{b.value_deg2:.4f}" if trust else "-", bounds)
+    console.print(errors)
+    seconds = f"{d.scored_s:.0f} s scored, {d.excited_s:.0f} s of them excited"
+    console.print(f"{len(result.drives)} drives, {d.blocks} blocks, {seconds}")
+    console.print(f"trust cap {d.cap:g}: {d.reason}")
+    console.print(f"car in {result.car}", soft_wrap=True)
+
+
+def render_calibration(result: CalibrateResult, console: Console) -> None:
+    """Print how the 95 % intervals of sideslip stand before and after, on drives that were not fitted to."""
+    widths = (">covered %\nbefore", ">\nafter", ">width / normal\nbefore", ">\nafter")
+    intervals = table("\nestimator", "\ncar", "grip\nuse", ">\ndrives", ">RMSE\n°", *widths)
+    for entry in result.intervals.entries:
+        for c in entry.coverage:
+            covered = (f"{100.0 * c[key]:.1f}" for key in ("covered_before", "covered_after"))
+            width = (f"{c[key]:.2f}" for key in ("width_before", "width_after"))
+            given = "made wrong" if c["wrong_vehicle"] else "as given"
+            rmse = cell(c["rmse_rad"], math.degrees(1.0), 4)
+            intervals.add_row(entry.estimator, given, c["bin"], str(c["drives"]), rmse, *covered, *width)
+    console.print("95 % intervals of sideslip, each drive judged by a fit without it; width over 3.92 x RMSE")
+    console.print(intervals)
+    console.print(f"{len(result.intervals.drives)} drives; intervals in {result.file}", soft_wrap=True)

@@ -1,0 +1,161 @@
+"""``pdhef run``, ``metrics`` and ``view``: estimate on logs, score what others estimated, look at the recordings."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+from typer import Argument, Option
+
+from pdhef_logtool.cli import console, options
+from pdhef_logtool.records.errors import OutputError
+
+if TYPE_CHECKING:
+    from pdhef_logtool.runs.config import RunConfig
+    from pdhef_logtool.runs.pipeline import RunResult
+
+commands = typer.Typer()
+RECORDING = "recording.rrd"
+
+
+@options.command(
+    commands,
+    "pdhef run drive.mcap -o out",
+    "pdhef run drive.bag -o out --car mycar --mapping mapping.toml",
+    "pdhef run logs/ -o out --estimators zero,phy-ukf --annotate sidecar",
+    "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
+    "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
+    notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
+    "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).",
+    shared="estimators annotate sensors friction thresholds config_file network intervals model calibration",
+    car="Your car (default: a sedan)",
+)
+def run(
+    logs: options.Logs,
+    output: Annotated[Path, Option("--output", "-o", help="Folder for everything that the run writes.")],
+    config: RunConfig,
+    junit: options.JunitFile = None,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Run estimators on logs, score and annotate them. Recordings and metrics are written too."""
+    from pdhef_logtool.runs.pipeline import run_logs
+
+    with console.progress() as bar:
+        result = run_logs(logs, output, config, junit=junit, progress=bar, warn=console.warn)
+    _finish(result, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef metrics drive.mcap --estimate /localization/odometry",
+    "pdhef metrics drive.mcap --estimate sideslip_rad=/esc/state.beta \\",
+    "  --estimate vx_m_s=/esc/state.speed --name esc",
+    "pdhef metrics drive.mcap --estimate /pdhef/phy_ukf/state \\",
+    "  --truth /ins/odometry --car mycar -o out",
+    "pdhef metrics drive.mcap -m mapping.toml --thresholds limits.toml --json",
+    notes="The type tells the signals of nav_msgs/Odometry, geometry_msgs/Twist*Stamped and "
+    "pdhef_msgs/VehicleStateEstimate; others need SIGNAL=, one of vx_m_s, vy_m_s, yaw_rate_rad_s, sideslip_rad, "
+    "ay_m_s2, their *_std_*, valid. Scales, offsets, signs and several estimators stand in a mapping file, one "
+    "[estimates.NAME.SIGNAL] table a signal.",
+    shared="thresholds config_file",
+    car="The car (place of its truth, friction, lowest speed)",
+)
+def metrics(
+    log: options.Log,
+    config: RunConfig,
+    estimate: Annotated[
+        list[str] | None,
+        Option(metavar="SOURCE", help="[SIGNAL=]TOPIC[.FIELD], repeatable. Default: the mapping's [estimates]."),
+    ] = None,
+    truth: Annotated[
+        list[str] | None,
+        Option(metavar="SOURCE", help="[SIGNAL=]TOPIC[.FIELD], repeatable. Default: the mapped or recognised truth."),
+    ] = None,
+    name: Annotated[str | None, Option(help="What the estimator is called; or which of [estimates] is scored.")] = None,
+    output: Annotated[
+        Path | None, Option("--output", "-o", help="Folder for tables and report. Default: print only.")
+    ] = None,
+    junit: options.JunitFile = None,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Score an estimate that the log itself holds. The figures are those of pdhef run."""
+    from pdhef_logtool.runs.recorded_estimates import score_log
+
+    with console.progress() as bar:
+        result = score_log(
+            log,
+            config,
+            estimates=estimate or (),
+            truth=truth or (),
+            name=name,
+            output=output,
+            junit=junit,
+            progress=bar,
+            warn=console.warn,
+        )
+    _finish(result, as_json)
+
+
+@options.command(commands, "pdhef view out", "pdhef view out/logs/drive/recording.rrd")
+def view(
+    output: Annotated[Path, Argument(metavar="OUTPUT", help="Folder of a run or of one of its logs, or a .rrd file.")],
+    log: Annotated[str | None, Option(help="Which log of the run; default: the first.")] = None,
+) -> None:
+    """Open the recording of a run in the Rerun viewer."""
+    recording = find_recording(output, log)
+    console.say(f"opening {recording}")
+    raise typer.Exit(open_viewer(recording))
+
+
+def _finish(result: RunResult, as_json: bool) -> NoReturn:
+    """Print and leave; what closed the gate, and what the exit code then does not show, goes to stderr."""
+    from pdhef_logtool.cli.run_tables import render_run
+
+    console.show(result, render_run, as_json)
+    failed = [v for v in result.verdicts if v.failed]
+    for verdict in failed:
+        where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"
+        console.say(f"pdhef: threshold failed: {where}: {verdict.reason}")
+    if failed:
+        for one in result.results:
+            if one.outcome.outcome != "ok":
+                console.say(f"pdhef: {one.outcome.log} besides {one.outcome.outcome}")
+    raise typer.Exit(result.exit_code)
+
+
+def find_recording(output: Path, log: str | None) -> Path:
+    """Return the recording of one log of a run.
+
+    Parameters
+    ----------
+    output : output folder of a run, the folder of one log, or the recording itself.
+    log : stem of the log; None takes the first in alphabetical order.
+
+    Raises
+    ------
+    OutputError
+        There is no such recording; the ones that there are get named.
+    """
+    if output.is_file():
+        return output
+    if log is None and (output / RECORDING).is_file():
+        return output / RECORDING
+    recordings = {p.parent.name: p for p in sorted((output / "logs").glob(f"*/{RECORDING}"))}
+    if log is None and recordings:
+        return next(iter(recordings.values()))
+    if log is not None and log in recordings:
+        return recordings[log]
+    raise OutputError(
+        expected=RECORDING if log is None else f"a log named {log}",
+        got=", ".join(recordings) or "none",
+        where=str(output),
+        remedy="" if recordings else "pdhef run LOG -o OUT writes one",
+    )
+
+
+def open_viewer(recording: Path) -> int:
+    """Open the recording in Rerun's viewer and return its exit code."""
+    return subprocess.call([sys.executable, "-m", "rerun", str(recording)])  # noqa: S603 (our own interpreter)

@@ -1,0 +1,93 @@
+"""What of a log is read and how: slice, sensors, truth, friction; and times as users write them."""
+
+from __future__ import annotations
+
+import datetime as dt
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from pdhef_logtool.records.errors import UsageError
+
+#: A bare integer from here on is nanoseconds, not seconds from the log's start.
+NANOSECONDS_FROM = 10**15
+WINDOW_S = 600.0
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """Everything that decides what an estimator sees of a log, beside the mapping and the car.
+
+    Attributes
+    ----------
+    start, end : slice as given (:func:`parse_time`); None = the log's own.
+    sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
+    friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log says, if anything.
+    prefer_truth : which truth counts in a simulated log that has both.
+    window_s : length of the windows that the log is processed in; changes no number.
+    """
+
+    start: str | None = None
+    end: str | None = None
+    sensors: Literal["full", "esp"] = "full"
+    friction: str | float | None = "auto"
+    prefer_truth: Literal["perfect", "rtk"] = "perfect"
+    window_s: float = WINDOW_S
+
+    @property
+    def use_speed(self) -> bool:
+        """Whether the filters use the speed sensor after their start."""
+        return self.sensors == "full"
+
+
+def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:
+    """Turn a time as users write it into int64 nanoseconds of the log's clock.
+
+    ``12.5`` and ``+12.5s`` are seconds from the log's start, ``end-5s`` is 5 s before its end, a bare integer of at
+    least 1e15 is nanoseconds, and anything with a ``T`` or ``-`` between digits is RFC 3339 (UTC when it names no
+    zone).
+
+    Raises
+    ------
+    UsageError : The text is none of these.
+    """
+    text = text.strip()
+    if re.fullmatch(r"\d+", text) and int(text) >= NANOSECONDS_FROM:
+        return int(text)
+    relative = re.fullmatch(r"\+?(\d+(?:\.\d*)?|\.\d+)\s*s?", text)
+    if relative:
+        return start_ns + round(float(relative[1]) * 1e9)
+    from_end = re.fullmatch(r"end(?:\s*-\s*(\d+(?:\.\d*)?|\.\d+)\s*s?)?", text)
+    if from_end:
+        return end_ns - round(float(from_end[1] or 0.0) * 1e9)
+    try:
+        when = dt.datetime.fromisoformat(text)
+    except ValueError:
+        raise UsageError(
+            expected="a time such as 12.5, +10s, end-5s, 1700000000000000000 or 2026-01-31T12:00:00Z",
+            got=repr(text),
+            where=option,
+        ) from None
+    if when.tzinfo is None:
+        when = when.replace(tzinfo=dt.UTC)
+    delta = when - dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+    return (delta.days * 86_400 + delta.seconds) * 10**9 + delta.microseconds * 1000
+
+
+def time_slice(options: ReadOptions, start_ns: int, end_ns: int) -> tuple[int, int]:
+    """Return the slice [start, end) of a log that spans [start_ns, end_ns).
+
+    Raises
+    ------
+    UsageError : The slice is empty or lies outside of the log.
+    """
+    begin = start_ns if options.start is None else parse_time(options.start, start_ns, end_ns, option="--start")
+    finish = end_ns if options.end is None else parse_time(options.end, start_ns, end_ns, option="--end")
+    begin, finish = max(begin, start_ns), min(finish, end_ns)
+    if begin >= finish:
+        raise UsageError(
+            expected=f"a slice inside the log's {(end_ns - start_ns) / 1e9:.3f} s",
+            got=f"start {options.start or 'of the log'}, end {options.end or 'of the log'}",
+            where="--start/--end",
+        )
+    return begin, finish

@@ -1,0 +1,288 @@
+"""The one way to read a drive: a log opened for a car, mapped and planned, then read in windows or as a whole."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Self
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.friction import FrictionSource, friction_source
+from pdhef_logtool.drive.options import ReadOptions, time_slice
+from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive
+from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping, check_mapping, choose_mapping, merge_losses
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.signals import Loss, Signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+
+Tell = Callable[[str], None]
+#: Makes the mapping that is read with from the log and the mapping in effect; may tell something.
+Adjust = Callable[[DriveLog, Mapping, Tell], Mapping]
+
+#: Signals, truth and what is computed of them may take this much memory, of all drives of a command together.
+MAX_BYTES = 2 << 30
+_AS_IT_IS = ReadOptions()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WholeDrive:
+    """A drive in memory: signals [N], and the truth [N] at their stamps (None if the log has none)."""
+
+    name: str
+    path: Path
+    plan: DrivePlan
+    signals: Signals
+    truth: StateTrack | None
+    log_start_ns: int
+
+    def windows(self) -> Iterator[DriveWindow]:
+        """Yield all of it as one window."""
+        yield DriveWindow(self.signals, self.truth, 1.0)
+
+    @property
+    def seconds(self) -> float:
+        """Time from first to last stamp."""
+        return float(self.signals.stamps_ns[-1] - self.signals.stamps_ns[0]) * 1e-9
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """First and last stamp in seconds from the log's start."""
+        stamps = self.signals.stamps_ns
+        return float(stamps[0] - self.log_start_ns) * 1e-9, float(stamps[-1] - self.log_start_ns) * 1e-9
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that its columns take."""
+        return _nbytes(self.signals) + (0 if self.truth is None else _nbytes(self.truth))
+
+
+@dataclass(slots=True, eq=False)
+class Drive:
+    """One log, opened for one car; a context that closes the log.
+
+    Attributes
+    ----------
+    name : of the log in tables and folders. missing : signals that the mapping lacks. plan : what was decided from the
+        first minutes; another one may be put in its place before reading.
+    friction : what :meth:`windows` fills in; another one may be put in its place before reading.
+    notes : everything that was told of this drive.
+    """
+
+    name: str
+    log: DriveLog
+    car: Car
+    options: ReadOptions
+    plan: DrivePlan
+    missing: tuple[str, ...]
+    notes: list[str]
+    friction: FrictionSource
+    _tell: Tell
+    _reader: DriveReader | None = None
+    _sha256: str = ""
+
+    @property
+    def path(self) -> Path:
+        """The file or folder."""
+        return self.log.path
+
+    @property
+    def mapping(self) -> Mapping:
+        """The mapping that it is read with."""
+        return self.plan.mapping
+
+    @property
+    def available(self) -> frozenset[str]:
+        """Aligned signals that the log provides."""
+        return self.plan.alignment.available
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the log, computed when it is first asked for."""
+        self._sha256 = self._sha256 or hash_log(self.path)
+        return self._sha256
+
+    @property
+    def losses(self) -> tuple[Loss, ...]:
+        """What could not be used; complete once all windows were read. Files are named without their folder."""
+        found = merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
+        folder = f"{self.path.parent}/"
+        return tuple(replace(x, where=x.where.removeprefix(folder)) for x in found)
+
+    @property
+    def samples(self) -> dict[str, int]:
+        """Messages that were used so far, by source."""
+        return {} if self._reader is None else dict(self._reader.samples or {})
+
+    def tell(self, text: str) -> None:
+        """Say what a user must know of this drive, and keep it in the notes."""
+        self.notes.append(text)
+        self._tell(f"{self.name}: {text}")
+
+    def windows(self, *, fill_friction: bool = True) -> Iterator[DriveWindow]:
+        """Read the drive once from start to end; joined, the windows are bit-identical to one window over all.
+
+        Parameters
+        ----------
+        fill_friction : False leaves the friction that the log says.
+        """
+        self._reader = DriveReader(self.log, self.plan, self.options.window_s)
+        if not fill_friction:
+            return self._reader.windows()
+        self.friction = self.friction.afresh()
+        return self.friction.fill_windows(self._reader.windows())
+
+    def whole(self, *, fill_friction: bool = True, max_bytes: int | None = None) -> WholeDrive:
+        """Read all of the drive into memory.
+
+        Parameters
+        ----------
+        fill_friction : as for :meth:`windows`. max_bytes : that signals and truth may take; None = no bound.
+
+        Raises
+        ------
+        EstimatorError : The slice holds no stamp, or the drive takes more memory than it may.
+        """
+        signals, truth, held = [], [], 0
+        for window in self.windows(fill_friction=fill_friction):
+            if not len(window.signals):
+                continue
+            signals.append(window.signals)
+            if window.truth is not None:
+                truth.append(window.truth)
+            held += _nbytes(window.signals) + (0 if window.truth is None else _nbytes(window.truth))
+            if max_bytes is not None and held > max_bytes:
+                raise too_big(self.name)
+        if not signals:
+            raise no_samples(self.path)
+        joined = concatenate(truth) if truth else None
+        return WholeDrive(self.name, self.path, self.plan, join_signals(signals), joined, self.log.start_ns)
+
+    def close(self) -> None:
+        """Close the log."""
+        self.log.close()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the log."""
+        self.close()
+
+
+def read_drive(
+    log: LogInput | Path | str,
+    car: Car,
+    mapping: Mapping | None = None,
+    options: ReadOptions = _AS_IT_IS,
+    *,
+    tell: Tell = lambda _text: None,
+    adjust: Adjust | None = None,
+    require_sensors: bool = True,
+) -> Drive:
+    """Open a log for a car and decide everything that holds for all of it: mapping, clocks, alignment, friction.
+
+    Parameters
+    ----------
+    log : a file or folder; a :class:`LogInput` brings the name that the drive has beside others.
+    mapping : None recognises types.
+    tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
+    adjust : changes the mapping in effect.
+    require_sensors : False reads a log without an IMU, or without any recognised signal, for its truth alone.
+
+    Returns
+    -------
+    drive : to be closed, best by ``with``.
+
+    Raises
+    ------
+    PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the slice is outside of it.
+    """
+    log_input = log if isinstance(log, LogInput) else one_log(str(log))
+    notes: list[str] = []
+
+    def told(text: str) -> None:
+        notes.append(text)
+        tell(f"{log_input.stem}: {text}")
+
+    opened = open_log(log_input.path)
+    try:
+        chosen, missing = choose_mapping(
+            opened, mapping, told, prefer_truth=options.prefer_truth, require_signals=require_sensors
+        )
+        if adjust is not None:
+            chosen = adjust(opened, chosen, told)
+            check_mapping(chosen, opened)
+        slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
+        plan = plan_drive(opened, chosen, car.vehicle, *slice_ns, require_imu=require_sensors)
+        _tell_doubts(plan, told)
+        friction = friction_of(plan, car.vehicle, options)
+        if friction.note:
+            told(friction.note)
+    except BaseException:
+        opened.close()
+        raise
+    return Drive(log_input.stem, opened, car, options, plan, missing, notes, friction, tell)
+
+
+def one_log(argument: str) -> LogInput:
+    """Return the log that a file, folder or pattern stands for; raises UsageError unless it is one."""
+    inputs = find_logs([argument])
+    if len(inputs) != 1:
+        raise UsageError(expected="one log", got=f"{len(inputs)} of them", where=argument)
+    return inputs[0]
+
+
+def lost_texts(losses: Iterable[Loss]) -> tuple[str, ...]:
+    """Return what of the input is gone, in words."""
+    return tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
+
+
+def no_samples(path: Path) -> EstimatorError:
+    """Return the error for a slice without a stamp."""
+    return EstimatorError(
+        expected="IMU samples in the chosen slice",
+        got="none that can be used",
+        where=str(path),
+        remedy="pdhef inspect LOG shows what the log holds and what was dropped",
+    )
+
+
+def too_big(where: str) -> EstimatorError:
+    """Return the error for drives that do not fit into memory."""
+    return EstimatorError(
+        expected=f"drives whose signals and truth fit in {MAX_BYTES >> 20} MiB together",
+        got="more",
+        where=where,
+        remedy="give fewer drives, or a slice of each with --start and --end",
+    )
+
+
+def _tell_doubts(plan: DrivePlan, tell: Tell) -> None:
+    from pdhef_logtool.drive.plausibility import plausibility_warnings
+
+    for warning in plausibility_warnings(plan.survey_signals):
+        tell(warning.message)
+    for name, reason in plan.alignment.unused:
+        tell(f"{name} is not used: {reason}")
+
+
+def friction_of(
+    plan: DrivePlan, vehicle: VehicleParameters, options: ReadOptions, factor: float = 1.0
+) -> FrictionSource:
+    """Return the friction of a drive as the options choose it, for a vehicle; ``factor`` makes it wrong on purpose."""
+    source = plan.mapping.signals.get("friction")
+    topic = "" if source is None else source.label
+    if options.friction is None:
+        return FrictionSource(f"topic {topic}" if topic else "none")
+    available = plan.alignment.available
+    return friction_source(options.friction, vehicle, available, topic, use_speed=options.use_speed, factor=factor)
+
+
+def _nbytes(record: Signals | StateTrack) -> int:
+    return sum(getattr(getattr(record, f.name), "nbytes", 0) for f in fields(record))

@@ -1,0 +1,229 @@
+"""Every estimator: a line of :data:`SPECS` and a file that builds it.
+
+A name is a preset: ``build`` makes of it, for a car and options, the algorithm that runs (:mod:`~.algorithm`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Literal
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.residual_model.service import NetworkService
+
+_ESP = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """What a run asks of every estimator.
+
+    Attributes
+    ----------
+    use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only starts them (METHOD §1).
+    trust : of the hybrid filters, in [0, 1]; None: what the car's evidence allows.
+    network : of the car, ready to run, where several estimators share it; None: made anew.
+    """
+
+    use_speed: bool = True
+    trust: float | None = None
+    network: NetworkService | None = field(default=None, compare=False)
+
+    def service(self, car: Car) -> NetworkService:
+        """Return the car's network, ready to run."""
+        assert car.network is not None, "the table lets no estimator run without the network that it needs"
+        return self.network or NetworkService(car.network)
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """One estimator.
+
+    Attributes
+    ----------
+    build : ``module:function`` under :mod:`pdhef_logtool.estimators`, or a whole dotted path; called with the name,
+        the :class:`Car` and :class:`Options`, imported when it is first needed.
+    needs : aligned signals without which it cannot run.
+    colour : 0xRRGGBB in every plot, tellable apart with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
+    causal : whether an estimate at t uses only what had arrived by t.
+    default : whether it runs where none are named.
+    network : which part of a network bundle it needs; empty: none.
+    needs_noise : whether it cannot run without noise of its own in the car.
+    tunable : whether ``pdhef tune`` searches its noise: always, or where it is named; ``tuned_as`` : the estimator that
+        the search runs, where that is another (the same filter without what its noise does not change).
+    """
+
+    name: str
+    text: str
+    build: str
+    needs: frozenset[str]
+    colour: int
+    causal: bool = True
+    default: bool = True
+    network: Literal["", "residual", "pure_lstm", "linear_regression"] = ""
+    needs_noise: bool = False
+    tunable: Literal["", "always", "on request"] = ""
+    tuned_as: str = ""
+
+    def missing(self, car: Car) -> str:
+        """Return why a car does not let it run, empty if it does."""
+        if self.needs_noise and self.name not in car.noise:
+            return f"the car has no noise for {self.name}; pdhef identify finds it"
+        if not self.network:
+            return ""
+        if car.network is None:
+            return "no network; --network names one, pdhef train writes one"
+        if self.network != "residual" and getattr(car.network, self.network) is None:
+            return "the network has no such baseline; pdhef train --baselines writes it"
+        return ""
+
+    def make(self, car: Car, options: Options) -> Estimator:
+        """Build it; compiled code is imported here and not before.
+
+        Raises
+        ------
+        UsageError
+            The car lacks what it needs.
+        """
+        if reason := self.missing(car):
+            raise UsageError(expected="a car that has what it needs", got=reason, where=self.name)
+        module, _, function = self.build.partition(":")
+        module = module if "." in module else f"{__package__}.{module}"
+        estimator: Estimator = getattr(import_module(module), function)(self.name, car, options)
+        return estimator
+
+
+#: In the order of the tables.
+SPECS: tuple[Spec, ...] = (
+    Spec(
+        "zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors", "pass_through:build",
+        frozenset({"speed_m_s", "yaw_rate_rad_s"}), 0xF0E442,
+    ),
+    Spec(
+        "gyro", "the sensors passed through; claims no lateral velocity", "pass_through:build",
+        frozenset({"speed_m_s", "yaw_rate_rad_s"}), 0xCC79A7,
+    ),
+    Spec(
+        "kinematic", "leaky integral of a_y - v_x r", "kinematic:build",
+        frozenset({"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}), 0x009E73,
+    ),
+    Spec(
+        "open-loop", "nominal single-track model from steering and speed alone", "open_loop:build",
+        frozenset({"steer_rad", "speed_m_s"}), 0xE69F00,
+    ),
+    Spec(
+        "linear-regression",
+        "sideslip linear in the network's features, low-passed at 2 Hz (needs a network with baselines)",
+        "linear_regression:build", _ESP, 0xDDCC77, network="linear_regression",
+    ),
+    Spec(
+        "phy-ukf", "unscented Kalman filter on the nominal model, sensor-level noise (frozen baseline)",
+        "physics:build", _ESP, 0x0072B2,
+    ),
+    Spec(
+        "physics-plus", "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
+        "physics_plus:build", _ESP, 0x44AA99, tunable="always",
+    ),
+    Spec(
+        "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",
+        "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable="always",
+    ),
+    Spec(
+        "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",
+        "direct_network:build", _ESP, 0xAA4499, network="pure_lstm",
+    ),
+    Spec(
+        "pd-hef", "hybrid filter that finds faulty sensors and scales wrong forces (needs a network)",
+        "pd_hef:build", _ESP, 0xD55E00, network="residual", tunable="always", tuned_as="pd-hef-fixed-r",
+    ),
+    Spec(
+        "pd-hef-fixed-r",
+        "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs a network)",
+        "hybrid:build", _ESP, 0x117733, network="residual",
+    ),
+    Spec(
+        "pd-hef-smoothed",
+        "the hybrid filter smoothed with what came later: not causal, ranked apart (needs a network)",
+        "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="residual", tunable="on request",
+    ),
+    Spec(
+        "pd-hef-trust0", "the hybrid filter with its network switched off (needs a network)",
+        "hybrid:build", _ESP, 0x999933, network="residual",
+    ),
+    Spec(
+        "pd-hef-trust1", "the hybrid filter at trust 1, whatever the car allows (needs a network)",
+        "hybrid:build", _ESP, 0x882255, default=False, network="residual",
+    ),
+    Spec(
+        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs a network)",
+        "hybrid_paper:build", _ESP, 0xCC6677, network="residual",
+    ),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """An estimator that cannot run, and why."""
+
+    spec: Spec
+    reason: str
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.spec.name
+
+
+def spec_of(name: str) -> Spec:
+    """Return the line of a name; raises UsageError if there is none."""
+    check_names((name,))
+    return next(s for s in SPECS if s.name == name)
+
+
+def check_names(names: Sequence[str]) -> None:
+    """Raise UsageError if a name is unknown or occurs twice, or there is none."""
+    known = [s.name for s in SPECS]
+    wrong = [n for n in names if n not in known] + sorted({n for n in names if names.count(n) > 1})
+    if wrong or not names:
+        raise UsageError(
+            expected=f"estimators out of {', '.join(known)}", got=", ".join(wrong) or "none", where="--estimators"
+        )
+
+
+def default_names(car: Car) -> tuple[str, ...]:
+    """Return the estimators that run when none are named: every default one that the car has what it needs for.
+
+    Baselines and physics first, then what rests on a network.
+    """
+    suited = [s for s in SPECS if s.default and not s.missing(car)]
+    return tuple(s.name for s in sorted(suited, key=lambda s: bool(s.network)))
+
+
+def make_estimator(name: str, car: Car, options: Options | None = None) -> Estimator:
+    """Build an estimator by its name; raises UsageError if the car lacks what it needs."""
+    return spec_of(name).make(car, options or Options())
+
+
+def runnable(
+    names: Sequence[str] | None, car: Car, available: frozenset[str], options: Options | None = None
+) -> tuple[list[Estimator], list[Skipped]]:
+    """Split estimators into those whose needs car and log meet, built, and those that are skipped with the reason.
+
+    Parameters
+    ----------
+    names : None: :func:`default_names`. available : signals of the log.
+    """
+    estimators: list[Estimator] = []
+    skipped: list[Skipped] = []
+    for spec in map(spec_of, default_names(car) if names is None else names):
+        lacking = sorted(spec.needs - available)
+        reason = spec.missing(car) or (f"the log has no {', '.join(lacking)}" if lacking else "")
+        if reason:
+            skipped.append(Skipped(spec, reason))
+        else:
+            estimators.append(spec.make(car, options or Options()))
+    return estimators, skipped

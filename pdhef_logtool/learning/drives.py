@@ -1,0 +1,340 @@
+"""Drives of the learning commands: which are taken, how they are read, and what is told and recorded of each."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import LearntOn
+from pdhef_logtool.car.store import check_output
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import MAX_BYTES, Drive, Tell, WholeDrive, lost_texts, read_drive
+from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.learning.noise.search import scorable_stamps
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import load_mapping
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.sinks.report import tool_versions
+
+#: What of the configuration decides what is learnt.
+_SETTINGS = ("car", "mapping", "network", "start", "end", "sensors", "friction", "prefer_truth", "estimators")
+#: Drives that are named in an error.
+_NAMED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Splits that a command refuses, what it expects instead, who says so, and what to do."""
+
+    splits: tuple[str, ...]
+    expected: str
+    where: str
+    remedy: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnSettings:
+    """What decides what a command learns, beside the logs.
+
+    Attributes
+    ----------
+    config : car, network, mapping, slice, sensors, which truth, estimators where they matter.
+    seed : of whatever is drawn. split : only drives that their set's manifest puts into this split.
+    any_split : do not refuse drives of the splits that the command refuses.
+    """
+
+    config: RunConfig
+    seed: int = 0
+    split: str | None = None
+    any_split: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse what no seed is; raises UsageError."""
+        if self.seed < 0:
+            raise UsageError(expected="a seed of at least 0", got=str(self.seed), where="--seed")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the settings as JSON-able values; files by name only."""
+        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "config"}
+        return {**config_document(self.config), **own}
+
+
+def config_document(config: RunConfig) -> dict[str, Any]:
+    """Return what of a configuration decides what is learnt, as JSON-able values; files by name only."""
+    document = config.to_dict()
+    return {k: document[k] for k in _SETTINGS if k != "estimators" or document[k] is not None}
+
+
+def open_car(config: RunConfig, output: Path | None, warn: Tell) -> Car:
+    """Return the car of a command that learns of it, after a look at where it is to be written (None: nowhere).
+
+    Raises
+    ------
+    UsageError
+        No car is named, or ``output`` is no place for it.
+    """
+    if config.car is None:
+        raise UsageError(
+            expected="a car", got="none", where="--car", remedy="pdhef identify makes one from a vehicle.toml"
+        )
+    car = Car.load(config.car, network=config.network, intervals=config.intervals)
+    if output is not None:
+        check_output(car, output)
+    for note in car.notes:
+        warn(note)
+    return car
+
+
+def open_mapping(config: RunConfig) -> SignalMapping | None:
+    """Return the mapping that is configured, None without."""
+    return None if config.mapping is None else load_mapping(config.mapping)
+
+
+def record_head(kind: str, version: int, settings: LearnSettings, car: Car) -> dict[str, Any]:
+    """Return how every record of a command begins; no date, so that the same command gives the same bytes."""
+    return {
+        "format": kind,
+        "version": version,
+        "versions": tool_versions(),
+        "settings": settings.to_dict(),
+        "car": {"name": car.vehicle.name, "physics_sha256": car.physics_sha256},
+        "network_sha256": None if car.network is None else car.network.sha256,
+    }
+
+
+def choose_drives(
+    inputs: Sequence[LogInput], choice: LearnSettings, refusal: Refusal
+) -> tuple[list[LogInput], dict[str, str]]:
+    """Return the logs to take, and by name the split that the manifest of a set beside a log gives it.
+
+    Raises
+    ------
+    UsageError
+        A drive is of a refused split, or none is left.
+    """
+    manifests = cache(set_manifest)
+    splits = {i.stem: str(manifests(i.path.parent).get(i.path.name, {}).get("split") or "") for i in inputs}
+    if choice.split is not None:
+        inputs = [i for i in inputs if splits[i.stem] == choice.split]
+        if not inputs:
+            there = ", ".join(sorted({s for s in splits.values() if s}))
+            raise UsageError(
+                expected=f"drives of split {choice.split}",
+                got=f"drives of {there}" if there else "drives without a set's manifest beside them",
+                where="--split",
+            )
+    refused = [f"{i.stem} ({splits[i.stem]})" for i in inputs if splits[i.stem] in refusal.splits]
+    if refused and not choice.any_split:
+        more = f" and {len(refused) - _NAMED} more" if len(refused) > _NAMED else ""
+        raise UsageError(
+            expected=refusal.expected,
+            got=", ".join(refused[:_NAMED]) + more,
+            where=refusal.where,
+            remedy=refusal.remedy,
+        )
+    return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
+
+
+def set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
+    """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
+    documents: list[Any] = []
+    for name, parse in (("manifest.json", json.loads), ("manifest.toml", tomllib.loads)):
+        try:
+            documents.append(parse((folder / name).read_text(encoding="utf-8")))
+        except (OSError, ValueError):
+            continue  # there is none, or it is somebody else's
+    entries = [e for d in documents if isinstance(d, dict) for key in ("drives", "log") for e in _entries(d.get(key))]
+    return {e["file"]: e for e in entries if isinstance(e.get("file"), str)}
+
+
+def _entries(value: Any) -> list[dict[str, Any]]:
+    return [e for e in value if isinstance(e, dict)] if isinstance(value, list) else []
+
+
+@dataclass(frozen=True, slots=True)
+class DriveRecord:
+    """What every command records of a drive; ``left_out`` says why it is not used, empty if it is.
+
+    Attributes
+    ----------
+    seconds : from first to last stamp. span_s : these two, in seconds from the log's start.
+    truth : its sources. friction_from : in the words of the report. notes : what the reading told.
+    counts : what a command counts of it, by name. bytes_held : memory that it takes in the command.
+    """
+
+    name: str
+    file: str
+    sha256: str = ""
+    split: str | None = None
+    seconds: float = 0.0
+    span_s: tuple[float, float] | None = None
+    truth: tuple[str, ...] = ()
+    friction_from: str = ""
+    losses: tuple[Loss, ...] = ()
+    notes: tuple[str, ...] = ()
+    left_out: str = ""
+    counts: Mapping[str, int] = field(default_factory=dict)
+    bytes_held: int = 0
+
+    @property
+    def learnt_on(self) -> LearntOn:
+        """The drive as a car remembers it."""
+        start_s, end_s = self.span_s or (0.0, 0.0)
+        return LearntOn(name=self.name, sha256=self.sha256, start_s=round(start_s, 2), end_s=round(end_s, 2))
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """What of the input is gone, in words."""
+        return lost_texts(self.losses)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the record as JSON-able values."""
+        document = asdict(self)
+        for key in ("counts", "bytes_held", "left_out"):
+            del document[key]
+        if self.left_out:
+            document["reason"] = self.left_out
+        return {
+            **document,
+            **self.counts,
+            "seconds": round(self.seconds, 3),
+            "span_s": None if self.span_s is None else [round(s, 3) for s in self.span_s],
+        }
+
+
+def record_of(
+    drive: Drive, *, split: str | None = None, whole: WholeDrive | None = None, left_out: str = ""
+) -> DriveRecord:
+    """Return the record of a drive, after it was read."""
+    return DriveRecord(
+        name=drive.name,
+        file=drive.path.name,
+        sha256=drive.sha256,
+        split=split,
+        seconds=0.0 if whole is None else whole.seconds,
+        span_s=None if whole is None else whole.span_s,
+        truth=tuple(sorted({source.label for source in drive.mapping.truth.values()})),
+        friction_from=drive.friction.label,
+        losses=drive.losses,
+        notes=tuple(drive.notes),
+        left_out=left_out,
+        bytes_held=0 if whole is None else whole.nbytes,
+    )
+
+
+def tell_drive(record: DriveRecord, warn: Tell) -> None:
+    """Say what a user must know of a drive: notes, what of the input is gone, and why it is left out."""
+    for text in (*record.notes, *record.lost):
+        warn(f"{record.name}: {text}")
+    if record.left_out:
+        warn(f"{record.name} is left out: {record.left_out}")
+
+
+def exit_code(records: Sequence[DriveRecord]) -> int:
+    """Return 0 if all drives took part as they were recorded, 3 if not, 1 if none took part."""
+    if all(r.left_out for r in records):
+        return EXIT_FAILURE
+    return EXIT_PARTIAL if any(r.left_out or r.lost for r in records) else EXIT_OK
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LearnResult:
+    """What every command returns: the car that it wrote (a folder, or a flat file), and a record of every drive."""
+
+    car: Path
+    records: tuple[DriveRecord, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all drives took part whole, 3 if not."""
+        return exit_code(self.records)
+
+    @property
+    def drives(self) -> tuple[DriveRecord, ...]:
+        """Those that took part."""
+        return tuple(r for r in self.records if not r.left_out)
+
+    @property
+    def left_out(self) -> tuple[DriveRecord, ...]:
+        """The others."""
+        return tuple(r for r in self.records if r.left_out)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {"car": str(self.car), "exit_code": self.exit_code, **drives_document(self.records)}
+
+
+def no_drive(expected: str, where: str) -> EstimatorError:
+    """Return the error for drives of which none can be learnt from."""
+    return EstimatorError(
+        expected=f"at least one drive with {expected}",
+        got="none",
+        where=where,
+        remedy="map v_y, sideslip, or position and heading of an RTK, INS or motion-capture reference",
+    )
+
+
+def drives_document(records: Sequence[DriveRecord]) -> dict[str, list[dict[str, Any]]]:
+    """Return the drives and those left out, as they stand in every command's JSON."""
+    return {
+        "drives": [r.to_dict() for r in records if not r.left_out],
+        "left_out": [r.to_dict() for r in records if r.left_out],
+    }
+
+
+def no_true_sideslip(plan: DrivePlan) -> str:
+    """Return why a drive has no truth to learn a sideslip from, empty if it has."""
+    if plan.truth is None or "sideslip_rad" not in plan.derivation:
+        return "no true sideslip"
+    if "sideslip_rad" in plan.dependent:
+        return f"its truth is no truth: {plan.dependent['sideslip_rad']}"
+    return ""
+
+
+def load_drive(
+    log_input: LogInput,
+    car: Car,
+    mapping: SignalMapping | None,
+    options: ReadOptions,
+    *,
+    split: str | None = None,
+    refuse: Callable[[Drive], str] = lambda _drive: "",
+    fill_friction: bool = True,
+    least_scored: int = 0,
+    max_bytes: int = MAX_BYTES,
+) -> tuple[DriveRecord, WholeDrive | None]:
+    """Read a drive with a true sideslip into memory; None with the reason in the record if it cannot be used.
+
+    Parameters
+    ----------
+    refuse : why a command cannot use it, empty if it can; asked before anything but its beginning is read.
+    least_scored : stamps with a true sideslip above the car's lowest speed that it must have.
+
+    Raises
+    ------
+    PdhefError
+        The log cannot be read, or takes more than ``max_bytes``.
+    """
+    with read_drive(log_input, car, mapping, options) as drive:
+        left_out = no_true_sideslip(drive.plan) or refuse(drive)
+        if left_out:
+            return record_of(drive, split=split, left_out=left_out), None
+        whole = drive.whole(fill_friction=fill_friction, max_bytes=max_bytes)
+        assert whole.truth is not None
+        slow = car.vehicle.low_speed_blend_m_s
+        scored = int(np.count_nonzero(scorable_stamps(whole.truth, slow)))
+        if scored < least_scored or not np.isfinite(whole.truth.sideslip_rad).any():
+            left_out = f"{scored} stamps with a true sideslip above {slow:g} m/s"
+            return record_of(drive, split=split, left_out=left_out), None
+        return replace(record_of(drive, split=split, whole=whole), counts={"scored_stamps": scored}), whole

@@ -1,0 +1,133 @@
+"""What a run does: defaults, ``pdhef.toml`` and flags, where flags win."""
+
+from __future__ import annotations
+
+import datetime as dt
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
+from pdhef_logtool.drive.friction import parse_friction
+from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
+from pdhef_logtool.estimators.table import check_names
+from pdhef_logtool.records.documents import read_toml, validated
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.readings import POSSIBLE_FRICTION
+from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
+
+_FILES = ("car", "mapping", "thresholds", "network", "intervals")
+#: What may stand in place of a file.
+_KEYWORDS = {
+    "car": tuple(SHIPPED_CARS),
+    "network": (*SHIPPED_FOLDERS, NO_MODEL),
+    "intervals": (NO_INTERVALS, UNSURE),
+}
+#: Keys of older files, and what they are now.
+FORMER_KEYS = {"vehicle": "car", "model": "network", "calibration": "intervals"}
+
+
+def _as_text(value: object) -> object:
+    plain = isinstance(value, int | float) and not isinstance(value, bool)
+    return str(value) if plain or isinstance(value, dt.date) else value
+
+
+#: As users write it; in a file also a number or a TOML date. No time is longer.
+Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
+#: As a list or with commas.
+Names = Annotated[
+    tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
+]
+Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid", strict=True))
+class RunConfig:
+    """Everything that decides a run's numbers and outputs; its types are checked wherever one is made.
+
+    Attributes
+    ----------
+    estimators : names, in the order of the tables; None = every one that the car suits.
+    car : a car's folder, a vehicle.toml, or ``saloon``, the shipped one; None = the default sedan.
+    mapping : file; None = recognised types.
+    start, end : slice as given (:func:`~pdhef_logtool.drive.options.parse_time`); None = the log's own.
+    annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only.
+    sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
+    friction : ``auto`` is the log's own, else the car's, else estimated; ``file``, ``estimate``, or a number.
+    prefer_truth : which truth counts in a simulated log that has both.
+    window_s : length of the windows that the log is processed in; changes no number.
+    network : instead of the car's: a folder, ``default``, ``many-cars`` (the shipped one for any car), ``none``.
+    intervals : instead of the car's: a file of ``pdhef calibrate``, ``none`` (intervals as they are), ``unsure`` (wide
+        ones, for a car that may have changed since its file was made).
+    thresholds : limits that the figures are held against; None = no gate.
+    """
+
+    estimators: Names | None = None
+    car: Path | None = None
+    mapping: Path | None = None
+    start: Time | None = None
+    end: Time | None = None
+    annotate: Literal["full", "sidecar", "none"] = "full"
+    sensors: Literal["full", "esp"] = "full"
+    friction: Literal["auto", "file", "estimate"] | Friction = "auto"
+    prefer_truth: Literal["perfect", "rtk"] = "perfect"
+    window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
+    thresholds: Path | None = None
+    network: Path | None = None
+    intervals: Path | None = None
+
+    @property
+    def read_options(self) -> ReadOptions:
+        """What of it decides how a log is read."""
+        return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
+        document = asdict(self)
+        document["estimators"] = None if self.estimators is None else list(self.estimators)
+        for key in _FILES:
+            path = document[key]
+            document[key] = None if path is None else Path(path).name
+        return document
+
+
+def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
+    """Merge defaults, the configuration file and the flags that were given (None = not given).
+
+    ``path`` None reads ``pdhef.toml`` of the working directory if there is one. Paths in the file are relative to it.
+
+    Raises
+    ------
+    UsageError
+        The file is missing or wrong, or a value is none of those allowed.
+    """
+    if path is None and Path("pdhef.toml").is_file():
+        path = Path("pdhef.toml")
+    raw = {} if path is None else _read_file(path)
+    given = {key: value for key, value in flags.items() if value is not None}
+    if "friction" in given:
+        given["friction"] = parse_friction(given["friction"])
+    for where, entries in ((str(path), raw), ("options", {**raw, **given})):
+        config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
+    if config.estimators is not None:
+        check_names(config.estimators)
+    # Times are understood without a log, so that a typing error is told before the first log is opened.
+    for name, text in (("--start", config.start), ("--end", config.end)):
+        if text is not None:
+            parse_time(text, 0, 0, option=name)
+    return config
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    raw = read_toml(path, "a configuration TOML file", UsageError)
+    if twice := [f"{old} and {new}" for old, new in FORMER_KEYS.items() if old in raw and new in raw]:
+        raise UsageError(expected="an entry or its former name", got=", ".join(twice), where=str(path))
+    raw = {FORMER_KEYS.get(key, key): value for key, value in raw.items()}
+    for key in _FILES:
+        value = raw.get(key)
+        if isinstance(value, str):
+            raw[key] = Path(value) if value in _KEYWORDS.get(key, ()) else path.parent / value
+    return raw

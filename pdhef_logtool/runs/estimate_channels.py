@@ -1,0 +1,179 @@
+"""An estimate that somebody else recorded, from its fields to a state track on its own stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.estimators.filter_shell import sideslip_std
+from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
+from pdhef_logtool.mapping import SignalSource, apply_clock, clock_key, fit_clocks, resolve_mapping
+from pdhef_logtool.mapping.can_frames import with_can_signals
+from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
+from pdhef_logtool.mapping.clocks import raw_stamps
+from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, CovarianceSource, EstimateSource
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import ESTIMATE_UNITS, Channel, FloatArray, IntArray, Loss
+from pdhef_logtool.records.tracks import StateTrack, diagonal_covariance, make_track
+
+#: Nothing is interpolated across a step of more than this many of its median periods.
+GAP_PERIODS = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedEstimate:
+    """A recorded estimate on its own stamps.
+
+    ``channels`` are its quantities on their own stamps, NaN left out; ``claimed`` are the names of all that the
+    estimate consists of; ``samples`` counts the messages by source.
+    """
+
+    track: StateTrack
+    channels: Mapping[str, Channel]
+    claimed: frozenset[str]
+    samples: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def read_estimate(
+    log: DriveLog, source: EstimateSource, start_ns: int, end_ns: int, window_s: float
+) -> tuple[RecordedEstimate, list[Loss]]:
+    """Read one recorded estimate with log time in [start, end) onto the stamps of its first quantity of BASE_ORDER.
+
+    NaN stays: where an estimator says nothing it is not available, which is a figure and no loss.
+
+    Raises
+    ------
+    MappingError : The slice holds no message of it, or not one number.
+    """
+    log = with_can_signals(log, source.as_mapping())
+    mapping = resolve_mapping(log, source.as_mapping())
+    clocks = fit_clocks(log, mapping, start_ns, end_ns)
+    requests: dict[str, list[str]] = {}
+    for s in mapping.signals.values():
+        request_source(log, s, requests)
+    if source.covariance is not None:
+        requests[source.covariance.topic].append(source.covariance.field)
+    parts: dict[str, list[tuple[IntArray, IntArray, FloatArray]]] = {name: [] for name in mapping.signals}
+    matrices: list[FloatArray] = []
+    losses: list[Loss] = []
+    base = next(name for name in BASE_ORDER if name in mapping.signals)
+    for a, b in windows(start_ns, end_ns, round(window_s * 1e9)):
+        columns = log.read(requests, a, b)
+        for name, s in mapping.signals.items():
+            topic = columns.get(s.read_topic)
+            if topic is None or len(topic) == 0:
+                continue
+            raw, usable = raw_stamps(log, topic, s)
+            stamps = apply_clock(raw, clocks[clock_key(s)]) - np.int64(round(s.latency_s * 1e9))
+            values = _in_range(si_values(topic, s), s)
+            parts[name].append((stamps[usable], topic.log_time_ns[usable], values[usable]))
+            if name == base:
+                if not usable.all():
+                    losses.append(dropped("bad-stamp", s.topic, topic.log_time_ns[~usable]))
+                if source.covariance is not None:
+                    matrices.append(_planar_covariance(topic, source.covariance)[usable])
+    channels, kept = {}, {}
+    for name, s in mapping.signals.items():
+        channels[name], kept[name] = _ordered(name, s, parts[name])
+    stamps_ns = channels[base].stamps_ns
+    if not any(np.isfinite(channels[name].values).any() for name in BASE_ORDER if name in channels):
+        wanted = ", ".join(s.label for n, s in mapping.signals.items() if n in BASE_ORDER)
+        raise MappingError(
+            expected="numbers in the recorded estimate",
+            got="none in the chosen slice",
+            where=f"{log.path} {wanted}",
+            remedy="check topic, field and slice",
+        )
+    repeated = sum(p[0].shape[0] for p in parts[base]) - len(channels[base])
+    if repeated:
+        where = mapping.signals[base].topic
+        losses.append(Loss("duplicate-stamp", LOSS_TEXTS["duplicate-stamp"], where, count=repeated, severity="note"))
+    covariance = np.concatenate(matrices)[kept[base]] if matrices else None
+    track, notes = _track(source.name, stamps_ns, channels, covariance)
+    finite = {n: _without_nan(c) for n, c in channels.items() if n in BASE_ORDER}
+    samples = {s.label: len(channels[n]) for n, s in mapping.signals.items()}
+    return RecordedEstimate(track, finite, frozenset(channels), samples, notes), losses
+
+
+def _without_nan(channel: Channel) -> Channel:
+    """Return the channel without the samples that are not numbers."""
+    return channel.take(np.isfinite(channel.values))
+
+
+def _in_range(values: FloatArray, source: SignalSource) -> FloatArray:
+    with np.errstate(invalid="ignore"):
+        outside = np.zeros(values.shape[0], dtype=np.bool_)
+        if source.valid_min is not None:
+            outside |= values < source.valid_min
+        if source.valid_max is not None:
+            outside |= values > source.valid_max
+    return np.where(outside | ~np.isfinite(values), np.nan, values)
+
+
+def _ordered(
+    name: str, source: SignalSource, parts: Sequence[tuple[IntArray, IntArray, FloatArray]]
+) -> tuple[Channel, IntArray]:
+    """Return the samples in order of unique stamps, the first arrival of each kept, and their places in the parts."""
+    empty = np.empty(0, dtype=np.int64)
+    stamps, arrival = (np.concatenate([p[i] for p in parts]) if parts else empty for i in (0, 1))
+    values = np.concatenate([p[2] for p in parts]) if parts else np.empty(0)
+    order = np.lexsort((arrival, stamps))
+    ordered = stamps[order]
+    first = np.concatenate([[True], ordered[1:] > ordered[:-1]]) if len(ordered) else np.empty(0, dtype=np.bool_)
+    kept = order[first]
+    return Channel(name, ESTIMATE_UNITS[name], source.label, stamps[kept], arrival[kept], values[kept]), kept
+
+
+def _planar_covariance(topic: Columns, source: CovarianceSource) -> FloatArray:
+    """Return [N, 3, 3] over v_x, v_y, yaw rate; NaN where it is unknown (all zero, or −1 first, as ROS says)."""
+    raw = np.asarray(topic.fields[source.field], dtype=np.float64)
+    n = raw.shape[0]
+    if raw.ndim != 2 or raw.shape[1] != source.size**2:
+        return np.full((n, 3, 3), np.nan)
+    places = np.array(source.planar)
+    planar = raw.reshape(n, source.size, source.size)[:, places[:, None], places]
+    unknown = (planar == 0.0).all(axis=(1, 2)) | (raw[:, 0] < 0.0)
+    return np.where(unknown[:, None, None], np.nan, planar)
+
+
+def _track(
+    name: str, stamps_ns: IntArray, channels: Mapping[str, Channel], covariance: FloatArray | None
+) -> tuple[StateTrack, tuple[str, ...]]:
+    notes: list[str] = []
+    columns: dict[str, FloatArray] = {}
+    for quantity, channel in channels.items():
+        same = np.array_equal(channel.stamps_ns, stamps_ns)
+        columns[quantity] = channel.values if same else _interpolated(channel, stamps_ns)
+        if not same and quantity in BASE_ORDER:
+            notes.append(f"{quantity} has other stamps than the estimate and is interpolated to them")
+    if "sideslip_rad" in columns:
+        beta = columns["sideslip_rad"]
+        columns["sideslip_rad"] = np.where(np.abs(beta) > np.pi, wrap_angle(beta), beta)
+        if "vx_m_s" in columns and "vy_m_s" not in columns:
+            columns["vy_m_s"] = columns["vx_m_s"] * np.tan(columns["sideslip_rad"])
+            notes.append("v_y is v_x times tan of the sideslip")
+    if covariance is None or not np.isfinite(covariance).any():
+        covariance = diagonal_covariance([columns.get(s, np.full(stamps_ns.shape[0], np.nan)) for s in STDS])
+    flags = {flag: columns[flag] >= 0.5 for flag in ("valid", "diverged") if flag in columns}
+    if covariance.shape[0] and "sideslip_std_rad" not in columns and {"vx_m_s", "vy_m_s"} <= columns.keys():
+        # Where only deviations are known the correlation of the two velocities counts as 0.
+        completed = np.where(np.eye(3, dtype=np.bool_), covariance, np.nan_to_num(covariance, nan=0.0))
+        columns["sideslip_std_rad"] = sideslip_std(columns["vx_m_s"], columns["vy_m_s"], completed)
+    state = {n: c for n, c in columns.items() if n not in (*STDS, "valid", "diverged")}
+    return make_track(name, stamps_ns, covariance=covariance, **state, **flags), tuple(notes)
+
+
+def _interpolated(channel: Channel, stamps_ns: IntArray) -> FloatArray:
+    known = _without_nan(channel)
+    bracket = Bracket(known.stamps_ns, stamps_ns, gap_ns(known.stamps_ns))
+    return bracket.angle(known.values) if channel.name == "sideslip_rad" else bracket.linear(known.values)
+
+
+def gap_ns(stamps_ns: IntArray) -> int:
+    """Return the longest step of stamps [N] that is interpolated across."""
+    return round(GAP_PERIODS * float(np.median(np.diff(stamps_ns)))) if stamps_ns.shape[0] > 1 else 0

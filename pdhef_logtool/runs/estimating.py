@@ -1,0 +1,122 @@
+"""The one way to estimate: estimators over the windows of a drive, with divergence, intervals and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import Drive, WholeDrive, no_samples
+from pdhef_logtool.drive.windows import with_look_ahead
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import Estimator, look_ahead_of, run_window
+from pdhef_logtool.records.geometry import dead_reckon
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.watches.intervals import TrackCalibrator
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimated:
+    """One window with the tracks of all estimators, in their order.
+
+    ``truth`` is what they are scored against, ``drawn_truth`` the same with a pose; None if the log has none.
+    """
+
+    signals: Signals
+    truth: StateTrack | None
+    drawn_truth: StateTrack | None
+    tracks: tuple[StateTrack, ...]
+    share_done: float
+
+
+def estimate_windows(
+    drive: Drive | WholeDrive,
+    estimators: Sequence[Estimator],
+    *,
+    watched: bool = True,
+    drawn: bool = True,
+    intervals: TrackCalibrator | None = None,
+) -> Iterator[Estimated]:
+    """Run estimators over a drive window by window; joined, the windows give the same bits as one over all.
+
+    Parameters
+    ----------
+    watched : complete ``diverged`` by the watch on wrong branches. drawn : dead-reckon poses.
+    intervals : calibrates them; None leaves them as the estimators give them.
+
+    Raises
+    ------
+    EstimatorError
+        The drive holds no stamp.
+    """
+    from pdhef_logtool.watches.divergence import DivergenceWatch
+
+    watch = DivergenceWatch(drive.plan.vehicle) if watched else None
+    carries: dict[str, Any] = {}
+    poses = {e.name: DeadReckoning() for e in estimators}
+    truth_pose = DeadReckoning()
+    start: tuple[float, float, float] | None = None
+    look_ahead_s = max(map(look_ahead_of, estimators), default=0.0)
+    for window, ahead in with_look_ahead(drive.windows(), look_ahead_s):
+        signals, truth = window.signals, window.truth
+        if start is None:
+            start = first_pose(truth)
+        drawn_truth = truth
+        if drawn and truth is not None and not drive.plan.has_truth_pose:
+            drawn_truth = truth_pose.add(truth, start)
+        tracks = []
+        for estimator in estimators:
+            track, carries[estimator.name] = run_window(estimator, signals, carries.get(estimator.name), ahead)
+            track = track if watch is None else watch.add(track, signals)
+            track = track if intervals is None else intervals.add(track, signals)
+            tracks.append(poses[estimator.name].add(track, start) if drawn else track)
+        yield Estimated(signals, truth, drawn_truth, tuple(tracks), window.share_done)
+    if start is None:
+        raise no_samples(drive.path)
+
+
+def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
+    """Return what puts the car's intervals on the tracks of estimators, by what they really are."""
+    algorithms = {}
+    for estimator in estimators:
+        other = getattr(estimator, "calibrated_as", None)
+        algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
+    return TrackCalibrator(car.intervals, algorithms)
+
+
+class DeadReckoning:
+    """Dead-reckons one track from window to window, from the true pose at the start where there is one."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, float, float, float] | None = None
+        self._pose: tuple[float, float, float] | None = None
+
+    def add(self, track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
+        """Return the next window of the track with its pose; ``start`` is where the first window begins."""
+        if len(track) == 0:
+            return track
+        stamps, vx, vy, rate = track.stamps_ns, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
+        if not np.isfinite(vy).any():
+            vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
+        if self._last is not None:
+            stamps = np.concatenate([[self._last[0]], stamps])
+            vx, vy, rate = (np.concatenate([[v], c]) for v, c in zip(self._last[1:], (vx, vy, rate), strict=True))
+        x, y, yaw = dead_reckon(stamps, vx, vy, rate, self._pose or start)
+        self._last = (int(stamps[-1]), float(vx[-1]), float(vy[-1]), float(rate[-1]))
+        self._pose = (float(x[-1]), float(y[-1]), float(yaw[-1]))
+        skip = len(x) - len(track)
+        return track.with_pose(x[skip:], y[skip:], yaw[skip:])
+
+
+def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:
+    """Return the first known pose x, y, yaw of the truth; the origin without one."""
+    if truth is not None:
+        known = np.flatnonzero(np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad))
+        if known.size:
+            i = int(known[0])
+            return float(truth.x_m[i]), float(truth.y_m[i]), float(truth.yaw_rad[i])
+    return 0.0, 0.0, 0.0

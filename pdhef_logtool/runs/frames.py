@@ -1,0 +1,87 @@
+"""Estimates and figures of one drive as polars frames, for notebooks and scripts; a run writes the same rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from pdhef_logtool.car.parts import Algorithm
+from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.table import Options, Skipped, runnable
+from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.sinks.base import TRUTH
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimates:
+    """Whole tracks of a drive.
+
+    Attributes
+    ----------
+    tracks : by estimator, and ``truth`` where the log has one, with dead-reckoned poses, divergence and intervals.
+    signals : what the estimators saw. algorithms : what ran under each name. skipped : what could not run, and why.
+    """
+
+    drive: Drive
+    tracks: dict[str, StateTrack]
+    signals: Signals
+    algorithms: dict[str, Algorithm]
+    skipped: tuple[Skipped, ...]
+
+    def frame(self) -> pl.DataFrame:
+        """Return the tracks as rows of estimates.parquet, in SI units."""
+        import polars as pl
+
+        from pdhef_logtool.sinks.parquet import track_table
+
+        frames = (pl.DataFrame(track_table(track)) for track in self.tracks.values())
+        return pl.concat(f.with_columns(pl.col("estimator").cast(pl.String)) for f in frames)
+
+
+def choose(drive: Drive, names: Sequence[str] | None = None) -> tuple[list[Estimator], list[Skipped]]:
+    """Return the estimators that a drive and its car let run, and those that they do not; None = the usual ones."""
+    return runnable(names, drive.car, drive.available, Options(drive.options.use_speed))
+
+
+def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
+    """Run estimators over a drive and keep all of it in memory; long logs: :func:`~.estimating.estimate_windows`.
+
+    Parameters
+    ----------
+    drive : of :func:`~pdhef_logtool.drive.reading.read_drive`. names : of estimators; None = those that a run takes.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown. EstimatorError: the drive holds no stamp.
+    """
+    estimators, skipped = choose(drive, names)
+    parts: dict[str, list[StateTrack]] = {}
+    signals: list[Signals] = []
+    for window in estimate_windows(drive, estimators, intervals=calibrator(drive.car, estimators)):
+        signals.append(window.signals)
+        for track in (*((window.drawn_truth,) if window.drawn_truth is not None else ()), *window.tracks):
+            parts.setdefault(track.name, []).append(track)
+    algorithms = {e.name: resolve(e) for e in estimators}
+    tracks = {name: concatenate(of_name) for name, of_name in parts.items()}
+    return Estimates(drive, tracks, join_signals(signals), algorithms, tuple(skipped))
+
+
+def score(estimates: Estimates) -> pl.DataFrame:
+    """Return the figures of estimates as rows of metrics.parquet; without truth those that need none."""
+    import polars as pl
+
+    from pdhef_logtool.runs.scoring import evaluate
+
+    names = [name for name in estimates.tracks if name != TRUTH]
+    rows, _, _ = evaluate(estimates.drive, names, estimates.tracks.get, estimates.signals)
+    columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
+    return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

@@ -1,0 +1,445 @@
+"""One log from start to end, and several of them in turn: read, estimate, compare, write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.car.car import SHOWN_DIGITS, Car
+from pdhef_logtool.car.parts import Algorithm
+from pdhef_logtool.drive.friction import FrictionSource
+from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import Estimator, notes_of
+from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
+from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
+from pdhef_logtool.records.errors import (
+    EXIT_FAILURE,
+    EXIT_GATE,
+    EXIT_OK,
+    EXIT_PARTIAL,
+    EstimatorError,
+    OutputError,
+    PdhefError,
+    UsageError,
+)
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals, join_signals
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.scoring import evaluate, in_time
+from pdhef_logtool.runs.track_store import TrackStore
+from pdhef_logtool.sinks.base import Event, Sink
+from pdhef_logtool.sinks.report import (
+    EstimatorFacts,
+    FrictionFacts,
+    LogFacts,
+    LogOutcome,
+    ReportFacts,
+    SourceFacts,
+    TopicFacts,
+    TruthFacts,
+    build_report,
+    build_run,
+    tool_versions,
+    write_json,
+)
+from pdhef_logtool.watches.intervals import TrackCalibrator
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
+
+#: ``update(text, share)`` with share in [0, 1].
+Progress = Callable[[str, float], None]
+
+#: Units of truth quantities that have no channel of their own name.
+_DERIVED_UNITS = {"position_m": "m"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogResult:
+    """What came out of one log; ``report`` is the document of report.json, None if the log failed.
+
+    ``verdicts``: how its figures stand against the thresholds; None without thresholds.
+    """
+
+    outcome: LogOutcome
+    output: Path | None
+    report: dict[str, Any] | None
+    rows: tuple[MetricRow, ...]
+    verdicts: tuple[Verdict, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunResult:
+    """What came out of a run; ``output`` is None when nothing was to be written."""
+
+    output: Path | None
+    results: tuple[LogResult, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all is well, 4 if a threshold failed, 3 if input was lost or some logs failed, 1 if all failed."""
+        if all(r.report is None for r in self.results):
+            return EXIT_FAILURE
+        if any(v.failed for v in self.verdicts):
+            return EXIT_GATE
+        return EXIT_OK if all(r.outcome.outcome == "ok" for r in self.results) else EXIT_PARTIAL
+
+    @property
+    def verdicts(self) -> tuple[Verdict, ...]:
+        """The verdicts of all logs in order."""
+        return tuple(v for r in self.results for v in r.verdicts or ())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        return {
+            "output": None if self.output is None else str(self.output),
+            "exit_code": self.exit_code,
+            "logs": [
+                {
+                    "log": r.outcome.log,
+                    "outcome": r.outcome.outcome,
+                    "output": None if r.output is None else str(r.output),
+                    "report": r.report,
+                    **({} if r.verdicts is None else {"verdicts": [v.to_dict() for v in r.verdicts]}),
+                }
+                for r in self.results
+            ],
+        }
+
+
+def run_logs(
+    arguments: Sequence[str],
+    output: Path,
+    config: RunConfig,
+    *,
+    junit: Path | None = None,
+    progress: Progress = lambda _text, _share: None,
+    warn: Callable[[str], None] = lambda _text: None,
+) -> RunResult:
+    """Run the configured estimators on logs and write everything of DESIGN §6 to ``output``.
+
+    A log that fails is reported and never stops the others.
+
+    Parameters
+    ----------
+    arguments : logs, folders, glob patterns. junit : where the verdicts of the thresholds are written as JUnit XML.
+    progress, warn : called with lines for people.
+
+    Raises
+    ------
+    UsageError, VehicleError, MappingError
+        What holds for all logs is wrong: arguments, vehicle or mapping file.
+    OutputError
+        The output folder cannot be written.
+    """
+    inputs = find_logs(arguments)
+    car = Car.load(config.car, network=config.network, intervals=config.intervals)
+    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    thresholds = read_thresholds(config, junit)
+    if config.car is None:
+        warn(f"no --car: the default {car.vehicle.name} is assumed, so the model-based estimates are of another car")
+    for note in car.notes:
+        warn(note)
+    make_folder(output)
+    results: list[LogResult] = []
+    for number, log_input in enumerate(inputs):
+
+        def of_all(text: str, share: float, number: int = number) -> None:
+            progress(text, (number + share) / len(inputs))
+
+        try:
+            result = run_log(log_input, output, config, car, mapping, progress=of_all, warn=warn)
+        except Exception as error:  # one bad log never stops the others, whatever is wrong with it
+            if len(inputs) == 1:
+                raise
+            reason = str(error) if isinstance(error, PdhefError) else f"internal error, {type(error).__name__}: {error}"
+            warn(reason)
+            outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
+            result = LogResult(outcome, None, None, ())
+        results.append(judge(result, thresholds))
+    write_run(output, config.to_dict(), results, car)
+    write_verdicts(junit, results)
+    return RunResult(output, tuple(results))
+
+
+def read_thresholds(config: RunConfig, junit: Path | None) -> tuple[Threshold, ...] | None:
+    """Return the configured thresholds, None without; raises UsageError when they are wrong or miss for ``junit``."""
+    from pdhef_logtool.evaluation.thresholds import load_thresholds
+
+    if config.thresholds is not None:
+        return load_thresholds(config.thresholds)
+    if junit is not None:
+        raise UsageError(
+            expected="thresholds to give verdicts on", got="none", where="--junit", remedy="--thresholds FILE"
+        )
+    return None
+
+
+def judge(result: LogResult, thresholds: Sequence[Threshold] | None) -> LogResult:
+    """Return the result with verdicts; a log that failed has no figures, so that its thresholds fail too."""
+    from pdhef_logtool.evaluation.thresholds import check_thresholds
+
+    if thresholds is None:
+        return result
+    verdicts = check_thresholds(thresholds, result.rows, log=result.outcome.log)
+    return replace(result, verdicts=tuple(verdicts))
+
+
+def write_verdicts(junit: Path | None, results: Sequence[LogResult]) -> None:
+    """Write JUnit XML if a file is asked for; raises OutputError."""
+    from pdhef_logtool.sinks.junit import write_junit
+
+    if junit is not None:
+        write_junit(junit, {r.outcome.log: r.verdicts or () for r in results})
+
+
+def run_log(
+    log_input: LogInput,
+    output: Path,
+    config: RunConfig,
+    car: Car,
+    mapping: Mapping | None,
+    *,
+    progress: Progress = lambda _text, _share: None,
+    warn: Callable[[str], None] = lambda _text: None,
+) -> LogResult:
+    """Run one log and write its folder ``output/logs/<stem>``.
+
+    Raises
+    ------
+    PdhefError
+        Nothing of the log can be used; nothing is then left under a final name.
+    """
+    progress(log_input.stem, 0.0)
+    with read_drive(log_input, car, mapping, config.read_options, tell=warn) as drive:
+        ready, skipped = _choose_estimators(drive, config, car)
+        algorithms = {e.name: resolve(e) for e in ready}
+        intervals = calibrator(car, ready)
+        folder = output / "logs" / drive.name
+        sinks = _open_sinks(folder, drive, config, car)
+        try:
+            with TrackStore(folder) as store:
+                signals = _estimate(drive, ready, intervals, sinks, store, progress)
+                rows, events, reasons = evaluate(drive, [e.name for e in ready], store.read, signals)
+            rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in rows]
+            if drive.friction.bank is not None:
+                events = sorted([*events, *friction_events(drive.friction, signals.stamps_ns)], key=in_time)
+            losses = merge_losses([drive.losses, *(sink.lost for sink in sinks)])
+            ran = [
+                EstimatorFacts(
+                    e.name,
+                    causal=e.causal,
+                    notes=(*notes_of(e), *intervals.notes(e.name)),
+                    reasons=reasons[e.name],
+                    algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
+                )
+                for e, a in zip(ready, algorithms.values(), strict=True)
+            ]
+            left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in skipped]
+            facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
+            report = build_report(replace(facts, friction=friction_facts(drive.friction)))
+            from pdhef_logtool.sinks.parquet import write_metrics
+
+            for sink in sinks:
+                sink.finish(report, events)
+            write_metrics(folder / "metrics.parquet", rows)
+            write_json(folder / "report.json", report)
+        except BaseException:
+            for sink in sinks:
+                sink.abort()
+            with suppress(OSError):
+                folder.rmdir()
+            raise
+        outcome = outcome_of(drive, losses)
+    progress(drive.name, 1.0)
+    return LogResult(outcome, folder, report, tuple(rows))
+
+
+def _short(algorithm: Algorithm | None) -> str:
+    return "" if algorithm is None else algorithm.sha256[:SHOWN_DIGITS]
+
+
+def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
+    """Return how a log that was read is recorded in run.json."""
+    return LogOutcome(log=drive.name, file=drive.path.name, sha256=drive.sha256, lost=lost_texts(losses))
+
+
+def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[Estimator], list[Skipped]]:
+    """Return the estimators that can run and those that cannot; raises EstimatorError if none can."""
+    estimators, skipped = runnable(config.estimators, car, drive.available, Options(drive.options.use_speed))
+    for skip in skipped:
+        drive.tell(f"{skip.name} is skipped: {skip.reason}")
+    if not estimators:
+        raise EstimatorError(
+            expected="at least one estimator that can run",
+            got="; ".join(f"{s.name}: {s.reason}" for s in skipped),
+            where=str(drive.path),
+            remedy="map the missing signals (pdhef inspect LOG --write-mapping mapping.toml)",
+        )
+    return estimators, skipped
+
+
+def _open_sinks(folder: Path, drive: Drive, config: RunConfig, car: Car) -> list[Sink]:
+    from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
+    from pdhef_logtool.sinks.parquet import EstimatesSink
+    from pdhef_logtool.sinks.rerun import RerunSink
+
+    sinks: list[Sink] = []
+    try:
+        sinks.append(EstimatesSink(folder / "estimates.parquet"))
+        if config.annotate != "none":
+            sinks.append(AnnotatedMcapSink(folder / "annotated.mcap", drive.log if config.annotate == "full" else None))
+        sinks.append(
+            RerunSink(
+                folder / "recording.rrd",
+                log_name=drive.name,
+                input_hash=drive.sha256,
+                start_ns=drive.plan.start_ns,
+                min_speed_m_s=car.vehicle.low_speed_blend_m_s,
+                colours={s.name: s.colour for s in SPECS},
+            )
+        )
+    except BaseException:
+        for sink in sinks:
+            sink.abort()
+        raise
+    return sinks
+
+
+def _estimate(
+    drive: Drive,
+    estimators: Sequence[Estimator],
+    intervals: TrackCalibrator,
+    sinks: Sequence[Sink],
+    store: TrackStore,
+    progress: Progress,
+) -> Signals:
+    """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
+    seen: list[Signals] = []
+    for window in estimate_windows(drive, estimators, intervals=intervals):
+        seen.append(window.signals)
+        for sink in sinks:
+            sink.append_signals(window.signals)
+        if window.truth is not None:
+            store.append(window.truth)
+            assert window.drawn_truth is not None
+            for sink in sinks:
+                sink.append(window.drawn_truth)
+        for track in window.tracks:
+            store.append(track)
+            for sink in sinks:
+                sink.append(track)
+        progress(drive.name, 0.8 * window.share_done)
+    progress(drive.name, 0.8)
+    return join_signals(seen)
+
+
+def friction_events(friction: FrictionSource, stamps_ns: IntArray) -> list[Event]:
+    """Return when an estimated friction was observable; ``stamps_ns`` are those of all windows."""
+    from pdhef_logtool.evaluation.segments import find_intervals
+
+    found = find_intervals(stamps_ns, {"friction observable": friction.observable})
+    return [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in found]
+
+
+def report_facts(
+    drive: Drive,
+    car: Car,
+    estimators: Sequence[EstimatorFacts],
+    rows: Sequence[MetricRow],
+    events: Sequence[Event],
+    losses: Sequence[Loss],
+    samples: dict[str, int] | None = None,
+) -> ReportFacts:
+    """Gather what report.json says of one log; ``samples`` by source, None: those that the drive has read."""
+    plan, log = drive.plan, drive.log
+    samples = drive.samples if samples is None else samples
+    mapping = plan.mapping
+    mapped = set(mapping.topics)
+    notes = []
+    if plan.latency is not None:
+        found = plan.latency
+        measured = f"{found.latency_s * 1e3:.1f} ms ± {found.std_error_s * 1e3:.1f} ms" if found.reliable else "unknown"
+        verdict = "applied" if plan.truth_latency_s else "not applied: it does not stand out of its own uncertainty"
+        notes.append(f"latency {measured} ({found.reason}), {verdict}")
+    notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
+    if "cg" in plan.derivation:
+        notes.append(plan.derivation["cg"])
+    if plan.truth is not None and not plan.has_truth_pose:
+        notes.append("no true position: the drawn truth trajectory is its velocity dead-reckoned")
+    return ReportFacts(
+        log=LogFacts(
+            name=drive.name,
+            file=drive.path.name,
+            kind=log.kind,
+            sha256=drive.sha256,
+            start_ns=plan.start_ns,
+            end_ns=plan.end_ns,
+            topics=[
+                TopicFacts(t.name, t.type_name, t.encoding, t.messages, mapped=t.name in mapped) for t in log.topics
+            ],
+        ),
+        signals=[SourceFacts(n, s.label, SIGNAL_UNITS[n], samples.get(s.label, 0)) for n, s in mapping.signals.items()],
+        missing_signals=list(drive.missing),
+        vehicle_name=car.vehicle.name,
+        vehicle_sha256=car.physics_sha256,
+        estimators=list(estimators),
+        truth=TruthFacts(
+            quantities=[
+                _truth_quantity(name, how, mapping, samples) for name, how in plan.derivation.items() if name != "cg"
+            ],
+            latency_s=None if plan.latency is None else plan.truth_latency_s,
+            not_independent=sorted(plan.dependent),
+            notes=notes,
+        ),
+        metrics=rows,
+        segments=events,
+        losses=losses,
+        warnings=drive.notes,
+        versions=tool_versions(),
+    )
+
+
+def friction_facts(friction: FrictionSource) -> FrictionFacts:
+    """Return what the report says of a run's friction, after the run."""
+    return FrictionFacts(
+        source=friction.label,
+        estimated=friction.bank is not None,
+        observable_share=friction.observable_share,
+        observable_std=friction.observable_std,
+        summary=friction.summary,
+    )
+
+
+def _truth_quantity(name: str, how: str, mapping: Mapping, samples: dict[str, int]) -> SourceFacts:
+    source = mapping.truth.get(name)
+    if source is None:
+        return SourceFacts(name, "derived", _DERIVED_UNITS.get(name) or TRUTH_UNITS[name], 0, derivation=how)
+    derivation = "" if how == source.label else how
+    return SourceFacts(name, source.label, TRUTH_UNITS[name], samples.get(source.label, 0), derivation=derivation)
+
+
+def make_folder(output: Path) -> None:
+    """Make an output folder; raises OutputError."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            expected="a folder to write to", got=error.strerror or str(error), where=str(output)
+        ) from None
+
+
+def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult], car: Car | None = None) -> None:
+    """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values."""
+    from pdhef_logtool.sinks.parquet import write_metrics
+
+    network = None if car is None else car.network
+    used = None if car is None or network is None else {"name": Path(car.network_name).name, "sha256": network.sha256}
+    write_metrics(output / "metrics.parquet", [row for r in results for row in r.rows])
+    write_json(output / "run.json", build_run(tool_versions(), config, used, [r.outcome for r in results]))

@@ -1,0 +1,371 @@
+"""Scores estimates that somebody else recorded in a log: which fields they are, their stamps, truth there, figures.
+
+The scored stamps are the estimate's own. The truth is interpolated to them, its latency measured gyro to truth where
+the log has an IMU; the sensors, which only cut the drive into segments, are interpolated to them too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.drive.interpolation import Bracket
+from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
+from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
+from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.logs.drive_log import DriveLog, windows
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import check_mapping, join_channels, load_mapping, merge_losses, read_signals
+from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
+from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.signals import (
+    ALIGNED_SIGNALS,
+    TRUTH_UNITS,
+    WHEELS,
+    Channel,
+    FloatArray,
+    IntArray,
+    Loss,
+    Signals,
+    join_signals,
+)
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.residual_model.bundle import NO_MODEL
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
+from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
+from pdhef_logtool.runs.pipeline import (
+    LogResult,
+    Progress,
+    RunResult,
+    judge,
+    make_folder,
+    outcome_of,
+    read_thresholds,
+    report_facts,
+    write_run,
+    write_verdicts,
+)
+from pdhef_logtool.runs.scoring import diverged_events, in_time, segment_events
+from pdhef_logtool.sinks.base import TRUTH, Event
+from pdhef_logtool.sinks.report import EstimatorFacts, build_report, write_json
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.metrics import MetricRow
+
+
+_RECORDED = "read from the log: nothing says whether it is causal, or what it was computed from"
+
+
+def score_log(
+    argument: str,
+    config: RunConfig,
+    *,
+    estimates: Sequence[str] = (),
+    truth: Sequence[str] = (),
+    name: str | None = None,
+    output: Path | None = None,
+    junit: Path | None = None,
+    progress: Progress = lambda _text, _share: None,
+    warn: Tell = lambda _text: None,
+) -> RunResult:
+    """Score recorded estimates of one log against its truth; same figures, tables and report as a run.
+
+    Parameters
+    ----------
+    argument : the log. config : of it count vehicle, mapping, slice, truth choice and thresholds.
+    estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
+        the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
+    truth : likewise; without any, the mapping's or the recognised truth.
+    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.pipeline.run_logs`.
+
+    Raises
+    ------
+    PdhefError : There is no estimate, no truth, or nothing of the log can be used.
+    """
+    log_input = one_log(argument)
+    car = Car.load(config.car, network=NO_MODEL, intervals=NO_INTERVALS)
+    mapping = None if config.mapping is None else load_mapping(config.mapping)
+    thresholds = read_thresholds(config, junit)
+    if config.car is None:
+        slow = car.vehicle.low_speed_blend_m_s
+        warn(
+            f"no --car: the truth is taken to be measured at the centre of gravity, sideslip is scored above "
+            f"{slow:g} m/s, and segments are cut at friction {car.vehicle.assumed_friction:g}"
+        )
+    scoring = _Scoring(config, car, warn, estimates, truth, name)
+    with scoring.read(log_input, mapping) as drive:
+        result = judge(scoring.score(drive, output, progress), thresholds)
+    if output is not None:
+        document = _config_document(config, drive, scoring.estimates)
+        write_run(output, document, [result])
+    write_verdicts(junit, [result])
+    return RunResult(output, (result,))
+
+
+def _config_document(config: RunConfig, drive: Drive, estimates: Sequence[EstimateSource]) -> dict[str, Any]:
+    document = config.to_dict()
+    for key in ("estimators", "annotate", "sensors"):
+        del document[key]
+    document["estimates"] = {e.name: {name: source.label for name, source in e.signals.items()} for e in estimates}
+    document["truth"] = {name: source.label for name, source in drive.mapping.truth.items()}
+    return document
+
+
+@dataclass(slots=True)
+class _Scoring:
+    """One log being scored: what was asked for, and which fields were chosen."""
+
+    config: RunConfig
+    car: Car
+    warn: Tell
+    asked: Sequence[str]
+    truth: Sequence[str]
+    name: str | None
+    estimates: tuple[EstimateSource, ...] = ()
+
+    def read(self, log_input: LogInput, mapping: SignalMapping | None) -> Drive:
+        """Open the log; decide which fields are estimate, truth and sensors."""
+        given = mapping
+        if mapping is not None and not mapping.signals and not mapping.truth:
+            mapping = None  # a file of estimates alone leaves the rest to recognition
+        elif mapping is not None and self.truth:
+            mapping = replace(mapping, truth={}, quality=None)
+
+        def choose(log: DriveLog, chosen: SignalMapping, tell: Tell) -> SignalMapping:
+            self.estimates = choose_estimates(log, self.asked, given, self.name)
+            for estimate in self.estimates:
+                check_mapping(estimate.as_mapping(), log)
+            if self.truth:
+                quality = chosen.quality if given is None else given.quality
+                if quality is not None:
+                    tell(f"--truth replaces the mapped truth and its gate on {quality.describe()}")
+                named = sources_of(log, self.truth, TRUTH_UNITS, "--truth")[0]
+                can = None if given is None else given.can
+                chosen = replace(chosen, truth=named, quality=None, can=can)
+            if not chosen.truth:
+                raise MappingError(
+                    expected="a truth to score against",
+                    got="none mapped and none recognised",
+                    where=str(log.path),
+                    remedy="name it with --truth SIGNAL=TOPIC.FIELD or in a mapping file",
+                )
+            return chosen
+
+        options = replace(self.config.read_options, friction=None)
+        return read_drive(log_input, self.car, mapping, options, tell=self.warn, adjust=choose, require_sensors=False)
+
+    def score(self, drive: Drive, output: Path | None, progress: Progress) -> LogResult:
+        """Read, compare and, with a folder, write."""
+        plan = drive.plan
+        progress(drive.name, 0.1)
+        recorded, losses = self._read_estimates(drive)
+        progress(drive.name, 0.3)
+        truth, truth_losses, samples = read_truth(drive.log, plan, drive.options.window_s)
+        progress(drive.name, 0.6)
+        signals = _read_sensors(drive)
+        all_losses = merge_losses([drive.losses, losses, truth_losses])
+        progress(drive.name, 0.8)
+        scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
+        plan = self._with_dependence(plan, recorded)
+        rows, dependent = self._figures(drive, plan, recorded, truth, signals)
+        drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
+        truth_track = truth_at(truth, scored_ns, plan.truth_latency_s)
+        events = self._events(truth_track, signals_at(signals, scored_ns), recorded)
+        samples |= drive.samples
+        for r in recorded:
+            samples |= r.samples
+        facts = report_facts(
+            drive, self.car,
+            [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded],
+            rows, events, all_losses, samples,
+        )  # fmt: skip
+        read = {s.topic for e in self.estimates for s in e.signals.values()}
+        topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
+        latency = [] if plan.latency is not None else ["no gyro to measure the truth's latency with: taken as 0"]
+        facts = replace(
+            facts,
+            log=replace(facts.log, topics=topics),
+            truth=replace(facts.truth, notes=[*latency, *facts.truth.notes]),
+        )
+        report = build_report(facts)
+        folder = None
+        if output is not None:
+            make_folder(output)
+            folder = output / "logs" / drive.name
+            _write(folder, report, rows, [truth_track, *(r.track for r in recorded)], plan)
+        progress(drive.name, 1.0)
+        return LogResult(outcome_of(drive, all_losses), folder, report, tuple(rows))
+
+    def _read_estimates(self, drive: Drive) -> tuple[list[RecordedEstimate], list[Loss]]:
+        losses: list[Loss] = []
+        recorded = []
+        for estimate in self.estimates:
+            found, lost = read_estimate(
+                drive.log, estimate, drive.plan.start_ns, drive.plan.end_ns, drive.options.window_s
+            )
+            for note in found.notes:
+                drive.tell(f"{estimate.name}: {note}")
+            recorded.append(found)
+            losses += lost
+        return recorded, losses
+
+    def _with_dependence(self, plan: DrivePlan, recorded: Sequence[RecordedEstimate]) -> DrivePlan:
+        """Add the truth channels that one of the estimates is, as a recorded channel."""
+        found = dict(plan.dependent)
+        for r in recorded:
+            same = dependent_signals(r.channels, plan.survey_truth, role=f"estimate {r.track.name}'s")
+            found |= {name: reason for name, reason in same.items() if name not in found}
+        return replace(plan, dependent=found)
+
+    def _figures(
+        self,
+        drive: Drive,
+        plan: DrivePlan,
+        recorded: Sequence[RecordedEstimate],
+        truth: TruthTrack,
+        signals: Signals | None,
+    ) -> tuple[list[MetricRow], dict[str, str]]:
+        """Score each estimate at its own stamps; return what of the derived truth equals an estimate besides."""
+        from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS, score_track
+        from pdhef_logtool.evaluation.segments import segment_masks
+
+        rows: list[MetricRow] = []
+        dependent: dict[str, str] = {}
+        for r in recorded:
+            at_stamps = truth_at(truth, r.track.stamps_ns, plan.truth_latency_s)
+            masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.car.vehicle)
+            same = {
+                name: f"the truth's {name} equals that of the estimate {r.track.name}"
+                for name in SCORED_SIGNALS
+                if _same_column(getattr(r.track, name), getattr(at_stamps, name))
+            }
+            dependent |= same
+            figures = score_track(
+                r.track,
+                at_stamps,
+                masks,
+                log=drive.name,
+                low_speed_m_s=self.car.vehicle.low_speed_blend_m_s,
+                not_independent={**plan.dependent, **same},
+            )
+            if not any(row.metric == "rmse" for row in figures):
+                drive.tell(f"{r.track.name}: nowhere are estimate and truth known together, so there are no errors")
+            # What the estimate does not claim is not missing from it.
+            silent = {n for n in SCORED_SIGNALS if n not in r.claimed and not np.isfinite(getattr(r.track, n)).any()}
+            rows += [
+                row
+                for row in figures
+                if row.signal not in silent and (row.metric != "diverged" or "diverged" in r.claimed)
+            ]
+        return rows, dependent
+
+    def _events(self, truth: StateTrack, signals: Signals, recorded: Sequence[RecordedEstimate]) -> list[Event]:
+        from pdhef_logtool.evaluation.segments import segment_masks
+
+        masks = segment_masks(signals, truth, self.car.vehicle)
+        events = segment_events(truth.stamps_ns, masks) + [e for r in recorded for e in diverged_events(r.track)]
+        return sorted(events, key=in_time)
+
+
+def _read_sensors(drive: Drive) -> Signals | None:
+    """Return what the mapped sensors say, None without any; the drive then has the losses and samples of that."""
+    if not drive.plan.alignment.channels:
+        drive.tell("no IMU in the mapping: segments come from the truth alone")
+        return None
+    drive.plan = replace(drive.plan, truth=None, mapping=replace(drive.mapping, truth={}, quality=None))
+    seen = [w.signals for w in drive.windows() if len(w.signals)]
+    return join_signals(seen) if seen else None
+
+
+def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
+    known = np.isfinite(estimate) & np.isfinite(truth)
+    return int(np.count_nonzero(known)) >= 10 and share_equal(estimate[known], truth[known]) >= SAME_SHARE
+
+
+def _write(
+    folder: Path, report: dict[str, Any], rows: Sequence[MetricRow], tracks: Sequence[StateTrack], plan: DrivePlan
+) -> None:
+    from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
+
+    start = first_pose(tracks[0])
+    sink = EstimatesSink(folder / "estimates.parquet")
+    try:
+        for track in tracks:
+            has_pose = track.name == TRUTH and plan.has_truth_pose
+            sink.append(track if has_pose else DeadReckoning().add(track, start))
+        sink.finish(report)
+    except BaseException:
+        sink.abort()
+        raise
+    write_metrics(folder / "metrics.parquet", rows)
+    write_json(folder / "report.json", report)
+
+
+def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int]]:
+    """Read and derive the whole truth on its own clock, window by window, with losses and samples by source.
+
+    Raises
+    ------
+    MappingError : The slice holds no truth.
+    """
+    alone = replace(plan.mapping, signals={})
+    channels: dict[str, Channel] = {}
+    tracks: list[StateTrack] = []
+    losses: tuple[Loss, ...] = ()
+    samples: dict[str, int] = {}
+    done_ns: int | None = None
+    for a, b in windows(plan.start_ns, plan.end_ns, round(window_s * 1e9)):
+        if plan.truth is None:
+            break
+        part = read_signals(log, alone, plan.clocks, a, b)
+        losses = merge_losses([losses, part.losses])
+        for name, channel in part.truth.items():
+            samples[channel.source] = samples.get(channel.source, 0) + len(channel)
+            channels[name] = join_channels([channels[name], channel]) if name in channels else channel
+        stamps = [c.stamps_ns for c in channels.values() if len(c)]
+        if not stamps:
+            continue
+        newest = max(int(s[-1]) for s in stamps) + 1
+        until = newest if b >= plan.end_ns else min(newest, b) - plan.truth.margin_ns
+        if done_ns is not None and until <= done_ns:
+            continue
+        tracks.append(derive_truth(channels, plan=plan.truth).track.between(done_ns, until))
+        done_ns = until
+        channels = {n: c.between(until - plan.truth.margin_ns) for n, c in channels.items()}
+    if plan.truth is None or not sum(len(t) for t in tracks):
+        raise MappingError(
+            expected="truth in the chosen slice",
+            got="no samples that can be used",
+            where=f"{log.path} {', '.join(s.label for s in plan.mapping.truth.values())}",
+            remedy="pdhef inspect LOG shows what the log holds and what was dropped",
+        )
+    gap_s = plan.truth.max_gap_s[plan.truth.base]
+    return TruthTrack(concatenate(tracks), gap_s, plan.derivation), losses, samples
+
+
+def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:
+    """Return the sensors at other stamps [N], interpolated between samples, never across gaps; all NaN without any."""
+    n = stamps_ns.shape[0]
+
+    def column(name: str) -> FloatArray:
+        if signals is None:
+            return np.full(n, np.nan)
+        values: FloatArray = getattr(signals, name)
+        known = np.isfinite(values)
+        at = signals.stamps_ns[known]
+        return Bracket(at, stamps_ns, gap_ns(at)).linear(values[known])
+
+    return Signals(
+        stamps_ns=stamps_ns,
+        ready_ns=stamps_ns,
+        wheel_speed_m_s=np.full((n, len(WHEELS)), np.nan),
+        available=frozenset() if signals is None else signals.available,
+        **{name: column(name) for name in ALIGNED_SIGNALS},
+    )

@@ -1,0 +1,81 @@
+"""The figures and events of one drive, of tracks that are read one at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.records.signals import BoolArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.sinks.base import TRUTH, Event
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.metrics import MetricRow
+    from pdhef_logtool.evaluation.reasons import ReasonFacts
+
+
+def evaluate(
+    drive: Drive, names: Sequence[str], read: Callable[[str], StateTrack | None], signals: Signals
+) -> tuple[list[MetricRow], list[Event], dict[str, tuple[ReasonFacts, ...] | None]]:
+    """Score the tracks of a drive, one whole track in memory at a time besides the truth.
+
+    Parameters
+    ----------
+    names : of the estimators. read : returns the whole track of a name, ``truth`` too; None if there is none.
+    signals : what the estimators saw.
+
+    Returns
+    -------
+    The figures, the events in order of time, and by estimator why it did not use its sensors as usual.
+    """
+    from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
+    from pdhef_logtool.evaluation.metrics import score_track, state_rows
+    from pdhef_logtool.evaluation.reasons import summarise_reasons
+    from pdhef_logtool.evaluation.segments import segment_masks
+
+    stem, truth, vehicle = drive.name, read(TRUTH), drive.car.vehicle
+    masks = segment_masks(signals, truth, vehicle)
+    slow = vehicle.low_speed_blend_m_s
+    rows: list[MetricRow] = []
+    reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
+    events = segment_events(signals.stamps_ns, masks)
+    for name in names:
+        track = read(name)
+        assert track is not None
+        if truth is not None:
+            rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
+        else:
+            rows += state_rows(track, masks, log=stem)
+        rows += whiteness_rows(track, masks, log=stem)
+        reasons[name] = summarise_reasons(track)
+        events += diverged_events(track)
+    if truth is None:
+        for a, b in combinations(names, 2):
+            pair = [t for t in (read(a), read(b)) if t is not None]
+            rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
+    rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
+    return rows, sorted(events, key=in_time), reasons
+
+
+def in_time(event: Event) -> tuple[int, int, str]:
+    """Return what events are sorted by."""
+    return event.start_ns, event.end_ns, event.name
+
+
+def segment_events(stamps_ns: IntArray, masks: dict[str, BoolArray]) -> list[Event]:
+    """Return the segments that are worth an event: not the whole drive, nor what is only not nonlinear."""
+    from pdhef_logtool.evaluation.segments import find_intervals
+
+    worth = {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
+    return [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(stamps_ns, worth)]
+
+
+def diverged_events(track: StateTrack) -> list[Event]:
+    """Return when an estimator says of itself that it diverges."""
+    from pdhef_logtool.evaluation.segments import find_intervals
+
+    name, text = f"{track.name} diverged", "the estimator reports its own divergence"
+    spans = find_intervals(track.stamps_ns, {"diverged": track.diverged})
+    return [Event(name, s.start_ns, s.end_ns, text) for s in spans]

@@ -1,0 +1,54 @@
+"""What the pages share: the repository's places, Markdown tables and numbers, filled blocks, the commands' options."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from pdhef_logtool.records.files import write_bytes
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+SAMPLE_VEHICLE = ROOT / "sample_logs" / "vehicle.toml"
+#: Recorded drives and runs of another simulator, which may not be redistributed: beside the repository, or nowhere.
+DRIVES = ROOT.parent / "shared" / "data" / "drives"
+INDEPENDENT = ROOT.parent / "shared" / "data" / "independent_sim"
+
+
+def table(head: Iterable[str], body: Iterable[Iterable[str]], *, right_from: int | None = None) -> str:
+    """Return a Markdown table, columns from ``right_from`` on ranged right."""
+    names = list(head)
+    rule = ["---" if right_from is None or i < right_from else "---:" for i in range(len(names))]
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (names, rule, *body))
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a figure, a dash for what is not finite."""
+    return "–" if not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def fill(page: str, blocks: Mapping[str, str], where: str) -> str:
+    """Put blocks between their comments ``<!-- begin NAME -->`` and ``<!-- end NAME -->``; no place is an error."""
+    for name, text in blocks.items():
+        pattern = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.DOTALL)
+        places = list(pattern.finditer(page))
+        if len(places) != 1:
+            raise SystemExit(f"{where}: expected one place for {name}")
+        page = f"{page[: places[0].end(1)]}{text}\n{page[places[0].start(2) :]}"
+    return page
+
+
+def write(path: Path, text: str) -> None:
+    """Write a page, whole or not at all, and print where it is."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, text.encode())
+    print(path)
+
+
+def options(name: str, text: str | None) -> argparse.ArgumentParser:
+    """Return the parser of ``python -m studies.NAME``; ``text`` is its module's."""
+    shape = argparse.RawDescriptionHelpFormatter
+    return argparse.ArgumentParser(prog=f"python -m studies.{name}", description=text, formatter_class=shape)

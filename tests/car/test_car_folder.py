@@ -1,0 +1,626 @@
+"""A car is a folder of parts: read one by one, left out when their basis has changed, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tomllib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdhef_logtool.car import store
+from pdhef_logtool.car.car import (
+    FIT_FILE,
+    HISTORY_FILE,
+    INTERVALS_FILE,
+    NETWORK_FILE,
+    NETWORK_FOLDER,
+    NOISE_FILE,
+    SHIPPED_CARS,
+    VEHICLE_FILE,
+    Car,
+    read_history,
+)
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import (
+    FilterNoise,
+    Fit,
+    FittedSensors,
+    FittedValues,
+    LearntOn,
+    Noise,
+    Record,
+    Trust,
+    digest,
+    physics_sha256,
+)
+from pdhef_logtool.car.store import Change, check_output, update_car, write_change
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.cautious import strongest_physics
+from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
+from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
+
+#: A person's file: with comments, an order of its own, and a line that is set apart.
+PERSONS = """# My car, weighed on 3 May.
+mass_kg = 1440.0            # with driver
+name = "mine"
+
+yaw_inertia_kg_m2 = 1523.0
+cg_to_front_axle_m = 1.16
+cg_to_rear_axle_m = 1.71    # tank full
+friction = 0.85
+truth_position_m = [-0.4, 0.0, 0.0]
+
+[tyres.front]  # guessed
+cornering_stiffness_n_per_rad = 110000.0
+[tyres.rear]
+cornering_stiffness_n_per_rad = 108000.0
+# end
+"""
+COMMENTS = ("# My car, weighed on 3 May.", "# with driver", "# tank full", "# guessed", "# end")
+DRIVES = (LearntOn(name="lap", sha256="cd" * 32, start_s=0.0, end_s=80.0),)
+TUNED, PLUS = "phy-ukf-tuned", "physics-plus"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    path = tmp_path / "car"
+    path.mkdir()
+    (path / VEHICLE_FILE).write_text(PERSONS)
+    return path
+
+
+def load(path: Path, network: str = "none") -> Car:
+    return Car.load(path, network=network, intervals="none")
+
+
+def write_part(path: Path, part: Record) -> None:
+    path.write_text(part_toml(part, "Written by a test."))
+
+
+def add_fit(folder: Path, **values: Any) -> Fit:
+    fit = Fit(
+        physics_sha256=physics_sha256(load(folder).own),
+        values=FittedValues(**(values or {"friction": 0.6, "steer_offset_rad": 0.01})),
+        filter={TUNED: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5})},
+        drives=DRIVES,
+    )
+    write_part(folder / FIT_FILE, fit)
+    return fit
+
+
+def add_noise(folder: Path, name: str = PLUS, **entries: Any) -> FilterNoise:
+    noise = FilterNoise(q_std=(0.4, 0.5, 0.6), physics_sha256=load(folder).physics_sha256, **entries)
+    write_part(folder / NOISE_FILE, Noise(filter={name: noise}))
+    return noise
+
+
+def add_trust(folder: Path, network: str = "default") -> Trust:
+    car = load(folder, network)
+    assert car.network is not None
+    trust = Trust(
+        network=network,
+        network_sha256=car.network.sha256,
+        trust_cap=0.5,
+        evidence="a gain on one drive",
+        physics_sha256=car.physics_sha256,
+        noise_sha256=car.noise_sha256,
+    )
+    write_part(folder / NETWORK_FILE, trust)
+    return trust
+
+
+def edit(folder: Path, old: str, new: str) -> None:
+    text = (folder / VEHICLE_FILE).read_text()
+    assert text.count(old) == 1
+    (folder / VEHICLE_FILE).write_text(text.replace(old, new))
+
+
+# --- reading -------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_with_a_persons_file_alone_is_a_car(folder: Path) -> None:
+    car = load(folder)
+    assert (car.vehicle, car.source) == (car.own, folder)
+    assert car.vehicle == load(folder / VEHICLE_FILE).vehicle
+    assert (dict(car.noise), car.trust, car.network, car.learnt_on, car.notes) == ({}, None, None, (), ())
+
+
+def test_the_shipped_car_is_found_by_name_and_none_is_the_default_sedan() -> None:
+    saloon = Car.load("saloon")
+    assert (saloon.vehicle.name, saloon.source) == ("truthsim saloon", SHIPPED_CARS["saloon"])
+    assert saloon.network is not None and saloon.intervals is not None
+    assert Car.load(SHIPPED_CARS["saloon"]).physics_sha256 == saloon.physics_sha256
+    default = Car.load()
+    assert (default.vehicle, default.source) == (default_vehicle(), None)
+    assert default.allowed_trust.cap == 0.0
+
+
+def test_parts_come_one_by_one(folder: Path) -> None:
+    own = load(folder).vehicle
+    fit = add_fit(folder)
+    car = load(folder)
+    assert car.own == own
+    assert car.vehicle == own.model_copy(
+        update={"friction": 0.6, "steer_offset_rad": 0.01, "name": "mine (identified)"}
+    )
+    assert dict(car.noise) == fit.filter
+    assert car.learnt_on == DRIVES
+    noise = add_noise(folder)
+    car = load(folder)
+    assert dict(car.noise) == {**fit.filter, PLUS: noise}
+    trust = add_trust(folder)
+    car = load(folder, "default")
+    assert car.trust == trust
+    assert (car.allowed_trust.cap, car.allowed_trust.reason) == (0.5, "a gain on one drive")
+    assert Car.load(folder).network_name == "default"
+    assert car.notes == ()
+
+
+def test_what_tune_found_comes_before_what_identify_found(folder: Path) -> None:
+    add_fit(folder)
+    noise = add_noise(folder, TUNED)
+    assert load(folder).noise[TUNED] == noise
+
+
+def test_a_fit_of_biases_leaves_the_other_sensors(folder: Path) -> None:
+    edit(folder, "[tyres.front]", "[sensors]\nay_std_m_s2 = 0.3\n[tyres.front]")
+    add_fit(folder, sensors=FittedSensors(ay_bias_m_s2=0.05, yaw_rate_bias_rad_s=-0.002))
+    sensors = load(folder).vehicle.sensors
+    assert (sensors.ay_std_m_s2, sensors.ay_bias_m_s2, sensors.yaw_rate_bias_rad_s) == (0.3, 0.05, -0.002)
+
+
+def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder: Path, tmp_path: Path) -> None:
+    shutil.copytree(SHIPPED_FOLDERS["many-cars"], folder / NETWORK_FOLDER)
+    add_trust(folder, "many-cars")
+    text = (folder / NETWORK_FILE).read_text()
+    (folder / NETWORK_FILE).write_text(text.replace('"many-cars"', '"network"'))
+    car = Car.load(folder)
+    assert (car.network_name, car.network_folder) == ("network", folder / NETWORK_FOLDER)
+    assert car.allowed_trust.cap == 0.5
+    (tmp_path / "bare.toml").write_text(PERSONS)
+    other = Car.load(tmp_path / "bare.toml", network=folder)
+    assert other.network is not None and car.network is not None
+    assert other.network.sha256 == car.network.sha256
+
+
+# --- staleness -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("mass_kg = 1440.0 ", "mass_kg = 1450.0 "),
+        ("110000.0", "111000.0"),
+        ("friction = 0.85\n", ""),
+        ("[tyres.front]", "[sensors]\nay_bias_m_s2 = 0.1\n[tyres.front]"),
+    ],
+)
+def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, old: str, new: str) -> None:
+    add_fit(folder)
+    add_noise(folder)
+    add_trust(folder)
+    edit(folder, old, new)
+    car = load(folder, "default")
+    assert car.vehicle == car.own
+    assert dict(car.noise) == {}
+    assert car.learnt_on == ()
+    assert car.notes == (
+        "fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew",
+        "noise of physics-plus is not used: it belongs to other physics; pdhef tune makes it anew",
+        "network.toml allows no trust: it was found with other physics; pdhef trust makes it anew",
+    )
+    assert car.allowed_trust.cap == 0.0
+    assert "other physics; pdhef trust gives it anew" in car.allowed_trust.note
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('name = "mine"', 'name = "ours"'),
+        ("# with driver", "# without"),
+        ("# My car, weighed on 3 May.\n", ""),
+        ("truth_position_m = [-0.4, 0.0, 0.0]", "truth_position_m = [-0.5, 0.0, 0.0]"),
+        ("mass_kg = 1440.0 ", "mass_kg = 1440 "),
+        ("[tyres.front]", "[sensors]\nax_bias_m_s2 = 0.0\n[tyres.front]"),  # its default
+    ],
+)
+def test_what_is_no_physics_makes_nothing_stale(folder: Path, old: str, new: str) -> None:
+    add_fit(folder)
+    add_noise(folder)
+    add_trust(folder)
+    before = load(folder, "default")
+    edit(folder, old, new)
+    car = load(folder, "default")
+    assert car.notes == before.notes == ()
+    assert dict(car.noise) == dict(before.noise)
+    assert car.allowed_trust == before.allowed_trust
+    assert (car.physics_sha256, car.noise_sha256) == (before.physics_sha256, before.noise_sha256)
+
+
+def test_an_entry_that_a_later_version_adds_makes_no_car_stale(tmp_path: Path) -> None:
+    """What stands at its default is as if it were absent."""
+    (tmp_path / "mine.toml").write_text(PERSONS)
+    said = {k: v for k, v in tomllib.loads(PERSONS).items() if k not in ("name", "truth_position_m")}
+    assert load(tmp_path / "mine.toml").physics_sha256 == digest(said)
+
+
+def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
+    add_fit(folder)
+    add_noise(folder)
+    add_trust(folder)
+    fit = add_fit(folder, friction=0.7)
+    car = load(folder, "default")
+    assert car.vehicle.friction == 0.7
+    assert dict(car.noise) == fit.filter
+    assert [note.split(":")[0] for note in car.notes] == [
+        "noise of physics-plus is not used",
+        "network.toml allows no trust",
+    ]
+    assert car.allowed_trust.cap == 0.0
+
+
+def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
+    add_fit(folder)
+    add_trust(folder)
+    add_noise(folder)
+    car = load(folder, "default")
+    assert car.notes == ("network.toml allows no trust: it was found with other noise; pdhef trust makes it anew",)
+    assert car.allowed_trust.cap == 0.0
+    assert "other noise" in car.allowed_trust.reason
+
+
+def test_noise_of_a_filter_with_another_network_is_left_out(folder: Path) -> None:
+    network = load(folder, "many-cars").network
+    assert network is not None
+    noise = add_noise(folder, "pd-hef", network_sha256=network.sha256)
+    assert dict(load(folder, "many-cars").noise) == {"pd-hef": noise}
+    assert load(folder, "many-cars").notes == ()
+    other = load(folder, "default")
+    assert dict(other.noise) == {}
+    assert other.notes == ("noise of pd-hef is not used: it belongs to another network; pdhef tune makes it anew",)
+    assert dict(load(folder, "none").noise) == {"pd-hef": noise}  # no filter that could take it
+    add_noise(folder)
+    add_trust(folder, "many-cars")
+    assert load(folder, "default").notes == ()  # noise of physics alone, and evidence about another network
+    assert "the car's evidence is about network" in load(folder, "default").allowed_trust.reason
+
+
+def test_trust_changes_no_physics_so_that_intervals_stay_those_of_the_car(folder: Path) -> None:
+    intervals = json.loads((SHIPPED_CARS["saloon"] / INTERVALS_FILE).read_text())
+    (folder / INTERVALS_FILE).write_text(json.dumps(intervals | {"physics_sha256": load(folder).physics_sha256}))
+    before = Car.load(folder, network="default")
+    add_trust(folder)
+    after = Car.load(folder, network="default")
+    assert after.allowed_trust.cap > before.allowed_trust.cap
+    assert after.physics_sha256 == before.physics_sha256
+    assert after.intervals == before.intervals
+    assert after.intervals is not None and after.intervals.physics_sha256 == after.physics_sha256
+    assert after.notes == ()
+    edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
+    assert "intervals.json was made with other physics; pdhef calibrate makes it anew" in Car.load(folder).notes
+    assert not any("intervals" in note for note in load(folder).notes)  # they are not in force
+
+
+# --- what is refused -------------------------------------------------------------------------------------------------
+
+
+def test_a_network_is_no_car(tmp_path: Path) -> None:
+    with pytest.raises(VehicleError, match=r"a folder with vehicle\.toml, or such a file, got a network's folder"):
+        Car.load(SHIPPED_FOLDERS["many-cars"])
+    with pytest.raises(VehicleError, match="got another folder"):
+        Car.load(tmp_path)
+
+
+NOISE = f'format = "pdhef-noise"\nversion = 1\n[filter.{TUNED}]\n'
+FIT = f'format = "pdhef-fit"\nversion = 1\nphysics_sha256 = "{"ab" * 32}"\n'
+TRUST = 'format = "pdhef-network"\nversion = 1\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        (VEHICLE_FILE, PERSONS.replace("friction", "frictoin"), "frictoin: unknown, did you mean friction?"),
+        (VEHICLE_FILE, PERSONS.replace("[tyres.rear]", "[tyres.reer]"), "did you mean tyres.rear?"),
+        (VEHICLE_FILE, PERSONS + "[filtre.x]\n", "filtre: unknown, did you mean filter?"),
+        (VEHICLE_FILE, PERSONS + "[network]\ntrust = 1.0\n", "network.trust: unknown, did you mean network.trust_cap?"),
+        (FIT_FILE, FIT + "drive = []\n[values]\n", "drive: unknown, did you mean drives?"),
+        (FIT_FILE, FIT + "[values]\nmass_kg = 3.0\n", "values.mass_kg: unknown"),
+        (FIT_FILE, FIT + "[values]\nsteering_ration = 3.0\n", "did you mean values.steering_ratio?"),
+        (FIT_FILE, FIT + "[values.sensors]\nay_bias = 3.0\n", "did you mean values.sensors.ay_bias_m_s2?"),
+        (FIT_FILE, FIT.replace("version = 1", "version = 2") + "[values]\n", "version: should be 1"),
+        (NOISE_FILE, NOISE + "q_sdt = []\n", f"did you mean filter.{TUNED}.q_std?"),
+        (NOISE_FILE, NOISE + "r_std = {ay = 1.0}\n", f"did you mean filter.{TUNED}.r_std.ay_m_s2?"),
+        (NOISE_FILE, NOISE.replace("tuned", "tunde") + "q_std = []\n", f"did you mean filter.{TUNED}?"),
+        (NOISE_FILE, NOISE + "q_std = [1.0]\n", "q_std needs 3 or 4 entries"),
+        (NOISE_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics-plus's"),
+        (NOISE_FILE, NOISE.replace("noise", "fit"), "format: should be 'pdhef-noise'"),
+        (NETWORK_FILE, TRUST + "trust_kap = 1.0\n", "trust_kap: unknown, did you mean trust_cap?"),
+        (NETWORK_FILE, TRUST + "trust_cap = 1.5\n", "trust_cap: "),
+        (NETWORK_FILE, TRUST + 'network_sha256 = "ab"\n', "network_sha256: "),
+        (INTERVALS_FILE, '{"entris": []}', "entris: unknown, did you mean entries?"),
+        (INTERVALS_FILE, '{"format": "pdhef-calibration", "estimators": {}}', "pdhef calibrate makes it anew"),
+    ],
+)
+def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: str, text: str, said: str) -> None:
+    (folder / name).write_text(text)
+    with pytest.raises(VehicleError) as caught:
+        Car.load(folder, network="none")
+    assert said in str(caught.value)
+    assert str(folder / name) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# --- one file, as older versions wrote it --------------------------------------------------------------------------
+
+FLAT = """
+[filter.phy-ukf-tuned]
+q_std = [0.1, 0.1, 0.1]
+[filter.physics-plus]
+q_std = [0.1, 0.1, 0.1]
+[network]
+trust_cap = 0.25
+evidence = "a drive of 300 s"
+[identification]
+drives = ["lap: 0 to 80.5 s", {name = "other", sha256 = "cd", start_s = 1.0, end_s = 2.0}]
+tuning_scores = ["physics-plus: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
+tool = "pdhef 0.1"
+"""
+
+
+def test_scores_and_drives_of_older_files_are_understood(tmp_path: Path) -> None:
+    path = tmp_path / "old.toml"
+    path.write_text(PERSONS + FLAT)
+    car = load(path)
+    assert {n: (one.score_deg, one.trial) for n, one in car.noise.items()} == {PLUS: (0.1092, 63), TUNED: (0.1378, 7)}
+    assert strongest_physics(car).name == PLUS
+    assert [(d.name, d.start_s, d.end_s) for d in car.learnt_on] == [("other", 1.0, 2.0), ("lap", 0.0, 80.5)]
+    assert car.allowed_trust.cap == 0.25
+    path.write_text(PERSONS + FLAT.replace("0.1092", "0.2092"))
+    assert strongest_physics(load(path)).name == TUNED
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("0.1092 deg at trial", "0.1092° at trial"),
+        ("0.1092 deg at trial 63", "0.1092 deg"),
+        ("physics-plus: 0.1092", "physics-plus 0.1092"),
+        ("lap: 0 to 80.5 s", "lap: all of it"),
+    ],
+)
+def test_a_sentence_that_is_not_understood_is_an_error_and_chooses_no_filter(
+    tmp_path: Path, old: str, new: str
+) -> None:
+    path = tmp_path / "old.toml"
+    path.write_text(PERSONS + FLAT.replace(old, new))
+    with pytest.raises(VehicleError, match=r"identification\.(tuning_scores|drives)") as caught:
+        load(path)
+    assert new in str(caught.value)
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+def noise_change(noise: dict[str, FilterNoise], **more: Any) -> Change:
+    data = part_toml(Noise(filter=noise), "Written by pdhef tune.").encode()
+    return Change("tune", NOISE_FILE, {NOISE_FILE: data}, settings={"trials": 8}, drives=DRIVES, **more)
+
+
+NEW = {PLUS: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.7}, score_deg=0.11, trial=5)}
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder: Path, tmp_path: Path) -> None:
+    add_fit(folder)
+    written = update_car(load(folder), tmp_path / "deep" / "new", noise_change(NEW))
+    assert written == tmp_path / "deep" / "new" / NOISE_FILE
+    assert {*files_of(written.parent)} == {VEHICLE_FILE, FIT_FILE, NOISE_FILE, HISTORY_FILE}
+    assert (written.parent / VEHICLE_FILE).read_bytes() == (folder / VEHICLE_FILE).read_bytes()
+    assert load(written.parent).noise[PLUS] == NEW[PLUS]
+    assert {p.name for p in folder.iterdir()} == {VEHICLE_FILE, FIT_FILE}
+    assert [p.name for p in (tmp_path / "deep").iterdir()] == ["new"]
+
+
+def test_a_bare_file_and_the_default_car_become_folders(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(PERSONS)
+    update_car(load(tmp_path / "mine.toml"), tmp_path / "mine", noise_change(NEW))
+    assert (tmp_path / "mine" / VEHICLE_FILE).read_text() == PERSONS
+    mask = os.umask(0)
+    os.umask(mask)
+    assert (tmp_path / "mine").stat().st_mode & 0o777 == 0o777 & ~mask
+    update_car(Car.load(None, network="none"), tmp_path / "sedan", noise_change(NEW))
+    assert load(tmp_path / "sedan").own == default_vehicle()
+
+
+def test_what_the_output_knows_of_the_car_stays(folder: Path, tmp_path: Path) -> None:
+    """The bare file of the same car is named: its folder keeps what other commands found."""
+    fit = add_fit(folder)
+    shutil.copy(folder / VEHICLE_FILE, tmp_path / "mine.toml")
+    update_car(load(tmp_path / "mine.toml"), folder, noise_change(NEW))
+    assert dict(load(folder).noise) == {**fit.filter, **NEW}
+    assert load(folder).learnt_on == DRIVES
+
+
+def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path) -> None:
+    (folder / "notes.txt").write_text("mine too")
+    vehicle = (folder / VEHICLE_FILE).read_bytes()
+    update_car(load(folder), folder, noise_change(NEW))
+    update_car(load(folder), folder, noise_change({TUNED: NEW[PLUS]}))
+    assert (folder / VEHICLE_FILE).read_bytes() == vehicle
+    assert (folder / "notes.txt").read_text() == "mine too"
+    assert set(load(folder).noise) == {TUNED}
+    lines = read_history(folder)
+    assert [(line["command"], line["part"], line["settings"]) for line in lines] == [
+        ("tune", NOISE_FILE, {"trials": 8})
+    ] * 2
+    assert lines[0]["drives"] == [DRIVES[0].model_dump(mode="json")]
+    assert lines[1]["sha256"] == digest((folder / NOISE_FILE).read_text()) != lines[0]["sha256"]
+    assert [p.name for p in folder.parent.iterdir()] == [folder.name]
+
+
+def test_a_network_is_copied_whole_and_replaces_the_one_before(folder: Path) -> None:
+    (folder / NETWORK_FOLDER / "baselines").mkdir(parents=True)
+    (folder / NETWORK_FOLDER / "baselines" / "old.json").write_text("{}")
+    many = SHIPPED_FOLDERS["many-cars"]
+    change = Change("trust", NETWORK_FILE, {NETWORK_FILE: b"x = 1\n"}, {NETWORK_FOLDER: many})
+    update_car(load(folder), folder, change)
+    assert files_of(folder / NETWORK_FOLDER) == files_of(many)
+    again = Change("trust", NETWORK_FILE, {NETWORK_FILE: b"x = 2\n"}, {NETWORK_FOLDER: folder / NETWORK_FOLDER})
+    (folder / NETWORK_FILE).unlink()
+    update_car(load(folder), folder, again)
+    assert files_of(folder / NETWORK_FOLDER) == files_of(many)
+
+
+def _raise(error: BaseException) -> Callable[..., Any]:
+    def fail(*_: object) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("error", [OSError(28, "no space left"), KeyboardInterrupt(), ValueError("mine")])
+@pytest.mark.parametrize("place", ["file", "log", "exchange"])
+@pytest.mark.parametrize("new", [False, True])
+def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, place: str, new: bool
+) -> None:
+    car, before = load(folder), files_of(folder)
+    change = noise_change(NEW)
+    if place == "file":
+        change = Change("tune", NOISE_FILE, {**change.files, "noise.png": _raise(error)})
+    else:
+        monkeypatch.setattr(store, {"log": "_log", "exchange": "_exchanged"}[place], _raise(error))
+    output = folder.with_name("new") if new else folder
+    if place == "exchange" and new:
+        monkeypatch.setattr(Path, "rename", _raise(error))
+    with pytest.raises(OutputError if isinstance(error, OSError) else type(error)):
+        update_car(car, output, change)
+    assert files_of(folder) == before
+    assert [p.name for p in folder.parent.iterdir()] == [folder.name]
+
+
+@pytest.mark.parametrize("back", [False, True])
+def test_a_file_system_without_exchange_keeps_a_car_under_its_name(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, back: bool
+) -> None:
+    monkeypatch.setattr(store, "_exchanged", lambda *_: False)
+    car, before = load(folder), files_of(folder)
+    if not back:
+        update_car(car, folder, noise_change(NEW))
+        assert load(folder).noise == NEW
+    else:
+        rename = Path.rename
+
+        def fails_for_the_new_one(self: Path, target: Path) -> Path:
+            if self.suffix == ".partial":
+                raise OSError(5, "input/output error")
+            return rename(self, target)
+
+        monkeypatch.setattr(Path, "rename", fails_for_the_new_one)
+        with pytest.raises(OutputError):
+            update_car(car, folder, noise_change(NEW))
+        assert files_of(folder) == before
+    assert [p.name for p in folder.parent.iterdir()] == [folder.name]
+
+
+def test_what_is_no_place_for_a_car_is_refused_and_untouched(folder: Path, tmp_path: Path) -> None:
+    car = load(folder)
+    another, full, file = tmp_path / "another", tmp_path / "full", tmp_path / "file"
+    for path, text in ((another / VEHICLE_FILE, PERSONS.replace("0.85", "0.75")), (full / "x.txt", "x")):
+        path.parent.mkdir()
+        path.write_text(text)
+    file.write_text("x")
+    before = files_of(tmp_path)
+    for output, said in (
+        (another, r"got another, whose vehicle\.toml is another; name another folder, or give --car"),
+        (full, "a new folder, a car's folder"),
+        (file, "a new folder, a car's folder"),
+    ):
+        for act in (lambda o=output: check_output(car, o), lambda o=output: update_car(car, o, noise_change(NEW))):
+            with pytest.raises(UsageError, match=said):
+                act()
+    assert files_of(tmp_path) == before
+    (tmp_path / "empty").mkdir()
+    for output in (folder, tmp_path / "empty", tmp_path / "none", tmp_path / "flat.toml"):
+        check_output(car, output)
+
+
+def test_a_flat_export_keeps_a_persons_comments_and_changes_only_what_differs(folder: Path, tmp_path: Path) -> None:
+    add_fit(folder, friction=0.6)
+    add_noise(folder, score_deg=0.1092, trial=63)
+    add_trust(folder)
+    car = load(folder, "default")
+    flat = tmp_path / "flat.toml"
+    change = noise_change({**car.noise, **NEW})
+    assert write_change(car, car.with_noise(PLUS, NEW[PLUS]), flat, change) == flat
+    text = flat.read_text()
+    for comment in COMMENTS:
+        assert text.count(comment) == 1
+    kept = [line for line in PERSONS.splitlines() if line and not line.startswith(("friction", "name"))]
+    assert [line for line in text.splitlines() if line in kept] == kept
+    again = load(flat, "default")
+    assert again.vehicle == car.vehicle
+    assert {n: (one.q_std, one.score_deg) for n, one in again.noise.items()} == {
+        n: (one.q_std, one.score_deg) for n, one in {**car.noise, **NEW}.items()
+    }
+    assert again.allowed_trust.cap == 0.5
+    assert again.learnt_on == DRIVES
+    assert {p.name for p in tmp_path.iterdir()} == {"car", "flat.toml"}
+
+
+def test_a_flat_export_again_and_again_does_not_grow(tmp_path: Path) -> None:
+    source = tmp_path / "old.toml"
+    source.write_text(PERSONS + FLAT)
+    sizes = []
+    for number in range(3):
+        car = load(source)
+        source = write_change(car, car.with_noise(PLUS, NEW[PLUS]), tmp_path / f"{number}.toml", noise_change(NEW))
+        sizes.append(len(source.read_text()))
+        assert all(source.read_text().count(comment) == 1 for comment in COMMENTS)
+    assert sizes[0] == sizes[1] == sizes[2] < 2 * len(PERSONS + FLAT)
+    told = tomllib.loads(source.read_text())
+    assert "tuning_scores" not in told["identification"]
+    assert told["identification"]["tool"] == "pdhef 0.1"
+    assert load(source).noise[TUNED].score_deg == 0.1378
+
+
+def test_tables_of_older_files_are_changed_where_they_stand(tmp_path: Path) -> None:
+    """What stands below a table in the file is a part of it for a parser, comments of what follows too."""
+    old, tyres = tmp_path / "old.toml", PERSONS.index("[tyres.front]")
+    text = PERSONS[:tyres] + FLAT.replace("trust_cap = 0.25", "trust_cap = 0.25  # my guess")
+    old.write_text(text + "\n# tyres of last summer\n" + PERSONS[tyres:])
+    car = load(old)
+    trusted = Trust(trust_cap=0.75, evidence="another drive")
+    flat = write_change(
+        car, replace(car.with_noise(PLUS, NEW[PLUS]), trust=trusted), tmp_path / "flat.toml", noise_change(NEW)
+    )
+    text = flat.read_text()
+    for comment in (*COMMENTS, "# my guess", "# tyres of last summer"):
+        assert text.count(comment) == 1, comment
+    again = load(flat)
+    assert (again.noise[PLUS].q_std, again.noise[TUNED].q_std) == ((0.1, 0.2, 0.3), (0.1, 0.1, 0.1))
+    assert (again.allowed_trust.cap, again.vehicle) == (0.75, car.vehicle)
+
+
+def test_what_a_command_writes_beside_stands_beside_a_flat_export(folder: Path, tmp_path: Path) -> None:
+    change = noise_change(NEW)
+    change = Change("tune", NOISE_FILE, {**change.files, "noise.record.json": b"{}"})
+    write_change(load(folder), load(folder), tmp_path / "out" / "flat.toml", change)
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"flat.toml", "flat.noise.record.json"}
+
+
+def test_a_place_that_cannot_be_written_is_one_line(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    for output in (tmp_path / "file" / "car", tmp_path / "file" / "car.toml"):
+        with pytest.raises(PdhefError) as caught:
+            write_change(load(folder), load(folder), output, noise_change(NEW))
+        assert "\n" not in str(caught.value)

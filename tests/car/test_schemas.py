@@ -1,0 +1,87 @@
+"""The JSON Schemas of a car's parts are what their models say; ``PDHEF_UPDATE_SCHEMAS=1`` writes them anew."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from pdhef_logtool.car.car import SHIPPED_CARS
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import FilterNoise, Fit, FittedSensors, FittedValues, Intervals, LearntOn, Noise, Trust
+from pdhef_logtool.car.vehicle import Record, VehicleParameters, default_vehicle
+from pdhef_logtool.sinks.schema import load_schema
+
+FOLDER = Path(__file__).parents[2] / "schemas"
+#: By the name of the part.
+MODELS: dict[str, type[Record]] = {
+    "vehicle": VehicleParameters,
+    "fit": Fit,
+    "noise": Noise,
+    "network": Trust,
+    "intervals": Intervals,
+}
+every_part = pytest.mark.parametrize("part", MODELS)
+FIT = Fit(
+    physics_sha256="ab" * 32,
+    values=FittedValues(
+        friction=0.9,
+        tyres=default_vehicle().tyres,
+        sensors=FittedSensors(ay_bias_m_s2=0.1, yaw_rate_bias_rad_s=0.0),
+    ),
+    filter={"phy-ukf-tuned": FilterNoise(q_std=(0.1, 0.1, 0.1), r_std={"ay_m_s2": 1.0})},
+    drives=(LearntOn(name="lap", sha256="cd", end_s=9.0),),
+    scores={"fit": {"rmse": 0.1}},
+    notes=("a note",),
+)
+
+
+def said_by_the_model(part: str) -> str:
+    head = {"$schema": "https://json-schema.org/draft/2020-12/schema", "$id": f"car-{part}.schema.json"}
+    return json.dumps({**head, **MODELS[part].model_json_schema()}, indent=2, ensure_ascii=False) + "\n"
+
+
+def document(part: str) -> dict[str, Any]:
+    """Return one that pdhef wrote."""
+    if part == "fit":
+        return tomllib.loads(part_toml(FIT, "Written by a test."))
+    path = next(SHIPPED_CARS["saloon"].glob(f"{part}.[tj]*"))
+    return json.loads(path.read_text()) if path.suffix == ".json" else tomllib.loads(path.read_text())
+
+
+def valid(part: str, value: dict[str, Any]) -> bool:
+    return bool(jsonschema.Draft202012Validator(load_schema(f"car-{part}.schema.json")).is_valid(value))
+
+
+@every_part
+def test_a_schema_is_what_its_model_says(part: str) -> None:
+    path = FOLDER / f"car-{part}.schema.json"
+    if os.environ.get("PDHEF_UPDATE_SCHEMAS") == "1":
+        path.write_text(said_by_the_model(part), encoding="utf-8")
+    assert path.read_text(encoding="utf-8") == said_by_the_model(part), "PDHEF_UPDATE_SCHEMAS=1 writes it anew"
+    jsonschema.Draft202012Validator.check_schema(load_schema(path.name))
+
+
+@every_part
+def test_what_pdhef_wrote_is_valid_and_what_it_refuses_is_not(part: str) -> None:
+    written = document(part)
+    assert valid(part, written)
+    assert not valid(part, written | {"no_such_entry": 1})
+    for name in MODELS[part].model_json_schema().get("required", []):
+        assert not valid(part, {k: v for k, v in written.items() if k != name}), name
+    if part != "vehicle":
+        assert not valid(part, written | {"version": 99})
+        assert not valid(part, written | {"format": "pdhef-else"})
+
+
+def test_misspelt_filters_and_measurements_are_seen_by_an_editor() -> None:
+    noise = document("noise")
+    (name, one), *_ = noise["filter"].items()
+    assert not valid("noise", noise | {"filter": {name.replace("-", "_"): one}})
+    assert not valid("noise", noise | {"filter": {name: one | {"r_std": {"ay": 1.0}}}})
+    assert not valid("vehicle", document("vehicle") | {"mass_kg": 1e6})

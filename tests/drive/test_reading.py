@@ -1,0 +1,135 @@
+"""The one way to read a drive and the one way to estimate: windows are the whole, and logs are closed."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive import reading
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
+from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.logs.discovery import hash_log
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping, SignalSource
+from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
+from pdhef_logtool.records.signals import Signals, join_signals
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.runs.estimating import estimate_windows
+
+
+@pytest.fixture
+def car(sample_logs_dir: Path) -> Car:
+    return Car.load(sample_logs_dir / "vehicle.toml")
+
+
+def _assert_equal(a: Signals | StateTrack, b: Signals | StateTrack) -> None:
+    for f in fields(a):
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, np.ndarray):
+            assert x.tobytes() == y.tobytes(), f.name
+
+
+def _windows(drive: Drive) -> list[DriveWindow]:
+    return [w for w in drive.windows() if len(w.signals)]
+
+
+def test_windows_are_the_whole_and_a_second_pass_is_the_first(sample_logs_dir: Path, car: Car) -> None:
+    # Friction is estimated here: the source has a memory, which no pass may take over from another.
+    options = ReadOptions(friction="estimate", window_s=1.7)
+    with read_drive(sample_logs_dir / "dlc.mcap", car, options=options) as drive:
+        first, second = _windows(drive), _windows(drive)
+        share = drive.friction.observable_share
+        whole = drive.whole()
+        assert drive.friction.observable_share == share > 0.0
+        assert drive.sha256 == hash_log(drive.path)
+        assert drive.losses == ()
+        assert drive.samples["/imu/data.angular_velocity.z"] > len(whole.signals) - 3
+    assert len(first) == 3
+    for windows in (first, second):
+        _assert_equal(join_signals([w.signals for w in windows]), whole.signals)
+        assert whole.truth is not None
+        _assert_equal(concatenate([w.truth for w in windows if w.truth is not None]), whole.truth)
+    assert whole.seconds == pytest.approx(9.5, abs=0.1)
+    assert whole.nbytes > 100 * len(whole.signals)
+
+
+def test_estimates_of_windows_are_those_of_the_whole(sample_logs_dir: Path, car: Car) -> None:
+    estimators = [make_estimator(name, car) for name in ("zero", "kinematic", "phy-ukf")]
+    with read_drive(sample_logs_dir / "dlc.mcap", car, options=ReadOptions(window_s=1.7)) as drive:
+        parts = list(estimate_windows(drive, estimators))
+        (whole,) = estimate_windows(drive.whole(), estimators)
+        (plain,) = estimate_windows(drive.whole(), estimators, watched=False, drawn=False)
+    assert parts[-1].share_done == 1.0
+    for i, track in enumerate(whole.tracks):
+        assert track.name == estimators[i].name
+        _assert_equal(concatenate([p.tracks[i] for p in parts]), track)
+        assert np.isfinite(track.x_m).any()
+        assert not np.isfinite(plain.tracks[i].x_m).any()
+        _assert_equal(replace(plain.tracks[i], x_m=track.x_m, y_m=track.y_m, yaw_rad=track.yaw_rad), track)
+
+
+def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> None:
+    told: list[str] = []
+    without = car.with_vehicle(car.vehicle.model_copy(update={"friction": None}))
+    with read_drive(sample_logs_dir / "dlc.mcap", without, tell=told.append) as drive:
+        drive.tell("one more")
+        notes = list(drive.notes)
+    assert told == [f"dlc: {note}" for note in notes]
+    assert any("/rtk/odometry not used" in note for note in notes)
+    assert any("friction" in note for note in notes)
+    assert notes[-1] == "one more"
+
+
+def test_the_mapping_can_be_adjusted_and_is_checked(sample_logs_dir: Path, car: Car) -> None:
+    def with_friction(field: str) -> reading.Adjust:
+        def adjust(_log: DriveLog, mapping: Mapping, tell: Tell) -> Mapping:
+            tell("adjusted")
+            source = SignalSource("friction", "/truth/perfect/state", field)
+            return replace(mapping, signals={**mapping.signals, "friction": source})
+
+        return adjust
+
+    log, options = sample_logs_dir / "dlc.mcap", ReadOptions(friction=None)
+    with read_drive(log, car, options=options, adjust=with_friction("friction")) as drive:
+        assert drive.friction.label == "topic /truth/perfect/state.friction"
+        assert "adjusted" in drive.notes
+        np.testing.assert_allclose(drive.whole().signals.friction, 0.85, rtol=1e-6)
+    with read_drive(log, car, options=options) as drive:
+        assert drive.friction.label == "none"
+        assert not np.isfinite(drive.whole().signals.friction).any()
+    with pytest.raises(MappingError):
+        read_drive(log, car, options=options, adjust=with_friction("nothing"))
+
+
+def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[str] = []
+    open_log = reading.open_log
+
+    def watched_log(path: Path) -> DriveLog:
+        log = open_log(path)
+        close = log.close
+        monkeypatch.setattr(type(log), "close", lambda _self: closed.append(path.name) or close())
+        return log
+
+    log = sample_logs_dir / "dlc.mcap"
+    with read_drive(log, car) as drive:
+        size = drive.whole().nbytes
+        assert drive.whole(max_bytes=size).nbytes == size
+        with pytest.raises(EstimatorError, match="--start and --end"):
+            drive.whole(max_bytes=size - 1)
+        monkeypatch.setattr(reading.DriveReader, "windows", lambda _self: iter(()))
+        for read in (lambda: drive.whole(), lambda: list(estimate_windows(drive, []))):
+            with pytest.raises(EstimatorError, match="IMU samples in the chosen slice"):
+                read()
+    monkeypatch.setattr(reading, "open_log", watched_log)
+    with pytest.raises(UsageError, match="a slice inside"):
+        read_drive(log, car, options=ReadOptions(start="99"))
+    assert closed == ["dlc.mcap"]
+    with pytest.raises(UsageError, match="one log"):
+        one_log(str(sample_logs_dir))

@@ -1,0 +1,263 @@
+"""The table of estimators: every line builds what it says, and what runs under a name is told from the object."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from reference_car import drive, make_signals, slalom, with_noise
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import Algorithm, FilterNoise, IntervalEntry, Intervals, Trust
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import LookingAhead, run_window
+from pdhef_logtool.estimators.cautious import CautiousPhysics
+from pdhef_logtool.estimators.table import SPECS, Options, default_names, make_estimator, runnable, spec_of
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, RESIDUAL, ModelBundle, Normalisation
+from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.linear_model import LinearModel
+from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
+from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.watches.intervals import make_inflation
+
+pytestmark = pytest.mark.slow
+
+VEHICLE = default_vehicle()
+NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
+EVIDENCE = Trust(trust_cap=1.0, evidence="a drive of 300 s")
+every_spec = pytest.mark.parametrize("spec", SPECS, ids=lambda spec: spec.name)
+
+
+def make_network(target: str = RESIDUAL, names: tuple[str, ...] = ONE_CAR_FEATURES, seed: int = 1) -> ModelBundle:
+    torch.manual_seed(seed)
+    outputs = 2 if target == RESIDUAL else 1
+    network = ResidualNetwork(Architecture(len(names), 8, 1, (4,), outputs=outputs))
+    weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
+    normalisation = Normalisation((0.0,) * len(names), (5.0,) * len(names), (1.0,) * outputs)
+    return ModelBundle(names, 8, 1, (4,), 0.01, normalisation, weights, target=target)
+
+
+def make_model(seed: int = 1) -> ModelBundle:
+    """Return a network with all baselines beside it."""
+    return replace(
+        make_network(seed=seed),
+        pure_lstm=make_network(LATERAL_VELOCITY, seed=seed),
+        linear_regression=LinearModel(("ay_m_s2", "physics_vy_m_s"), (-0.001 * seed, 0.9 / 22.0), 0.0, 2.0),
+        paper_network=make_network(names=PAPER_FEATURES, seed=seed),
+    )
+
+
+MODEL = make_model()
+#: It has all that any estimator needs.
+CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf-tuned": NOISE}, trust=EVIDENCE)
+
+
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    s = with_noise(drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals, seed=3)
+    return replace(s, friction=np.full(len(s), 0.85), ready_ns=s.stamps_ns + 10_000_000)
+
+
+def run(name: str, signals: Signals, car: Car = CAR) -> StateTrack:
+    return run_window(make_estimator(name, car), signals, None, None)[0]
+
+
+def same(a: StateTrack, b: StateTrack, upto: int | None = None) -> bool:
+    columns = [f.name for f in fields(StateTrack) if isinstance(getattr(a, f.name), np.ndarray)]
+    return all(np.array_equal(getattr(a, c)[:upto], getattr(b, c)[:upto], equal_nan=True) for c in columns)
+
+
+# --- the lines -------------------------------------------------------------------------------------------------------
+
+
+def test_no_two_lines_share_a_name_or_a_colour() -> None:
+    assert len({s.name for s in SPECS}) == len({s.colour for s in SPECS}) == len({s.text for s in SPECS}) == len(SPECS)
+    assert all(0 < s.colour <= 0xFFFFFF for s in SPECS)
+
+
+@every_spec
+def test_a_line_builds_what_it_says(spec: Any) -> None:
+    estimator = make_estimator(spec.name, CAR)
+    assert (estimator.name, estimator.causal) == (spec.name, spec.causal)
+    assert isinstance(estimator, LookingAhead) == (not spec.causal)
+    assert spec_of(spec.name) is spec
+    assert (spec.name in default_names(CAR)) == spec.default
+    assert spec.needs <= frozenset(ALIGNED_SIGNALS)
+    assert spec.tuned_as in ("", *(s.name for s in SPECS))
+
+
+@every_spec
+def test_what_it_needs_is_what_it_needs(spec: Any, signals: Signals) -> None:
+    """It runs on that alone; without any of it, it is skipped and says why; and none of it is asked for in vain."""
+    dt = np.diff(signals.stamps_ns) * 1e-9
+    bare = make_signals(dt, **{c: getattr(signals, c) for c in spec.needs})
+    estimators, skipped = runnable((spec.name,), CAR, bare.available)
+    assert ([e.name for e in estimators], skipped) == ([spec.name], [])
+    track = run(spec.name, bare)
+    assert track.valid[5:].all()
+    assert np.isfinite(track.vx_m_s[5:]).all()
+    assert np.isfinite(track.yaw_rate_rad_s[5:]).all()
+    for lacking in spec.needs:
+        estimators, skipped = runnable((spec.name,), CAR, frozenset(ALIGNED_SIGNALS) - {lacking})
+        assert estimators == []
+        assert [s.reason for s in skipped] == [f"the log has no {lacking}"]
+        without = replace(bare, **{lacking: np.full(len(bare), np.nan)})
+        assert not same(run(spec.name, without), track), lacking
+
+
+@every_spec
+def test_only_what_is_causal_sees_nothing_of_what_comes(spec: Any, signals: Signals) -> None:
+    at = 300
+    later = np.arange(len(signals)) >= at
+    changed = replace(
+        signals, ay_m_s2=np.where(later, 9.0, signals.ay_m_s2), speed_m_s=np.where(later, 5.0, signals.speed_m_s)
+    )
+    before = int(np.searchsorted(signals.stamps_ns, signals.ready_ns[at]))
+    assert same(run(spec.name, changed), run(spec.name, signals), before) == spec.causal
+
+
+@every_spec
+def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
+    everything = frozenset(ALIGNED_SIGNALS)
+    estimators, skipped = runnable((spec.name,), Car.of(VEHICLE), everything)
+    lacks = bool(spec.network) or spec.needs_noise
+    assert ([e.name for e in estimators], [s.name for s in skipped]) == (
+        ([], [spec.name]) if lacks else ([spec.name], [])
+    )
+    if lacks:
+        assert "--network" in skipped[0].reason or "pdhef identify" in skipped[0].reason
+        with pytest.raises(UsageError, match=spec.name):
+            make_estimator(spec.name, Car.of(VEHICLE))
+    assert (spec.name in default_names(Car.of(VEHICLE))) == (spec.default and not lacks)
+
+
+# --- what runs under a name ------------------------------------------------------------------------------------------
+
+#: Nothing of the car but its signals.
+SENSORS_ALONE = ("zero", "gyro", "kinematic")
+
+
+def ran(name: str, car: Car = CAR, **options: Any) -> Algorithm:
+    return resolve(make_estimator(name, car, Options(**options)))
+
+
+def other(**changes: Any) -> VehicleParameters:
+    return VEHICLE.model_copy(update=changes)
+
+
+def test_names_stand_for_different_algorithms() -> None:
+    structures: dict[str, list[str]] = {}
+    for spec in SPECS:
+        structures.setdefault(ran(spec.name).structure, []).append(spec.name)
+    assert [n for n in structures.values() if len(n) > 1] == [["pd-hef-fixed-r", "pd-hef-trust1"]]
+
+
+@every_spec
+def test_the_name_of_a_car_changes_no_algorithm_and_its_physics_do(spec: Any) -> None:
+    was = ran(spec.name)
+    for changes in ({"name": "ours"}, {"truth_position_m": (1.0, 0.0, 0.0)}):
+        assert ran(spec.name, replace(CAR, vehicle=other(**changes))) == was
+    heavier = ran(spec.name, replace(CAR, vehicle=other(mass_kg=1500.0)))
+    assert heavier.structure == was.structure  # intervals are found, and their note says what is other
+    assert (heavier.physics_sha256 != was.physics_sha256) == (spec.name not in SENSORS_ALONE)
+    assert (heavier.sha256 != was.sha256) == (spec.name not in SENSORS_ALONE)
+    assert (was.physics_sha256 is None) == (spec.name in SENSORS_ALONE)
+
+
+@every_spec
+def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
+    was, is_now = ran(spec.name), ran(spec.name, replace(CAR, network=make_model(2)))
+    assert (was.network_sha256 is None) == (not spec.network)
+    assert (was.sha256 != is_now.sha256) == (was.network_sha256 != is_now.network_sha256) == bool(spec.network)
+    assert was.structure == is_now.structure
+
+
+@pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics-plus", "pd-hef", "pd-hef-smoothed"])
+def test_other_noise_is_another_basis_of_the_same_structure(name: str) -> None:
+    was = ran(name, CAR.with_noise(name, NOISE))
+    for change in ({"q_std": (0.1, 0.2, 0.2)}, {"r_std": {"ay_m_s2": 1.0}}):
+        is_now = ran(name, CAR.with_noise(name, NOISE.model_copy(update=change)))
+        assert is_now.noise != was.noise
+        assert is_now.sha256 != was.sha256
+        assert is_now.structure == was.structure
+    told = ran(name, CAR.with_noise(name, NOISE.model_copy(update={"score_deg": 0.1, "trial": 3})))
+    assert told == was
+
+
+def test_trust_and_speed_sensor_are_told() -> None:
+    assert len({ran("pd-hef", trust=t).structure for t in (0.0, 0.5, 1.0)}) == 3
+    assert ran("pd-hef", trust=0.5).options["trust"] == 0.5
+    full, esp = ran("phy-ukf"), ran("phy-ukf", use_speed=False)
+    assert (full.use_speed, esp.use_speed) == (True, False)
+    assert full.sha256 != esp.sha256
+
+
+# --- pd-hef is two algorithms ----------------------------------------------------------------------------------------
+
+BARE = replace(CAR, trust=None, noise={})
+
+
+def intervals_for(*algorithms: Algorithm, factor: float = 2.0) -> Intervals:
+    inflation = make_inflation([factor * (k == 1) for k in range(7)], (0.0, 1.0, 0.0))
+    entries = tuple(IntervalEntry(estimator="pd-hef", algorithm=a, inflation=inflation) for a in algorithms)
+    return Intervals(car="car", physics_sha256=CAR.physics_sha256, roll_gradient_rad_per_m_s2=0.0, entries=entries)
+
+
+def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[float, Sequence[str]]:
+    """Return by how much the intervals widen the sideslip's 1-sigma of pd-hef, and what is said of it."""
+    estimator = make_estimator("pd-hef", car)
+    track, _ = estimator.run(signals, None)
+    applied = calibrator(replace(car, intervals=intervals), [estimator])
+    ratio = applied.add(track, signals).sideslip_std_rad / track.sideslip_std_rad
+    return float(np.nanmedian(ratio)), applied.notes("pd-hef")
+
+
+def test_evidence_decides_what_pd_hef_is() -> None:
+    trusted, cautious = make_estimator("pd-hef", CAR), make_estimator("pd-hef", BARE)
+    assert isinstance(cautious, CautiousPhysics) and not isinstance(trusted, CautiousPhysics)
+    assert trusted.name == cautious.name == "pd-hef"
+    assert resolve(trusted).algorithm != resolve(cautious).algorithm
+    assert resolve(trusted).structure != resolve(cautious).structure
+    # With noise that was found for it, the filter that stands in is another one.
+    assert ran("pd-hef", replace(BARE, noise=CAR.noise)).structure != resolve(cautious).structure
+
+
+def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> None:
+    hybrid, cautious = ran("pd-hef"), ran("pd-hef", BARE)
+    uncalibrated = (1.0, ("intervals not calibrated",))
+    assert with_intervals(BARE, intervals_for(hybrid), signals) == uncalibrated
+    assert with_intervals(CAR, intervals_for(cautious), signals) == uncalibrated
+    for car, algorithm in ((CAR, hybrid), (BARE, cautious)):
+        ratio, notes = with_intervals(car, intervals_for(algorithm), signals)
+        assert ratio == pytest.approx(2.0)
+        assert notes == ("intervals calibrated on car for friction and vehicle as told",)
+
+
+def test_without_its_own_it_has_those_of_the_filter_that_it_is(signals: Signals) -> None:
+    of_filter, own = ran("physics-plus", BARE), ran("pd-hef", BARE)
+    assert with_intervals(BARE, intervals_for(of_filter), signals)[0] == pytest.approx(2.0)
+    assert with_intervals(CAR, intervals_for(of_filter), signals)[0] == 1.0
+    both = intervals_for(of_filter).entries + intervals_for(own, factor=3.0).entries
+    assert with_intervals(BARE, intervals_for().model_copy(update={"entries": both}), signals)[0] == pytest.approx(3.0)
+    # The filter of a car with noise of its own is another; so are its intervals.
+    tuned = replace(BARE, noise=CAR.noise)
+    assert with_intervals(tuned, intervals_for(of_filter), signals)[0] == 1.0
+    assert with_intervals(tuned, intervals_for(ran("phy-ukf-tuned", tuned)), signals)[0] == pytest.approx(2.0)
+
+
+def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:
+    """Evidence makes pd-hef another algorithm; the intervals of all others hold, and nobody calls them foreign."""
+    entries = intervals_for(ran("physics-plus", BARE))
+    for car in (BARE, CAR):
+        estimator = make_estimator("physics-plus", car)
+        applied = calibrator(replace(car, intervals=entries), [estimator])
+        applied.add(estimator.run(signals, None)[0], signals)
+        assert applied.notes("physics-plus") == ("intervals calibrated on car for friction and vehicle as told",)

@@ -1,0 +1,91 @@
+"""One damaged log is the same to every command: the same losses in the same words, and exit code 3."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdhef_logtool.learning.car.identify_command import identify
+from pdhef_logtool.learning.drives import LearnSettings
+from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
+from pdhef_logtool.learning.evidence.trust_command import trust
+from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
+from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
+from pdhef_logtool.records.errors import EXIT_PARTIAL
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+
+pytestmark = pytest.mark.slow
+
+REFERENCE = Path(__file__).resolve().parents[1] / "reference"
+
+
+def _losses_by_command(
+    log: Path, others: list[Path], out: Path, config: RunConfig
+) -> dict[str, tuple[list[dict[str, Any]], list[str]]]:
+    """Run every command on a damaged log, calibrate with others beside it; return by command its losses and warnings.
+
+    Every one must end with exit code 3.
+    """
+    logs, found = [str(log)], {}
+    physics = replace(config, network=Path("none"), estimators=("phy-ukf",))
+
+    def learn(**settings: Any) -> dict[str, Any]:
+        return {"config": replace(physics, estimators=None), **settings}
+
+    commands = {
+        "identify": lambda tell: identify(logs, out / "1", config, holdout=0.0, warn=tell),
+        "extract": lambda tell: extract(logs, out / "2", ExtractSettings(physics), warn=tell),
+        "tune": lambda tell: tune(
+            logs, out / "3", TuneSettings(**learn(names=("phy-ukf-tuned",), trials=4)), warn=tell
+        ),
+        "trust": lambda tell: trust(logs, out / "4", LearnSettings(config=config), warn=tell),
+        "calibrate": lambda tell: calibrate(
+            [*logs, *map(str, others)], out / "5", CalibrateSettings(config=physics, spread=0.0), warn=tell
+        ),
+        "run": lambda tell: run_logs(logs, out / "6", replace(physics, annotate="none"), warn=tell),
+    }
+    for name, command in commands.items():
+        told: list[str] = []
+        result = command(told.append)
+        assert result.exit_code == EXIT_PARTIAL, name
+        document = json.loads(json.dumps(result.to_dict()))
+        if name == "run":
+            losses = document["logs"][0]["report"]["losses"]
+        else:
+            (losses,) = (d["losses"] for d in document["drives"] if d["name"] == log.stem)
+        found[name] = losses, [text for text in told if text.startswith(f"{log.stem}: ")]
+    return found
+
+
+def _check(found: dict[str, tuple[list[dict[str, Any]], list[str]]], name: str) -> None:
+    expected, _ = found["run"]
+    lost = [f"{name}: {x['what']} ({x['where']})" for x in expected if x["severity"] == "lost"]
+    assert lost
+    for command, (losses, told) in found.items():
+        assert losses == expected, command
+        if command != "run":
+            assert [text for text in told if text in lost] == lost, command
+
+
+def test_a_truncated_simulated_log(sample_logs_dir: Path, tmp_path: Path) -> None:
+    data = (sample_logs_dir / "road.mcap").read_bytes()
+    log = tmp_path / "cut.mcap"
+    log.write_bytes(data[: len(data) * 6 // 10])
+    # Beside it: drives of one name in two folders would get longer names.
+    others = [Path(shutil.copy(sample_logs_dir / f"{n}.mcap", tmp_path)) for n in ("dlc", "step", "fishhook", "sweep")]
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", end="34")
+    _check(_losses_by_command(log, others, tmp_path / "out", config), "cut")
+
+
+def test_the_truncated_drive_of_the_250_lm(shared_dir: Path, tmp_path: Path) -> None:
+    source = shared_dir / "data/drives/faulty/revs_250lm_a_truncated60.mcap"
+    log, *others = [Path(shutil.copyfile(source, tmp_path / f"cut_{number}.mcap")) for number in range(5)]
+    vehicle, mapping = REFERENCE / "vehicles/revs_250lm.toml", REFERENCE / "mappings/revs_250lm.toml"
+    config = RunConfig(car=vehicle, mapping=mapping, end="40")
+    _check(_losses_by_command(log, others, tmp_path / "out", config), "cut_0")

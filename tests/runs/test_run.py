@@ -1,0 +1,309 @@
+"""The whole way on sample logs: outputs, windows, slices, failures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.table import SPECS, default_names
+from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.sinks.schema import load_schema
+
+pytestmark = pytest.mark.slow
+
+OUTPUTS = {"annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.json"}
+
+NO_TRUTH_MAPPING = """
+[signals.steer_rad]
+topic = "/vehicle/status/steering_status"
+field = "steering_tire_angle"
+[signals.ax_m_s2]
+topic = "/imu/data"
+field = "linear_acceleration.x"
+[signals.ay_m_s2]
+topic = "/imu/data"
+field = "linear_acceleration.y"
+[signals.yaw_rate_rad_s]
+topic = "/imu/data"
+field = "angular_velocity.z"
+[signals.wheel_speed_rl_m_s]
+topic = "/vehicle/wheel_speeds"
+field = "rl_m_s"
+[signals.wheel_speed_rr_m_s]
+topic = "/vehicle/wheel_speeds"
+field = "rr_m_s"
+"""
+
+
+def _config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
+    values: dict[str, Any] = {"car": sample_logs_dir / "vehicle.toml", "annotate": "none", **changes}
+    return RunConfig(**values)
+
+
+def _value(metrics: pl.DataFrame, estimator: str, signal: str, metric: str, segment: str = "all") -> float:
+    rows = metrics.filter(
+        (pl.col("estimator") == estimator)
+        & (pl.col("signal") == signal)
+        & (pl.col("metric") == metric)
+        & (pl.col("segment") == segment)
+    )
+    assert rows.height == 1, rows
+    return float(rows["value"][0])
+
+
+@pytest.fixture(scope="module")
+def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("dlc")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], out, _config(sample_logs_dir, annotate="full"))
+    assert result.exit_code == 0
+    return out
+
+
+def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path) -> None:
+    assert {p.name for p in (dlc_run / "logs" / "dlc").iterdir()} == OUTPUTS
+    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "run.json"}
+
+
+def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
+    import jsonschema
+
+    report = json.loads((dlc_run / "logs/dlc/report.json").read_text())
+    run = json.loads((dlc_run / "run.json").read_text())
+    jsonschema.validate(report, load_schema("report.schema.json"))
+    jsonschema.validate(run, load_schema("run.schema.json"))
+    assert run["logs"][0]["outcome"] == "ok"
+    names = [e["name"] for e in report["estimators"]]
+    plain = [s.name for s in SPECS if s.default and not s.network and not s.needs_noise]
+    assert names[: len(plain)] == plain
+    assert set(names[len(plain) :]) <= {s.name for s in SPECS if s.network and s.default}  # where a network is shipped
+    assert not set(names) & {s.name for s in SPECS if s.needs_noise}  # the file is not an identified one
+    assert names == list(default_names(Car.load(sample_logs_dir / "vehicle.toml")))
+
+
+def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> None:
+    estimates = pl.read_parquet(dlc_run / "logs/dlc/estimates.parquet")
+    metrics = pl.read_parquet(dlc_run / "metrics.parquet")
+    truth = estimates.filter(pl.col("estimator") == "truth")
+    for name in ("zero", "kinematic", "open-loop", "phy-ukf"):
+        both = estimates.filter(pl.col("estimator") == name).join(truth, on="stamp_ns", suffix="_truth")
+        both = both.filter(pl.col("valid") & pl.col("valid_truth") & (pl.col("vx_m_s_truth") > 3.0))
+        error = (both["sideslip_rad"] - both["sideslip_rad_truth"]).to_numpy()
+        error = error[np.isfinite(error)]
+        rmse = float(np.sqrt(np.mean(error**2)))
+        assert _value(metrics, name, "sideslip_rad", "rmse") == pytest.approx(rmse, rel=1e-9)
+
+
+def test_physics_filter_beats_its_trivial_rivals_on_the_lane_change(dlc_run: Path) -> None:
+    metrics = pl.read_parquet(dlc_run / "metrics.parquet")
+    rmse = {n: _value(metrics, n, "sideslip_rad", "rmse") for n in ("zero", "kinematic", "phy-ukf")}
+    assert rmse["phy-ukf"] < min(rmse["zero"], rmse["kinematic"])
+
+
+def test_windows_change_no_number(sample_logs_dir: Path, tmp_path: Path) -> None:
+    frames = []
+    for name, window_s in (("whole", 600.0), ("cut", 1.7)):
+        out = tmp_path / name
+        run_logs([str(sample_logs_dir / "dlc.mcap")], out, _config(sample_logs_dir, window_s=window_s))
+        estimates = pl.read_parquet(out / "logs/dlc/estimates.parquet").sort("estimator", "stamp_ns")
+        frames.append((estimates, pl.read_parquet(out / "metrics.parquet")))
+    for whole, cut in zip(*frames, strict=True):
+        assert whole.equals(cut, null_equal=True)
+
+
+def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path, dlc_run: Path) -> None:
+    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full"))
+    for name in ("run.json", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
+        assert (tmp_path / name).read_bytes() == (dlc_run / name).read_bytes(), name
+
+
+def test_slice_scores_the_slice_alone(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = sample_logs_dir / "dlc.mcap"
+    run_logs([str(log)], tmp_path, _config(sample_logs_dir, start="2", end="end-3s", estimators=("phy-ukf",)))
+    report = json.loads((tmp_path / "logs/dlc/report.json").read_text())
+    stamps = pl.read_parquet(tmp_path / "logs/dlc/estimates.parquet")["stamp_ns"]
+    assert report["log"]["duration_s"] == pytest.approx(9.5 - 5.0, abs=0.1)
+    assert report["log"]["start_ns"] - 20_000_000 <= stamps.min() <= stamps.max() < report["log"]["end_ns"]
+
+
+def test_log_without_truth_still_runs(sample_logs_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    assert result.exit_code == 0
+    report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
+    assert report["truth"]["available"] is False
+    metrics = pl.read_parquet(tmp_path / "out/metrics.parquet")
+    assert {"nis", "disagreement_rms", "residual_rms", "nis_autocorrelation"} <= set(metrics["metric"])
+    assert "rmse" not in set(metrics["metric"])
+
+
+def test_estimates_do_not_depend_on_whether_truth_is_mapped(
+    sample_logs_dir: Path, tmp_path: Path, dlc_run: Path
+) -> None:
+    (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",))
+    full_wheels = pl.read_parquet(dlc_run / "logs/dlc/estimates.parquet").filter(pl.col("estimator") == "phy-ukf")
+    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "a", config)
+    without = pl.read_parquet(tmp_path / "a/logs/dlc/estimates.parquet")
+    truth = '[truth.vy_m_s]\ntopic = "/truth/perfect/odometry"\nfield = "twist.twist.linear.y"\n'
+    truth += '[truth.vx_m_s]\ntopic = "/truth/perfect/odometry"\nfield = "twist.twist.linear.x"\n'
+    (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING + truth)
+    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "b", config)
+    with_truth = pl.read_parquet(tmp_path / "b/logs/dlc/estimates.parquet").filter(pl.col("estimator") == "phy-ukf")
+    pose = ["x_m", "y_m", "yaw_rad"]
+    assert without.drop(pose).equals(with_truth.drop(pose), null_equal=True)
+    assert not without.drop(pose).equals(full_wheels.drop(pose), null_equal=True)  # four wheels are not two
+
+
+def test_missing_signal_skips_the_estimators_that_need_it(sample_logs_dir: Path, tmp_path: Path) -> None:
+    no_steering = NO_TRUTH_MAPPING[NO_TRUTH_MAPPING.index("[signals.ax_m_s2]") :]
+    (tmp_path / "m.toml").write_text(no_steering)
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml")
+    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    assert result.exit_code == 0
+    assert result.results[0].report is not None
+    outcomes = {e["name"]: (e["outcome"], e["reason"]) for e in result.results[0].report["estimators"]}
+    assert outcomes["zero"] == ("ran", None)
+    assert outcomes["phy-ukf"] == ("skipped", "the log has no steer_rad")
+    with pytest.raises(EstimatorError, match="steer_rad"):
+        run_logs(
+            [str(sample_logs_dir / "dlc.mcap")],
+            tmp_path / "none",
+            _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",)),
+        )
+
+
+def test_one_bad_log_does_not_stop_the_others(sample_logs_dir: Path, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log")
+    said: list[str] = []
+    arguments = [str(bad), str(sample_logs_dir / "dlc.mcap")]
+    config = _config(sample_logs_dir, estimators=("zero",))
+    result = run_logs(arguments, tmp_path / "out", config, warn=said.append)
+    assert result.exit_code == 3
+    run = json.loads((tmp_path / "out/run.json").read_text())
+    outcomes = [o["outcome"] for o in run["logs"]]
+    assert outcomes[0].startswith("failed: ")
+    assert outcomes[1] == "ok"
+    assert any("bad.mcap" in text for text in said)
+
+
+def test_all_logs_bad_is_a_failure(sample_logs_dir: Path, tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        (tmp_path / name).write_bytes(b"no log")
+    assert run_logs([str(tmp_path)], tmp_path / "out", _config(sample_logs_dir)).exit_code == 1
+    with pytest.raises(LogError):
+        run_logs([str(tmp_path / "a.mcap")], tmp_path / "out1", _config(sample_logs_dir))
+
+
+def test_wrong_files_for_all_logs_stop_the_run_before_it_starts(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = str(sample_logs_dir / "dlc.mcap")
+    with pytest.raises(VehicleError):
+        run_logs([log], tmp_path / "out", RunConfig(car=tmp_path / "none.toml"))
+    with pytest.raises(MappingError):
+        run_logs([log], tmp_path / "out", _config(sample_logs_dir, mapping=tmp_path / "none.toml"))
+    with pytest.raises(UsageError):
+        run_logs([log], tmp_path / "out", _config(sample_logs_dir, start="1000"))
+    assert not (tmp_path / "out" / "run.json").exists()
+
+
+def test_an_error_half_way_leaves_nothing_behind(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pdhef_logtool.evaluation import metrics
+
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("broken on purpose")
+
+    monkeypatch.setattr(metrics, "score_track", broken)
+    with pytest.raises(RuntimeError, match="on purpose"):
+        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full"))
+    assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
+
+
+def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pdhef_logtool.evaluation import metrics
+
+    log = str(sample_logs_dir / "dlc.mcap")
+    run_logs([log], tmp_path, _config(sample_logs_dir))
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+
+    def broken(*_: object, **__: object) -> None:
+        raise RuntimeError("broken on purpose")
+
+    monkeypatch.setattr(metrics, "score_track", broken)
+    with pytest.raises(RuntimeError, match="on purpose"):
+        run_logs([log], tmp_path, _config(sample_logs_dir))
+    assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before
+
+
+def test_esp_suite_is_not_the_full_suite(sample_logs_dir: Path, tmp_path: Path) -> None:
+    rmse = {}
+    for suite in ("full", "esp"):
+        config = _config(sample_logs_dir, sensors=suite, estimators=("phy-ukf",))
+        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / suite, config)
+        rmse[suite] = _value(pl.read_parquet(tmp_path / suite / "metrics.parquet"), "phy-ukf", "vx_m_s", "rmse")
+    assert rmse["esp"] > 1.5 * rmse["full"]
+
+
+def test_impossible_readings_are_told(sample_logs_dir: Path, tmp_path: Path) -> None:
+    in_g = NO_TRUTH_MAPPING.replace(
+        'field = "linear_acceleration.y"', 'field = "linear_acceleration.y"\nscale = 96.2361'
+    )
+    (tmp_path / "m.toml").write_text(in_g)
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("phy-ukf",))
+    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
+    report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
+    told = [x for x in report["losses"] if x["kind"] == "impossible"]
+    assert [x["where"] for x in told] == ["ay_m_s2"]
+    assert told[0]["count"] > 10
+
+
+def test_what_ran_under_a_name_stands_in_every_record(dlc_run: Path) -> None:
+    from mcap.reader import make_reader
+
+    folder = dlc_run / "logs" / "dlc"
+    told = {e["name"]: e["algorithm"] for e in json.loads((folder / "report.json").read_text())["estimators"]}
+    assert None not in told.values()
+    assert told["phy-ukf"]["algorithm"] == "physics-ukf"
+    for metrics in (dlc_run / "metrics.parquet", folder / "metrics.parquet"):
+        rows = pl.read_parquet(metrics).select("estimator", "algorithm").unique()
+        of = {name: digest for name, digest in rows.iter_rows() if name in told}
+        assert of == {name: told[name]["sha256"][:12] for name in of}
+        assert {"phy-ukf", "pd-hef"} <= of.keys()
+    with (folder / "annotated.mcap").open("rb") as stream:
+        (record,) = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == "pdhef.metrics"]
+    assert {n: json.loads(record[f"{n}/algorithm"]) for n in told} == told
+
+
+def test_a_part_that_is_not_used_is_told(sample_logs_dir: Path, tmp_path: Path) -> None:
+    car = tmp_path / "car"
+    car.mkdir()
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    (car / "vehicle.toml").write_text(text)
+    (car / "fit.toml").write_text(
+        'format = "pdhef-fit"\nversion = 1\n'
+        f'physics_sha256 = "{Car.load(car).physics_sha256}"\n[values]\nsteer_offset_rad = 0.02\n'
+    )
+    offset = {}
+    for name, changed in (("same", text), ("other", text.replace("1440.0", "1450.0"))):
+        (car / "vehicle.toml").write_text(changed)
+        said: list[str] = []
+        config = _config(sample_logs_dir, car=car, estimators=("open-loop",), end="3")
+        run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config, warn=said.append)
+        assert ("fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew" in said) == (
+            name == "other"
+        )
+        estimates = pl.read_parquet(tmp_path / name / "logs/dlc/estimates.parquet")
+        offset[name] = float(estimates.filter(pl.col("estimator") == "open-loop")["sideslip_rad"].abs().mean())
+    assert offset["same"] > 1.5 * offset["other"]

@@ -1,0 +1,349 @@
+"""Estimates recorded in a log, scored against figures that another path computed."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import polars as pl
+import pytest
+from mcap.writer import Writer
+
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
+from pdhef_logtool.records.errors import MappingError, UsageError
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.recorded_estimates import score_log
+from pdhef_logtool.sinks.schema import load_schema
+
+REFERENCE = Path(__file__).resolve().parents[1] / "reference"
+ERRORS = ("rmse", "rmse_relative", "mae", "bias", "p95_abs", "max_abs", "coverage95", "lag_s", "availability", "nees")
+
+Key = tuple[str, str, str]
+
+
+@pytest.fixture(scope="module")
+def annotated(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("annotated")
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", estimators=("phy-ukf", "zero"))
+    run_logs([str(sample_logs_dir / "dlc.mcap")], out, config)
+    return out / "logs/dlc"
+
+
+@pytest.fixture
+def config(sample_logs_dir: Path) -> RunConfig:
+    return RunConfig(car=sample_logs_dir / "vehicle.toml")
+
+
+def _figures(metrics: list[dict[str, Any]], estimator: str) -> dict[Key, tuple[float | None, int]]:
+    return {
+        (m["signal"], m["segment"], m["metric"]): (m["value"], m["n"])
+        for m in metrics
+        if m["estimator"] == estimator and (m["metric"] in ERRORS or m["metric"] == "diverged")
+    }
+
+
+def _scored(annotated: Path, config: RunConfig, *estimates: str, **options: Any) -> dict[str, Any]:
+    result = score_log(str(annotated / "annotated.mcap"), config, estimates=estimates, **options)
+    report = result.results[0].report
+    assert report is not None
+    return report
+
+
+def _value(report: dict[str, Any], signal: str, metric: str, estimator: str | None = None) -> float:
+    found = [
+        m["value"]
+        for m in report["metrics"]
+        if (m["signal"], m["segment"], m["metric"]) == (signal, "all", metric)
+        and (estimator is None or m["estimator"] == estimator)
+    ]
+    assert len(found) == 1
+    return float(found[0])
+
+
+@pytest.mark.parametrize("window_s", [600.0, 1.3])
+def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(
+    annotated: Path, sample_logs_dir: Path, window_s: float
+) -> None:
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", window_s=window_s)
+    report = _scored(annotated, config, "/pdhef/phy_ukf/state")
+    of_run = _figures(json.loads((annotated / "report.json").read_text())["metrics"], "phy-ukf")
+    again = _figures(report["metrics"], "phy-ukf")
+    assert again.keys() == of_run.keys()
+    assert {("sideslip_rad", "nonlinear", "rmse"), ("sideslip_rad", "all", "coverage95"), ("state", "all", "nees")} <= (
+        again.keys()
+    )
+    assert {("lateral_1s_m", "all", "rmse"), ("ay_m_s2", "linear", "bias")} <= again.keys()
+    for key, (value, n) in of_run.items():
+        assert again[key][1] == n, key
+        assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-9, abs=1e-15)), key
+
+
+def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path, config: RunConfig) -> None:
+    state = _figures(_scored(annotated, config, "/pdhef/phy_ukf/state", name="x")["metrics"], "x")
+    odometry = _figures(_scored(annotated, config, "/pdhef/phy_ukf/odometry", name="x")["metrics"], "x")
+    assert ("ay_m_s2", "all", "rmse") not in odometry  # the message has no acceleration
+    assert ("state", "all", "diverged") not in odometry  # nor does it say whether its author diverged
+    compared = 0
+    for signal in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"):
+        for metric in ("rmse", "mae", "bias", "p95_abs", "max_abs", "coverage95"):
+            (value, n), (other, m) = state[signal, "all", metric], odometry[signal, "all", metric]
+            assert n == m
+            assert other == pytest.approx(value, rel=1e-9)
+            compared += 1
+    assert compared == 24
+    assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-9)
+
+
+def test_named_fields_and_a_table_with_scale_give_the_same(
+    annotated: Path, sample_logs_dir: Path, tmp_path: Path, config: RunConfig
+) -> None:
+    whole = _scored(annotated, config, "/pdhef/phy_ukf/state")
+    named = _scored(
+        annotated, config, "sideslip_rad=/pdhef/phy_ukf/state.sideslip_rad", "/pdhef/phy_ukf/state.vx_m_s",
+        "sideslip_std_rad=/pdhef/phy_ukf/state.sideslip_std_rad", name="mine",
+    )  # fmt: skip
+    (tmp_path / "m.toml").write_text(
+        '[estimates.turned.sideslip_rad]\ntopic = "/pdhef/phy_ukf/state"\nfield = "sideslip_rad"\nscale = -1.0\n'
+        '[estimates.same.sideslip_rad]\ntopic = "/pdhef/phy_ukf/state"\nfield = "sideslip_rad"\n'
+    )
+    tables = RunConfig(car=sample_logs_dir / "vehicle.toml", mapping=tmp_path / "m.toml")
+    both = _scored(annotated, tables)
+    for metric in ("rmse", "bias", "p95_abs"):
+        expected = pytest.approx(_value(whole, "sideslip_rad", metric), rel=1e-9)
+        assert _value(named, "sideslip_rad", metric, "mine") == expected
+        assert _value(both, "sideslip_rad", metric, "same") == expected
+    assert _value(named, "sideslip_rad", "coverage95") == _value(whole, "sideslip_rad", "coverage95")
+    assert _value(both, "sideslip_rad", "rmse", "turned") > 2.0 * _value(both, "sideslip_rad", "rmse", "same")
+    assert {m["estimator"] for m in _scored(annotated, tables, name="same")["metrics"]} == {"same"}
+    with pytest.raises(UsageError, match="turned"):
+        _scored(annotated, tables, name="third")
+
+
+def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path: Path) -> None:
+    _scored(annotated, config, "/pdhef/phy_ukf/state", output=tmp_path)
+    folder = tmp_path / "logs/annotated"
+    assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json"}
+    assert {p.name for p in tmp_path.iterdir()} == {"logs", "metrics.parquet", "run.json"}
+    report = json.loads((folder / "report.json").read_text())
+    jsonschema.validate(report, load_schema("report.schema.json"))
+    run = json.loads((tmp_path / "run.json").read_text())
+    jsonschema.validate(run, load_schema("run.schema.json"))
+    assert run["config"]["estimates"]["phy-ukf"]["vx_m_s"] == "/pdhef/phy_ukf/state.vx_m_s"
+    again = pl.read_parquet(folder / "estimates.parquet")
+    of_run = pl.read_parquet(annotated / "estimates.parquet")
+    columns = ["stamp_ns", "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "valid", "x_m", "yaw_rad"]
+    for name in ("phy-ukf", "truth"):
+        a, b = (f.filter(pl.col("estimator") == name).select(columns) for f in (again, of_run))
+        assert a.equals(b, null_equal=True), name
+
+
+def test_nothing_is_written_without_a_folder(
+    annotated: Path, config: RunConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _scored(annotated, config, "/pdhef/zero/state")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_slice_scores_its_stamps_alone(annotated: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", start="3", end="6")
+    report = _scored(annotated, config, "/pdhef/zero/state", output=tmp_path)
+    stamps = pl.read_parquet(tmp_path / "logs/annotated/estimates.parquet")["stamp_ns"]
+    assert report["log"]["start_ns"] <= stamps.min() <= stamps.max() < report["log"]["end_ns"]
+    assert report["log"]["duration_s"] == pytest.approx(3.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("estimates", "error", "said"),
+    [
+        (("/pdhef/phy_ukf/stat",), MappingError, "did you mean /pdhef/phy_ukf/state?"),
+        (("sideslip_rad=/pdhef/phy_ukf/state.sideslip",), MappingError, "did you mean sideslip_rad?"),
+        (("sideslip_deg=/pdhef/phy_ukf/state.sideslip_rad",), UsageError, "did you mean sideslip_rad?"),
+        (("/imu/data.angular_velocity.z",), UsageError, "SIGNAL=TOPIC.FIELD"),
+        (("sideslip_rad=/pdhef/phy_ukf/state",), UsageError, "sideslip_rad=/pdhef/phy_ukf/state.FIELD"),
+        (("/pdhef/phy_ukf/state", "/pdhef/zero/state"), UsageError, "each signal once"),
+        (("sideslip_std_rad=/pdhef/phy_ukf/state.sideslip_std_rad",), UsageError, "one of sideslip_rad"),
+        ((), UsageError, "an estimate to score"),
+    ],
+)
+def test_wrong_estimates_are_one_clear_line(
+    annotated: Path, config: RunConfig, estimates: tuple[str, ...], error: type[Exception], said: str
+) -> None:
+    with pytest.raises(error) as caught:
+        _scored(annotated, config, *estimates)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["truth", "sensors", ""])
+def test_names_that_the_tables_use_themselves_are_refused(annotated: Path, config: RunConfig, name: str) -> None:
+    with pytest.raises(UsageError, match="--name"):
+        _scored(annotated, config, "/pdhef/zero/state", name=name)
+
+
+def test_no_truth_is_an_error_that_says_what_to_do(annotated: Path, sample_logs_dir: Path, tmp_path: Path) -> None:
+    (tmp_path / "m.toml").write_text('[signals.yaw_rate_rad_s]\ntopic = "/imu/data"\nfield = "angular_velocity.z"\n')
+    config = RunConfig(car=sample_logs_dir / "vehicle.toml", mapping=tmp_path / "m.toml")
+    with pytest.raises(MappingError, match="--truth"):
+        _scored(annotated, config, "/pdhef/zero/state")
+
+
+def test_named_truth_replaces_the_recognised_one(annotated: Path, config: RunConfig) -> None:
+    truth = ["/pdhef/zero/state.vx_m_s", "/pdhef/zero/state.vy_m_s"]
+    report = _scored(annotated, config, "/pdhef/phy_ukf/state", truth=truth)
+    sources = {q["name"]: q["source"] for q in report["truth"]["quantities"]}
+    assert sources["vy_m_s"] == "/pdhef/zero/state.vy_m_s"
+    stamps = pl.read_parquet(annotated / "estimates.parquet")
+    a, b = (stamps.filter(pl.col("estimator") == n)["vy_m_s"].to_numpy() for n in ("phy-ukf", "zero"))
+    difference = (a - b)[np.isfinite(a - b)]
+    # Without a yaw rate nothing measures a latency of this truth, so that the two are compared stamp by stamp.
+    assert _value(report, "vy_m_s", "rmse") == pytest.approx(math.sqrt(float(np.mean(difference**2))), rel=1e-6)
+
+
+def test_an_estimate_that_is_the_truth_is_marked(annotated: Path, config: RunConfig) -> None:
+    report = _scored(annotated, config, "/truth/perfect/odometry", name="copy")
+    dependent = {m["signal"] for m in report["metrics"] if m["metric"] == "not_independent"}
+    assert dependent == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"}
+    assert set(report["truth"]["not_independent"]) >= dependent
+    honest = _scored(annotated, config, "/pdhef/phy_ukf/state")
+    assert "not_independent" not in {m["metric"] for m in honest["metrics"]}
+
+
+def _write_log(
+    path: Path,
+    topics: dict[str, dict[str, np.ndarray[Any, Any]]],
+    stamps_ns: dict[str, np.ndarray[Any, Any]],
+) -> None:
+    writer = McapLogWriter(path, profile="ros2")
+    for name in topics:
+        writer.add_topic(name, "nav_msgs/msg/Odometry", constants={"header.frame_id": "map", "child_frame_id": "base"})
+    writer.write(
+        [
+            TopicBatch(name, stamps_ns[name], stamps_ns[name], {"header.stamp": stamps_ns[name], **fields})
+            for name, fields in topics.items()
+        ]
+    )
+    writer.close()
+
+
+def _odometry(vx: np.ndarray[Any, Any], vy: np.ndarray[Any, Any], rate: np.ndarray[Any, Any]) -> dict[str, Any]:
+    zero = np.zeros_like(vx)
+    n = vx.shape[0]
+    return {
+        "pose.pose.position": np.zeros((n, 3)),
+        "pose.pose.orientation": np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        "twist.twist.linear": np.stack([vx, vy, zero], axis=1),
+        "twist.twist.angular": np.stack([zero, zero, rate], axis=1),
+        "twist.covariance": np.zeros((n, 36)),
+    }
+
+
+def test_other_stamps_than_the_truths_without_any_imu(tmp_path: Path) -> None:
+    """A straight line in closed form: linear truth at 50 Hz, an estimate at odd stamps with a known error."""
+    start = 1_700_000_000_000_000_000
+    at_truth = start + np.arange(500) * 20_000_000
+    at_estimate = start + 3_333_333 + np.arange(310) * 33_000_000
+
+    def seconds(stamps: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        return (stamps - start) * 1e-9
+
+    t = seconds(at_estimate)
+    bias, noise = 0.02, 0.05 * np.where(np.arange(310) % 2 == 0, 1.0, -1.0)
+    _write_log(
+        tmp_path / "line.mcap",
+        {
+            "/ins/odometry": _odometry(10.0 + seconds(at_truth), 0.1 * seconds(at_truth), 0.3 * np.ones(500)),
+            "/mine": _odometry(10.0 + t + noise, 0.1 * t + bias, 0.3 * np.ones(310)),
+        },
+        {"/ins/odometry": at_truth, "/mine": at_estimate},
+    )
+    said: list[str] = []
+    result = score_log(str(tmp_path / "line.mcap"), RunConfig(), estimates=["/mine"], warn=said.append)
+    report = result.results[0].report
+    assert report is not None
+    assert _value(report, "vx_m_s", "rmse") == pytest.approx(0.05, rel=1e-6)
+    assert _value(report, "vy_m_s", "bias") == pytest.approx(0.02, rel=1e-6)
+    inside = t <= seconds(at_truth)[-1]
+    assert 290 < inside.sum() < 310  # the estimate outlives its truth
+    assert {m["n"] for m in report["metrics"] if m["metric"] == "rmse" and m["segment"] == "all"} == {int(inside.sum())}
+    assert report["truth"]["latency_s"] is None
+    assert any("latency" in note and "0" in note for note in report["truth"]["notes"])
+    assert any("no IMU" in text for text in said)
+    assert any("no --car" in text for text in said)
+
+
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: ECU
+BO_ 256 Esc: 4 ECU
+ SG_ Beta : 0|16@1- (0.01,0) [-300|300] "deg" ECU
+ SG_ Speed : 16|16@1+ (0.01,0) [0|600] "km/h" ECU
+"""
+
+
+def test_estimate_of_a_control_unit_on_can(tmp_path: Path) -> None:
+    """Sideslip in hundredths of a degree and speed in km/h, from raw frames, against a truth in JSON."""
+    start = 1_700_000_000_000_000_000
+    with (tmp_path / "esc.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        number = {"type": "number"}
+        frame = {"type": "object", "properties": {"id": number, "data": {"type": "array", "items": number}}}
+        truth = {"type": "object", "properties": {"vx": number, "vy": number}}
+        channels = {}
+        for topic, schema in (("can.raw", frame), ("ref.v", truth)):
+            schema_id = writer.register_schema(topic, "jsonschema", json.dumps(schema).encode())
+            channels[topic] = writer.register_channel(topic, "json", schema_id)
+        for i in range(400):
+            stamp = start + i * 20_000_000
+            beta_deg, speed = 2.0 * math.sin(i / 20.0), 20.0
+            state = {"vx": speed * math.cos(math.radians(beta_deg)), "vy": speed * math.sin(math.radians(beta_deg))}
+            raw = struct.pack("<hH", round(100.0 * beta_deg) + 50, round(360.0 * state["vx"]))
+            for topic, message in (("ref.v", state), ("can.raw", {"id": 256, "data": list(raw)})):
+                writer.add_message(channels[topic], stamp, json.dumps(message).encode(), stamp)
+        writer.finish()
+    (tmp_path / "esc.dbc").write_text(DBC)
+    (tmp_path / "m.toml").write_text(
+        '[can]\ndbc = "esc.dbc"\n'
+        '[estimates.esc.sideslip_rad]\ntopic = "can.raw"\nfield = "can:Esc.Beta"\nscale = 0.017453292519943295\n'
+        '[estimates.esc.vx_m_s]\ntopic = "can.raw"\nfield = "can:Esc.Speed"\nscale = 0.2777777777777778\n'
+    )
+    config = RunConfig(mapping=tmp_path / "m.toml")
+    named = ["vx_m_s=ref.v.vx", "vy_m_s=ref.v.vy"]
+    report = score_log(str(tmp_path / "esc.mcap"), config, truth=named).results[0].report
+    assert report is not None
+    assert _value(report, "sideslip_rad", "bias") == pytest.approx(math.radians(0.5), abs=math.radians(0.002))
+    assert _value(report, "vx_m_s", "max_abs") < 0.01 / 3.6
+    assert {m["signal"] for m in report["metrics"]} == {"vx_m_s", "vy_m_s", "sideslip_rad"}
+
+
+def test_250_lm_speed_is_not_independent_of_its_truth(shared_dir: Path) -> None:
+    log = shared_dir / "data/drives/revs_250lm_a.mcap"
+    config = RunConfig(car=REFERENCE / "vehicles/revs_250lm.toml", start="0", end="60")
+    estimate = "vx_m_s=/vehicle/status/velocity_status.longitudinal_velocity"
+    truth = [f"{s}=/ins/odometry.twist.twist.linear.{a}" for s, a in (("vx_m_s", "x"), ("vy_m_s", "y"))]
+    for named in ((), truth):
+        report = score_log(str(log), config, estimates=[estimate], truth=named).results[0].report
+        assert report is not None
+        assert "vx_m_s" in report["truth"]["not_independent"]
+        assert _value(report, "vx_m_s", "not_independent") == 1.0
+        assert _value(report, "vx_m_s", "rmse") < 1e-5
+        assert {m["signal"] for m in report["metrics"]} == {"vx_m_s"}  # it claims nothing else
+
+
+def test_log_of_the_fixture_is_what_the_tests_take_it_for(annotated: Path) -> None:
+    log = open_log(annotated / "annotated.mcap")
+    try:
+        counts = {t.name: t.messages for t in log.topics}
+    finally:
+        log.close()
+    # Invalid rows stand in the state topic alone: only so do the two differ.
+    assert counts["/pdhef/phy_ukf/state"] > counts["/pdhef/phy_ukf/odometry"] > 0

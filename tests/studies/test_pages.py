@@ -1,0 +1,49 @@
+"""What the pages share, and that the commands and files that documents name are there."""
+
+from __future__ import annotations
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from studies import condition_runs, friction
+from studies.pages import DOCS, ROOT, fill, number, table
+
+DOCUMENTS = [*DOCS.glob("*.md"), *ROOT.glob("*.md"), ROOT / "Makefile", *ROOT.glob("sample_logs/*.toml")]
+TEXTS = {p.name: p.read_text(encoding="utf-8") for p in DOCUMENTS}
+
+
+def test_every_command_and_file_that_a_document_names_is_there() -> None:
+    named = {(p, m) for p, t in TEXTS.items() for m in re.findall(r"-m ((?:benchmarks|studies)(?:\.\w+)*)", t)}
+    assert {"studies.paper", "studies.real", "benchmarks"} <= {m for _, m in named}
+    assert not {(p, m) for p, m in named if find_spec(m) is None}
+    files = {(p, f) for p, t in TEXTS.items() for f in re.findall(r"(?:benchmarks|studies)/[\w/]+\.py", t)}
+    assert files
+    assert not {(p, f) for p, f in files if not (ROOT / f).is_file()}
+
+
+def test_every_source_of_the_condition_table_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert all(list((ROOT / s).rglob("*.py")) for s in condition_runs._SOURCES)
+    monkeypatch.setattr(condition_runs, "ROOT", tmp_path)
+    digests = {condition_runs.source_digest.__wrapped__()}
+    for place in condition_runs._SOURCES:
+        file = tmp_path / place / "deep" / "one.py"
+        file.parent.mkdir(parents=True)
+        for text in ("a = 1", "a = 2"):
+            file.write_text(text)
+            digests.add(condition_runs.source_digest.__wrapped__())
+    assert len(digests) == 1 + 2 * len(condition_runs._SOURCES)
+
+
+def test_the_measured_tables_of_friction_have_their_place() -> None:
+    page = friction.DOCUMENT.read_text(encoding="utf-8")
+    filled = fill(page, {"measured": "| new |"}, "friction.md")
+    assert "<!-- begin measured -->\n| new |\n<!-- end measured -->" in filled
+    assert fill(filled, {"measured": "| new |"}, "friction.md") == filled != page
+
+
+def test_tables_and_numbers() -> None:
+    assert table(["a", "b"], [["1", "2"]], right_from=1) == "| a | b |\n| --- | ---: |\n| 1 | 2 |"
+    assert [number(1.23456), number(float("nan")), number(2.0, 1)] == ["1.235", "–", "2.0"]
