@@ -34,11 +34,11 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = "pdhef_logtool"
 #: By package that is mutated, the folders of the tests that know it best.
 FOLDERS = {
-    "estimators": ("estimators", "watches", "run"),
-    "evaluation": ("evaluation", "run"),
+    "estimators": ("estimators", "watches", "runs"),
+    "evaluation": ("evaluation", "runs"),
     "mapping": ("mapping", "drive", "inspection"),
     "learning": ("learning", "studies"),
-    "sinks": ("sinks", "run", "cli"),
+    "sinks": ("sinks", "runs", "cli"),
 }
 NOT_COPIED = (".git", ".venv", "out", "build", "dist", "*.egg-info", ".hypothesis", ".*_cache", "*.tmp")
 #: A mutant that loops for ever is stopped, and was noticed.
@@ -316,6 +316,8 @@ def run_tests(tree: Path, arguments: Sequence[str]) -> str | None:
         return "did not end"
     if done.returncode in (0, 5):
         return None
+    if done.returncode == 4:
+        raise SystemExit(f"pytest cannot run {' '.join(arguments)}: {done.stderr}")
     failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
     return failed[1] if failed else f"pytest ended with {done.returncode}"
 
