@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import doctest
+import importlib
 import re
 import subprocess
 import sys
@@ -76,3 +78,10 @@ def test_every_name_of_the_api_is_there() -> None:
     for name in pdhef_logtool.__all__:
         assert getattr(pdhef_logtool, name) is not None
         assert re.search(rf"\b{name}\b", page), name
+
+
+@pytest.mark.parametrize("module", ["car.car", "drive.reading", "runs.frames"])
+def test_examples_of_the_api_give_what_they_show(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    done = doctest.testmod(importlib.import_module(f"pdhef_logtool.{module}"))
+    assert done.attempted and not done.failed

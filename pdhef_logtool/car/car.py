@@ -112,6 +112,10 @@ class Car:
         ------
         VehicleError, ModelError
             A file is missing or wrong; all that is wrong in it is named at once.
+
+        >>> car = Car.load("saloon")
+        >>> car.vehicle.mass_kg, sorted(car.noise), car.allowed_trust.cap
+        (1440.0, ['pd-hef', 'phy-ukf-tuned', 'physics-plus'], 1.0)
         """
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None

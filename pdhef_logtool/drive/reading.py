@@ -202,6 +202,10 @@ def read_drive(
     Raises
     ------
     PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the slice is outside of it.
+
+    >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
+    ...     [len(window.signals.stamps_ns) for window in drive.windows()], drive.losses
+    ([951], ())
     """
     log_input = log if isinstance(log, LogInput) else one_log(str(log))
     notes: list[str] = []

@@ -62,6 +62,12 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     ------
     UsageError
         A name is unknown. EstimatorError: the drive holds no stamp.
+
+    >>> from pdhef_logtool import Car, read_drive
+    >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
+    ...     estimates = estimate(drive, ["zero", "phy-ukf"])
+    >>> list(estimates.tracks), estimates.algorithms["phy-ukf"].algorithm, len(estimates.frame())
+    (['truth', 'zero', 'phy-ukf'], 'physics-ukf', 2853)
     """
     estimators, skipped = choose(drive, names)
     parts: dict[str, list[StateTrack]] = {}
@@ -76,7 +82,14 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
 
 
 def score(estimates: Estimates) -> pl.DataFrame:
-    """Return the figures of estimates as rows of metrics.parquet; without truth those that need none."""
+    """Return the figures of estimates as rows of metrics.parquet; without truth those that need none.
+
+    >>> from pdhef_logtool import Car, read_drive
+    >>> with read_drive("sample_logs/dlc.mcap", Car.load("saloon")) as drive:
+    ...     figures = score(estimate(drive, ["zero", "phy-ukf"]))
+    >>> figures.filter(signal="sideslip_rad", segment="all", metric="rmse").get_column("value").round(4).to_list()
+    [0.0199, 0.0065]
+    """
     import polars as pl
 
     from pdhef_logtool.runs.scoring import evaluate
