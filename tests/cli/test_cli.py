@@ -196,6 +196,7 @@ def test_interrupt_is_one_line_and_exit_code_130() -> None:
         (("run", "no", "--car", "a.toml"), []),
     ],
 )
+@pytest.mark.slow
 def test_options_of_old_are_told_of_once(arguments: tuple[str, ...], notices: list[str], tmp_path: Path) -> None:
     result = _pdhef(*arguments, "-o", str(tmp_path / "car.toml"), cwd=tmp_path)
     assert result.returncode in (1, 2)

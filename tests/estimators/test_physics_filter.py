@@ -191,6 +191,7 @@ def test_standstill_holds_and_lets_go(bias):
 
 
 @pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsPlusUkf])
+@pytest.mark.slow
 def test_standstill_can_be_switched_off(maker):
     made = stop_and_go()
     still = (made.time_s >= 5.0) & (made.time_s <= 9.0)

@@ -63,6 +63,7 @@ def test_every_manoeuvre_reaches_what_it_is_for_without_a_spin(name: str) -> Non
     assert bool(drive.notes) == (name == "fishhook")
 
 
+@pytest.mark.slow
 def test_lane_change_is_the_standard_s_course_and_peaks_near_0_7_g(lane_change: Drive) -> None:
     assert 0.65 <= lane_change.peak_ay_m_s2 / G <= 0.75
     assert ISO_3888_1_M == (15.0, 30.0, 25.0, 25.0, 15.0, 15.0)

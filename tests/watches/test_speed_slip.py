@@ -80,6 +80,7 @@ def test_spinning_wheels_are_not_believed(good, size):
 
 
 @pytest.mark.parametrize("name", range(len(ESTIMATORS)))
+@pytest.mark.slow
 def test_all_estimators_heed_it_and_can_do_without(good, name):
     slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s))
     gated = ESTIMATORS[name].run(slipping, None)[0]
