@@ -336,6 +336,8 @@ def test_a_drive_without_truth_is_left_out_and_told(sample_logs_dir: Path, tmp_p
     )
     assert result.exit_code == 3
     assert [d.name for d in result.left_out] == ["no_truth"]
+    assert [d["reason"] for d in result.to_dict()["left_out"]] == ["no true sideslip"]
+    assert not any("reason" in d for d in result.to_dict()["drives"])
     assert any("no_truth is left out" in line for line in told)
     with pytest.raises(EstimatorError, match="at least one drive with a true sideslip"):
         tune(logs[1:], tmp_path / "none.toml", _settings(sample_logs_dir, split=None))
