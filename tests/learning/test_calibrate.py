@@ -93,6 +93,12 @@ def test_two_causes_are_told_apart() -> None:
     assert max(k[i] for i in (2, 3, 4, 6)) < 0.25
 
 
+def test_what_widens_nothing_is_0_but_the_first_coefficient() -> None:
+    rng = np.random.default_rng(5)
+    k = fit_coefficients(rng.uniform(0.5, 1.5, (400, 3)), 1e-5 * rng.standard_normal(400), np.full(400, 1 / 400))
+    assert 0.0 < k[0] < 1e-3 and k[1:] == (0.0, 0.0)
+
+
 def test_new_drives_are_covered_where_errors_are_small_and_where_they_are_large() -> None:
     rng = np.random.default_rng(3)
     terms = _terms(rng, 30_000)
