@@ -74,6 +74,7 @@ def good() -> Drive:
 
 @pytest.mark.parametrize("size", [20.0, -40.0])
 @pytest.mark.parametrize("column", CHANNELS)
+@pytest.mark.slow
 def test_a_single_spike_is_as_if_the_sample_were_missing(column, size, good):
     at = 400
     spike = edited(good.signals, column, at, getattr(good.signals, column)[at] + size)

@@ -79,6 +79,7 @@ def test_lane_change_is_the_standard_s_course_and_peaks_near_0_7_g(lane_change: 
     assert abs(lane_change.truth["vx_m_s"] * 3.6 - 100.0).max() < 5.0
 
 
+@pytest.mark.slow
 def test_sweep_reaches_nine_tenths_of_the_friction_limit() -> None:
     drive = simulate_drive("sine-sweep", seed=1)
     assert drive.friction == 0.3 and drive.speed_km_h == 60.0 and drive.duration_s == 12.0

@@ -262,6 +262,8 @@ def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
         assert share[0]["value"] == pytest.approx(said.mean(), abs=0.01)
         line = diverged_line(report, name)
         assert line.startswith("diverged for ")
+        of_log = (spans[0]["start_ns"] - report["log"]["start_ns"]) * 1e-9
+        assert f"first at {of_log:.2f} s" in line
         assert line in text.getvalue()
         assert line in markdown
     assert not table.filter(pl.col("estimator") == "zero")["diverged"].any()

@@ -181,6 +181,7 @@ def test_windows_change_no_bit_and_nothing_is_seen_ahead(good, data):
 
 
 @pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsPlusUkf])
+@pytest.mark.slow
 def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(maker, good):
     """The accelerometer says braking, the speed sensor falls silent: v_x runs below zero."""
     silent = good.time_s > 9.0
