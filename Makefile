@@ -15,7 +15,7 @@ JOBS ?= 2
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
-	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores"
+	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make bench    speed against peers"
