@@ -14,7 +14,7 @@ from pdhef_logtool.car.car import INTERVALS_FILE, Car
 from pdhef_logtool.car.parts import Algorithm, IntervalEntry, Intervals
 from pdhef_logtool.car.store import Change, update_car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.reading import friction_of
+from pdhef_logtool.drive.reading import Tell, friction_of
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.table import Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
@@ -65,7 +65,6 @@ MIN_SAMPLES = 20
 #: Share of the progress that running the estimators takes.
 RUNNING = 0.9
 
-Warn = Callable[[str], None]
 #: Drives that this command refuses.
 REFUSED = Refusal(
     HELD_OUT,
@@ -101,7 +100,7 @@ def calibrate(
     settings: CalibrateSettings,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
-    warn: Warn = lambda _text: None,
+    warn: Tell = lambda _text: None,
 ) -> CalibrateResult:
     """Fit the intervals of every algorithm that gives one; write them to the car ``output``.
 

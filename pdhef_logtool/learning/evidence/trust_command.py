@@ -13,7 +13,7 @@ from pdhef_logtool.car.car import NETWORK_FILE, NETWORK_FOLDER, SHOWN_DIGITS, Ca
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import LearntOn, Trust
 from pdhef_logtool.car.store import Change, write_change
-from pdhef_logtool.drive.reading import Drive, WholeDrive
+from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive
 from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import (
@@ -61,7 +61,6 @@ SEEN = ("train", "validation")
 #: Two slices that meet share a sample or two.
 EDGE_S = 0.05
 
-Warn = Callable[[str], None]
 #: Drives that this command refuses.
 REFUSED = Refusal(
     SEEN,
@@ -106,7 +105,7 @@ def trust(
     settings: LearnSettings,
     *,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
-    warn: Warn = lambda _text: None,
+    warn: Tell = lambda _text: None,
 ) -> TrustResult:
     """Try a network on drives with truth; write cap, evidence and a record of all figures to the car ``output``.
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
-from pdhef_logtool.drive.reading import friction_of, no_samples, read_drive
+from pdhef_logtool.drive.reading import Tell, friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
@@ -65,7 +65,6 @@ MAX_SMOOTHING_HALF_S = 1.0
 MAX_VARIATION = 0.3
 
 Progress = Callable[[str, float], None]
-Warn = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +176,7 @@ def extract(
     jobs: int = 1,
     resume: bool = False,
     progress: Progress = lambda _text, _share: None,
-    warn: Warn = lambda _text: None,
+    warn: Tell = lambda _text: None,
 ) -> ExtractResult:
     """Write the residual dataset of logs with truth to a folder.
 
@@ -266,7 +265,7 @@ def _plan_jobs(
     settings: ExtractSettings,
     mapping: SignalMapping | None,
     resume: bool,
-    warn: Warn,
+    warn: Tell,
 ) -> Iterator[_Job]:
     cars, manifests = cache(_car), cache(set_manifest)
     listed = [_listed(i.path, manifests(i.path.parent)) for i in inputs]

@@ -14,6 +14,7 @@ from pdhef_logtool.car.car import NOISE_FILE, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Noise
 from pdhef_logtool.car.store import Change, Content, write_change
+from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -59,7 +60,6 @@ DEFAULT_TRIALS = 128
 READING = 0.2
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
-Warn = Callable[[str], None]
 #: Drives that this command refuses.
 REFUSED = Refusal(
     HELD_OUT,
@@ -128,7 +128,7 @@ def tune(
     *,
     jobs: int = 1,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
-    warn: Warn = lambda _text: None,
+    warn: Tell = lambda _text: None,
 ) -> TuneResult:
     """Tune the noise of estimators alike; write them to the car ``output`` with a record of all trials and its plot.
 
