@@ -1,0 +1,1 @@
+"""Torture: damaged, hostile and odd input, kills, full disks; counts go to ``docs/reliability.md``."""

@@ -1,0 +1,402 @@
+"""Damage for recordings: bytes, and records that are taken apart, changed, and put together with valid sums again.
+
+A flipped byte inside a compressed chunk ends at its CRC; what harms lies behind it. So chunks are opened, their records
+changed, and closed again, so that the faults reach what reads declarations, schemas and payloads. The same seed and
+number give the same file.
+"""
+
+from __future__ import annotations
+
+import bz2
+import random
+import sqlite3
+import struct
+import zlib
+from dataclasses import dataclass, field
+from pathlib import PurePath
+
+#: Numbers at which arithmetic, allocation and time go wrong.
+EDGES = (
+    0,
+    1,
+    2,
+    7,
+    255,
+    256,
+    0x7FFF,
+    0x8000,
+    0xFFFF,
+    2**31 - 1,
+    2**31,
+    2**32 - 1,
+    2**32,
+    2**62,
+    2**63 - 1,
+    2**63,
+    2**64 - 1,
+)
+#: Texts that turn into paths, markup, terminal codes, forged lines, recursion.
+TEXTS = (
+    b"",
+    b"..",
+    b"/",
+    b"../../../etc/passwd",
+    b"/wheels[/red]",
+    b"[bold]x[/]",
+    b"\x1b[2J\x1b[31mwarning",
+    b"a\nwarning: b",
+    b"\0",
+    b"\xff\xfe",
+    b"\xed\xa0\x80",
+    "\u202etxt.mcap".encode(),
+    b"a" * 5000,
+    b"$(id)",
+    b"</script>",
+    b"%s%n",
+    b"../../odd/msg/T",
+    b"sensor_msgs/msg/Imu",
+    b"nav_msgs/msg/Odometry",
+    b"std_msgs/String",
+)
+SCHEMAS = (
+    b"float64[4294967296] x\n",
+    b"float64[99999999999999999999] x\n",
+    b"A[] a\n" + b"=" * 80 + b"\nMSG: p/A\nA[] a\n",
+    b"\n".join([b"A0 a"] + [b"=" * 80 + b"\nMSG: p/A%d\nA%d[2] a\nA%d[2] b" % (i, i + 1, i + 1) for i in range(40)]),
+    b'{"$ref": "#"}',
+    b'{"properties": {"a": {"$ref": "#"}, "b": {"$ref": "#"}}}',
+    b'{"a":' * 900 + b"1" + b"}" * 900,
+    b'{"type": "array", "items": [{}, {}]}',
+    b'{"type": ["number", "null"], "properties": 3}',
+    b"[" * 5000,
+    b"string<=5 a\nint32 A=3\n",
+    b"float64 x  # [/red]\nfloat64 x\n",
+    b"module a { module b { struct C { sequence<sequence<double>> x; }; }; };",
+    b"\x0a\xff\xff\xff\xff\x0f",
+    b"\x0a\x02\x0a\x00",
+)
+
+
+def mutant(name: str, content: bytes, seed: int, number: int) -> tuple[str, bytes]:
+    """Return the kind of the damage and the damaged file, the same for the same numbers."""
+    rng = random.Random(f"{seed} {name} {number}")
+    if rng.random() < 0.35:
+        return "bytes", damage_bytes(content, rng)
+    apart = {".mcap": damage_mcap, ".bag": damage_bag, ".db3": damage_database}[PurePath(name).suffix]
+    changed = apart(content, rng)
+    return ("records", changed) if rng.random() < 0.8 else ("records and bytes", damage_bytes(changed, rng))
+
+
+# ------------------------------------------------------------------------------------------------ bytes
+
+
+def damage_bytes(content: bytes, rng: random.Random) -> bytes:
+    """Flip, overwrite, cut, insert, repeat or move bytes, one to four times."""
+    data = bytearray(content)
+    for _ in range(rng.choice((1, 1, 1, 2, 4))):
+        if not data:
+            break
+        at = _place(len(data), rng)
+        match rng.randrange(7):
+            case 0 | 1:
+                data[at] ^= 1 << rng.randrange(8)
+            case 2:
+                _overwrite(data, at, rng)
+            case 3:
+                del data[at : len(data) if rng.random() < 0.5 else at + rng.randrange(1, 400)]
+            case 4:
+                data[at:at] = rng.randbytes(rng.randrange(1, 64))
+            case 5:
+                part = data[at : at + rng.randrange(1, 2000)]
+                to = _place(len(data), rng)
+                data[to:to] = part
+            case _:
+                n = rng.randrange(1, 300)
+                data[at : at + n] = bytes([rng.choice((0, 255, 32))]) * min(n, len(data) - at)
+    return bytes(data)
+
+
+def _place(size: int, rng: random.Random) -> int:
+    """Return a byte: anywhere, or near either end, where what decides most stands."""
+    near = min(size, 400)
+    return rng.choice((rng.randrange(size), rng.randrange(near), size - 1 - rng.randrange(near)))
+
+
+def _overwrite(data: bytearray, at: int, rng: random.Random) -> None:
+    """Write a number of 1, 2, 4 or 8 bytes."""
+    width = rng.choice((1, 2, 4, 4, 8, 8))
+    value = rng.choice(EDGES) % (1 << (8 * width))
+    if rng.random() < 0.3 and at + width <= len(data):
+        value = (int.from_bytes(data[at : at + width], "little") + rng.choice((-1, 1, 7, -128))) % (1 << (8 * width))
+    data[at : at + width] = value.to_bytes(width, "little")
+
+
+def _damage_payload(payload: bytes, rng: random.Random) -> bytes:
+    """Change a record's inside: a number, a text, a schema, or bytes."""
+    data = bytearray(payload)
+    choice = rng.random()
+    if choice < 0.5 and data:
+        _overwrite(data, min(rng.randrange(len(data)), rng.randrange(64)), rng)
+        return bytes(data)
+    if choice < 0.7:
+        return _with_text(payload, rng)
+    return damage_bytes(payload, rng)
+
+
+def _with_text(payload: bytes, rng: random.Random) -> bytes:
+    """Put a hostile text in the place of one that stands in the record behind its length."""
+    places = []
+    for at in range(min(len(payload) - 4, 400)):
+        (n,) = struct.unpack_from("<I", payload, at)
+        if 0 < n <= len(payload) - at - 4 and payload[at + 4 : at + 8].isascii():
+            places.append((at, n))
+    if not places:
+        return payload
+    at, n = rng.choice(places[:8])
+    text = rng.choice(SCHEMAS if n > 60 and rng.random() < 0.7 else TEXTS)
+    return payload[:at] + struct.pack("<I", len(text)) + text + payload[at + 4 + n :]
+
+
+# ------------------------------------------------------------------------------------------------ MCAP
+
+_MAGIC = b"\x89MCAP0\r\n"
+_CHUNK, _INDEX = 6, 7
+
+
+def damage_mcap(content: bytes, rng: random.Random) -> bytes:
+    """Change top-level records, or those inside a chunk, whose size, compression and CRC are then made valid again."""
+    records = _mcap_records(content[8:-8])
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        if not records:
+            break
+        chunks = [i for i, (op, _) in enumerate(records) if op == _CHUNK]
+        if chunks and rng.random() < 0.6:
+            i = rng.choice(chunks)
+            records[i] = (_CHUNK, _damage_chunk(records[i][1], rng))
+        else:
+            _damage_list(records, rng)
+    if rng.random() < 0.2:  # what a killed recorder leaves
+        records = [r for r in records if r[0] not in (_INDEX, 8, 11, 13, 14)]
+    body = b"".join(struct.pack("<BQ", op, len(payload)) + payload for op, payload in records)
+    return _MAGIC + body + (_MAGIC if rng.random() < 0.9 else b"")
+
+
+def _mcap_records(body: bytes) -> list[tuple[int, bytes]]:
+    records, at = [], 0
+    while at + 9 <= len(body):
+        op, n = struct.unpack_from("<BQ", body, at)
+        records.append((op, body[at + 9 : at + 9 + n]))
+        at += 9 + n
+    return records
+
+
+def _damage_list(records: list[tuple[int, bytes]], rng: random.Random) -> None:
+    i = rng.randrange(len(records))
+    op, payload = records[i]
+    match rng.randrange(8):
+        case 0:
+            del records[i]
+        case 1:
+            records.insert(rng.randrange(len(records) + 1), records[i])
+        case 2:
+            records.insert(rng.randrange(len(records)), records.pop(i))
+        case 3:
+            records[i] = (rng.choice((*range(16), 128, 255)), payload)
+        case 4:
+            records[i:i] = [(op, payload)] * rng.choice((2, 50, 1000))
+        case _:
+            records[i] = (op, _damage_payload(payload, rng))
+
+
+def _damage_chunk(payload: bytes, rng: random.Random) -> bytes:
+    try:
+        start, end, size, _ = struct.unpack_from("<QQQI", payload)
+        (n,) = struct.unpack_from("<I", payload, 28)
+        compression = payload[32 : 32 + n]
+        inner = _mcap_records(_unpacked(compression, payload[40 + n :], size))
+    except Exception:  # noqa: BLE001 (what an earlier fault left, whatever its decompressor calls it)
+        return damage_bytes(payload, rng)
+    if inner:
+        _damage_list(inner, rng)
+    body = b"".join(struct.pack("<BQ", op, len(p)) + p for op, p in inner)
+    size, crc = len(body), zlib.crc32(body)
+    if rng.random() < 0.1:
+        compression = rng.choice((b"", b"lz4", b"zstd", b"xz", b"\xff"))
+    packed = _packed(compression, body)
+    if rng.random() < 0.15:
+        size = rng.choice(EDGES)
+    if rng.random() < 0.15:
+        start, end = rng.choice(EDGES), rng.choice(EDGES)
+    if rng.random() < 0.1:
+        packed = damage_bytes(packed, rng)
+    head = struct.pack("<QQQI", start, end, size, crc if rng.random() < 0.9 else 0)
+    return head + struct.pack("<I", len(compression)) + compression + struct.pack("<Q", len(packed)) + packed
+
+
+def _unpacked(compression: bytes, stored: bytes, size: int) -> bytes:
+    if compression == b"zstd":
+        import zstandard
+
+        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    if compression == b"lz4":
+        import lz4.frame
+
+        return bytes(lz4.frame.decompress(stored))
+    return stored
+
+
+def _packed(compression: bytes, body: bytes) -> bytes:
+    if compression == b"zstd":
+        import zstandard
+
+        return zstandard.ZstdCompressor().compress(body)
+    if compression == b"lz4":
+        import lz4.frame
+
+        return bytes(lz4.frame.compress(body))
+    return body
+
+
+# ------------------------------------------------------------------------------------------------ bags
+
+
+@dataclass(slots=True)
+class BagRecord:
+    """A record of a ROS 1 bag: header fields and data; those of a chunk lie in ``inner``."""
+
+    fields: list[tuple[bytes, bytes]]
+    data: bytes
+    inner: list[BagRecord] = field(default_factory=list)
+
+    @property
+    def chunk(self) -> bytes | None:
+        """Compression of a chunk; None for other records."""
+        named = dict(self.fields)
+        return named.get(b"compression") if named.get(b"op") == b"\x05" else None
+
+
+def damage_bag(content: bytes, rng: random.Random) -> bytes:
+    """Change header fields and data of records, inside chunks as well; chunks are compressed anew."""
+    head = content.index(b"\n") + 1
+    records = _bag_records(content[head:])
+    for record in records:
+        if record.chunk is not None:
+            body = bz2.decompress(record.data) if record.chunk == b"bz2" else _unpacked(record.chunk, record.data, 0)
+            record.inner = _bag_records(body)
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        chunks = [r for r in records if r.inner]
+        _damage_bag_list(rng.choice(chunks).inner if chunks and rng.random() < 0.6 else records, rng)
+    return content[:head] + b"".join(_bag_bytes(r, rng) for r in records)
+
+
+def _bag_records(body: bytes) -> list[BagRecord]:
+    records, at = [], 0
+    while at + 8 <= len(body):
+        (n,) = struct.unpack_from("<I", body, at)
+        header, at = body[at + 4 : at + 4 + n], at + 4 + n
+        (m,) = struct.unpack_from("<I", body, at)
+        fields, inside = [], 0
+        while inside + 4 <= len(header):
+            (k,) = struct.unpack_from("<I", header, inside)
+            name, _, value = header[inside + 4 : inside + 4 + k].partition(b"=")
+            fields.append((name, value))
+            inside += 4 + k
+        records.append(BagRecord(fields, body[at + 4 : at + 4 + m]))
+        at += 4 + m
+    return records
+
+
+def _damage_bag_list(records: list[BagRecord], rng: random.Random) -> None:
+    if not records:
+        return
+    i = rng.randrange(len(records))
+    record = records[i]
+    match rng.randrange(9):
+        case 0:
+            del records[i]
+        case 1:
+            records.insert(rng.randrange(len(records) + 1), record)
+        case 2:
+            record.data = _damage_payload(record.data, rng)
+            record.inner = []
+        case 3 if record.fields:
+            del record.fields[rng.randrange(len(record.fields))]
+        case 4 if record.fields:
+            record.fields.append(rng.choice(record.fields))
+        case 5:
+            records[i:i] = [record] * rng.choice((2, 50, 500))
+        case _ if record.fields:
+            j = rng.randrange(len(record.fields))
+            name, value = record.fields[j]
+            changed = bytearray(value or b"\0")
+            if rng.random() < 0.4:
+                changed = bytearray(rng.choice(TEXTS))
+            else:
+                _overwrite(changed, rng.randrange(len(changed)), rng)
+            record.fields[j] = (name, bytes(changed))
+        case _:
+            del records[i]
+
+
+def _bag_bytes(record: BagRecord, rng: random.Random) -> bytes:
+    data, fields = record.data, record.fields
+    if record.inner and record.chunk is not None:
+        body = b"".join(_bag_bytes(r, rng) for r in record.inner)
+        data = bz2.compress(body) if record.chunk == b"bz2" else _packed(record.chunk, body)
+        size = struct.pack("<I", len(body) if rng.random() < 0.95 else rng.choice(EDGES) % 2**32)
+        fields = [(n, size if n == b"size" else v) for n, v in fields]
+    header = b"".join(struct.pack("<I", len(n) + 1 + len(v)) + n + b"=" + v for n, v in fields)
+    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+
+# ------------------------------------------------------------------------------------------------ databases
+
+_STATEMENTS = (
+    "UPDATE messages SET timestamp = ? WHERE id = ?",
+    "UPDATE messages SET timestamp = ? WHERE id > ?",
+    "UPDATE messages SET data = ? WHERE id = ?",
+    "UPDATE messages SET topic_id = ? WHERE id = ?",
+    "UPDATE topics SET name = ? WHERE id % 3 = ? % 3",
+    "UPDATE topics SET type = ? WHERE id % 3 = ? % 3",
+    "UPDATE topics SET serialization_format = ? WHERE id % 3 = ? % 3",
+    "UPDATE topics SET offered_qos_profiles = ? WHERE id % 3 = ? % 3",
+    "UPDATE message_definitions SET encoded_message_definition = ? WHERE id % 3 = ? % 3",
+    "UPDATE message_definitions SET encoding = ? WHERE id % 3 = ? % 3",
+    "INSERT INTO topics (name, type, serialization_format, offered_qos_profiles) VALUES (?1, ?1, 'cdr', ?2)",
+    "INSERT INTO messages (topic_id, timestamp, data) VALUES (1, ?1, ?2)",
+    "DELETE FROM messages WHERE id % ?2 = 0 AND ?1 IS ?1",
+)
+_STRUCTURE = (
+    "DROP TABLE topics",
+    "DROP TABLE messages",
+    "DROP TABLE message_definitions",
+    "DROP TABLE schema",
+    "ALTER TABLE messages RENAME COLUMN data TO payload",
+    "DELETE FROM topics",
+    "DELETE FROM messages",
+    "DROP TABLE messages; CREATE VIEW messages AS WITH RECURSIVE r(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM r) "
+    "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM r",
+)
+
+
+def damage_database(content: bytes, rng: random.Random) -> bytes:
+    """Change rows, types of values, tables."""
+    with sqlite3.connect(":memory:") as database:
+        database.deserialize(content)
+        for _ in range(rng.choice((1, 1, 2, 3))):
+            statement = rng.choice(_STATEMENTS if rng.random() < 0.9 else _STRUCTURE)
+            text = rng.choice((*TEXTS, *SCHEMAS))
+            signed = rng.choice(EDGES) - 2**63 if rng.random() < 0.3 else rng.choice(EDGES) % 2**63
+            as_text = text.decode("utf-8", errors="surrogateescape")
+            as_text = as_text if as_text.isprintable() else as_text.encode("ascii", "replace").decode()
+            value = rng.choice((signed, text, as_text, None, 0.5, rng.randbytes(40)))
+            try:
+                if statement in _STRUCTURE:
+                    database.executescript(statement)
+                else:
+                    database.execute(statement, (value, rng.randrange(1, 200)))
+            except sqlite3.Error:
+                continue
+        database.commit()
+        stored: bytes = database.serialize()
+        return stored
