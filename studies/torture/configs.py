@@ -1,4 +1,4 @@
-"""Mutated configurations: mapping, vehicle, car folder, pdhef.toml, thresholds, network description, rosbag2 metadata."""
+"""Mutated configurations: mapping, vehicle, car folder, pdhef.toml, thresholds, metadata of networks and bags."""
 
 from __future__ import annotations
 
@@ -115,22 +115,25 @@ def damage_document(name: str, content: bytes, rng: random.Random) -> bytes:
     if rng.random() < 0.3:
         return damage_bytes(content, rng)
     text = content.decode()
-    toml = name.endswith(".toml")
-    lines = name.endswith(".jsonl")
-    document = (
-        tomllib.loads(text) if toml else [json.loads(x) for x in text.splitlines()] if lines else json.loads(text)
-    )
-    for _ in range(rng.choice((1, 1, 2, 3))):
-        _damage_entry(document, rng)
-    if not toml:
-        dumped = [json.dumps(x, ensure_ascii=False) for x in document] if lines else [json.dumps(document)]
-        return "\n".join(dumped).encode("utf-8", errors="surrogatepass")
-    import tomlkit
-
+    toml, lines = name.endswith(".toml"), name.endswith(".jsonl")
+    parse = tomllib.loads if toml else (lambda t: [json.loads(x) for x in t.splitlines()]) if lines else json.loads
+    document: Any = parse(text)
     try:
-        return tomlkit.dumps(document).encode("utf-8", errors="surrogatepass")
-    except (ValueError, TypeError, RecursionError):  # what TOML cannot say
+        for _ in range(rng.choice((1, 1, 2, 3))):
+            _damage_entry(document, rng)
+        return _dumped(document, toml, lines)
+    except (ValueError, TypeError, RecursionError):  # what the format, or its writer, cannot say
         return damage_bytes(content, rng)
+
+
+def _dumped(document: Any, toml: bool, lines: bool) -> bytes:
+    if toml:
+        import tomlkit
+
+        text = tomlkit.dumps(document)
+    else:
+        text = "\n".join(json.dumps(x, ensure_ascii=False) for x in (document if lines else [document]))
+    return text.encode("utf-8", errors="surrogatepass")
 
 
 def _damage_entry(document: Any, rng: random.Random) -> None:

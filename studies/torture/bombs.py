@@ -1,0 +1,371 @@
+"""Small files that claim, unfold or hide much; places that are no files; names that steer terminals and paths.
+
+Each must end within the limits of :mod:`studies.torture.workers` and with one of the exit codes that it names.
+"""
+
+from __future__ import annotations
+
+import bz2
+import json
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from studies.torture.outside import measured
+from studies.torture.seeds import START_NS, write_seeds
+from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Ended, Verdict, judge
+
+_MAGIC = b"\x89MCAP0\r\n"
+_LOST, _NO_LOG, _EITHER = (3,), (1,), (1, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Bomb:
+    """``make`` writes below a folder and returns what to inspect; ``codes`` are the exit codes that are right."""
+
+    name: str
+    make: Callable[[Path], Path]
+    codes: tuple[int, ...]
+
+
+def _text(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
+
+
+def _record(op: int, payload: bytes) -> bytes:
+    return struct.pack("<BQ", op, len(payload)) + payload
+
+
+def _schema(id_: int, name: bytes, encoding: bytes, data: bytes) -> bytes:
+    return _record(3, struct.pack("<H", id_) + _text(name) + _text(encoding) + _text(data))
+
+
+def _channel(id_: int, schema: int, topic: bytes, encoding: bytes) -> bytes:
+    return _record(4, struct.pack("<HH", id_, schema) + _text(topic) + _text(encoding) + _text(b""))
+
+
+def _message(channel: int, time_ns: int, payload: bytes, claimed: int | None = None) -> bytes:
+    head = struct.pack("<HIQQ", channel, 0, time_ns, time_ns)
+    return struct.pack("<BQ", 5, (len(head) + len(payload)) if claimed is None else claimed) + head + payload
+
+
+def _chunk(
+    compression: bytes, stored: bytes, size: int, crc: int = 0, times: tuple[int, int] = (START_NS, START_NS)
+) -> bytes:
+    head = struct.pack("<QQQI", *times, size, crc)
+    return _record(6, head + _text(compression) + struct.pack("<Q", len(stored)) + stored)
+
+
+def _mcap(*records: bytes) -> bytes:
+    body = _record(1, _text(b"ros2") + _text(b"torture")) + b"".join(records)
+    return _MAGIC + body + _record(15, struct.pack("<I", 0)) + _record(2, struct.pack("<QQI", 0, 0, 0)) + _MAGIC
+
+
+def _file(name: str, content: Callable[[], bytes], folder: Path) -> Path:
+    path = folder / name
+    path.write_bytes(content())
+    return path
+
+
+def _typed(name: bytes, encoding: bytes, schema: bytes, wire: bytes, payload: bytes, topic: bytes = b"/t") -> bytes:
+    declared = _schema(1, name, encoding, schema) + _channel(1, 1, topic, wire)
+    return _mcap(declared, *(_message(1, START_NS + i * 10**7, payload) for i in range(50)))
+
+
+def _zeros_zstd(size: int) -> bytes:
+    import zstandard
+
+    compressor = zstandard.ZstdCompressor(level=3).compressobj(size=size)
+    block = bytes(1 << 20)
+    return b"".join([*(compressor.compress(block) for _ in range(size >> 20)), compressor.flush()])
+
+
+def _zeros_lz4(size: int) -> bytes:
+    import lz4.frame
+
+    with lz4.frame.LZ4FrameCompressor() as compressor:
+        block = bytes(1 << 20)
+        parts = [compressor.begin(), *(compressor.compress(block) for _ in range(size >> 20)), compressor.flush()]
+    return b"".join(bytes(p) for p in parts)
+
+
+def _zeros_bz2(size: int) -> bytes:
+    compressor, block = bz2.BZ2Compressor(9), bytes(1 << 20)
+    return b"".join([*(compressor.compress(block) for _ in range(size >> 20)), compressor.flush()])
+
+
+def _bag_record(fields: dict[bytes, bytes], data: bytes) -> bytes:
+    header = b"".join(_text(k + b"=" + v) for k, v in fields.items())
+    return _text(header) + _text(data)
+
+
+def _bag(*records: bytes) -> bytes:
+    head = {b"op": b"\x03", b"index_pos": bytes(8), b"conn_count": bytes(4), b"chunk_count": struct.pack("<I", 1)}
+    return b"#ROSBAG V2.0\n" + _bag_record(head, b" " * 4000) + b"".join(records)
+
+
+def _bag_chunk(compression: bytes, stored: bytes, size: int) -> bytes:
+    return _bag(_bag_record({b"op": b"\x05", b"compression": compression, b"size": struct.pack("<I", size)}, stored))
+
+
+def _nested(levels: int) -> bytes:
+    """Return a ROS type whose every level holds ten of the next."""
+    parts = [b"L0 a"]
+    parts += [
+        b"=" * 80 + b"\nMSG: p/L%d\n" % i + b"\n".join(b"L%d f%d" % (i + 1, k) for k in range(10))
+        for i in range(levels)
+    ]
+    return b"\n".join([*parts, b"=" * 80 + b"\nMSG: p/L%d\nfloat64 x\n" % levels])
+
+
+def _json_references(levels: int) -> bytes:
+    def kind(i: int) -> dict[str, object]:
+        return {"type": "object", "properties": {f"p{k}": {"$ref": f"#/definitions/d{i + 1}"} for k in range(10)}}
+
+    own = {f"d{i}": kind(i) for i in range(levels)} | {f"d{levels}": {"type": "number"}}
+    return json.dumps({"type": "object", "$ref": "#/definitions/d0", "definitions": own}).encode()
+
+
+def _descriptors(levels: int, width: int) -> bytes:
+    from google.protobuf import descriptor_pb2
+
+    files = descriptor_pb2.FileDescriptorSet()
+    file = files.file.add(name="b.proto", package="p", syntax="proto3")
+    for i in range(levels + 1):
+        message = file.message_type.add(name=f"L{i}")
+        for k in range(width):
+            if i < levels:
+                message.field.add(name=f"f{k}", number=k + 1, type=11, label=1, type_name=f".p.L{i + 1}")
+            else:
+                message.field.add(name=f"f{k}", number=k + 1, type=1, label=1)
+    return bytes(files.SerializeToString())
+
+
+def _times(*extra: int) -> bytes:
+    """Return a sound small log with messages at odd times among the others."""
+    schema, channel = _schema(1, b"std_msgs/msg/Float64", b"ros2msg", b"float64 data\n"), _channel(1, 1, b"/x", b"cdr")
+    payload = b"\0\1\0\0" + struct.pack("<d", 1.0)
+    times = [START_NS + i * 10**7 for i in range(300)]
+    return _mcap(schema, channel, *(_message(1, t, payload) for t in (*times[:150], *extra, *times[150:])))
+
+
+def _claimed_counts() -> bytes:
+    payload = b"\0\1\0\0" + struct.pack("<d", 1.0)
+    inner = _schema(1, b"std_msgs/msg/Float64", b"ros2msg", b"float64 data\n") + _channel(1, 1, b"/x", b"cdr")
+    inner += _message(1, START_NS, payload)
+    index = _record(7, struct.pack("<HI", 1, 2**32 - 16) + bytes(64))
+    return _mcap(_chunk(b"", inner, len(inner), zlib.crc32(inner)), index)
+
+
+def _fifo(folder: Path) -> Path:
+    os.mkfifo(folder / "drive.mcap")
+    return folder / "drive.mcap"
+
+
+def _device(folder: Path) -> Path:
+    (folder / "drive.mcap").symlink_to("/dev/zero")
+    return folder / "drive.mcap"
+
+
+def _loops(folder: Path) -> Path:
+    """Two links to the folder that they lie in: 2^n ways lead to everything."""
+    (folder / "a").symlink_to(".")
+    (folder / "b").symlink_to(".")
+    return folder
+
+
+def _sparse(folder: Path) -> Path:
+    path = folder / "drive.mcap"
+    with path.open("wb") as file:
+        file.write(_mcap()[:40])
+        file.truncate(20 << 30)
+    return path
+
+
+def _metadata(text: str, folder: Path) -> Path:
+    (folder / "metadata.yaml").write_text(text)
+    return folder
+
+
+def _laughs() -> str:
+    lines = ['a0: &a0 ["ha", "ha", "ha", "ha", "ha", "ha", "ha", "ha", "ha"]']
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 12)]
+    return "\n".join([*lines, "rosbag2_bagfile_information:", "  relative_file_paths: *a11", ""])
+
+
+def _database(statement: str, folder: Path) -> Path:
+    import sqlite3
+
+    path = folder / "drive.db3"
+    path.write_bytes(write_seeds(folder / "seeds")["rosbag2.db3"])
+    with sqlite3.connect(path) as database:
+        database.executescript(statement)
+    database.close()
+    return path
+
+
+_ENDLESS = (
+    "DROP TABLE messages; CREATE VIEW messages AS WITH RECURSIVE r(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM r) "
+    "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM r"
+)
+_HUGE_ROW = (
+    "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE VIEW messages AS SELECT id, topic_id, "
+    "timestamp, zeroblob(900000000) AS data FROM rows"
+)
+_FLOAT, _CDR = b"float64 data\n", b"\0\1\0\0" + bytes(8)
+_ODD_NAME = b"/wheels[/red]\x1b[2J\nwarning: all is well\0\xe2\x80\xae"
+
+
+def _many_channels(n: int) -> bytes:
+    schema = _schema(1, b"std_msgs/msg/Float64", b"ros2msg", _FLOAT)
+    declared = b"".join(_channel(i, 1, b"/c%d" % i, b"cdr") for i in range(1, n))
+    return _mcap(schema, declared, *(_message(i, START_NS + i, _CDR) for i in range(1, n)))
+
+
+def _made(name: str, codes: tuple[int, ...], content: Callable[[], bytes], suffix: str = ".mcap") -> Bomb:
+    return Bomb(name, partial(_file, f"drive{suffix}", content), codes)
+
+
+GIB = 1 << 30
+BOMBS = (
+    _made("zstd chunk of 4 GiB", _EITHER, lambda: _mcap(_chunk(b"zstd", _zeros_zstd(4 * GIB), 4 * GIB))),
+    _made(
+        "zstd chunk that claims 1000 bytes and holds 4 GiB",
+        _EITHER,
+        lambda: _mcap(_chunk(b"zstd", _zeros_zstd(4 * GIB), 1000)),
+    ),
+    _made("zstd chunk that claims 100 GB", _EITHER, lambda: _mcap(_chunk(b"zstd", _zeros_zstd(1 << 20), 10**11))),
+    _made("lz4 chunk of 2 GiB", _EITHER, lambda: _mcap(_chunk(b"lz4", _zeros_lz4(2 * GIB), 2 * GIB))),
+    _made(
+        "lz4 chunk that claims 1000 bytes and holds 2 GiB",
+        _EITHER,
+        lambda: _mcap(_chunk(b"lz4", _zeros_lz4(2 * GIB), 1000)),
+    ),
+    _made(
+        "bag: bz2 chunk that claims 1000 bytes and holds 3 GiB",
+        _EITHER,
+        lambda: _bag_chunk(b"bz2", _zeros_bz2(3 * GIB), 1000),
+        ".bag",
+    ),
+    _made(
+        "bag: lz4 chunk that claims 1000 bytes and holds 2 GiB",
+        _EITHER,
+        lambda: _bag_chunk(b"lz4", _zeros_lz4(2 * GIB), 1000),
+        ".bag",
+    ),
+    _made("whole file of 8 GiB as zstd", _EITHER, lambda: _zeros_zstd(8 * GIB), ".mcap.zst"),
+    _made("MCAP header and 4 GiB of zeros as zstd", _EITHER, lambda: _zeros_zstd(4 * GIB), ".mcap.zstd"),
+    _made("65,534 channels", (0, 1, 3), lambda: _many_channels(65_535)),
+    _made("an index that claims 268 million messages", (0, 1, 3), _claimed_counts),
+    _made(
+        "a message size near 2^63",
+        _EITHER,
+        lambda: _mcap(
+            _schema(1, b"a/B", b"ros2msg", _FLOAT), _channel(1, 1, b"/t", b"cdr"), _message(1, START_NS, b"", 2**63 - 8)
+        ),
+    ),
+    _made(
+        "ROS type of 10^12 leaves", _EITHER, lambda: _typed(b"p/msg/Root", b"ros2msg", _nested(12), b"cdr", bytes(64))
+    ),
+    _made(
+        "ROS type that holds itself",
+        _EITHER,
+        lambda: _typed(b"p/msg/A", b"ros2msg", b"A a\n" + b"=" * 80 + b"\nMSG: p/A\nA a\n", b"cdr", bytes(64)),
+    ),
+    _made(
+        "ROS array of 2^32",
+        (0, 1, 3),
+        lambda: _typed(b"p/msg/A", b"ros2msg", b"float64[4294967296] a\nfloat64 b\n", b"cdr", bytes(64)),
+    ),
+    _made(
+        "ROS 1 sequence that claims 2^32 - 1",
+        (0, 1, 3),
+        lambda: _typed(b"p/A", b"ros1msg", b"float64[] a\n", b"ros1", b"\xff" * 8),
+    ),
+    _made(
+        "CDR sequence of structs that claims 2^32 - 1",
+        (0, 1, 3),
+        lambda: _typed(
+            b"p/msg/A",
+            b"ros2msg",
+            b"B[] a\n" + b"=" * 80 + b"\nMSG: p/B\nstring s\n",
+            b"cdr",
+            b"\0\1\0\0" + b"\xff" * 8,
+        ),
+    ),
+    _made(
+        "IDL of 500 modules",
+        (0, 1, 3),
+        lambda: _typed(
+            b"p/msg/A", b"ros2idl", b"module m {" * 500 + b"struct A { double x; };" + b"};" * 500, b"cdr", bytes(64)
+        ),
+    ),
+    _made(
+        "JSON schema of 10^12 leaves",
+        _EITHER,
+        lambda: _typed(b"S", b"jsonschema", _json_references(12), b"json", b"{}"),
+    ),
+    _made(
+        "JSON schema 5000 deep",
+        _EITHER,
+        lambda: _typed(b"S", b"jsonschema", b'{"properties":{"a":' * 5000 + b"{}" + b"}}" * 5000, b"json", b"{}"),
+    ),
+    _made(
+        "JSON messages 900 deep, without a schema",
+        (0, 1, 3),
+        lambda: _typed(b"S", b"", b"", b"json", b'{"a":' * 900 + b"1" + b"}" * 900),
+    ),
+    _made(
+        "JSON number of a million digits",
+        (0, 1, 3),
+        lambda: _typed(b"S", b"", b"", b"json", b'{"a": ' + b"9" * 1_000_000 + b"}"),
+    ),
+    _made(
+        "protobuf type of 10^12 leaves",
+        _EITHER,
+        lambda: _typed(b"p.L0", b"protobuf", _descriptors(12, 10), b"protobuf", b""),
+    ),
+    _made(
+        "a type name that is a path",
+        (0, 1, 3),
+        lambda: _typed(b"../../../pdhef_msgs/msg/VehicleStateEstimate", b"ros2msg", b"", b"cdr", bytes(64)),
+    ),
+    _made(
+        "a topic that is markup, terminal codes and a forged line",
+        (0, 1, 3),
+        lambda: _typed(b"std_msgs/msg/Float64", b"ros2msg", _FLOAT, b"cdr", _CDR, _ODD_NAME),
+    ),
+    _made("one message at time 0", (0, 3), lambda: _times(0)),
+    _made("one message at 2^64 - 1", (0, 3), lambda: _times(2**64 - 1)),
+    _made(
+        "a clock that jumps ten years",
+        (0, 3),
+        lambda: _times(*(START_NS - 315_360_000 * 10**9 + i * 10**7 for i in range(100))),
+    ),
+    Bomb("a FIFO", _fifo, _NO_LOG),
+    Bomb("a device", _device, _NO_LOG),
+    Bomb("two links to their own folder", _loops, (1, 2)),
+    Bomb("20 GiB of nothing behind a header", _sparse, _EITHER),
+    Bomb("metadata.yaml that unfolds to 10^11 names", partial(_metadata, _laughs()), (1, 2)),
+    Bomb("metadata.yaml 3000 deep", partial(_metadata, "rosbag2_bagfile_information: " + "[" * 3000), (1, 2)),
+    Bomb("database whose messages are an endless view", partial(_database, _ENDLESS), _EITHER),
+    Bomb("database whose rows are 900 MB of nothing each", partial(_database, _HUGE_ROW), _EITHER),
+)
+
+
+def judge_bomb(bomb: Bomb, folder: Path) -> tuple[Verdict, float, int]:
+    """Make a bomb, inspect it in a process of its own; return how it ended, seconds and bytes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = bomb.make(folder)
+    process = measured("inspect", str(path), limit_s=3 * LIMIT_S)
+    verdict = judge(Ended(process.code, process.out, process.err), bomb.codes)
+    problems = [verdict.problem] if verdict.problem else []
+    if process.late or process.wall_s > LIMIT_S:
+        problems.append(f"{process.wall_s:.1f} s")
+    if process.peak_bytes > LIMIT_BYTES:
+        problems.append(f"{process.peak_bytes >> 20} MiB")
+    return Verdict(verdict.end, "; ".join(problems)), process.wall_s, process.peak_bytes
