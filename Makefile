@@ -9,7 +9,7 @@ CAR := saloon
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: help demo test quick mutants check lint format bench train-default samples conditions real switches \
+.PHONY: help demo test quick mutants check lint format bench train-default samples conditions real switches torture \
   docs-truthsim paper clean
 
 help:
@@ -18,6 +18,7 @@ help:
 	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
+	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
@@ -106,6 +107,9 @@ conditions: $(VENV)/installed-dev $(VENV)/compiled
 
 real: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.real $(if $(NETWORK),--network $(NETWORK))
+
+torture: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m studies.torture --jobs $(JOBS)
 
 switches: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches

@@ -1,4 +1,4 @@
-"""Odd numbers in sound files: rates, irregular stamps, gaps, NaN, constants, impossible values, clocks; and long drives.
+"""Odd numbers in sound files: rates, irregular stamps, gaps, NaN, constants, impossible values, clocks; long drives.
 
 The signals of a sample drive are changed as columns and written as a log of the same topics.
 """

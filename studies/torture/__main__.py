@@ -1,0 +1,267 @@
+"""Torture, counted: ``docs/reliability.md``.
+
+    python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--configs 20000] [--kills 200]
+                              [--hours 10] [--jobs 2] [--only logs ...] [--out docs/reliability.md]
+
+Resumable: what stands in the work folder is not done again; remove it after a change of the code. Exit code 1:
+something ended as it should not.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from studies.pages import DOCS, ROOT, fill, options, table, write
+from studies.torture.bombs import BOMBS, judge_bomb
+from studies.torture.configs import config_judge
+from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
+from studies.torture.logs import log_judge
+from studies.torture.numerics import NUMERICS, judge_numerics, read_samples, write_hours
+from studies.torture.outside import measured
+from studies.torture.places import PLACES, SkippedError
+from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Tally, run_cases
+
+_SHARED = ROOT.parent / "shared" / "torture"
+_THREE = ("--estimators", "zero,kinematic,phy-ukf")
+
+
+def mutations(work: Path, seed: int, jobs: int, logs: int, configs: int) -> dict[str, Any]:
+    """Judge mutated logs and configurations."""
+    found = {}
+    for name, make, count in (("logs", log_judge, logs), ("configurations", config_judge, configs)):
+        begin = time.monotonic()
+        tallies = run_cases(make(work, seed), count, work / f"{name}-{seed}.jsonl", jobs=jobs, tell=_say)
+        found[name] = {"seed": seed, "wall_s": time.monotonic() - begin, **_sum(tallies, count)}
+    return found
+
+
+def _sum(tallies: Iterable[Tally], count: int) -> dict[str, Any]:
+    tallies = list(tallies)
+    ends: Counter[str] = Counter()
+    for tally in tallies:
+        ends.update(tally.ends)
+    return {
+        "count": min(count, sum(ends.values())),
+        "ends": dict(sorted(ends.items())),
+        "problems": [(n, p[-800:]) for t in tallies for n, p in t.problems],
+        "slowest_s": max((t.slowest_s for t in tallies), default=0.0),
+        "peak_bytes": max((t.peak_bytes for t in tallies), default=0),
+    }
+
+
+def bombs(work: Path) -> list[dict[str, Any]]:
+    """Inspect every bomb in a process of its own."""
+    found = []
+    for i, bomb in enumerate(BOMBS):
+        folder = work / f"bomb-{i}"
+        verdict, wall_s, peak = judge_bomb(bomb, folder)
+        shutil.rmtree(folder, ignore_errors=True)
+        found.append({"name": bomb.name, "end": verdict.end, "problem": verdict.problem, "s": wall_s, "bytes": peak})
+        _say(f"bombs: {bomb.name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
+    return found
+
+
+def numerics(work: Path) -> list[dict[str, Any]]:
+    """Run every estimator on every odd drive."""
+    drive = read_samples(ROOT / "sample_logs" / "dlc.mcap")
+    found = []
+    for i, name in enumerate(NUMERICS):
+        folder = work / f"numerics-{i}"
+        verdict, process = judge_numerics(name, folder, drive)
+        shutil.rmtree(folder, ignore_errors=True)
+        found.append({"name": name, "end": verdict.end, "problem": verdict.problem, "s": process.wall_s})
+        _say(f"numerics: {name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
+    return found
+
+
+def places(work: Path) -> list[dict[str, Any]]:
+    """Run in places where something is in the way."""
+    found = []
+    for i, (name, judge_place) in enumerate(PLACES.items()):
+        folder = work / f"place-{i}"
+        folder.mkdir(parents=True)
+        try:
+            verdict = judge_place(folder)
+            found.append({"name": name, "end": verdict.end, "problem": verdict.problem})
+        except SkippedError as reason:
+            found.append({"name": name, "end": f"skipped: {reason}", "problem": ""})
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+        _say(f"places: {name}: {found[-1]['end']}{found[-1]['problem'] and ', WRONG: ' + found[-1]['problem']}")
+    return found
+
+
+def kills(work: Path, seed: int, count: int) -> dict[str, Any]:
+    """Kill runs into one folder; then the next run must give what an undisturbed one gives, and leave nothing else."""
+    logs = [str(ROOT / "sample_logs" / name) for name in ("step.mcap", "dlc.mcap")]
+    call = [*logs, "--car", "saloon"]
+    calm, output = work / "calm", work / "killed"
+    begin = time.monotonic()
+    measured("run", *call, "-o", str(calm), limit_s=300.0)
+    lasts_s = time.monotonic() - begin
+    ends: Counter[str] = Counter()
+    wrong: list[str] = []
+    for killed in kill_many(call, output, count=count, lasts_s=lasts_s, writes_s=lasts_s / 3, seed=seed):
+        ends["done before" if killed.exit_code is None else f"signal {killed.number}: {killed.exit_code}"] += 1
+        wrong += faults(output)
+        if sum(ends.values()) % 20 == 0:
+            _say(f"kills: {sum(ends.values())} of {count}")
+    left = leftovers(output)
+    kill_run(call, output, after_s=300.0)
+    same, other = contents(calm), contents(output)
+    wrong += [
+        f"{p} differs from the undisturbed run's"
+        for p in sorted(same.keys() | other.keys())
+        if same.get(p) != other.get(p)
+    ]
+    wrong += [f"{p} was not swept" for p in leftovers(output)]
+    shutil.rmtree(calm)
+    shutil.rmtree(output)
+    return {"count": count, "seed": seed, "ends": dict(sorted(ends.items())), "left": len(left), "problems": wrong}
+
+
+def hours(work: Path, most: float) -> list[dict[str, Any]]:
+    """Measure the memory of ``inspect`` and of ``run`` with three estimators over an hour and over many."""
+    found = []
+    for length in (1.0, most):
+        log = work / "hours.mcap"
+        write_hours(log, length)
+        for call in (("inspect", str(log)), ("run", str(log), "-o", str(work / "out"), "--annotate", "none", *_THREE)):
+            process = measured(*call, *(["--car", "saloon"] if call[0] == "run" else []), limit_s=3600.0)
+            entry = {
+                "command": call[0],
+                "hours": length,
+                "code": process.code,
+                "s": process.wall_s,
+                "bytes": process.peak_bytes,
+            }
+            found.append(entry)
+            _say(f"hours: {entry}")
+        shutil.rmtree(work / "out", ignore_errors=True)
+        log.unlink()
+    return found
+
+
+def shared_cases() -> list[dict[str, Any]]:
+    """Inspect the cases that others keep, where they are at hand."""
+    found = []
+    for path in sorted(_SHARED.glob("*.mcap")) + sorted(_SHARED.glob("*.bag")):
+        process = measured("inspect", str(path))
+        late = process.wall_s > LIMIT_S or process.peak_bytes > LIMIT_BYTES or process.code not in (0, 1, 3)
+        found.append(
+            {"name": path.name, "end": f"exit {process.code}", "s": process.wall_s, "problem": "wrong" if late else ""}
+        )
+    return found
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+# ------------------------------------------------------------------------------------------------ the page
+
+
+def blocks(results: dict[str, Any]) -> dict[str, str]:
+    """Return the tables of the page by name."""
+    lists = [name for name in ("bombs", "numerics", "places", "shared") if results.get(name)]
+    found: dict[str, str] = {name: _list(results[name]) for name in lists}
+    if done := results.get("mutations"):
+        found["mutations"] = _mutations(done)
+    if done := results.get("kills"):
+        rows = [[end, str(n)] for end, n in done["ends"].items()]
+        wrong = "; ".join(sorted(set(done["problems"]))) or "none"
+        text = f"{done['count']} kills, seed {done['seed']}. Hidden paths left by the last: {done['left']}."
+        found["kills"] = f"{text} Faults found: {wrong}.\n\n{table(['ended', 'times'], rows, right_from=1)}"
+    if done := results.get("hours"):
+        rows = [[f"`{r['command']}`", f"{r['hours']:g}", str(r["code"]), *_costs(r)] for r in done]
+        found["hours"] = table(["command", "hours", "exit code", "s", "MiB"], rows, right_from=1)
+    return found
+
+
+def _list(rows: list[dict[str, Any]]) -> str:
+    head = ["case", "ended", *[name for key, name in (("s", "s"), ("bytes", "MiB")) if key in rows[0]]]
+    wrong = [f", **wrong**: {_cell(r['problem'])}" if r["problem"] else "" for r in rows]
+    body = [[r["name"], r["end"] + w, *_costs(r)] for r, w in zip(rows, wrong, strict=True)]
+    return table(head, body, right_from=2)
+
+
+def _costs(row: dict[str, Any]) -> list[str]:
+    return [*([f"{row['s']:.1f}"] if "s" in row else []), *([f"{row['bytes'] >> 20}"] if "bytes" in row else [])]
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split())[-200:].replace("|", "/")
+
+
+_ENDS = ("exit 0", "exit 1", "exit 2", "exit 3", "internal error", "hang", "memory")
+
+
+def _mutations(found: dict[str, Any]) -> str:
+    rows = []
+    for name, r in found.items():
+        ends: Counter[str] = Counter()
+        for end, n in r["ends"].items():
+            ends[end.partition(",")[0]] += n
+        known = [ends[k] for k in _ENDS]
+        counts = [f"{n:,}" for n in (r["count"], *known, r["count"] - sum(known))]
+        rows.append([name, str(r["seed"]), *counts, f"{r['slowest_s']:.1f}", str(r["peak_bytes"] >> 20)])
+    text = table(["what", "seed", "cases", *_ENDS, "other", "slowest s", "peak MiB"], rows, right_from=1)
+    wrong = [(name, *p) for name, r in found.items() for p in r["problems"]]
+    if wrong:
+        text += "\n\nWrong, by number:\n\n" + "\n".join(f"- {n} {i}: `{_cell(p)}`" for n, i, p in wrong[:40])
+    return text
+
+
+def main() -> int:
+    """Do what is not done, and write the page."""
+    parser = options("torture", __doc__)
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "torture")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--logs", type=int, default=200_000)
+    parser.add_argument("--configs", type=int, default=20_000)
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--hours", type=float, default=10.0)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--only", action="append", help="a part; may be given again")
+    parser.add_argument("--out", type=Path, default=DOCS / "reliability.md")
+    given = parser.parse_args()
+    work: Path = given.work
+    work.mkdir(parents=True, exist_ok=True)
+    todo: dict[str, Callable[[], Any]] = {
+        "bombs": lambda: bombs(work),
+        "shared": shared_cases,
+        "places": lambda: places(work),
+        "numerics": lambda: numerics(work),
+        "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs, given.configs),
+        "kills": lambda: kills(work, given.seed, given.kills),
+        "hours": lambda: hours(work, given.hours),
+    }
+    results: dict[str, Any] = {}
+    for name, do in todo.items():
+        kept = work / f"{name}.json"
+        if not kept.is_file() and (given.only is None or name in given.only):
+            done = do()
+            kept.write_text(json.dumps(done, indent=1))
+        if kept.is_file():
+            results[name] = json.loads(kept.read_text())
+    if given.out.is_file():
+        write(given.out, fill(given.out.read_text(), blocks(results), str(given.out)))
+    return int(any(_wrong(r) for r in results.values()))
+
+
+def _wrong(result: Any) -> bool:
+    """Tell whether anything in a part's results ended as it should not."""
+    if isinstance(result, list):
+        return any(r.get("problem") or r.get("code", 0) not in (0, 3) for r in result)
+    return bool(result.get("problems")) or any(isinstance(r, dict) and r.get("problems") for r in result.values())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

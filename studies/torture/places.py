@@ -1,0 +1,150 @@
+"""Places and neighbours that do harm: no home, no right to write, a full disk, a second run, a file that shrinks."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from studies.pages import ROOT
+from studies.torture.numerics import write_hours
+from studies.torture.outside import Process, files_below, measured, start
+from studies.torture.workers import Ended, Verdict, judge
+
+_SAMPLE = ROOT / "sample_logs" / "dlc.mcap"
+_CAR = ("--car", "saloon")
+_NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--")
+
+
+class SkippedError(Exception):
+    """Cannot be tried here; the text says why."""
+
+
+def _judged(process: Process, codes: tuple[int, ...]) -> Verdict:
+    return judge(Ended(process.code, process.out, process.err), codes)
+
+
+def as_nobody(work: Path) -> Verdict:
+    """Run from an installation that nobody may write, without a home."""
+    if os.geteuid() != 0 or shutil.which("setpriv") is None:
+        raise SkippedError("another user needs root and setpriv")
+    installed = work / "installed"
+    for name in ("pdhef_logtool", "truthsim", "schemas"):
+        shutil.copytree(ROOT / name, installed / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(_SAMPLE, work / "dlc.mcap")
+    subprocess.run(["chmod", "-R", "a+rX,a-w", str(installed)], check=True)
+    output = work / "nobodys"
+    output.mkdir()
+    os.chown(output, 65534, 65534)
+    for folder in (output, *output.parents):
+        if not folder.stat().st_mode & 0o001:
+            raise SkippedError(f"nobody may not enter {folder}")
+    env = {
+        "PATH": os.environ["PATH"],
+        "HOME": "/nonexistent",
+        "PYTHONPATH": str(installed),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    log = str(work / "dlc.mcap")
+    ended = measured("run", log, "-o", str(output), *_CAR, prefix=_NOBODY, env=env, cwd="/", limit_s=400.0)
+    return _judged(ended, (0,))
+
+
+def full_disk(work: Path) -> Verdict:
+    """Run into a file system of 1 MB, three times as small as the outputs."""
+    disk = work / "disk"
+    disk.mkdir()
+    if (
+        os.geteuid() != 0
+        or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(disk)], check=False).returncode
+    ):
+        raise SkippedError("a small file system needs root and mount")
+    try:
+        verdict = _judged(measured("run", str(_SAMPLE), "-o", str(disk / "out"), *_CAR, limit_s=120.0), (1, 3))
+        left = [p for p in disk.rglob("*") if p.suffix in (".parquet", ".mcap", ".rrd") and not _hidden(p, disk)]
+        return Verdict(verdict.end, verdict.problem or (f"left {left}" if left and verdict.end == "exit 1" else ""))
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=False)
+
+
+def _hidden(path: Path, root: Path) -> bool:
+    return any(part.startswith(".") for part in path.relative_to(root).parts)
+
+
+def second_run(work: Path) -> Verdict:
+    """Start a run in a folder in which one is going on."""
+    road = str(ROOT / "sample_logs" / "road.mcap")
+    with start(
+        "run", road, "-o", str(work / "out"), *_CAR, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as first:
+        until = time.monotonic() + 60.0
+        while not (work / "out").is_dir() and time.monotonic() < until:
+            time.sleep(0.05)
+        time.sleep(1.0)
+        second = measured("run", str(_SAMPLE), "-o", str(work / "out"), *_CAR)
+        verdict = _judged(second, (1, 2))
+        if first.wait(300) != 0:
+            return Verdict(verdict.end, f"the first run ended with {first.returncode}")
+    if "dlc" in "".join(files_below(work / "out")):
+        return Verdict(verdict.end, "the second run wrote something")
+    return verdict
+
+
+def shrinking_file(work: Path) -> Verdict:
+    """Cut a log while it is read."""
+    log = work / "hour.mcap"
+    write_hours(log, 0.5)
+    with start("inspect", str(log), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        time.sleep(1.5)
+        with log.open("r+b") as file:
+            file.truncate(log.stat().st_size // 3)
+        out, err = process.communicate(timeout=120)
+    return judge(Ended(process.returncode, out.decode(), err.decode()), (1, 3))
+
+
+def output_is_input(work: Path) -> Verdict:
+    """Run on an output of ours, into the folder that it came from."""
+    measured("run", str(_SAMPLE), "-o", str(work / "out"), *_CAR)
+    name = next((work / "out" / "logs").iterdir()).name
+    inner = work / "out" / "logs" / "annotated"
+    inner.mkdir()
+    shutil.copy(work / "out" / "logs" / name / "annotated.mcap", inner / "annotated.mcap")
+    before = (inner / "annotated.mcap").read_bytes()
+    ended = measured("run", str(inner / "annotated.mcap"), "-o", str(work / "out"), "--annotate", "sidecar", *_CAR)
+    verdict = _judged(ended, (1, 2))
+    same = (inner / "annotated.mcap").is_file() and (inner / "annotated.mcap").read_bytes() == before
+    return Verdict(verdict.end, verdict.problem or ("" if same else "the recording changed"))
+
+
+def full_stdout(work: Path) -> Verdict:
+    """Print to a device that is full."""
+    del work
+    call = ("inspect", str(_SAMPLE))
+    with Path("/dev/full").open("wb") as full, start(*call, stdout=full, stderr=subprocess.PIPE) as process:
+        err = process.communicate(timeout=60)[1].decode()
+    return judge(Ended(process.returncode, "", err), (1,))
+
+
+def closed_pipe(work: Path) -> Verdict:
+    """Print to a reader that goes away."""
+    del work
+    code = "from pdhef_logtool.cli.app import main; main()"
+    line = f'"{sys.executable}" -c "{code}" inspect "{_SAMPLE}" | head -1'
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, env=env, timeout=60, check=False)
+    return Verdict(f"exit {done.returncode}", done.stderr)
+
+
+PLACES: dict[str, Callable[[Path], Verdict]] = {
+    "as nobody, no home, read-only installation": as_nobody,
+    "a full disk": full_disk,
+    "a second run in the same folder": second_run,
+    "a log that is cut while it is read": shrinking_file,
+    "an output that is the input": output_is_input,
+    "a full standard output": full_stdout,
+    "a reader that closes the pipe": closed_pipe,
+}

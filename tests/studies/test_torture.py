@@ -1,0 +1,106 @@
+"""The fixed part of the torture: mutants with a fixed seed, the bombs, and the harness itself against known faults."""
+
+from __future__ import annotations
+
+import os
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from studies.torture.bombs import BOMBS, Bomb, judge_bomb
+from studies.torture.configs import config_judge
+from studies.torture.logs import log_judge
+from studies.torture.mutating import mutant
+from studies.torture.seeds import SEEDS, write_seeds
+from studies.torture.workers import Ended, Verdict, judge, read_journal, run_cases
+
+LOGS, CONFIGS = 440, 120
+
+
+def _quiet(_text: str) -> None:
+    """Say nothing."""
+
+
+@pytest.mark.slow
+def test_mutated_logs_do_no_harm(tmp_path: Path) -> None:
+    tallies = run_cases(log_judge(tmp_path, 7), LOGS, tmp_path / "logs.jsonl", jobs=1, tell=_quiet)
+    assert [p for t in tallies for p in t.problems] == []
+    ends = {end for t in tallies for end in t.ends}
+    assert {"exit 0", "exit 1", "exit 3"} <= ends  # the mutants are neither harmless nor all refused
+
+
+@pytest.mark.slow
+def test_mutated_configurations_do_no_harm(tmp_path: Path) -> None:
+    tallies = run_cases(config_judge(tmp_path, 7), CONFIGS, tmp_path / "configs.jsonl", jobs=1, tell=_quiet)
+    assert [p for t in tallies for p in t.problems] == []
+
+
+# Making and unpacking gigabytes takes seconds; the rest takes as long as a start.
+_LARGE = ("GiB", "MB", "channels", "million")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bomb", [b for b in BOMBS if not any(w in b.name for w in _LARGE)][::3], ids=lambda b: b.name)
+def test_a_bomb_ends_in_time_with_its_exit_code(bomb: Bomb, tmp_path: Path) -> None:
+    verdict, _, _ = judge_bomb(bomb, tmp_path / "bomb")
+    assert verdict.problem == ""
+
+
+def test_the_same_number_gives_the_same_mutant_and_most_differ_from_the_seed(tmp_path: Path) -> None:
+    seeds = write_seeds(tmp_path)
+    assert seeds.keys() == SEEDS.keys()
+    for name in ("zstd.mcap", "lz4.bag", "rosbag2.db3"):
+        made = [mutant(name, seeds[name], 3, n) for n in range(20)]
+        assert made == [mutant(name, seeds[name], 3, n) for n in range(20)]
+        assert sum(content != seeds[name] for _, content in made) > 15
+
+
+def _case(folder: Path, number: int) -> Verdict:
+    with (folder / "done").open("a") as file:
+        file.write(f"{number}\n")
+    if number == 1:
+        os._exit(9)
+    if number == 2:
+        raise ValueError("no judge")
+    if number == 3:
+        time.sleep(60.0)
+    if number == 4:
+        kept = bytearray(200 << 20)
+        time.sleep(1.0)
+        del kept
+    return Verdict("exit 0")
+
+
+def test_what_dies_hangs_or_grows_is_told_and_the_rest_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("studies.torture.workers.LIMIT_S", 2.0)
+    monkeypatch.setattr("studies.torture.workers.LIMIT_BYTES", 190 << 20)
+    own = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    monkeypatch.setattr("studies.torture.workers.LIMIT_BYTES", own + (100 << 20))
+    journal = tmp_path / "cases.jsonl"
+    (tally,) = run_cases(partial(_case, tmp_path), 8, journal, jobs=1, tell=_quiet)
+    assert tally.ends == {"exit 0": 4, "died": 1, "no verdict": 1, "hang": 1, "memory": 1}
+    assert [number for number, _ in tally.problems] == [1, 2, 3, 4]
+    with journal.open("a") as file:
+        file.write('{"first": 500, "ends"')  # cut by a kill
+    before = (tmp_path / "done").read_text()
+    assert run_cases(partial(_case, tmp_path), 8, journal, jobs=1, tell=_quiet) == [tally]
+    assert (tmp_path / "done").read_text() == before
+    assert list(read_journal(journal)) == [tally]
+
+
+@pytest.mark.parametrize(
+    ("ended", "wrong"),
+    [
+        (Ended(0, "fine", ""), False),
+        (Ended(1, "", "pdhef: drive.mcap: expected a log, got none\n"), False),
+        (Ended(1, "", "Traceback\nValueError: x\n"), True),
+        (Ended(1, "", "pdhef: internal error, ValueError: x\n"), True),
+        (Ended(9, "", "pdhef: x\n"), True),
+        (Ended(0, "topic \x1b[2J", ""), True),
+        (Ended(3, "", "warning: \u202ereversed\n"), True),
+    ],
+)
+def test_what_counts_as_wrong(ended: Ended, wrong: bool) -> None:
+    assert bool(judge(ended).problem) is wrong
