@@ -39,7 +39,7 @@ class Budget:
 
     chunk_bytes: int = 256 << 20
     chunk_ratio: int = 2000
-    chunk_messages: int = 2_000_000
+    chunk_messages: int = 1_000_000
     channels: int = 8192
     metadata_bytes: int = 64 << 20
     schema_bytes: int = 4 << 20

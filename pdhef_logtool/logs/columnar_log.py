@@ -54,6 +54,7 @@ class ColumnarLog:
         for c, container in enumerate(self.containers):
             for channel in container.channels.values():
                 self._by_topic.setdefault(channel.topic, []).append((c, channel))
+        self._rank = [{id_: i for i, id_ in enumerate(container.channels)} for container in self.containers]
         self._seen: set[tuple[int, int]] = set()  # spans that were loaded before
         self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
@@ -195,7 +196,9 @@ class ColumnarLog:
         known = {id_: n for id_, n in held.items() if id_ in container.channels}
         times = block.log_time_ns
         undeclared = sum(held.values()) - sum(known.values()) - container.undeclared.get(span.index, 0)
-        outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
+        outside = 0
+        if len(times) and (times.min() < span.start_ns or times.max() >= span.end_ns):
+            outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
         if known == span.counts and not outside and not undeclared:
             return
         container.spans[span.index] = replace(span, counts=known)
@@ -299,28 +302,36 @@ class ColumnarLog:
 
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
-        overlapping = (
-            (c, container, span)
-            for c, container in enumerate(self.containers)
-            for span in container.spans
-            if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
-        )
-        for c, container, span in overlapping:
-            topics = {id_: container.channels[id_].topic for id_ in span.counts}
-            if not any(topic in plans for topic in topics.values()):
-                continue
-            block = self.load(c, span, frozenset(id_ for id_, topic in topics.items() if topic in plans))
-            if block is None:
-                continue
-            keep = in_window(block.log_time_ns, start_ns, end_ns)
+        for c, container in enumerate(self.containers):
             with container.meter.running():
-                # The counts are now those that the block has.
-                for id_, rows in _rows_by_channel(block, container.spans[span.index].counts, keep):
-                    topic = container.channels[id_].topic
-                    if topic in plans:
-                        columns = self._decode(topic, plans[topic], c, span, id_, block, rows)
-                        parts[topic] += [] if columns is None else [columns]
+                for span in container.spans:
+                    if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
+                        self._collect_span(plans, c, span, (start_ns, end_ns), parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
+
+    def _collect_span(
+        self,
+        plans: Mapping[str, _Plan],
+        c: int,
+        span: Span,
+        window_ns: tuple[int | None, int | None],
+        parts: Mapping[str, list[Columns]],
+    ) -> None:
+        """Add what a span holds of the topics asked for."""
+        channels = self.containers[c].channels
+        want = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
+        block = self.load(c, span, want) if want else None
+        if block is None:
+            return
+        keep = in_window(block.log_time_ns, *window_ns)
+        # By what the block holds: the span's counts may have come from an index that is wrong.
+        for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
+            topic = channels[id_].topic if id_ in channels else ""
+            rows = block.rows[id_] if keep is None else block.rows[id_][keep[block.rows[id_]]]
+            if topic in plans and rows.size:
+                columns = self._decode(topic, plans[topic], c, span, id_, block, rows)
+                if columns is not None:
+                    parts[topic].append(columns)
 
     def _decode(
         self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray
@@ -342,7 +353,7 @@ class ColumnarLog:
             key = (c, id_, span.index)
             seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
             # Count by place in the channel: which other channels a block holds depends on what was asked for.
-            places = np.searchsorted(np.flatnonzero(block.channel == id_), decoder.undecodable)
+            places = np.searchsorted(block.rows[id_], decoder.undecodable)
             self._undecodable[key] = np.union1d(seen, places.astype(np.int64))
         return Columns(topic, block.log_time_ns[rows], block.publish_time_ns[rows], fields)
 
@@ -362,19 +373,6 @@ def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
         f"reading took longer than {container.meter.allowed_s:.3g} s: {count} messages of the rest are lost (--budget)"
     )
     return Loss("over-budget", what, str(container.path), start, end, count)
-
-
-def _rows_by_channel(block: Block, counts: Mapping[int, int], keep: BoolArray | None) -> Iterator[tuple[int, IntArray]]:
-    """Yield the rows of each of these channels that has any, ascending."""
-    order = np.argsort(block.narrow_channel, kind="stable")
-    ordered = block.channel[order]
-    ids = np.array(list(counts), dtype=np.int64)
-    starts, ends = np.searchsorted(ordered, ids), np.searchsorted(ordered, ids, side="right")
-    for id_, start, end in zip(ids.tolist(), starts.tolist(), ends.tolist(), strict=True):
-        rows = order[start:end]
-        rows = rows if keep is None else rows[keep[rows]]
-        if rows.size:
-            yield id_, rows
 
 
 def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:

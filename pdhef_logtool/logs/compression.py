@@ -5,21 +5,24 @@ from __future__ import annotations
 import bz2
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from threading import local
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from pdhef_logtool.logs.budget import Budget, BudgetError, Meter
 from pdhef_logtool.logs.container import SpanDamageError
 
 if TYPE_CHECKING:
-    from _typeshed import ReadableBuffer
+    import zstandard
 
+_Bytes: TypeAlias = bytes | memoryview
+_OF_THREAD = local()
 _BLOCK_BYTES = 1 << 20
 _FRAME_HEAD_BYTES = 18
 #: A decompressed copy leaves this much of the disk to others.
 _DISK_RESERVE_BYTES = 256 << 20
 
 
-def decompress(compression: str, stored: ReadableBuffer, size: int, budget: Budget) -> bytes:
+def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> bytes:
     """Decompress a chunk that claims ``size`` bytes.
 
     Parameters
@@ -49,7 +52,7 @@ def decompress(compression: str, stored: ReadableBuffer, size: int, budget: Budg
     return content
 
 
-def decompress_message(stored: ReadableBuffer, budget: Budget) -> bytes:
+def decompress_message(stored: _Bytes, budget: Budget) -> bytes:
     """Decompress a message that is a zstd frame; errors as of :func:`decompress`."""
     import zstandard
 
@@ -58,7 +61,7 @@ def decompress_message(stored: ReadableBuffer, budget: Budget) -> bytes:
         limit = budget.chunk_bytes if size < 0 else size
         if size > 0:
             budget.check_unpacked(size, memoryview(stored).nbytes, "a compressed message")
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=limit)
+        return _zstd_decompressor().decompress(stored, max_output_size=limit)
     except (zstandard.ZstdError, OverflowError, MemoryError) as error:
         raise SpanDamageError(f"a compressed message is damaged: {error}") from error
 
@@ -94,28 +97,38 @@ def decompress_file(source: Path, target: Path, meter: Meter) -> str:
             unpacked.write(block)
 
 
-def _zstd(stored: ReadableBuffer, size: int) -> bytes:
+def _zstd(stored: _Bytes, size: int) -> bytes:
     import zstandard
 
     try:
         if zstandard.frame_content_size(stored) not in (-1, size):
             raise SpanDamageError("its compressed content has another size")
-        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+        return _zstd_decompressor().decompress(stored, max_output_size=size)
     except zstandard.ZstdError as error:
         raise SpanDamageError(str(error)) from error
 
 
-def _lz4(stored: ReadableBuffer, size: int) -> bytes:
+def _zstd_decompressor() -> zstandard.ZstdDecompressor:
+    """Return the one of this thread: it is no small thing to make, and serves one call at a time."""
+    import zstandard
+
+    if not hasattr(_OF_THREAD, "zstd"):
+        _OF_THREAD.zstd = zstandard.ZstdDecompressor()
+    found: zstandard.ZstdDecompressor = _OF_THREAD.zstd
+    return found
+
+
+def _lz4(stored: _Bytes, size: int) -> bytes:
     import lz4.frame
 
     return _in_turn(stored, size, lz4.frame.LZ4FrameDecompressor)
 
 
-def _bz2(stored: ReadableBuffer, size: int) -> bytes:
+def _bz2(stored: _Bytes, size: int) -> bytes:
     return _in_turn(stored, size, bz2.BZ2Decompressor)
 
 
-def _in_turn(stored: ReadableBuffer, size: int, decompressor: Callable[[], Any]) -> bytes:
+def _in_turn(stored: _Bytes, size: int, decompressor: Callable[[], Any]) -> bytes:
     """Decompress one stream after another to at most a byte more than ``size``."""
     parts: list[bytes] = []
     missing = size + 1
@@ -131,4 +144,4 @@ def _in_turn(stored: ReadableBuffer, size: int, decompressor: Callable[[], Any])
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
 
-_UNPACK: dict[str, Callable[[ReadableBuffer, int], bytes]] = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}
+_UNPACK: dict[str, Callable[[_Bytes, int], bytes]] = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}

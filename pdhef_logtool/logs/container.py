@@ -5,10 +5,10 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_account import ByteAccount
@@ -58,7 +58,7 @@ class Span:
     counts: Mapping[int, int]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Block:
     """The messages of one span in file order, undecoded.
 
@@ -81,22 +81,23 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
-    @property
-    def narrow_channel(self) -> NDArray[np.int64] | NDArray[np.uint16]:
-        """The channels in 16 bits where they fit, which sort and count much faster."""
-        fit = not len(self) or (self.channel.min() >= 0 and self.channel.max() < 1 << 16)
-        return self.channel.astype(np.uint16) if fit else self.channel
+    @cached_property
+    def rows(self) -> dict[int, IntArray]:
+        """Rows by channel, ascending."""
+        if not len(self):
+            return {}
+        # 16 bits, where they are enough, sort much faster.
+        fit = self.channel.min() >= 0 and self.channel.max() < 1 << 16
+        order = np.argsort(self.channel.astype(np.uint16) if fit else self.channel, kind="stable")
+        ordered = self.channel[order]
+        firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
+        ends = [*firsts[1:], len(self)]
+        return {int(ordered[at]): order[at:end] for at, end in zip(firsts, ends, strict=True)}
 
     @property
     def counts(self) -> dict[int, int]:
         """Messages by channel."""
-        narrow = self.narrow_channel
-        if narrow.dtype == np.uint16:
-            counts = np.bincount(narrow)
-            channels = np.flatnonzero(counts)
-            return dict(zip(channels.tolist(), counts[channels].tolist(), strict=True))
-        channels, counts = np.unique(narrow, return_counts=True)
-        return dict(zip(channels.tolist(), counts.tolist(), strict=True))
+        return {channel: len(rows) for channel, rows in self.rows.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

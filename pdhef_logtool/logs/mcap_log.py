@@ -45,7 +45,7 @@ from pdhef_logtool.records.signals import IntArray
 _RECORD = struct.Struct("<BQ")
 _MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
-_PAIR = struct.Struct("<Q8xQ")  # of a message index: a log time, and the next one
+_INDEX_HEAD = struct.Struct("<9sHI")  # head of the record, channel, bytes of the pairs
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
@@ -332,7 +332,7 @@ class McapContainer(FileContainer):
         return self._crc(0, end)
 
     def _crc(self, start: int, end: int) -> int:
-        crc = 0
+        crc: int = 0
         for at in range(start, end, _CRC_BLOCK_BYTES):
             crc = zlib.crc32(self.source.read(at, min(_CRC_BLOCK_BYTES, end - at)), crc)
         return crc
@@ -386,7 +386,8 @@ class McapContainer(FileContainer):
     def read_metadata(self, at: int, end: int) -> Metadata:
         """Read a metadata record."""
         self.meter.budget.check("metadata_bytes", end - at, "a metadata record")
-        return Metadata.read(ReadDataStream(BytesIO(self.source.read(at + 9, end - at - 9))))
+        metadata: Metadata = Metadata.read(ReadDataStream(BytesIO(self.source.read(at + 9, end - at - 9))))
+        return metadata
 
     def note_metadata(self, at: int, end: int) -> None:
         """Take note of a metadata record that can be read."""
@@ -406,16 +407,22 @@ class McapContainer(FileContainer):
         except Exception as error:  # noqa: BLE001 (the boundary)
             kind, text = told(error)
             count = sum(claimed.counts.values()) or None
-            held = f"{count} messages" if count else "an unknown number of messages"
-            what = f"{held} lost in the chunk at byte {extent.at}: {text}"
+            gone = f"{count} messages" if count else "an unknown number of messages"
+            what = f"{gone} lost in the chunk at byte {extent.at}: {text}"
             self.lose(kind, what, claimed.start_ns, claimed.end_ns, count)
             self.account.lose(extent.at, extent.index_end)
             return
+        held = block.counts
+        missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
+        if missing:
+            what = f"{missing} messages that the index names are not in the chunk at byte {extent.at}"
+            self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
+            self.account.lose(extent.end, extent.index_end)
         if not len(block):
             self.account.decode(extent.at, extent.end)
             return
         first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        self.add_span(extent, Span(0, first, last + 1, block.counts))
+        self.add_span(extent, Span(0, first, last + 1, held))
 
     def add_span(self, extent: _Extent, span: Span) -> None:
         """Add a span at the end."""
@@ -459,7 +466,8 @@ class _Walk:
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
         self.run_times = (0, 0)
         self.run_counts: Counter[int] = Counter()
-        self.chunk: _Extent | None = None
+        self.chunk: tuple[int, int] | None = None  # extent of the chunk whose message indexes are being read
+        self.index_end = 0
         self.head = (0, 0, 0)  # of the chunk: first and last log time, size
         self.index_counts: Counter[int] = Counter()
         self.index_times: list[int] = []  # first and last time of each message index
@@ -483,7 +491,7 @@ class _Walk:
         self._end_run()
         if opcode == _OP_CHUNK:
             first, last, size, _ = _CHUNK.unpack(source.read(at + 9, _CHUNK.size))
-            self.chunk = _Extent(at, end, True, end)
+            self.chunk, self.index_end = (at, end), end
             self.head = (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS), size)
             self.index_counts, self.index_times, self.index_sound = Counter(), [], True
         elif opcode == Opcode.ATTACHMENT:
@@ -523,10 +531,10 @@ class _Walk:
             if base + place - start >= _UNCHUNKED_RUN_BYTES:
                 break
         if place == first:  # not even the first one is a message
-            length = _RECORD.unpack(of.source.read(at, 9))[1]
+            end = at + 9 + int(_RECORD.unpack(of.source.read(at, 9))[1])
             self._end_run()
-            of.lose_record(at, at + 9 + length, SpanDamageError("a message record is too short"))
-            return at + 9 + length
+            of.lose_record(at, end, SpanDamageError("a message record is too short"))
+            return end
         self.run, self.run_times = (start, base + place), (first_ns, last_ns)
         if base + place - start >= _UNCHUNKED_RUN_BYTES:
             self._end_run()
@@ -538,17 +546,16 @@ class _Walk:
         if self.chunk is None:
             self._end_run()
             raise SpanDamageError("a message index without its chunk, whose messages are lost")
-        self.chunk = replace(self.chunk, index_end=end)
+        self.index_end = end
         sound, self.index_sound = self.index_sound, False
-        head = of.source.read(at + 9, 6)
-        (channel,), (n,) = _U16.unpack_from(head, 0), _U32.unpack_from(head, 2)
+        block, place = of.source.ahead(at, min(end - at, _INDEX_HEAD.size))
+        _, channel, n = _INDEX_HEAD.unpack_from(block, place)
         if n % 16 or at + 15 + n > end or channel in self.index_counts:
-            return
+            raise SpanDamageError(f"a message index that names {n / 16:.10g} messages of channel {channel}")
         if n:
             self.index_counts[channel] = n // 16
-            (first,) = _U64.unpack(of.source.read(at + 15, 8))
-            (last,) = _U64.unpack(of.source.read(at + 15 + n - 16, 8))
-            self.index_times += (first, last)
+            self.index_times.append(int.from_bytes(of.source.read(at + 15, 8), "little"))
+            self.index_times.append(int.from_bytes(of.source.read(at + 15 + n - 16, 8), "little"))
         self.index_sound = sound
         of.account.decode(at, end)
 
@@ -570,7 +577,7 @@ class _Walk:
     def _all_times(self) -> tuple[int, int]:
         """Return the first and the last time in the chunk's indexes, which need not be in order."""
         assert self.chunk is not None
-        record = self.of.source.read(self.chunk.end, self.chunk.index_end - self.chunk.end)
+        record = self.of.source.read(self.chunk[1], self.index_end - self.chunk[1])
         pairs = _index_pairs(record, 0)
         times = np.concatenate([p[::2] for p in pairs or ()] or [np.zeros(1, dtype=np.uint64)])
         return int(times.min()), int(times.max())
@@ -579,7 +586,7 @@ class _Walk:
         """Check the CRC of the data section where nothing else protects the messages."""
         self.data_end = True
         of = self.of
-        (crc,) = _U32.unpack(of.source.read(at + 9, 4))
+        crc: int = _U32.unpack(of.source.read(at + 9, 4))[0]
         of.account.decode(at, end)
         if crc and not all(extent.is_chunk for extent in of._extents) and of.crc_up_to(at) != crc:
             what = "the CRC of the data section does not match: some unchunked messages are damaged"
@@ -609,7 +616,7 @@ class _Walk:
         sound = self._index_agrees()
         fits = self.index_sound and self.index_counts.total() * MESSAGE_HEAD.itemsize <= size
         span = Span(0, first, last + 1, dict(self.index_counts) if fits else {})
-        extent, self.chunk = self.chunk, None
+        extent, self.chunk = _Extent(*self.chunk, True, self.index_end), None
         if sound and index_complete:
             self.of.add_span(extent, span)
         else:
@@ -641,7 +648,7 @@ class _Walk:
         self._end_chunk(index_complete=self.closed)
         self._end_run()
         if self.closed and not self.data_end:
-            if not of.spans and not of.lost:
+            if not of.spans and all(loss.kind == "bad-record" for loss in of.lost):
                 raise of.no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
             of.lose("bad-record", "the data end record is missing")
             of.account.cut = True

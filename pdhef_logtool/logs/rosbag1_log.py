@@ -289,7 +289,7 @@ class Rosbag1Container(FileContainer):
                     self._add_connection(fields, content[begin:at])
             except (KeyError, struct.error, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
-        return block_from_lists(content, channels, stamps, stamps, np.zeros(len(stamps)), offsets, lengths)
+        return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
 
 
 def _op(fields: Mapping[str, bytes]) -> int:
