@@ -55,7 +55,7 @@ class ColumnarLog:
             for channel in container.channels.values():
                 self._by_topic.setdefault(channel.topic, []).append((c, channel))
         self._rank = [{id_: i for i, id_ in enumerate(container.channels)} for container in self.containers]
-        self._seen: set[tuple[int, int]] = set()  # spans that were loaded before
+        self._seen: set[tuple[int, int, frozenset[int] | None]] = set()  # what was loaded before
         self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
@@ -179,30 +179,31 @@ class ColumnarLog:
             self._damaged[key] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
             container.account.lose(*extent)
             return None
-        if key not in self._seen:
-            self._seen.add(key)
+        if (*key, want) not in self._seen:
+            self._seen.add((*key, want))
             container.account.decode(*extent)
-            if want is None:
-                self._hold_against(c, span, block)
+            self._hold_against(c, span, block, want)
         self._kept[(*key, want)] = block
         while len(self._kept) > _KEPT_SPANS:
             self._kept.pop(next(iter(self._kept)))
         return block
 
-    def _hold_against(self, c: int, span: Span, block: Block) -> None:
+    def _hold_against(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
         """Correct what an index claimed of a span by what the span holds, with a loss for what it should hold."""
         container = self.containers[c]
         held = block.counts
         known = {id_: n for id_, n in held.items() if id_ in container.channels}
+        claimed = {id_: n for id_, n in span.counts.items() if want is None or id_ in want}
         times = block.log_time_ns
         undeclared = sum(held.values()) - sum(known.values()) - container.undeclared.get(span.index, 0)
         outside = 0
         if len(times) and (times.min() < span.start_ns or times.max() >= span.end_ns):
             outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
-        if known == span.counts and not outside and not undeclared:
+        if known == claimed and not outside and undeclared <= 0:
             return
-        container.spans[span.index] = replace(span, counts=known)
-        missing = sum(max(n - known.get(id_, 0), 0) for id_, n in span.counts.items())
+        others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
+        container.spans[span.index] = replace(span, counts=others | known)
+        missing = sum(max(n - known.get(id_, 0), 0) for id_, n in claimed.items())
         at, end = container.extent(span)
         for kind, count, text in (
             ("missing-messages", missing, "that the index names are not there"),
@@ -212,7 +213,7 @@ class ColumnarLog:
             if count > 0:
                 what = f"{count} messages {text}, at byte {at}"
                 loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
-                self._partial[c, span.index, kind] = loss
+                self._partial[c, span.index, (kind, want)] = loss
                 container.account.lose_share((at, end), count / (len(block) + missing))
 
     def _schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:

@@ -50,6 +50,7 @@ _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
+_CHUNK_HEAD_BYTES = 49 + 4  # with the longest name of a compression
 _RECORDS_A_CHECK = 256  # of the time that a walk takes
 _MESSAGES_A_CHECK = 1 << 16
 #: Plain numbers: comparing with the members of an enumeration takes longer than reading a record.
@@ -462,7 +463,8 @@ class _Walk:
         self.of = container
         self.closed = False
         self.cut_off = False
-        self.data_end = False
+        self.data_end: tuple[int, int] | None = None  # extent of the record
+        self.data_crc = 0
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
         self.run_times = (0, 0)
         self.run_counts: Counter[int] = Counter()
@@ -504,6 +506,16 @@ class _Walk:
             self._statistics(at, end)
         elif opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self.data_end):
             raise SpanDamageError(f"no record of kind {opcode} may stand here")
+        elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(at, end):
+            raise SpanDamageError("a chunk whose kind has one wrong bit, which makes it a private record")
+
+    def _is_chunk(self, at: int, end: int) -> bool:
+        """Tell whether a record of a private kind is laid out like a chunk."""
+        head = self.of.source.read(at, min(end - at, _CHUNK_HEAD_BYTES))
+        if len(head) < _CHUNK_HEAD_BYTES:
+            return False
+        (n,) = _U32.unpack_from(head, 37)
+        return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - at)
 
     def messages(self, at: int) -> int:
         """Take the message records from here on whose heads are read ahead; returns where the next record begins."""
@@ -583,15 +595,21 @@ class _Walk:
         return int(times.min()), int(times.max())
 
     def _data_end(self, at: int, end: int) -> None:
-        """Check the CRC of the data section where nothing else protects the messages."""
-        self.data_end = True
+        """Note the CRC of the data section."""
+        self.data_end = (at, end)
+        (self.data_crc,) = _U32.unpack(self.of.source.read(at + 9, 4))
+        self.of.account.decode(at, end)
+
+    def _check_data(self) -> None:
+        """Check the CRC of the data section where nothing else protects the messages, or tells of missing ones."""
         of = self.of
-        crc: int = _U32.unpack(of.source.read(at + 9, 4))[0]
-        of.account.decode(at, end)
-        if crc and not all(extent.is_chunk for extent in of._extents) and of.crc_up_to(at) != crc:
-            what = "the CRC of the data section does not match: some unchunked messages are damaged"
+        if self.data_end is None or not self.data_crc or of.lost:
+            return
+        protected = self.statistics is not None and all(extent.is_chunk for extent in of._extents)
+        if not protected and of.crc_up_to(self.data_end[0]) != self.data_crc:
+            what = "the CRC of the data section does not match: some messages are damaged or missing"
             of.lose("bad-data-crc", what)
-            of.account.lose(at, end)
+            of.account.lose(*self.data_end)
 
     def _statistics(self, at: int, end: int) -> None:
         """Note how many messages the file claims by channel."""
@@ -656,6 +674,7 @@ class _Walk:
             of.lose("truncated", "the file ends without its closing magic bytes", of.last_ns())
             of.account.cut = True
         of.resolve_channels()
+        self._check_data()
         if self.statistics is not None:
             of.check_statistics(*self.statistics)
             of.resolve_channels()

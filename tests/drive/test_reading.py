@@ -14,8 +14,8 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
 from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.budget import Budget
+from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
