@@ -23,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Metadata, Schema
 
-from pdhef_logtool.logs.budget import Meter
+from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
@@ -268,7 +268,10 @@ class McapContainer(FileContainer):
                     self.meter.check()
                 offsets.append(at)
             elif declare and opcode in _DECLARATIONS:
-                (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[at + 9 : end])
+                try:
+                    (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[at + 9 : end])
+                except BudgetError as error:
+                    self.lose(*told(error))
             elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
                 raise SpanDamageError(f"it holds a record of kind {opcode}, which no chunk may")
             at = end
@@ -482,6 +485,9 @@ class _Walk:
         of, source = self.of, self.of.source
         if opcode == _OP_MESSAGE_INDEX:
             self._message_index(at, end)
+            return
+        if self.chunk is not None and opcode == _FIRST_PRIVATE | _OP_MESSAGE_INDEX:
+            self.index_sound = False  # an index with one wrong bit: what it named is found in the chunk
             return
         self._end_chunk()
         if opcode in _DECLARATIONS:
@@ -699,9 +705,9 @@ def _index_pairs(record: bytes, at: int) -> list[IntArray] | None:
     """Return time and offset in turn (uint64) of each message index from a byte on; None if one is malformed."""
     found: list[IntArray] = []
     while at < len(record):
-        _, length = _RECORD.unpack_from(record, at)
+        opcode, length = _RECORD.unpack_from(record, at)
         (n,) = _U32.unpack_from(record, at + 11)
-        if n % 16 or n + 6 > length:
+        if opcode != _OP_MESSAGE_INDEX or n % 16 or n + 6 > length:
             return None
         found.append(np.frombuffer(record, dtype="<u8", count=n // 8, offset=at + 15))
         at += 9 + length
