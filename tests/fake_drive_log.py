@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import ByteLedger, Columns, FieldInfo, TopicInfo
 from pdhef_logtool.records.signals import IntArray, Loss
 
 
@@ -43,6 +43,10 @@ class FakeLog:
     @property
     def end_ns(self) -> int:
         return max((int(t.log_time_ns.max()) + 1 for t in self.contents.values() if len(t.log_time_ns)), default=0)
+
+    @property
+    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
+        return ()
 
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         out = []

@@ -25,6 +25,7 @@ class ReadOptions:
     friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log says, if anything.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
+    budget : factor on what reading a log may cost (:class:`~pdhef_logtool.logs.budget.Budget`).
     """
 
     start: str | None = None
@@ -33,6 +34,7 @@ class ReadOptions:
     friction: str | float | None = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: float = WINDOW_S
+    budget: float = 1.0
 
     @property
     def use_speed(self) -> bool:

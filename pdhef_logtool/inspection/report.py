@@ -13,6 +13,7 @@ import numpy as np
 
 from pdhef_logtool.drive.plausibility import GRID_S, PlausibilityWarning, plausibility_warnings
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import (
@@ -167,19 +168,23 @@ class Inspection:
 
 
 def inspect_log(
-    path: Path, mapping: Mapping | None = None, *, prefer_truth: Literal["perfect", "rtk"] = "perfect"
+    path: Path,
+    mapping: Mapping | None = None,
+    *,
+    prefer_truth: Literal["perfect", "rtk"] = "perfect",
+    budget: Budget = DEFAULT_BUDGET,
 ) -> Inspection:
     """Read a log once through and report on it; without a mapping the well-known types are recognised.
 
     Memory is bounded by windows of ten minutes, whatever the log's length. ``prefer_truth`` is the choice of
-    :func:`pdhef_logtool.mapping.auto_map`.
+    :func:`pdhef_logtool.mapping.auto_map`; ``budget`` is what reading may cost.
 
     Raises
     ------
     LogError : The file is no log.
     MappingError : The mapping names what the log does not hold.
     """
-    with closing(open_log(path)) as log:
+    with closing(open_log(path, budget)) as log:
         return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
 
 

@@ -6,11 +6,15 @@ limit lies far above what recorders write and far below what harms a machine; on
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
 from pdhef_logtool.records.errors import LogError
 
 _OPTION = "--budget"
+_MIB = 1 << 20
 
 
 class BudgetError(LogError):
@@ -23,25 +27,27 @@ class Budget:
 
     Attributes
     ----------
-    chunk_bytes : decompressed bytes of one chunk, or of one message that is compressed by itself.
-    chunk_ratio : decompressed by stored bytes of a chunk of more than a MiB.
+    chunk_bytes : decompressed bytes of what is read as a whole: a chunk, or a run of messages without chunks.
+    chunk_ratio : decompressed by stored bytes of a chunk, or file, of more than a MiB.
+    chunk_messages : messages of what is read as a whole.
     channels : of one file. metadata_bytes : of one declaration, metadata record or header.
     schema_bytes : text or descriptors of one schema. schema_leaves : scalar places of an unfolded schema.
     schema_depth : structs inside one another, also of a JSON message.
     array_width : elements of an array that become columns.
-    seconds, seconds_per_mib : time that reading a log once may take, whatever its size and by its size.
+    seconds, seconds_per_mib : processor time that reading may take, whatever is read and by what is read.
     """
 
     chunk_bytes: int = 256 << 20
     chunk_ratio: int = 2000
+    chunk_messages: int = 1_000_000
     channels: int = 8192
     metadata_bytes: int = 64 << 20
     schema_bytes: int = 4 << 20
     schema_leaves: int = 20_000
     schema_depth: int = 32
     array_width: int = 65_536
-    seconds: float = 8.0
-    seconds_per_mib: float = 2.0
+    seconds: float = 5.0
+    seconds_per_mib: float = 20.0
 
     def times(self, factor: float) -> Budget:
         """Return the budget with every limit raised by a factor."""
@@ -59,5 +65,54 @@ class Budget:
                 remedy=f"if the recording is sound, raise the limit with {_OPTION}",
             )
 
+    def check_unpacked(self, size: int, stored: int, what: str) -> None:
+        """Raise :class:`BudgetError` if ``stored`` bytes may not become, or claim to become, ``size`` bytes."""
+        self.check("chunk_bytes", size, what)
+        if size > _MIB:
+            self.check("chunk_ratio", size / max(stored, 1), what)
+
 
 DEFAULT_BUDGET = Budget()
+
+
+class Meter:
+    """Processor time that reading one log took, against what its budget allows for the bytes read so far.
+
+    What is read again counts again on both sides, so that a sound log can be read for ever.
+    """
+
+    def __init__(self, budget: Budget = DEFAULT_BUDGET) -> None:
+        self.budget = budget
+        self._seconds = 0.0
+        self._bytes = 0
+        self._since: float | None = None
+
+    @property
+    def allowed_s(self) -> float:
+        """Seconds that may have been spent by now."""
+        return self.budget.seconds + self.budget.seconds_per_mib * self._bytes / _MIB
+
+    def check(self) -> None:
+        """Raise :class:`BudgetError` if reading has taken too long."""
+        spent = self._seconds + (0.0 if self._since is None else time.thread_time() - self._since)
+        if spent > self.allowed_s:
+            raise BudgetError(
+                expected="a log that is read in time",
+                got=f"reading took longer than {self.allowed_s:.3g} s",
+                where=f"{self._bytes} bytes read",
+                remedy=f"if the recording is sound, raise the limit with {_OPTION}",
+            )
+
+    @contextmanager
+    def running(self, size: int = 0) -> Iterator[None]:
+        """Count the time that a block takes, which reads ``size`` bytes; inside another such block only its bytes."""
+        self._bytes += size
+        if self._since is not None:
+            yield
+            return
+        self._since = time.thread_time()
+        try:
+            yield
+        finally:
+            self._seconds += time.thread_time() - self._since
+            self._since = None

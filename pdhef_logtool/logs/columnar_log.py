@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError
+from pdhef_logtool.logs.budget import BudgetError
+from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, told
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
     channel_schema,
@@ -17,7 +18,7 @@ from pdhef_logtool.logs.decoding import (
     empty_column,
     missing_column,
 )
-from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import ByteLedger, Columns, FieldInfo, TopicInfo
 from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves, resolve
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
@@ -49,7 +50,17 @@ class ColumnarLog:
         self._damaged: dict[tuple[int, int], Loss] = {}
         # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
         self._undecodable: dict[tuple[int, int, int], IntArray] = {}
+        self._by_topic: dict[str, list[tuple[int, ChannelRecord]]] = {}
+        for c, container in enumerate(self.containers):
+            for channel in container.channels.values():
+                self._by_topic.setdefault(channel.topic, []).append((c, channel))
+        self._rank = [{id_: i for i, id_ in enumerate(container.channels)} for container in self.containers]
+        self._seen: set[tuple[int, int, frozenset[int] | None]] = set()  # what was loaded before
+        self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
+        self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
+        self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
+        self._refused: dict[str, Loss] = {}  # topics whose schema no parser foresaw, or the budget refuses
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
 
@@ -57,17 +68,15 @@ class ColumnarLog:
     def topics(self) -> tuple[TopicInfo, ...]:
         """All topics by name; ``messages`` leaves out those of spans found damaged so far."""
         counts: Counter[str] = Counter()
-        first: dict[str, ChannelRecord] = {}
         for c, container in enumerate(self.containers):
-            for channel in container.channels.values():
-                first.setdefault(channel.topic, channel)
+            by_id: Counter[int] = Counter()
             for span in container.spans:
                 if (c, span.index) not in self._damaged:
-                    for id_, n in span.counts.items():
-                        counts[container.channels[id_].topic] += n
-        return tuple(
-            TopicInfo(name, first[name].type_name, first[name].encoding, counts[name]) for name in sorted(first)
-        )
+                    by_id.update(span.counts)
+            for id_, n in by_id.items():
+                counts[container.channels[id_].topic] += n
+        firsts = ((name, channels[0][1]) for name, channels in sorted(self._by_topic.items()))
+        return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
     @property
     def start_ns(self) -> int:
@@ -86,8 +95,16 @@ class ColumnarLog:
         for c, container in enumerate(self.containers):
             found.extend(container.lost)
             found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
+            found.extend(loss for (of, _, _), loss in self._partial.items() if of == c)
+            if c in self._late:
+                found.append(_out_of_time(container, list(self._late[c].values())))
             found.extend(self._undecodable_losses(c, container))
-        return tuple(found)
+        return (*found, *self._refused.values())
+
+    @property
+    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
+        """Where the bytes of each file went, as far as is known by now."""
+        return tuple(c.account.ledger(str(c.path)) for c in self.containers)
 
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
@@ -100,12 +117,10 @@ class ColumnarLog:
 
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
-        for c, container in enumerate(self.containers):
-            for channel in container.channels.values():
-                if channel.topic == topic:
-                    schema = self._schema(c, channel)
-                    if isinstance(schema, MessageSchema):
-                        return tuple(leaves(schema.root))
+        for c, channel in self._by_topic.get(topic, ()):
+            schema = self._schema(c, channel)
+            if isinstance(schema, MessageSchema):
+                return tuple(leaves(schema.root))
         return ()
 
     def read(
@@ -134,7 +149,10 @@ class ColumnarLog:
             container.close()
 
     def load(self, c: int, span: Span, want: frozenset[int] | None = None) -> Block | None:
-        """Read a span of the c-th container; None and a recorded loss if it is damaged."""
+        """Read a span of the c-th container; None and a recorded loss if it is damaged.
+
+        The boundary: whatever escapes a container's load is the loss of the span.
+        """
         container = self.containers[c]
         want = want if container.selective else None
         key = (c, span.index)
@@ -143,28 +161,86 @@ class ColumnarLog:
         kept = self._kept.get((*key, want))
         if kept is not None:
             return kept
+        extent = container.extent(span)
         try:
-            block = container.load(span, want)
-        except SpanDamageError as error:
+            container.meter.check()
+        except BudgetError:
+            self._late.setdefault(c, {})[span.index] = span
+            container.account.lose(*extent)
+            return None
+        try:
+            with container.meter.running(extent[1] - extent[0]):
+                block = container.load(span, want)
+        except Exception as error:  # noqa: BLE001
+            kind, text = told(error)
             count = sum(span.counts.values()) or None
             held = f"{count} messages" if count else "an unknown number of messages"
-            self._damaged[key] = Loss(
-                "bad-chunk", f"{held} lost: {error}", str(container.path), span.start_ns, span.end_ns, count
-            )
+            what = f"{held} lost at byte {extent[0]}: {text}"
+            self._damaged[key] = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
+            container.account.lose(*extent)
             return None
+        if (*key, want) not in self._seen:
+            self._seen.add((*key, want))
+            container.account.decode(*extent)
+            self._hold_against(c, span, block, want)
         self._kept[(*key, want)] = block
         while len(self._kept) > _KEPT_SPANS:
             self._kept.pop(next(iter(self._kept)))
         return block
 
+    def _hold_against(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
+        """Correct what an index claimed of a span by what the span holds, with a loss for what it should hold."""
+        container = self.containers[c]
+        held = block.counts
+        known = {id_: n for id_, n in held.items() if id_ in container.channels}
+        claimed = {id_: n for id_, n in span.counts.items() if want is None or id_ in want}
+        times = block.log_time_ns
+        undeclared = sum(held.values()) - sum(known.values()) - container.undeclared.get(span.index, 0)
+        outside = 0
+        if len(times) and (times.min() < span.start_ns or times.max() >= span.end_ns):
+            outside = int(np.count_nonzero((times < span.start_ns) | (times >= span.end_ns)))
+        if known == claimed and not outside and undeclared <= 0:
+            return
+        others = {id_: n for id_, n in span.counts.items() if id_ not in claimed}
+        container.spans[span.index] = replace(span, counts=others | known)
+        missing = sum(max(n - known.get(id_, 0), 0) for id_, n in claimed.items())
+        at, end = container.extent(span)
+        for kind, count, text in (
+            ("missing-messages", missing, "that the index names are not there"),
+            ("unknown-channel", undeclared, "are on channels that no readable record declares"),
+            ("bad-times", outside, "have log times outside of those that the index names"),
+        ):
+            if count > 0:
+                what = f"{count} messages {text}, at byte {at}"
+                loss = Loss(kind, what, str(container.path), span.start_ns, span.end_ns, count)
+                self._partial[c, span.index, (kind, want)] = loss
+                container.account.lose_share((at, end), count / (len(block) + missing))
+
     def _schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         key = (c, channel.id)
         if key not in self._schemas:
-            try:
-                self._schemas[key] = channel_schema(channel, self.distro, self._example(c, channel))
-            except SchemaError as error:
-                self._schemas[key] = error
+            self._schemas[key] = self._parse_schema(c, channel)
         return self._schemas[key]
+
+    def _parse_schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
+        """Parse a schema once. The boundary: what no parser foresaw, or the budget refuses, is a loss of the topic."""
+        example = self._example(c, channel)
+        names = (channel.encoding, channel.schema_encoding, channel.schema_name, channel.type_name)
+        definition = (*names, channel.schema_data, example)
+        meter = self.containers[c].meter
+        try:
+            meter.check()
+            with meter.running():
+                if definition not in self._parsed:
+                    self._parsed[definition] = channel_schema(channel, self.distro, example)
+                return self._parsed[definition]
+        except SchemaError as error:
+            return self._parsed.setdefault(definition, error)
+        except Exception as error:  # noqa: BLE001
+            kind, text = told(error)
+            kind = "bad-schema" if kind == "bad-chunk" else kind
+            self._refused.setdefault(channel.topic, Loss(kind, f"its schema cannot be used: {text}", channel.topic))
+            return SchemaError(text)
 
     def _example(self, c: int, channel: ChannelRecord) -> bytes | None:
         """Return a channel's first message if its schema has to be taken from it."""
@@ -187,32 +263,25 @@ class ColumnarLog:
             return self._plans[topic, paths]
         decoders: dict[tuple[int, int], ChannelDecoder] = {}
         problems: list[MappingError] = []
-        found = False
-        for c, container in enumerate(self.containers):
-            for channel in container.channels.values():
-                if channel.topic != topic:
-                    continue
-                found = True
-                if not paths:
-                    continue
-                schema = self._schema(c, channel)
-                if isinstance(schema, SchemaError):
-                    problems.append(
-                        MappingError(
-                            expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
-                            got=str(schema),
-                            where=topic,
-                            remedy="map another topic",
-                        )
-                    )
-                    continue
-                try:
-                    selections = tuple(resolve(schema, topic, path) for path in paths)
-                    decoders[(c, channel.id)] = ChannelDecoder(schema, selections)
-                except MappingError as error:
-                    problems.append(error)
-        if not found:
+        if topic not in self._by_topic:
             raise self._no_such_topic(topic)
+        for c, channel in self._by_topic[topic] if paths else ():
+            schema = self._schema(c, channel)
+            if isinstance(schema, SchemaError):
+                problems.append(
+                    MappingError(
+                        expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
+                        got=str(schema),
+                        where=topic,
+                        remedy="map another topic",
+                    )
+                )
+                continue
+            try:
+                selections = tuple(resolve(schema, topic, path) for path in paths)
+                decoders[(c, channel.id)] = ChannelDecoder(schema, selections)
+            except MappingError as error:
+                problems.append(error)
         if paths and not decoders:
             raise problems[0]
         # A second publisher of another type under the same topic lacks the fields: NaN there.
@@ -223,7 +292,7 @@ class ColumnarLog:
     def _no_such_topic(self, topic: str) -> MappingError:
         import difflib
 
-        names = [t.name for t in self.topics]
+        names = sorted(self._by_topic)
         near = difflib.get_close_matches(topic, names, n=3, cutoff=0.3) or names[:5]
         return MappingError(
             expected="a topic of the log",
@@ -234,38 +303,58 @@ class ColumnarLog:
 
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
-        overlapping = (
-            (c, container, span)
-            for c, container in enumerate(self.containers)
-            for span in container.spans
-            if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
-        )
-        for c, container, span in overlapping:
-            topic_of = {i: ch.topic for i, ch in container.channels.items() if ch.topic in plans and i in span.counts}
-            if not topic_of:
-                continue
-            block = self.load(c, span, frozenset(topic_of))
-            if block is None:
-                continue
-            keep = in_window(block.log_time_ns, start_ns, end_ns)
-            for id_, topic in topic_of.items():
-                mine = block.channel == id_
-                rows = np.flatnonzero(mine if keep is None else mine & keep)
-                if rows.size:
-                    parts[topic].append(self._decode(topic, plans[topic], c, span, id_, block, rows))
+        for c, container in enumerate(self.containers):
+            with container.meter.running():
+                for span in container.spans:
+                    if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
+                        self._collect_span(plans, c, span, (start_ns, end_ns), parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
-    def _decode(self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray) -> Columns:
+    def _collect_span(
+        self,
+        plans: Mapping[str, _Plan],
+        c: int,
+        span: Span,
+        window_ns: tuple[int | None, int | None],
+        parts: Mapping[str, list[Columns]],
+    ) -> None:
+        """Add what a span holds of the topics asked for."""
+        channels = self.containers[c].channels
+        want = frozenset(id_ for id_ in span.counts if channels[id_].topic in plans)
+        block = self.load(c, span, want) if want else None
+        if block is None:
+            return
+        keep = in_window(block.log_time_ns, *window_ns)
+        # By what the block holds: the span's counts may have come from an index that is wrong.
+        for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
+            topic = channels[id_].topic if id_ in channels else ""
+            rows = block.rows[id_] if keep is None else block.rows[id_][keep[block.rows[id_]]]
+            if topic in plans and rows.size:
+                columns = self._decode(topic, plans[topic], c, span, id_, block, rows)
+                if columns is not None:
+                    parts[topic].append(columns)
+
+    def _decode(
+        self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray
+    ) -> Columns | None:
+        """Decode some messages of a channel. The boundary: whatever escapes a decoder is the loss of these messages."""
         decoder = plan.decoders.get((c, id_))
-        if decoder is None:
-            fields = {s.path: missing_column(s, len(rows)) for s in plan.selections}
-        else:
-            fields = decoder.columns(block, rows)
+        try:
+            if decoder is None:
+                fields = {s.path: missing_column(s, len(rows)) for s in plan.selections}
+            else:
+                fields = decoder.columns(block, rows)
+        except Exception as error:  # noqa: BLE001
+            kind, text = told(error)
+            kind = "undecodable" if kind == "bad-chunk" else kind
+            what = f"{len(rows)} messages cannot be decoded: {text}"
+            self._partial[c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
+            return None
         if decoder is not None and decoder.undecodable:
             key = (c, id_, span.index)
             seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
             # Count by place in the channel: which other channels a block holds depends on what was asked for.
-            places = np.searchsorted(np.flatnonzero(block.channel == id_), decoder.undecodable)
+            places = np.searchsorted(block.rows[id_], decoder.undecodable)
             self._undecodable[key] = np.union1d(seen, places.astype(np.int64))
         return Columns(topic, block.log_time_ns[rows], block.publish_time_ns[rows], fields)
 
@@ -276,6 +365,15 @@ class _Plan:
 
     selections: tuple[Selection, ...]
     decoders: Mapping[tuple[int, int], ChannelDecoder]
+
+
+def _out_of_time(container: Container, spans: Sequence[Span]) -> Loss:
+    count = sum(sum(span.counts.values()) for span in spans)
+    start, end = min(s.start_ns for s in spans), max(s.end_ns for s in spans)
+    what = (
+        f"reading took longer than {container.meter.allowed_s:.3g} s: {count} messages of the rest are lost (--budget)"
+    )
+    return Loss("over-budget", what, str(container.path), start, end, count)
 
 
 def in_window(log_time_ns: IntArray, start_ns: int | None, end_ns: int | None) -> BoolArray | None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import mmap
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.logs.budget import BudgetError, Meter
+from pdhef_logtool.logs.byte_account import ByteAccount
+from pdhef_logtool.logs.byte_source import CutError, LocalFile
+from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
 # What the files of each format begin with.
@@ -19,6 +22,9 @@ ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
 #: Log times above this (unsigned in the file) cannot be held in int64 and are set to it.
 MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
+_LOSSES_OF_A_KIND = 20  # of one file; what comes behind them is told as one
+_IDS_TOLD = 5
+_TOLD_CHARACTERS = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +58,7 @@ class Span:
     counts: Mapping[int, int]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Block:
     """The messages of one span in file order, undecoded.
 
@@ -75,11 +81,23 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
+    @cached_property
+    def rows(self) -> dict[int, IntArray]:
+        """Rows by channel, ascending."""
+        if not len(self):
+            return {}
+        # 16 bits, where they are enough, sort much faster.
+        fit = self.channel.min() >= 0 and self.channel.max() < 1 << 16
+        order = np.argsort(self.channel.astype(np.uint16) if fit else self.channel, kind="stable")
+        ordered = self.channel[order]
+        firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
+        ends = [*firsts[1:], len(self)]
+        return {int(ordered[at]): order[at:end] for at, end in zip(firsts, ends, strict=True)}
+
     @property
     def counts(self) -> dict[int, int]:
         """Messages by channel."""
-        channels, counts = np.unique(self.channel, return_counts=True)
-        return dict(zip(channels.tolist(), counts.tolist(), strict=True))
+        return {channel: len(rows) for channel, rows in self.rows.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,6 +151,14 @@ class SpanDamageError(Exception):
     """A span cannot be decoded; caught inside this package and turned into a loss."""
 
 
+def told(error: Exception) -> tuple[str, str]:
+    """Return the kind of loss that an error makes, and what to tell of it: the one boundary's words."""
+    if isinstance(error, BudgetError):
+        return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
+    text = str(error) if isinstance(error, SpanDamageError | CutError) else f"{type(error).__name__}: {error}"
+    return "bad-chunk", " ".join(text.split())[:_TOLD_CHARACTERS]
+
+
 class Container(ABC):
     """One open file of a log. Opening it fills what stands below.
 
@@ -140,6 +166,8 @@ class Container(ABC):
     ----------
     path : the file as the user named it.
     channels : by their id in this file. spans : in file order. lost : damage found while the file was opened.
+    undeclared : messages by span that are not in its counts, as no record declares their channels.
+    meter : what reading may cost. account : where the file's bytes went; the spans' are told by who loads them.
     form : ``mcap``, ``rosbag1`` or ``sqlite3``.
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
@@ -152,22 +180,31 @@ class Container(ABC):
     distro = ""
     remedy = ""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, size: int, meter: Meter | None = None) -> None:
         self.path = path
         self.channels: dict[int, ChannelRecord] = {}
         self.spans: list[Span] = []
         self.lost: list[Loss] = []
+        self.undeclared: dict[int, int] = {}
+        self.meter = meter or Meter()
+        self.account = ByteAccount(size)
+        self._losses: dict[str, int] = {}  # how many of a kind
+        self._folded: dict[str, int] = {}  # where in ``lost`` those behind the first ones stand
 
     @abstractmethod
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
-        """Read a span's messages (of the channels in ``want`` at least); raises :class:`SpanDamageError`."""
+        """Read a span's messages (of the channels in ``want`` at least); whatever it raises is the loss of the span."""
+
+    @abstractmethod
+    def extent(self, span: Span) -> tuple[int, int]:
+        """Return the bytes [start, end) of a span, by which :attr:`account` counts it."""
 
     def attachments(self) -> Iterator[Attachment]:
         """Read the attachments; a damaged one is among the losses and left out."""
         yield from ()
 
     def metadata_records(self) -> Iterator[MetadataRecord]:
-        """Read the metadata records."""
+        """Read the metadata records; a damaged one is among the losses and left out."""
         yield from ()
 
     @abstractmethod
@@ -181,8 +218,19 @@ class Container(ABC):
     def lose(
         self, kind: str, what: str, start_ns: int | None = None, end_ns: int | None = None, count: int | None = None
     ) -> None:
-        """Note damage of this file."""
-        self.lost.append(Loss(kind, what, str(self.path), start_ns, end_ns, count))
+        """Note damage of this file; from the 21st of a kind on they are told as one."""
+        n = self._losses[kind] = self._losses.get(kind, 0) + 1
+        more = n - _LOSSES_OF_A_KIND
+        if more <= 0:
+            self.lost.append(Loss(kind, what, str(self.path), start_ns, end_ns, count))
+        elif more == 1:
+            self._folded[kind] = len(self.lost)
+            self.lost.append(Loss(kind, f"more of this kind: {what}", str(self.path), start_ns, end_ns, count))
+        else:
+            old = self.lost[self._folded[kind]]
+            total = None if old.count is None or count is None else old.count + count
+            text = f"{more} more of this kind, the last: {what}"
+            self.lost[self._folded[kind]] = Loss(kind, text, str(self.path), old.start_ns, end_ns, total)
 
     def drop_undeclared(self, called: str) -> None:
         """Take the messages of channels that the file does not declare out of the spans' counts, with a loss each."""
@@ -190,19 +238,24 @@ class Container(ABC):
             unknown = {c: n for c, n in span.counts.items() if c not in self.channels}
             if unknown:
                 count = sum(unknown.values())
-                what = f"{count} messages on {called.format(sorted(unknown))} that no readable record declares"
+                ids = f"{sorted(unknown)[:_IDS_TOLD]}{' and more' if len(unknown) > _IDS_TOLD else ''}"
+                what = f"{count} messages on {called.format(ids)} that no readable record declares"
                 self.lose("unknown-channel", what, span.start_ns, span.end_ns, count)
+                self.account.lose_share(self.extent(span), count / sum(span.counts.values()))
+                self.undeclared[i] = count
                 known = {c: n for c, n in span.counts.items() if c not in unknown}
                 self.spans[i] = Span(span.index, span.start_ns, span.end_ns, known)
 
 
-class MappedContainer(Container):
-    """A file that begins with ``magic`` (``magic_text`` in words), mapped into memory and walked once.
+class FileContainer(Container):
+    """A file that begins with ``magic`` (``magic_text`` in words), walked once from record to record.
 
     Parameters
     ----------
     path : file to read.
     shown_path : what to call it in messages (a decompressed copy has another name than its source).
+    undeclared : messages by span that are not in its counts, as no record declares their channels.
+    meter : what reading may cost; None = the default budget.
 
     Raises
     ------
@@ -212,27 +265,57 @@ class MappedContainer(Container):
     magic = b""
     magic_text = ""
 
-    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
-        super().__init__(shown_path or path)
-        with path.open("rb") as file:
-            if file.read(len(self.magic)) != self.magic:
+    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
+        self.source = LocalFile(path, shown_path)
+        super().__init__(shown_path or path, self.source.size, meter)
+        self.at = len(self.magic)  # where the walk is
+        try:
+            if self.source.size < self.at or self.source.read(0, self.at) != self.magic:
                 raise self.no_log(self.magic_text, "other content")
-            self._data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            self.account.decode(0, self.at)
+            with self.meter.running(self.source.size):
+                self._open()
+        except BaseException:
+            self.source.close()
+            raise
+
+    def _open(self) -> None:
+        """Walk the file. What escapes the walk loses the rest of the file from there on."""
         try:
             self._walk()
-        except BaseException:
-            self._data.close()
-            raise
+        except Exception as error:
+            if isinstance(error, PdhefError) and not isinstance(error, BudgetError):
+                raise
+            kind, text = told(error)
+            self.lose(kind, f"what follows byte {self.at} of {self.source.size} is lost: {text}", self.last_ns())
+            self.account.lose(self.at, self.source.size)
+            self.account.cut = True
+        self._finish()
+
+    def last_ns(self) -> int | None:
+        """End of the last span so far; None before the first."""
+        return self.spans[-1].end_ns if self.spans else None
+
+    def lose_record(self, start: int, end: int, error: Exception) -> None:
+        """Note that the record in bytes [start, end) cannot be read: the boundary of the walk."""
+        kind, text = told(error)
+        kind = "bad-record" if kind == "bad-chunk" else kind
+        self.lose(kind, f"the record at byte {start} is malformed: {text}")
+        self.account.lose(start, end)
 
     @abstractmethod
     def _walk(self) -> None:
-        """Fill channels, spans and losses."""
+        """Find channels, spans and losses, keeping :attr:`at` up to date."""
+
+    @abstractmethod
+    def _finish(self) -> None:
+        """Close what the walk left open, and check what only the whole file tells."""
 
     def close(self) -> None:
         """Release the file."""
-        self._data.close()
+        self.source.close()
 
 
 def block_from_lists(buffer: bytes | memoryview, *columns: Sequence[int]) -> Block:
-    """Build a block from Python lists, in the order of its columns."""
+    """Build a block from sequences of integers, in the order of its columns."""
     return Block(buffer, *(np.array(column, dtype=np.int64) for column in columns))

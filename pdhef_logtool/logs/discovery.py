@@ -5,11 +5,13 @@ from __future__ import annotations
 import glob
 import hashlib
 import os
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.records.errors import UsageError
 
 #: Suffixes that a search through folders takes for logs; a file that is named outright may have any.
@@ -54,8 +56,14 @@ def find_logs(arguments: Sequence[str]) -> list[LogInput]:
 
 
 def hash_log(path: Path) -> str:
-    """Return the sha256 of a log file, or of the names and contents of a log folder's files in order."""
-    if path.is_file():
+    """Return the sha256 of a log file, or of the names and contents of a log folder's files in order.
+
+    Raises
+    ------
+    LogError : It is neither a folder nor a regular file.
+    """
+    if not path.is_dir():
+        require_regular(path)
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     total = hashlib.sha256()
@@ -69,19 +77,36 @@ def hash_log(path: Path) -> str:
 def _expand(argument: str) -> Iterator[Path]:
     path = Path(argument)
     if path.is_dir():
-        yield from _search(path)
+        yield from _search(path, set())
     elif path.exists() or not glob.has_magic(argument):
         yield path
     else:
-        for name in sorted(glob.glob(argument, recursive=True)):  # noqa: PTH207 (the pattern may be absolute)
-            match = Path(name)
+        visited: set[str] = set()
+        for match in _matches(argument):
             if match.is_dir():
-                yield from _search(match)
+                yield from _search(match, visited)
             else:
                 yield match
 
 
-def _search(folder: Path) -> Iterator[Path]:
+def _matches(pattern: str) -> list[Path]:
+    """Return what a glob pattern stands for; ``**`` enters no folder by a link, which could lead round for ever."""
+    if "**" not in Path(pattern).parts:
+        return [Path(name) for name in sorted(glob.glob(pattern))]  # noqa: PTH207 (the pattern may be absolute)
+    parts = Path(pattern).parts
+    first = next(i for i, part in enumerate(parts) if glob.has_magic(part))
+    root = Path(*parts[:first])
+    below = str(Path(*(part if part == "**" else re.sub(r"\*\*+", "*", part) for part in parts[first:])))
+    found = (p for p in root.glob(below) if not any(x.startswith(".") for x in p.relative_to(root).parts))
+    return sorted(found, key=str)
+
+
+def _search(folder: Path, visited: set[str]) -> Iterator[Path]:
+    """Yield the logs below a folder, each folder once: links can lead back to where they lie."""
+    place = os.path.realpath(folder)
+    if place in visited:
+        return
+    visited.add(place)
     if (folder / ROSBAG2_METADATA).is_file():
         yield folder
         return
@@ -91,7 +116,7 @@ def _search(folder: Path) -> Iterator[Path]:
         if entry.name.startswith("."):
             continue
         if entry.is_dir():
-            yield from _search(entry)
+            yield from _search(entry, visited)
         elif _bare_name(entry.name) != entry.name:
             yield entry
 

@@ -6,14 +6,15 @@ channels that only its chunks declare, with chunks that no index names, or with 
 
 from __future__ import annotations
 
-import mmap
 import struct
 import zlib
+from array import array
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -22,40 +23,70 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Metadata, Schema
 
+from pdhef_logtool.logs.budget import BudgetError, Meter
+from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
     MCAP_MAGIC,
     Attachment,
     Block,
     ChannelRecord,
-    MappedContainer,
+    FileContainer,
     MetadataRecord,
     RawChunk,
     Span,
     SpanDamageError,
     block_from_lists,
+    told,
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
 
-if TYPE_CHECKING:
-    import zstandard
-
 _RECORD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
+_MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
+_INDEX_HEAD = struct.Struct("<9sHI")  # head of the record, channel, bytes of the pairs
+_U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 _FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
-_MAPPED_BYTES = 32 << 20  # pages of the file that may stay mapped, roughly
-_PAGES_AROUND_BYTES = 64 << 10  # Linux maps this much around a place that is read
-_LARGEST_CHUNK_BYTES = 4 << 30  # a larger claim is damage, not a chunk
+_CRC_BLOCK_BYTES = 4 << 20
+_CHUNK_HEAD_BYTES = 49 + 4  # with the longest name of a compression
+_RECORDS_A_CHECK = 256  # of the time that a walk takes
+_MESSAGES_A_CHECK = 1 << 16
+#: Plain numbers: comparing with the members of an enumeration takes longer than reading a record.
+_OP_MESSAGE, _OP_CHUNK, _OP_MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX)
+_OP_SCHEMA, _OP_CHANNEL, _OP_HEADER = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.HEADER)
+_DECLARATIONS = (_OP_SCHEMA, _OP_CHANNEL)
+_OP_STATISTICS = int(Opcode.STATISTICS)
+_SUMMARY_ONLY = frozenset(
+    int(op)
+    for op in (
+        Opcode.FOOTER,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.STATISTICS,
+        Opcode.METADATA_INDEX,
+        Opcode.SUMMARY_OFFSET,
+    )
+)
+_FIRST_PRIVATE = 0x80  # what is neither known nor private is no record of the format
 #: What stands before the payload of a message record.
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 
 
-class McapContainer(MappedContainer):
+@dataclass(frozen=True, slots=True)
+class _Extent:
+    """Bytes [at, end) of a chunk record or a run of message records; message indexes follow up to ``index_end``."""
+
+    at: int
+    end: int
+    is_chunk: bool
+    index_end: int
+
+
+class McapContainer(FileContainer):
     """One MCAP 1.0 file; its spans are chunks and runs of unchunked messages, in file order."""
 
     form = "mcap"
@@ -63,94 +94,112 @@ class McapContainer(MappedContainer):
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
 
-    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
+    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
         self.profile = ""
         self.library = ""
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
-        self._extents: list[tuple[int, int, bool, tuple[int, int]]] = []  # start, end, is chunk, its message indexes
+        self._extents: list[_Extent] = []
         self._attachment_at: list[tuple[int, int]] = []
         self._metadata_at: list[tuple[int, int]] = []
-        self._zstd: zstandard.ZstdDecompressor | None = None
-        self._touched_bytes = 0
-        super().__init__(path, shown_path)
+        self._indexed: list[int] | None = None  # where the chunks lie that the summary names
+        self._walked = _Walk(self)
+        super().__init__(path, shown_path, meter)
 
     def _walk(self) -> None:
-        data, size = self._data, len(self._data)
-        at = len(MCAP_MAGIC)
-        if at + 9 > size or data[at] != Opcode.HEADER:
-            raise self.no_log("a header record after the magic bytes", "none")
-        walk = _Walk(self)
+        source, size, walk = self.source, self.source.size, self._walked
         header_seen = False
-        while at < size:
-            if size - at == len(MCAP_MAGIC) and data[at:size] == MCAP_MAGIC:
+        records = 0
+        while self.at < size:
+            at = self.at
+            records += 1
+            if records % _RECORDS_A_CHECK == 0:
+                self.meter.check()
+            if size - at == len(MCAP_MAGIC) and source.read(at, len(MCAP_MAGIC)) == MCAP_MAGIC:
+                self.account.decode(at, size)
                 walk.closed = True
-                break
-            if at + 9 > size:
-                walk.cut(at)
-                break
-            opcode, length = _RECORD.unpack_from(data, at)
+                return
+            opcode, length = _RECORD.unpack(source.read(at, 9)) if at + 9 <= size else (0, 0)
             end = at + 9 + length
             if end > size or opcode == 0:
                 if not header_seen:
-                    raise self.no_log("a complete header record", "a record that runs past the end of the file")
+                    raise self.no_log("a complete header record", "none, or one that runs past the end of the file")
                 resume = self._next_indexed_chunk(at)
                 if resume is None:
                     walk.cut(at)
-                    break
+                    return
                 walk.skipped(at, resume)
-                at = resume
+                self.at = resume
                 continue
-            try:
-                if not header_seen:
-                    self._read_header(at + 9, length)
-                    header_seen = True
-                walk.record(opcode, at, at + 9, end)
-            except (struct.error, UnicodeDecodeError, ValueError, IndexError, McapError) as error:
-                walk.damaged_record(at, error)
-            # Reading a header maps the pages around it as well.
-            self._touched(min(end - at, _PAGES_AROUND_BYTES))
-            at = end
-        walk.finish()
+            if not header_seen:
+                if opcode != _OP_HEADER:
+                    raise self.no_log("a header record after the magic bytes", "none")
+                self._read_header(at, length)
+                header_seen = True
+            elif opcode == _OP_MESSAGE:
+                end = walk.messages(at)
+            else:
+                try:
+                    walk.record(opcode, at, end)
+                except Exception as error:  # noqa: BLE001 (whatever a record does, the next one is read)
+                    self.lose_record(at, end, error)
+            self.at = end
+        if not header_seen:
+            raise self.no_log("a header record after the magic bytes", "none")
+
+    def _finish(self) -> None:
+        self._walked.finish()
 
     def _read_header(self, at: int, length: int) -> None:
+        self.meter.budget.check("metadata_bytes", length, "the header record")
+        payload = self.source.read(at + 9, length)
         try:
-            (n,) = struct.unpack_from("<I", self._data, at)
-            (m,) = struct.unpack_from("<I", self._data, at + 4 + n)
-            profile = self._data[at + 4 : at + 4 + n].decode()
-            library = self._data[at + 8 + n : at + 8 + n + m].decode()
+            (n,) = _U32.unpack_from(payload, 0)
+            (m,) = _U32.unpack_from(payload, 4 + n)
+            self.profile = payload[4 : 4 + n].decode()
+            self.library = payload[8 + n : 8 + n + m].decode()
         except (struct.error, UnicodeDecodeError) as error:
             raise self.no_log("a header record with profile and library", "a malformed one") from error
         if 8 + n + m > length:
             raise self.no_log("a header record with profile and library", "a draft of the format before 1.0")
-        self.profile, self.library = profile, library
+        self.account.decode(at, at + 9 + length)
 
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Return the first chunk behind a damaged place that the summary names, or None."""
-        data, size = self._data, len(self._data)
+        if self._indexed is None:
+            self._indexed = self._indexed_chunks()
+        at = bisect_right(self._indexed, after)
+        return self._indexed[at] if at < len(self._indexed) else None
+
+    def _indexed_chunks(self) -> list[int]:
+        read, size = self.source.read, self.source.size
         foot = size - len(MCAP_MAGIC) - _FOOTER_BYTES
-        if foot <= after or data[foot] != Opcode.FOOTER or data[-len(MCAP_MAGIC) :] != MCAP_MAGIC:
-            return None
-        (at,) = struct.unpack_from("<Q", data, foot + 9)
+        if foot <= 0 or read(foot, 1)[0] != Opcode.FOOTER or read(size - len(MCAP_MAGIC), 8) != MCAP_MAGIC:
+            return []
+        (at,) = _U64.unpack(read(foot + 9, 8))
         found: list[int] = []
-        while after < at < foot and at + 9 <= foot:
-            opcode, length = _RECORD.unpack_from(data, at)
+        while at > 0 and at + 9 <= foot:
+            opcode, length = _RECORD.unpack(read(at, 9))
             if opcode == Opcode.CHUNK_INDEX and length >= 24 and at + 9 + length <= foot:
-                (offset,) = struct.unpack_from("<Q", data, at + 9 + 16)
-                if after < offset < foot and data[offset] == Opcode.CHUNK:
+                (offset,) = _U64.unpack(read(at + 9 + 16, 8))
+                if offset < foot and read(offset, 1)[0] == Opcode.CHUNK:
                     found.append(offset)
             at += 9 + length
-        return min(found) if found else None
+        return sorted(found)
 
     def add_schema(self, payload: bytes) -> None:
         """Take note of a schema record."""
+        self.meter.budget.check("metadata_bytes", len(payload), "a schema record")
         schema = Schema.read(ReadDataStream(BytesIO(payload)))
         self._schemas.setdefault(schema.id, schema)
 
     def add_channel(self, payload: bytes) -> None:
         """Take note of a channel record."""
+        self.meter.budget.check("metadata_bytes", len(payload), "a channel record")
         channel = Channel.read(ReadDataStream(BytesIO(payload)))
-        self._raw_channels.setdefault(channel.id, channel)
+        if channel.id not in self._raw_channels:
+            self.meter.budget.check("channels", len(self._raw_channels) + 1, f"channel {channel.id}")
+            self._raw_channels[channel.id] = channel
 
     def resolve_channels(self) -> None:
         """Join channels and schemas once all are known."""
@@ -171,40 +220,67 @@ class McapContainer(MappedContainer):
                 schema_id=channel.schema_id if schema else 0,
             )
 
+    def extent(self, span: Span) -> tuple[int, int]:
+        """Return the bytes of the span's record or records."""
+        extent = self._extents[span.index]
+        return extent.at, extent.end
+
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one span."""
         del want
-        start, end, is_chunk, index_extent = self._extents[span.index]
-        if not is_chunk:
-            self._touched(end - start)
-            return _scan_messages(self._data[start:end], None)
-        content = self.chunk_content(start, end)
-        indexed = self._indexed_messages(content, *index_extent)
-        return indexed if indexed is not None else _scan_messages(content, None)
+        extent = self._extents[span.index]
+        budget = self.meter.budget
+        if not extent.is_chunk:
+            budget.check("chunk_bytes", extent.end - extent.at, "messages without a chunk")
+            return self._scan(self.source.read(extent.at, extent.end - extent.at))
+        record = self.source.read(extent.at, extent.index_end - extent.at)
+        content = self.chunk_content(record, extent.end - extent.at)
+        block = _indexed_messages(content, record, extent.end - extent.at)
+        if block is None:
+            return self._scan(content)
+        budget.check("chunk_messages", len(block), "a chunk")
+        return block
 
-    def chunk_content(self, start: int, end: int) -> bytes:
-        """Decompress the chunk record in [start, end) and check its CRC."""
-        data = self._data
-        try:
-            _, _, size, crc = _CHUNK.unpack_from(data, start)
-            (n,) = struct.unpack_from("<I", data, start + 28)
-            compression = bytes(data[start + 32 : start + 32 + n]).decode()
-            (stored,) = struct.unpack_from("<Q", data, start + 32 + n)
-        except (struct.error, UnicodeDecodeError) as error:
-            raise SpanDamageError(f"malformed chunk header: {error}") from error
-        at = start + 40 + n
-        if at + stored > end:
-            raise SpanDamageError("the chunk's records run past its end")
-        if size > _LARGEST_CHUNK_BYTES:
-            raise SpanDamageError(f"it claims {size} bytes")
-        with memoryview(data) as view, view[at : at + stored] as compressed:
-            content = self._decompress(compression, compressed, size)
-        self._touched(end - start)
-        if len(content) != size:
-            raise SpanDamageError(f"decompressed to {len(content)} bytes instead of {size}")
+    def chunk_content(self, record: bytes, end: int) -> bytes:
+        """Decompress the chunk record that is the first ``end`` bytes, and check its CRC."""
+        size, crc, compression, at, stored = _chunk_head(record[:end])
+        content = decompress(compression, memoryview(record)[at : at + stored], size, self.meter.budget)
         if crc and zlib.crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
         return content
+
+    def _scan(self, content: bytes, declare: bool = False) -> Block:
+        """Walk the records of a chunk's content; notes the schemas and channels it declares if told to."""
+        offsets = array("q")
+        at, size = 0, len(content)
+        while at < size:
+            if at + 9 > size:
+                raise SpanDamageError("its last record is cut")
+            opcode, length = _RECORD.unpack_from(content, at)
+            end = at + 9 + length
+            if end > size:
+                raise SpanDamageError("its last record is cut")
+            if opcode == _OP_MESSAGE:
+                if length < 22:
+                    raise SpanDamageError("a message record is too short")
+                if len(offsets) % _MESSAGES_A_CHECK == 0:
+                    self.meter.budget.check("chunk_messages", len(offsets), "a chunk")
+                    self.meter.check()
+                offsets.append(at)
+            elif declare and opcode in _DECLARATIONS:
+                try:
+                    (self.add_schema if opcode == _OP_SCHEMA else self.add_channel)(content[at + 9 : end])
+                except BudgetError as error:
+                    self.lose(*told(error))
+            elif opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS:
+                raise SpanDamageError(f"it holds a record of kind {opcode}, which no chunk may")
+            at = end
+        if not offsets:
+            return block_from_lists(content, *[()] * 6)
+        block = _gather_messages(content, np.array(offsets, dtype=np.int64))
+        if block is None:
+            raise SpanDamageError("its records contradict each other")
+        return block
 
     def raw_chunk(self, span: Span, block: Block, kept: frozenset[int]) -> RawChunk | None:
         """Return the chunk that a block was read from, to be written to another file as it is.
@@ -219,8 +295,8 @@ class McapContainer(MappedContainer):
         The chunk; None if these messages are in none, or if it holds or declares anything that the other file has
         not.
         """
-        start, _, is_chunk, _ = self._extents[span.index]
-        if not is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
+        extent = self._extents[span.index]
+        if not extent.is_chunk or not len(block) or not kept.issuperset(np.unique(block.channel).tolist()):
             return None
         if max(int(block.log_time_ns.max()), int(block.publish_time_ns.max())) >= MAX_TIME_NS:
             return None  # the index could not hold the time that the message has
@@ -229,14 +305,11 @@ class McapContainer(MappedContainer):
         others = _records_between(content, np.append(0, block.offset + block.length), np.append(head, len(content)))
         if others is None or not all(self._is_known(op, content[at:end], kept) for op, at, end in others):
             return None
-        _, _, size, crc = _CHUNK.unpack_from(self._data, start)
-        (n,) = struct.unpack_from("<I", self._data, start + 28)
-        compression = self._data[start + 32 : start + 32 + n].decode()
-        (length,) = struct.unpack_from("<Q", self._data, start + 32 + n)
-        at = start + 40 + n
+        record = self.source.read(extent.at, extent.end - extent.at)
+        size, crc, compression, at, length = _chunk_head(record)
         return RawChunk(
             compression=compression,
-            stored=self._data[at : at + length],
+            stored=record[at : at + length],
             size=size,
             crc=crc or zlib.crc32(content),
             channel=block.channel,
@@ -258,79 +331,132 @@ class McapContainer(MappedContainer):
             return False
         return True
 
-    def _indexed_messages(self, content: bytes, start: int, end: int) -> Block | None:
-        """Return the chunk's messages through its message indexes; None if these do not name all of them."""
-        offsets: list[IntArray] = []
-        at = start
-        while at < end:
-            _, length = _RECORD.unpack_from(self._data, at)
-            (n,) = struct.unpack_from("<I", self._data, at + 11)
-            if n % 16 or n + 6 > length:
-                return None
-            pairs = np.frombuffer(self._data, dtype="<u8", count=n // 8, offset=at + 15)
-            offsets.append(pairs[1::2].astype(np.int64))
-            at += 9 + length
-        if not offsets:
-            return None
-        # Each channel's offsets ascend already, which the stable sort makes use of.
-        offset = np.sort(np.concatenate(offsets), kind="stable")
-        return _gather_messages(content, offset)
-
     def crc_up_to(self, end: int) -> int:
         """Return the CRC of the file's first bytes."""
-        crc = 0
-        for start in range(0, end, _MAPPED_BYTES):
-            with memoryview(self._data) as view, view[start : min(start + _MAPPED_BYTES, end)] as part:
-                crc = zlib.crc32(part, crc)
-            self._touched(_MAPPED_BYTES)
+        return self._crc(0, end)
+
+    def _crc(self, start: int, end: int) -> int:
+        crc: int = 0
+        for at in range(start, end, _CRC_BLOCK_BYTES):
+            crc = zlib.crc32(self.source.read(at, min(_CRC_BLOCK_BYTES, end - at)), crc)
         return crc
 
-    def _touched(self, size: int) -> None:
-        """Give pages of the mapped file back now and then: they count as memory of this process."""
-        self._touched_bytes += size
-        if self._touched_bytes >= _MAPPED_BYTES:
-            self._touched_bytes = 0
-            if hasattr(mmap, "MADV_DONTNEED"):
-                self._data.madvise(mmap.MADV_DONTNEED)
-
-    def _decompress(self, compression: str, stored: memoryview, size: int) -> bytes:
-        """Undo a chunk's compression; every library's own error becomes one."""
-        if compression == "":
-            return bytes(stored)
-        if compression == "zstd":
-            return self._decompress_zstd(stored, size)
-        if compression != "lz4":
-            raise SpanDamageError(f"unknown compression {compression!r}")
-        import lz4.frame
-
-        try:
-            return bytes(lz4.frame.decompress(stored))
-        except (RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
-            raise SpanDamageError(str(error)) from error
-
-    def _decompress_zstd(self, stored: memoryview, size: int) -> bytes:
-        import zstandard
-
-        if self._zstd is None:
-            self._zstd = zstandard.ZstdDecompressor()
-        try:
-            if zstandard.frame_content_size(stored) not in (-1, size):
-                raise SpanDamageError("its compressed content has another size")
-            return self._zstd.decompress(stored, max_output_size=size)
-        except (zstandard.ZstdError, OverflowError, MemoryError) as error:
-            raise SpanDamageError(str(error)) from error
-
     def attachments(self) -> Iterator[Attachment]:
-        """Read the attachments; a damaged one was reported by the walk and is left out."""
+        """Read the attachments; a damaged one is among the losses and left out."""
         for start, end in self._attachment_at:
-            record = AttachmentRecord.read(ReadDataStream(BytesIO(self._data[start:end])))
+            try:
+                payload = self.source.read(start + 9, end - start - 9)
+                record = AttachmentRecord.read(ReadDataStream(BytesIO(payload)))
+            except Exception as error:  # noqa: BLE001 (the boundary)
+                self.lose_record(start, end, error)
+                continue
+            self.account.decode(start, end)
             yield Attachment(record.name, record.media_type, record.data, record.log_time, record.create_time)
 
+    def note_attachment(self, at: int, end: int) -> None:
+        """Take note of an attachment record, checking its CRC without holding it."""
+        source = self.source
+        place = at + 9 + 16  # behind both times
+        name = ""
+        for width in (_U32, _U32):  # name and media type
+            (n,) = width.unpack(source.read(place, 4))
+            if place + 4 + n > end:
+                raise SpanDamageError("it runs past its end")
+            self.meter.budget.check("metadata_bytes", n, "an attachment's name")
+            text = source.read(place + 4, n).decode()
+            name, place = name or text, place + 4 + n
+        (n,) = _U64.unpack(source.read(place, 8))
+        place += 8 + n  # a record may be padded behind its last member
+        if place + 4 > end:
+            raise SpanDamageError("it runs past its end")
+        (crc,) = _U32.unpack(source.read(place, 4))
+        if crc and self._crc(at + 9, place) != crc:
+            self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
+            self.account.lose(at, end)
+            return
+        self._attachment_at.append((at, end))
+
     def metadata_records(self) -> Iterator[MetadataRecord]:
-        """Read the metadata records."""
+        """Read the metadata records; a damaged one is among the losses and left out."""
         for start, end in self._metadata_at:
-            record = Metadata.read(ReadDataStream(BytesIO(self._data[start:end])))
+            try:
+                record = self.read_metadata(start, end)
+            except Exception as error:  # noqa: BLE001 (the boundary)
+                self.lose_record(start, end, error)
+                continue
+            self.account.decode(start, end)
             yield MetadataRecord(record.name, dict(record.metadata))
+
+    def read_metadata(self, at: int, end: int) -> Metadata:
+        """Read a metadata record."""
+        self.meter.budget.check("metadata_bytes", end - at, "a metadata record")
+        metadata: Metadata = Metadata.read(ReadDataStream(BytesIO(self.source.read(at + 9, end - at - 9))))
+        return metadata
+
+    def note_metadata(self, at: int, end: int) -> None:
+        """Take note of a metadata record that can be read."""
+        self.read_metadata(at, end)
+        self._metadata_at.append((at, end))
+
+    def open_chunk(self, extent: _Extent, claimed: Span) -> None:
+        """Add a chunk by its content, which alone tells its channels or its messages; losing it if it is damaged.
+
+        Parameters
+        ----------
+        claimed : log times of its header; counts of its message indexes, empty where these cannot be trusted.
+        """
+        try:
+            record = self.source.read(extent.at, extent.end - extent.at)
+            block = self._scan(self.chunk_content(record, len(record)), declare=True)
+        except Exception as error:  # noqa: BLE001 (the boundary)
+            kind, text = told(error)
+            count = sum(claimed.counts.values()) or None
+            gone = f"{count} messages" if count else "an unknown number of messages"
+            what = f"{gone} lost in the chunk at byte {extent.at}: {text}"
+            self.lose(kind, what, claimed.start_ns, claimed.end_ns, count)
+            self.account.lose(extent.at, extent.index_end)
+            return
+        held = block.counts
+        missing = sum(max(n - held.get(id_, 0), 0) for id_, n in claimed.counts.items())
+        if missing:
+            what = f"{missing} messages that the index names are not in the chunk at byte {extent.at}"
+            self.lose("missing-messages", what, claimed.start_ns, claimed.end_ns, missing)
+            self.account.lose(extent.end, extent.index_end)
+        if not len(block):
+            self.account.decode(extent.at, extent.end)
+            return
+        first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
+        self.add_span(extent, Span(0, first, last + 1, held))
+
+    def add_span(self, extent: _Extent, span: Span) -> None:
+        """Add a span at the end."""
+        self._extents.append(extent)
+        self.spans.append(replace(span, index=len(self.spans)))
+
+    def check_statistics(self, total: int, by_channel: Mapping[int, int]) -> None:
+        """Hold what the walk found against the file's statistics.
+
+        An index can hide messages; the statistics are believed in nothing, but where they name others than the
+        indexes, every chunk is opened.
+        """
+        found: Counter[int] = Counter()
+        for span in self.spans:
+            found.update(span.counts)
+        if self.lost or (found.total() == total and (not by_channel or found == Counter(by_channel))):
+            return
+        spans, extents = self.spans[:], self._extents[:]
+        self.spans.clear()
+        self._extents.clear()
+        for extent, span in zip(extents, spans, strict=True):
+            if extent.is_chunk:
+                self.open_chunk(extent, span)
+            else:
+                self.add_span(extent, span)
+        held = sum(sum(span.counts.values()) for span in self.spans)
+        if held < total and not self.lost:
+            what = f"the file's statistics name {total} messages, of which {held} are there"
+            self.lose("missing-messages", what, count=total - held)
+            self.account.lose(*self._walked.statistics_at)
 
 
 class _Walk:
@@ -339,139 +465,263 @@ class _Walk:
     def __init__(self, container: McapContainer) -> None:
         self.of = container
         self.closed = False
-        self.data_end = False
+        self.cut_off = False
+        self.data_end: tuple[int, int] | None = None  # extent of the record
+        self.data_crc = 0
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
-        self.run_times: list[int] = []
+        self.run_times = (0, 0)
         self.run_counts: Counter[int] = Counter()
-        self.chunk: tuple[int, int, int, int] | None = None  # start, end, first log time, last log time
-        self.index_extent = (0, 0)
+        self.chunk: tuple[int, int] | None = None  # extent of the chunk whose message indexes are being read
+        self.index_end = 0
+        self.head = (0, 0, 0)  # of the chunk: first and last log time, size
         self.index_counts: Counter[int] = Counter()
-        self.last_ns: int | None = None
+        self.index_times: list[int] = []  # first and last time of each message index
+        self.index_sound = True
+        self.statistics: tuple[int, dict[int, int]] | None = None
+        self.statistics_at = (0, 0)
 
-    def record(self, opcode: int, at: int, start: int, end: int) -> None:
-        """Handle one complete record."""
-        of, data = self.of, self.of._data
-        if opcode == Opcode.MESSAGE_INDEX and self.chunk is not None:
-            (channel,) = struct.unpack_from("<H", data, start)
-            (n,) = struct.unpack_from("<I", data, start + 2)
-            self.index_counts[channel] += n // 16
-            self.index_extent = (self.index_extent[0] or at, end)
+    def record(self, opcode: int, at: int, end: int) -> None:
+        """Handle one complete record that is no message."""
+        of, source = self.of, self.of.source
+        if opcode == _OP_MESSAGE_INDEX:
+            self._message_index(at, end)
+            return
+        if self.chunk is not None and opcode == _FIRST_PRIVATE | _OP_MESSAGE_INDEX:
+            self.index_sound = False  # an index with one wrong bit: what it named is found in the chunk
             return
         self._end_chunk()
-        if opcode == Opcode.MESSAGE:
-            channel, _, log_time, _ = _MESSAGE.unpack_from(data, start)
-            self.run = (self.run[0] if self.run else at, end)
-            self.run_times.append(min(log_time, MAX_TIME_NS))
-            self.run_counts[channel] += 1
-            if end - self.run[0] >= _UNCHUNKED_RUN_BYTES:
-                self._end_run()
-            return
-        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+        if opcode in _DECLARATIONS:
             # Stay inside a run: writers interleave declarations with the messages.
-            (of.add_schema if opcode == Opcode.SCHEMA else of.add_channel)(data[start:end])
+            of.meter.budget.check("metadata_bytes", end - at, "a declaration")
+            (of.add_schema if opcode == _OP_SCHEMA else of.add_channel)(source.read(at + 9, end - at - 9))
+            of.account.decode(at, end)
             return
         self._end_run()
-        if opcode == Opcode.CHUNK:
-            first, last, _, _ = _CHUNK.unpack_from(data, start)
-            self.chunk = (start, end, min(first, MAX_TIME_NS), min(last, MAX_TIME_NS))
+        if opcode == _OP_CHUNK:
+            first, last, size, _ = _CHUNK.unpack(source.read(at + 9, _CHUNK.size))
+            self.chunk, self.index_end = (at, end), end
+            self.head = (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS), size)
+            self.index_counts, self.index_times, self.index_sound = Counter(), [], True
         elif opcode == Opcode.ATTACHMENT:
-            self._attachment(start, end)
+            of.note_attachment(at, end)
         elif opcode == Opcode.DATA_END:
-            self._data_end(at, start)
+            self._data_end(at, end)
         elif opcode == Opcode.METADATA:
-            Metadata.read(ReadDataStream(BytesIO(data[start:end])))
-            of._metadata_at.append((start, end))
+            of.note_metadata(at, end)
+        elif opcode == _OP_STATISTICS and self.data_end:
+            self._statistics(at, end)
+        elif opcode < _FIRST_PRIVATE and (opcode not in _SUMMARY_ONLY or not self.data_end):
+            raise SpanDamageError(f"no record of kind {opcode} may stand here")
+        elif opcode - _FIRST_PRIVATE == _OP_CHUNK and self._is_chunk(at, end):
+            raise SpanDamageError("a chunk whose kind has one wrong bit, which makes it a private record")
 
-    def _data_end(self, at: int, start: int) -> None:
-        """Check the CRC of the data section where nothing else protects the messages."""
-        self.data_end = True
+    def _is_chunk(self, at: int, end: int) -> bool:
+        """Tell whether a record of a private kind is laid out like a chunk."""
+        head = self.of.source.read(at, min(end - at, _CHUNK_HEAD_BYTES))
+        if len(head) < _CHUNK_HEAD_BYTES:
+            return False
+        (n,) = _U32.unpack_from(head, 37)
+        return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - at)
+
+    def messages(self, at: int) -> int:
+        """Take the message records from here on whose heads are read ahead; returns where the next record begins."""
         of = self.of
-        (crc,) = struct.unpack_from("<I", of._data, start)
-        if crc and not all(is_chunk for _, _, is_chunk, _ in of._extents) and of.crc_up_to(at) != crc:
-            what = "the CRC of the data section does not match: some unchunked messages are damaged"
-            of.lose("bad-data-crc", what)
+        self._end_chunk()
+        size = of.source.size
+        block, place = of.source.ahead(at, min(_MESSAGE_RECORD.size, size - at))
+        base = at - place
+        last = min(len(block), size - base) - _MESSAGE_RECORD.size
+        unpack, counts = _MESSAGE_RECORD.unpack_from, self.run_counts
+        start = self.run[0] if self.run else at
+        first_ns, last_ns = self.run_times if self.run else (MAX_TIME_NS, 0)
+        first = place
+        while place <= last and block[place] == _OP_MESSAGE:
+            _, length, channel, _, log_time = unpack(block, place)
+            end = place + 9 + length
+            if length < 22 or base + end > size:
+                break
+            if log_time < first_ns:
+                first_ns = log_time
+            if log_time > last_ns:
+                last_ns = log_time
+            counts[channel] += 1
+            place = end
+            if base + place - start >= _UNCHUNKED_RUN_BYTES:
+                break
+        if place == first:  # not even the first one is a message
+            end = at + 9 + int(_RECORD.unpack(of.source.read(at, 9))[1])
+            self._end_run()
+            of.lose_record(at, end, SpanDamageError("a message record is too short"))
+            return end
+        self.run, self.run_times = (start, base + place), (first_ns, last_ns)
+        if base + place - start >= _UNCHUNKED_RUN_BYTES:
+            self._end_run()
+        return base + place
 
-    def _attachment(self, start: int, end: int) -> None:
-        of, data = self.of, self.of._data
-        stream = ReadDataStream(BytesIO(data[start:end]))
-        record = AttachmentRecord.read(stream)
-        crc_at = start + stream.count - 4  # a record may be padded behind its last member
-        (crc,) = struct.unpack_from("<I", data, crc_at)
-        if crc and zlib.crc32(data[start:crc_at]) != crc:
-            of.lose("bad-attachment", f"attachment {record.name!r} has a wrong CRC", count=1)
+    def _message_index(self, at: int, end: int) -> None:
+        """Take note of the messages that an index names, as far as it can be right."""
+        of = self.of
+        if self.chunk is None:
+            self._end_run()
+            raise SpanDamageError("a message index without its chunk, whose messages are lost")
+        self.index_end = end
+        sound, self.index_sound = self.index_sound, False
+        block, place = of.source.ahead(at, min(end - at, _INDEX_HEAD.size))
+        _, channel, n = _INDEX_HEAD.unpack_from(block, place)
+        if n % 16 or at + 15 + n > end or channel in self.index_counts:
+            raise SpanDamageError(f"a message index that names {n / 16:.10g} messages of channel {channel}")
+        if n:
+            self.index_counts[channel] = n // 16
+            self.index_times.append(int.from_bytes(of.source.read(at + 15, 8), "little"))
+            self.index_times.append(int.from_bytes(of.source.read(at + 15 + n - 16, 8), "little"))
+        self.index_sound = sound
+        of.account.decode(at, end)
+
+    def _index_agrees(self) -> bool:
+        """Tell whether the chunk's indexes can be believed without opening it: where all that is told agrees."""
+        assert self.chunk is not None
+        size = self.head[2]
+        of = self.of
+        held = self.index_counts.total() * MESSAGE_HEAD.itemsize
+        if not self.index_sound or not held or held > size or size > of.meter.budget.chunk_bytes:
+            return False
+        if not self.index_counts.keys() <= of._raw_channels.keys():
+            return False
+        return self._times_agree(min(self.index_times), max(self.index_times)) or self._times_agree(*self._all_times())
+
+    def _times_agree(self, first: int, last: int) -> bool:
+        return (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS)) == self.head[:2]
+
+    def _all_times(self) -> tuple[int, int]:
+        """Return the first and the last time in the chunk's indexes, which need not be in order."""
+        assert self.chunk is not None
+        record = self.of.source.read(self.chunk[1], self.index_end - self.chunk[1])
+        pairs = _index_pairs(record, 0)
+        times = np.concatenate([p[::2] for p in pairs or ()] or [np.zeros(1, dtype=np.uint64)])
+        return int(times.min()), int(times.max())
+
+    def _data_end(self, at: int, end: int) -> None:
+        """Note the CRC of the data section."""
+        self.data_end = (at, end)
+        (self.data_crc,) = _U32.unpack(self.of.source.read(at + 9, 4))
+        self.of.account.decode(at, end)
+
+    def _check_data(self) -> None:
+        """Check the CRC of the data section where nothing else protects the messages, or tells of missing ones."""
+        of = self.of
+        if self.data_end is None or not self.data_crc or of.lost:
             return
-        of._attachment_at.append((start, end))
+        protected = self.statistics is not None and all(extent.is_chunk for extent in of._extents)
+        if not protected and of.crc_up_to(self.data_end[0]) != self.data_crc:
+            what = "the CRC of the data section does not match: some messages are damaged or missing"
+            of.lose("bad-data-crc", what)
+            of.account.lose(*self.data_end)
+
+    def _statistics(self, at: int, end: int) -> None:
+        """Note how many messages the file claims by channel."""
+        payload = self.of.source.read(at + 9, min(end - at - 9, 46 + 10 * (1 << 16)))
+        (total,), (n,) = _U64.unpack_from(payload, 0), _U32.unpack_from(payload, 42)
+        entries = np.frombuffer(payload, dtype=np.dtype([("id", "<u2"), ("n", "<u8")]), count=n // 10, offset=46)
+        counts = {c: k for c, k in zip(entries["id"].tolist(), entries["n"].tolist(), strict=True) if k}
+        self.statistics, self.statistics_at = (total, counts), (at, end)
 
     def _end_run(self) -> None:
         if self.run is None:
             return
-        of = self.of
-        times = self.run_times
-        of._extents.append((*self.run, False, (0, 0)))
-        of.spans.append(Span(len(of.spans), min(times), max(times) + 1, dict(self.run_counts)))
-        self.last_ns = max(times)
-        self.run, self.run_times, self.run_counts = None, [], Counter()
+        first, last = (min(t, MAX_TIME_NS) for t in self.run_times)
+        self.of.add_span(_Extent(*self.run, False, self.run[1]), Span(0, first, last + 1, dict(self.run_counts)))
+        self.run, self.run_counts = None, Counter()
 
     def _end_chunk(self, index_complete: bool = True) -> None:
         """Close a chunk; open it now if only its content tells its channels or its messages."""
         if self.chunk is None:
             return
-        of = self.of
-        start, end, first, last = self.chunk
-        counts: Mapping[int, int] = dict(self.index_counts)
-        extent, known = self.index_extent, set(of._raw_channels)
-        self.chunk, self.index_extent, self.index_counts = None, (0, 0), Counter()
-        index = len(of.spans)
-        if not index_complete or not counts or not set(counts) <= known:
-            try:
-                content = of.chunk_content(start, end)
-                block = _scan_messages(content, of)
-            except SpanDamageError:
-                # A read of this span reports the damage; without its content the span is kept as it is indexed.
-                pass
-            else:
-                if not len(block):
-                    return
-                counts = block.counts
-                first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        of._extents.append((start, end, True, extent))
-        of.spans.append(Span(index, first, last + 1, counts))
-        self.last_ns = last
+        first, last, size = self.head
+        sound = self._index_agrees()
+        fits = self.index_sound and self.index_counts.total() * MESSAGE_HEAD.itemsize <= size
+        span = Span(0, first, last + 1, dict(self.index_counts) if fits else {})
+        extent, self.chunk = _Extent(*self.chunk, True, self.index_end), None
+        if sound and index_complete:
+            self.of.add_span(extent, span)
+        else:
+            self.of.open_chunk(extent, span)
 
     def cut(self, at: int) -> None:
         """Note that the file ends inside a record."""
+        of = self.of
         self._end_chunk(index_complete=False)
         self._end_run()
-        what = f"the file ends inside a record at byte {at} of {len(self.of._data)}; what follows is gone"
-        self.of.lose("truncated", what, self._after_last())
+        self.cut_off = True
+        what = f"the file ends inside a record at byte {at} of {of.source.size}; what follows is gone"
+        of.lose("truncated", what, of.last_ns())
+        of.account.lose(at, of.source.size)
+        of.account.cut = True
 
     def skipped(self, at: int, resume: int) -> None:
         """Note that a damaged stretch was stepped over."""
+        of = self.of
         self._end_chunk(index_complete=False)
         self._end_run()
         what = f"bytes {at} to {resume} hold no readable record; reading resumes at the next chunk"
-        self.of.lose("bad-record", what, self._after_last())
-
-    def damaged_record(self, at: int, error: Exception) -> None:
-        """Note that one record cannot be parsed."""
-        self.of.lose("bad-record", f"the record at byte {at} is malformed: {error}")
-
-    def _after_last(self) -> int | None:
-        return None if self.last_ns is None else self.last_ns + 1
+        of.lose("bad-record", what, of.last_ns())
+        of.account.lose(at, resume)
 
     def finish(self) -> None:
         """Close what is open and check what only the whole file tells."""
-        self._end_chunk()
-        self._end_run()
         of = self.of
+        self._end_chunk(index_complete=self.closed)
+        self._end_run()
         if self.closed and not self.data_end:
-            if not of.spans:
+            if not of.spans and all(loss.kind == "bad-record" for loss in of.lost):
                 raise of.no_log("an MCAP 1.0 file", "a draft of the format before 1.0")
             of.lose("bad-record", "the data end record is missing")
-        if not self.closed and not any(loss.kind == "truncated" for loss in of.lost):
-            of.lose("truncated", "the file ends without its closing magic bytes", self._after_last())
+            of.account.cut = True
+        if not self.closed and not of.account.cut:
+            of.lose("truncated", "the file ends without its closing magic bytes", of.last_ns())
+            of.account.cut = True
         of.resolve_channels()
+        self._check_data()
+        if self.statistics is not None:
+            of.check_statistics(*self.statistics)
+            of.resolve_channels()
         of.drop_undeclared("channels {}")
+
+
+def _chunk_head(record: bytes) -> tuple[int, int, str, int, int]:
+    """Return size, CRC, compression, and place and length of the stored bytes of a chunk record."""
+    try:
+        _, _, size, crc = _CHUNK.unpack_from(record, 9)
+        (n,) = _U32.unpack_from(record, 37)
+        compression = record[41 : 41 + n].decode()
+        (stored,) = _U64.unpack_from(record, 41 + n)
+    except (struct.error, UnicodeDecodeError) as error:
+        raise SpanDamageError(f"malformed chunk header: {error}") from error
+    if 49 + n + stored > len(record):
+        raise SpanDamageError("the chunk's records run past its end")
+    return size, crc, compression, 49 + n, stored
+
+
+def _index_pairs(record: bytes, at: int) -> list[IntArray] | None:
+    """Return time and offset in turn (uint64) of each message index from a byte on; None if one is malformed."""
+    found: list[IntArray] = []
+    while at < len(record):
+        opcode, length = _RECORD.unpack_from(record, at)
+        (n,) = _U32.unpack_from(record, at + 11)
+        if opcode != _OP_MESSAGE_INDEX or n % 16 or n + 6 > length:
+            return None
+        found.append(np.frombuffer(record, dtype="<u8", count=n // 8, offset=at + 15))
+        at += 9 + length
+    return found
+
+
+def _indexed_messages(content: bytes, record: bytes, at: int) -> Block | None:
+    """Return a chunk's messages through its message indexes; None if these do not name all of them."""
+    pairs = _index_pairs(record, at)
+    if not pairs:
+        return None
+    # Each channel's offsets ascend already, which the stable sort makes use of.
+    offset = np.sort(np.concatenate([p[1::2].astype(np.int64) for p in pairs]), kind="stable")
+    return _gather_messages(content, offset) if offset.size else None
 
 
 def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
@@ -483,15 +733,17 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
     heads = np.ndarray((n - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))[offset]
     heads = heads.view(MESSAGE_HEAD)
+    if (heads["op"] != _OP_MESSAGE).any() or (heads["size"] > n).any():
+        return None
     size = heads["size"].astype(np.int64)
     ends = offset + (9 + size)
-    if (heads["op"] != Opcode.MESSAGE).any() or (size < 22).any() or (ends > n).any():
+    if (size < 22).any() or (ends > n).any():
         return None
     starts = np.append(offset, n)
     ends = np.append(0, ends)
     if (starts != ends).any():
         others = _records_between(content, ends, starts)
-        if others is None or any(opcode == Opcode.MESSAGE for opcode, _, _ in others):
+        if others is None or any(opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS for opcode, _, _ in others):
             return None
     latest = np.uint64(MAX_TIME_NS)
     return Block(
@@ -519,34 +771,3 @@ def _records_between(content: bytes, starts: IntArray, ends: IntArray) -> list[t
         if at != end:
             return None
     return found
-
-
-def _scan_messages(content: bytes, declare: McapContainer | None) -> Block:
-    """Walk the records of a chunk's content, noting the schemas and channels it declares."""
-    columns: tuple[list[int], ...] = ([], [], [], [], [], [])
-    channels, logs, publishes, sequences, offsets, lengths = columns
-    at, size = 0, len(content)
-    while at < size:
-        if at + 9 > size:
-            raise SpanDamageError("its last record is cut")
-        opcode, length = _RECORD.unpack_from(content, at)
-        start, end = at + 9, at + 9 + length
-        if end > size:
-            raise SpanDamageError("its last record is cut")
-        if opcode == Opcode.MESSAGE:
-            if length < 22:
-                raise SpanDamageError("a message record is too short")
-            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(content, start)
-            channels.append(channel)
-            sequences.append(sequence)
-            logs.append(min(log_time, MAX_TIME_NS))
-            publishes.append(min(publish_time, MAX_TIME_NS))
-            offsets.append(start + 22)
-            lengths.append(length - 22)
-        elif declare is not None and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            try:
-                (declare.add_schema if opcode == Opcode.SCHEMA else declare.add_channel)(content[start:end])
-            except (struct.error, UnicodeDecodeError, ValueError, McapError) as error:
-                raise SpanDamageError(f"malformed declaration: {error}") from error
-        at = end
-    return block_from_lists(content, channels, logs, publishes, sequences, offsets, lengths)

@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, Meter
+from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.compression import decompress_file, decompress_message
 from pdhef_logtool.logs.container import (
     MCAP_MAGIC,
     ROSBAG1_MAGIC,
@@ -20,10 +23,10 @@ from pdhef_logtool.logs.container import (
     Container,
     MetadataRecord,
     Span,
-    SpanDamageError,
+    told,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -32,23 +35,27 @@ _WHAT_IS_A_LOG = "an MCAP file, a ROS 1 bag, a rosbag2 database or a rosbag2 fol
 _REMEDY = "give the recording itself"
 
 
-def open_log(path: Path | str) -> DriveLog:
+def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET) -> DriveLog:
     """Open a log, detected by its content.
 
     MCAP, ROS 1 bag (2.0), rosbag2 SQLite database, each also as a zstd-compressed file; a rosbag2 folder with its
     ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file.
 
+    Parameters
+    ----------
+    budget : what reading it may cost; what claims more is among the log's losses.
+
     Raises
     ------
-    LogError : the path is missing or is no log.
+    LogError : the path is missing, no regular file, or no log.
     """
-    path = Path(path)
+    path, meter = Path(path), Meter(budget)
     try:
         if path.is_dir():
-            return _open_folder(path)
+            return _open_folder(path, meter)
         if not path.exists():
             raise LogError(expected=_WHAT_IS_A_LOG, got="no such file", where=str(path), remedy="check the path")
-        container = _open_file(path)
+        container = _open_file(path, meter)
     except OSError as error:
         raise LogError(
             expected="a readable file",
@@ -56,6 +63,10 @@ def open_log(path: Path | str) -> DriveLog:
             where=str(path),
             remedy="check its permissions",
         ) from error
+    except PdhefError:
+        raise
+    except Exception as error:
+        raise LogError(expected=_WHAT_IS_A_LOG, got=told(error)[1], where=str(path), remedy=_REMEDY) from error
     kind = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[container.form]
     return ColumnarLog(path, kind, [container], distro=container.distro)
 
@@ -76,90 +87,88 @@ def looks_like_log(path: Path) -> bool:
     return head.startswith((MCAP_MAGIC, ROSBAG1_MAGIC, SQLITE_MAGIC))
 
 
-def _open_file(path: Path) -> Container:
+def _open_file(path: Path, meter: Meter) -> Container:
     """Open one storage file."""
-    with path.open("rb") as file:
-        head = file.read(_MAGIC_BYTES)
+    head = _head_of(path)
     if head.startswith(_ZSTD):
-        return _open_compressed(path)
-    return _open_plain(path, path, head)
+        return _open_compressed(path, meter)
+    return _open_plain(path, path, head, meter)
 
 
-def _open_plain(path: Path, shown_path: Path, head: bytes) -> Container:
+def _head_of(path: Path) -> bytes:
+    require_regular(path)
+    with path.open("rb") as file:
+        return file.read(_MAGIC_BYTES)
+
+
+def _open_plain(path: Path, shown_path: Path, head: bytes, meter: Meter) -> Container:
     if head.startswith(MCAP_MAGIC):
         from pdhef_logtool.logs.mcap_log import McapContainer
 
-        return McapContainer(path, shown_path)
+        return McapContainer(path, shown_path, meter)
     if head.startswith(ROSBAG1_MAGIC):
         from pdhef_logtool.logs.rosbag1_log import Rosbag1Container
 
-        return Rosbag1Container(path, shown_path)
+        return Rosbag1Container(path, shown_path, meter)
     if head.startswith(SQLITE_MAGIC):
         from pdhef_logtool.logs.rosbag2_sqlite_log import SqliteContainer
 
-        return SqliteContainer(path, shown_path)
+        return SqliteContainer(path, shown_path, meter)
     got = "an empty file" if not head else "a file that is none of these"
     raise LogError(expected=_WHAT_IS_A_LOG, got=got, where=str(shown_path), remedy=_REMEDY)
 
 
-def _open_compressed(path: Path) -> Container:
+def _open_compressed(path: Path, meter: Meter) -> Container:
     """Decompress a file to a temporary one and open that."""
-    import zstandard
-
     folder = tempfile.TemporaryDirectory(prefix="pdhef-")
     try:
         copy = Path(folder.name) / path.stem
-        cut: Loss | None = None
-        with path.open("rb") as source, copy.open("wb") as target:
-            try:
-                zstandard.ZstdDecompressor().copy_stream(source, target)
-            except zstandard.ZstdError as error:
-                cut = Loss("truncated", f"the compressed file is damaged: {error}", str(path))
-        with copy.open("rb") as file:
-            head = file.read(_MAGIC_BYTES)
-        return _TemporaryContainer(_open_plain(copy, path, head), folder, cut)
+        with meter.running(path.stat().st_size):
+            cut = decompress_file(path, copy, meter)
+        return _TemporaryContainer(_open_plain(copy, path, _head_of(copy), meter), folder, cut)
     except BaseException:
         folder.cleanup()
         raise
 
 
-def _open_folder(path: Path) -> ColumnarLog:
+def _open_folder(path: Path, meter: Meter) -> ColumnarLog:
     if (path / "metadata.yaml").is_file():
-        return _open_rosbag2_folder(path)
+        return _open_rosbag2_folder(path, meter)
     logs = [p for p in sorted(path.iterdir()) if p.is_file() and looks_like_log(p)]
     if len(logs) != 1:
         got = "a folder without a log" if not logs else f"a folder of {len(logs)} logs without metadata.yaml"
         raise LogError(
             expected=_WHAT_IS_A_LOG, got=got, where=str(path), remedy="name one recording" if logs else _REMEDY
         )
-    container = _open_file(logs[0])
+    container = _open_file(logs[0], meter)
     kind = {"mcap": "rosbag2-mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[container.form]
     return ColumnarLog(path, kind, [container], distro=container.distro)
 
 
-def _read_metadata(path: Path) -> Mapping[str, Any]:
+def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
     from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
 
-    where = str(path / "metadata.yaml")
+    file = path / "metadata.yaml"
+    budget.check("metadata_bytes", file.stat().st_size, str(file))
     try:
-        document = YAML(typ="safe").load((path / "metadata.yaml").read_text(encoding="utf-8"))
+        document = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
         information = document["rosbag2_bagfile_information"]
         files = information["relative_file_paths"]
-    except (YAMLError, KeyError, TypeError, ValueError) as error:
+    except Exception as error:
         raise LogError(
             expected="rosbag2_bagfile_information with relative_file_paths",
             got=f"a file without ({type(error).__name__})",
-            where=where,
+            where=str(file),
             remedy="re-index the folder with ros2 bag reindex, or give the storage file itself",
         ) from error
     if not isinstance(files, list) or not isinstance(information, dict):
-        raise LogError(expected="a list of relative_file_paths", got=repr(files), where=where, remedy=_REMEDY)
+        got = type(files).__name__
+        raise LogError(expected="a list of relative_file_paths", got=got, where=str(file), remedy=_REMEDY)
     return information
 
 
-def _open_rosbag2_folder(path: Path) -> ColumnarLog:
-    information = _read_metadata(path)
+def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
+    information = _read_metadata(path, meter.budget)
     per_message = str(information.get("compression_mode") or "").lower() == "message"
     encodings = _declared_encodings(information)
     containers: list[Container] = []
@@ -172,9 +181,12 @@ def _open_rosbag2_folder(path: Path) -> ColumnarLog:
                 lost.append(Loss("missing-file", f"{name} is named in metadata.yaml and absent", str(path)))
                 continue
             try:
-                container = _open_file(file)
+                container = _open_file(file, meter)
             except LogError as error:
                 lost.append(Loss("bad-file", f"expected {error.expected}, got {error.got}", str(file)))
+                continue
+            except Exception as error:  # noqa: BLE001 (one file of several)
+                lost.append(Loss("bad-file", told(error)[1], str(file)))
                 continue
             forms.add(container.form)
             containers.append(_Rosbag2Container(container, per_message, encodings))
@@ -191,10 +203,15 @@ def _open_rosbag2_folder(path: Path) -> ColumnarLog:
 
 
 def _storage_file(folder: Path, name: str) -> Path | None:
-    """Find a file that metadata.yaml names: as given, by its last part, or with the suffix of file compression."""
-    for candidate in (folder / name, folder / Path(name).name):
+    """Find a file that metadata.yaml names: as given, by its last part, or with the suffix of file compression.
+
+    A name that leads out of the folder counts by its last part only.
+    """
+    given = Path(name)
+    inside = not given.is_absolute() and ".." not in given.parts
+    for candidate in (folder / given if inside else folder / given.name, folder / given.name):
         for file in (candidate, candidate.with_name(candidate.name + ".zstd")):
-            if file.is_file():
+            if file.exists() and not file.is_dir():
                 return file
     return None
 
@@ -216,10 +233,14 @@ class _Wrapped(Container):
         self.container = container
         self.path, self.form, self.distro = container.path, container.form, container.distro
         self.channels, self.spans, self.lost = container.channels, container.spans, container.lost
-        self.selective = container.selective
+        self.undeclared = container.undeclared
+        self.meter, self.account, self.selective = container.meter, container.account, container.selective
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         return self.container.load(span, want)
+
+    def extent(self, span: Span) -> tuple[int, int]:
+        return self.container.extent(span)
 
     def attachments(self) -> Iterator[Attachment]:
         return self.container.attachments()
@@ -232,12 +253,14 @@ class _Wrapped(Container):
 
 
 class _TemporaryContainer(_Wrapped):
-    """A container in a temporary folder that goes with it."""
+    """A container in a temporary folder that goes with it; ``cut`` says why decompressing stopped early."""
 
-    def __init__(self, container: Container, folder: tempfile.TemporaryDirectory[str], cut: Loss | None) -> None:
+    def __init__(self, container: Container, folder: tempfile.TemporaryDirectory[str], cut: str) -> None:
         super().__init__(container)
         self._folder = folder
-        self.lost = [*([cut] if cut else []), *container.lost]
+        if cut:
+            self.container.lose("truncated", cut)
+            self.account.cut = True
 
     def close(self) -> None:
         super().close()
@@ -259,15 +282,12 @@ class _Rosbag2Container(_Wrapped):
         block = self.container.load(span, want)
         if not self._per_message:
             return block
-        import zstandard
-
-        decompressor = zstandard.ZstdDecompressor()
         payloads: list[bytes] = []
-        try:
-            for at, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
-                payloads.append(decompressor.decompress(bytes(block.buffer[at : at + n])))
-        except zstandard.ZstdError as error:
-            raise SpanDamageError(f"a compressed message is damaged: {error}") from error
+        size = 0
+        for at, n in zip(block.offset.tolist(), block.length.tolist(), strict=True):
+            payloads.append(decompress_message(block.buffer[at : at + n], self.meter.budget))
+            size += len(payloads[-1])
+            self.meter.budget.check("chunk_bytes", size, "compressed messages")
         length = np.array([len(p) for p in payloads], dtype=np.int64)
         offset = np.cumsum(length) - length
         return replace(block, buffer=b"".join(payloads), offset=offset, length=length)

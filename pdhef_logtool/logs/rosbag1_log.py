@@ -5,33 +5,54 @@ Bags without an index are walked like any other, so that an unindexed bag gives 
 
 from __future__ import annotations
 
-import bz2
 import contextlib
-import mmap
 import struct
+from array import array
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from pdhef_logtool.logs.budget import Meter
+from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
     ROSBAG1_MAGIC,
     Block,
     ChannelRecord,
-    MappedContainer,
+    FileContainer,
     Span,
     SpanDamageError,
     block_from_lists,
+    told,
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
 
-_OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CONNECTION = 2, 3, 4, 5, 7
+_OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
 _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
+_ZERO_BLOCK_BYTES = 1 << 20
+_LEAST_MESSAGE_BYTES = 8 + 3 * 4 + len(b"op=") + 1 + len(b"conn=") + 4 + len(b"time=") + 8
+_RECORDS_A_CHECK = 256  # of the time that a walk takes
+_MESSAGES_A_CHECK = 1 << 16
 
 
-class Rosbag1Container(MappedContainer):
+@dataclass(slots=True)
+class _Chunk:
+    """A chunk record in bytes [at, end) and what its index records tell."""
+
+    at: int
+    start: int  # of the stored bytes
+    end: int
+    compression: str
+    size: int
+    counts: Counter[int] = field(default_factory=Counter)
+    first_ns: int = 0
+    last_ns: int = 0
+
+
+class Rosbag1Container(FileContainer):
     """One ROS 1 bag of format 2.0, its connections as channels."""
 
     form = "rosbag1"
@@ -39,150 +60,246 @@ class Rosbag1Container(MappedContainer):
     magic_text = "'#ROSBAG V2.0' at its start"
     remedy = "is it a ROS 1 bag?"
 
-    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
-        self._chunks: list[tuple[str, int, int, int]] = []  # compression, uncompressed size, start, end
-        super().__init__(path, shown_path)
+    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
+        self._chunks: list[_Chunk] = []
+        self._found = 0
+        self._pending: _Chunk | None = None  # the chunk whose index records are being read
+        self._header: tuple[int, int] | None = None  # where the index begins, and how many chunks there are
+        self._infos: dict[int, Counter[int]] = {}  # counts by connection of the chunk at a byte, as the bag's end says
+        super().__init__(path, shown_path, meter)
 
     def _walk(self) -> None:
-        data, size = self._data, len(self._data)
-        at, index_at = len(self.magic), 0
-        pending: list[tuple[str, int, int, int]] = []  # the chunk whose index records are being read
-        times: list[int] = []
-        counts: Counter[int] = Counter()
-        header_seen = False
-
-        def close_chunk() -> None:
-            if pending:
-                self._add_chunk(pending.pop(), times, counts)
-            times.clear()
-            counts.clear()
-
-        while at < size:
-            record = _record_at(data, at, size)
+        size = self.source.size
+        records = 0
+        while self.at < size:
+            at = self.at
+            records += 1
+            if records % _RECORDS_A_CHECK == 0:
+                self.meter.check()
+            record = self._record_at(at)
             if record is None:
+                index_at = self._header[0] if self._header else 0
                 padded_to = index_at if at < index_at <= size else size
-                if not any(data[at:padded_to]):
-                    at = padded_to  # some writers pad with zeros behind the last chunk or the last record
+                if self._is_zero(at, padded_to):
+                    self.at = padded_to  # some writers pad with zeros behind the last chunk or the last record
                     continue
-                if not header_seen:
+                if self._header is None:
                     raise self.no_log("a complete bag header record", "a cut or malformed one")
-                close_chunk()
+                self._close_chunk(complete=False)
                 what = f"the file ends inside a record at byte {at} of {size}; what follows is gone"
-                self.lose("truncated", what, self._end_ns())
-                break
+                self.lose("truncated", what, self.last_ns())
+                self.account.lose(at, size)
+                self.account.cut = True
+                return
             fields, start, end = record
-            op = fields.get("op", b"\0")[0]
             try:
-                if op == _OP_BAG_HEADER:
-                    header_seen = True
-                    index_at = int.from_bytes(fields["index_pos"], "little")
-                elif op == _OP_CHUNK:
-                    close_chunk()
-                    pending.append((fields["compression"].decode(), _U32.unpack(fields["size"])[0], start, end))
-                elif op == _OP_INDEX and pending:
-                    connection, stamps = _index_record(fields, data[start:end])
-                    counts[connection] += len(stamps)
-                    times.extend(stamps)
-                elif op == _OP_CONNECTION:
-                    self._add_connection(fields, data[start:end])
-            except (KeyError, struct.error, ValueError, IndexError) as error:
-                self.lose("bad-record", f"the record at byte {at} is malformed: {error}")
-            at = end
-        if not header_seen:
+                self._take(fields, at, start, end)
+            except Exception as error:  # noqa: BLE001 (whatever a record does, the next one is read)
+                self.lose_record(at, end, error)
+            self.at = end
+
+    def _take(self, fields: Mapping[str, bytes], at: int, start: int, end: int) -> None:
+        """Handle one complete record."""
+        op = _op(fields)
+        budget = self.meter.budget
+        if op == _OP_INDEX and self._pending is not None:
+            budget.check("metadata_bytes", end - start, "an index record")
+            self._index_record(self._pending, fields, self.source.read(start, end - start))
+            self.account.decode(at, end)
+            return
+        self._close_chunk()
+        if op == _OP_CHUNK:
+            compression, (size,) = fields["compression"].decode(), _U32.unpack(fields["size"])
+            self._pending = _Chunk(at, start, end, compression, size)
+            return
+        if op == _OP_BAG_HEADER:
+            self._header = (int.from_bytes(fields["index_pos"], "little"), _U32.unpack(fields["chunk_count"])[0])
+        elif op == _OP_CONNECTION:
+            budget.check("metadata_bytes", end - start, "a connection record")
+            self._add_connection(fields, self.source.read(start, end - start))
+        elif op == _OP_CHUNK_INFO:
+            budget.check("metadata_bytes", end - start, "a chunk info record")
+            pairs = np.frombuffer(self.source.read(start, end - start), dtype="<u4")
+            counts = Counter(dict(zip(pairs[::2].tolist(), pairs[1::2].tolist(), strict=True)))
+            self._infos[int.from_bytes(fields["chunk_pos"], "little")] = counts
+            return
+        else:
+            raise SpanDamageError(f"no record of kind {op} may stand here")
+        self.account.decode(at, end)
+
+    def _finish(self) -> None:
+        if self._header is None:
             raise self.no_log("a bag header record", "none")
-        close_chunk()
+        self._close_chunk(complete=not self.account.cut)
+        index_at, chunks = self._header
+        if index_at and not self.lost:
+            self._check_infos(chunks)
         self._declare_from_chunks()
         if not index_at and not self.lost:
             what = "the bag has no index (it was not closed); its complete chunks were read by a scan"
-            self.lose("unindexed", what, self._end_ns())
+            self.lose("unindexed", what, self.last_ns())
+            self.account.cut = True
         self.drop_undeclared("connections")
 
-    def _end_ns(self) -> int | None:
-        return self.spans[-1].end_ns if self.spans else None
+    def _check_infos(self, chunks: int) -> None:
+        """Open the chunks whose index records tell other counts than the bag's end, which could hide messages."""
+        found, spans = self._chunks, self.spans[:]
+        missing = chunks - self._found
+        self._chunks = []
+        self.spans.clear()
+        for chunk, span in zip(found, spans, strict=True):
+            if self._infos.get(chunk.at, chunk.counts) == chunk.counts:
+                self._add_span(chunk, span)
+            else:
+                self._open_chunk(chunk)
+        if missing > 0 and not self.lost:
+            self.lose("missing-messages", f"the bag's header names {chunks} chunks, of which {missing} are not there")
+            self.account.lose(0, len(self.magic))
+
+    def _record_at(self, at: int) -> tuple[dict[str, bytes], int, int] | None:
+        """Return header fields and data extent of the record at a byte; None if it is cut or no record."""
+        source, size = self.source, self.source.size
+        if at + 8 > size:
+            return None
+        (header,) = _U32.unpack(source.read(at, 4))
+        if header == 0 or at + 8 + header > size or header > self.meter.budget.metadata_bytes:
+            return None
+        text = source.read(at + 4, header + 4)
+        start = at + 8 + header
+        (length,) = _U32.unpack_from(text, header)
+        if start + length > size:
+            return None
+        try:
+            return _header_fields(text[:header]), start, start + length
+        except (struct.error, ValueError):
+            return None
+
+    def _is_zero(self, start: int, end: int) -> bool:
+        return all(
+            not any(self.source.read(at, min(_ZERO_BLOCK_BYTES, end - at)))
+            for at in range(start, end, _ZERO_BLOCK_BYTES)
+        )
+
+    def _index_record(self, chunk: _Chunk, fields: Mapping[str, bytes], payload: bytes) -> None:
+        """Take note of the connection and the log times that an index record lists."""
+        (connection,), (count,) = _U32.unpack(fields["conn"]), _U32.unpack(fields["count"])
+        words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
+        if count:
+            times = words[:, 0] * 1_000_000_000 + words[:, 1]
+            first, last = int(times.min()), int(times.max())
+            chunk.first_ns = min(chunk.first_ns, first) if chunk.counts else first
+            chunk.last_ns = max(chunk.last_ns, last)
+            chunk.counts[connection] += count
 
     def _declare_from_chunks(self) -> None:
         """Find connections that only the chunks declare, as in a bag without its index section."""
         for span in self.spans:
             if not set(span.counts) <= set(self.channels):
-                with contextlib.suppress(SpanDamageError):  # a read of the span reports the damage
+                with contextlib.suppress(Exception):  # a read of the span reports the damage
                     self._decode(self._chunks[span.index], declare=True)
 
     def _add_connection(self, fields: Mapping[str, bytes], payload: bytes) -> None:
         inner = _header_fields(payload)
         id_ = _U32.unpack(fields["conn"])[0]
+        if id_ in self.channels:
+            return
+        self.meter.budget.check("channels", len(self.channels) + 1, f"connection {id_}")
         type_name = inner["type"].decode()
         metadata: dict[str, str] = {
             name: inner[name].decode("utf-8", errors="replace")
             for name in ("callerid", "latching", "md5sum")
             if name in inner
         }
-        self.channels.setdefault(
-            id_,
-            ChannelRecord(
-                id=id_,
-                topic=fields["topic"].decode(),
-                type_name=ros2_type_name(type_name),
-                encoding="ros1",
-                schema_name=type_name,
-                schema_encoding="ros1msg",
-                schema_data=inner.get("message_definition", b""),
-                metadata=metadata,
-            ),
+        self.channels[id_] = ChannelRecord(
+            id=id_,
+            topic=fields["topic"].decode(),
+            type_name=ros2_type_name(type_name),
+            encoding="ros1",
+            schema_name=type_name,
+            schema_encoding="ros1msg",
+            schema_data=inner.get("message_definition", b""),
+            metadata=metadata,
         )
 
-    def _add_chunk(self, chunk: tuple[str, int, int, int], times: Sequence[int], counts: Mapping[int, int]) -> None:
-        index = len(self.spans)
-        self._chunks.append(chunk)
-        if times:
-            self.spans.append(Span(index, min(times), max(times) + 1, dict(counts)))
+    def _close_chunk(self, complete: bool = True) -> None:
+        """Add the chunk whose index records were read; open it where they are missing or cannot be right."""
+        chunk, self._pending = self._pending, None
+        if chunk is None:
             return
+        self._found += 1
+        if not complete or not chunk.counts or chunk.counts.total() * _LEAST_MESSAGE_BYTES > chunk.size:
+            self._open_chunk(chunk)
+        else:
+            self._add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts)))
+
+    def _add_span(self, chunk: _Chunk, span: Span) -> None:
+        self._chunks.append(chunk)
+        self.spans.append(replace(span, index=len(self.spans)))
+
+    def _open_chunk(self, chunk: _Chunk) -> None:
+        """Add a chunk by its content; lose it if it is damaged."""
         try:
             block = self._decode(chunk, declare=True)
-        except SpanDamageError as error:
-            self._chunks.pop()
-            self.lose("bad-chunk", f"a chunk without index lost: {error}", self._end_ns())
+        except Exception as error:  # noqa: BLE001 (the boundary)
+            kind, text = told(error)
+            what = f"an unknown number of messages lost in the chunk at byte {chunk.at}: {text}"
+            self.lose(kind, what, self.last_ns())
+            self.account.lose(chunk.at, chunk.end)
             return
         if not len(block):
-            self._chunks.pop()
+            self.account.decode(chunk.at, chunk.end)
             return
-        self.spans.append(Span(index, int(block.log_time_ns.min()), int(block.log_time_ns.max()) + 1, block.counts))
+        first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
+        self._add_span(chunk, Span(0, first, last + 1, block.counts))
+
+    def extent(self, span: Span) -> tuple[int, int]:
+        """Return the bytes of the chunk's record."""
+        chunk = self._chunks[span.index]
+        return chunk.at, chunk.end
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one chunk; see :class:`~pdhef_logtool.logs.container.Container`."""
         del want
         return self._decode(self._chunks[span.index], declare=False)
 
-    def _decode(self, chunk: tuple[str, int, int, int], declare: bool) -> Block:
-        compression, size, start, end = chunk
-        content = _decompress(compression, self._data[start:end])
-        if len(content) != size:
-            raise SpanDamageError(f"decompressed to {len(content)} bytes instead of {size}")
-        channels: list[int] = []
-        stamps: list[int] = []
-        offsets: list[int] = []
-        lengths: list[int] = []
-        at = 0
+    def _decode(self, chunk: _Chunk, declare: bool) -> Block:
+        self.meter.budget.check("chunk_bytes", chunk.end - chunk.start, "a chunk")
+        stored = self.source.read(chunk.start, chunk.end - chunk.start)
+        content = decompress(chunk.compression or "unnamed", stored, chunk.size, self.meter.budget)
+        channels, stamps, offsets, lengths = (array("q") for _ in range(4))
+        at, size = 0, len(content)
         while at < size:
-            record = _record_at(content, at, size)
+            record = _record_in(content, at, size)
             if record is None:
                 raise SpanDamageError("its last record is cut")
             fields, begin, at = record
-            op = fields.get("op", b"\0")[0]
+            op = _op(fields)
             try:
                 if op == _OP_MESSAGE:
+                    if len(stamps) % _MESSAGES_A_CHECK == 0:
+                        self.meter.budget.check("chunk_messages", len(stamps), "a chunk")
+                        self.meter.check()
                     channels.append(_U32.unpack(fields["conn"])[0])
                     stamps.append(_time_ns(fields["time"]))
                     offsets.append(begin)
                     lengths.append(at - begin)
-                elif op == _OP_CONNECTION and declare:
+                elif op != _OP_CONNECTION:
+                    raise SpanDamageError(f"it holds a record of kind {op}, which no chunk may")
+                elif declare:
                     self._add_connection(fields, content[begin:at])
             except (KeyError, struct.error, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
         return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
 
 
-def _record_at(data: bytes | mmap.mmap, at: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
-    """Return header fields and data extent of the record at a byte; None if it is cut or no record."""
+def _op(fields: Mapping[str, bytes]) -> int:
+    """Return the kind of a record; -1 if it names none."""
+    op = fields.get("op", b"")
+    return op[0] if len(op) == 1 else -1
+
+
+def _record_in(data: bytes, at: int, size: int) -> tuple[dict[str, bytes], int, int] | None:
+    """Return header fields and data extent of the record at a byte of a chunk; None if it is cut or no record."""
     if at + 8 > size:
         return None
     (header,) = _U32.unpack_from(data, at)
@@ -214,25 +331,3 @@ def _header_fields(text: bytes) -> dict[str, bytes]:
 def _time_ns(value: bytes) -> int:
     seconds, nanoseconds = _TIME.unpack(value)
     return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
-def _index_record(fields: Mapping[str, bytes], payload: bytes) -> tuple[int, list[int]]:
-    """Return the connection and the log times that an index record lists."""
-    count = _U32.unpack(fields["count"])[0]
-    words = np.frombuffer(payload, dtype="<u4", count=3 * count).reshape(count, 3).astype(np.int64)
-    return _U32.unpack(fields["conn"])[0], (words[:, 0] * 1_000_000_000 + words[:, 1]).tolist()
-
-
-def _decompress(compression: str, stored: bytes) -> bytes:
-    try:
-        if compression == "none":
-            return stored
-        if compression == "bz2":
-            return bz2.decompress(stored)
-        if compression == "lz4":
-            import lz4.frame
-
-            return bytes(lz4.frame.decompress(stored))
-    except (OSError, RuntimeError, EOFError, ValueError, MemoryError) as error:
-        raise SpanDamageError(str(error)) from error
-    raise SpanDamageError(f"unknown compression {compression!r}")

@@ -10,11 +10,14 @@ from itertools import accumulate
 from pathlib import Path
 from urllib.parse import quote
 
-from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError, block_from_lists
+from pdhef_logtool.logs.budget import BudgetError, Meter
+from pdhef_logtool.logs.byte_source import require_regular
+from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError, block_from_lists, told
 from pdhef_logtool.logs.type_names import ros2_type_name
 
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
+_STEPS_A_CHECK = 100_000  # of the database's machine, between looks at the time
 
 
 class SqliteContainer(Container):
@@ -31,21 +34,38 @@ class SqliteContainer(Container):
     selective = True  # rows of other topics are not read
     remedy = "is it a rosbag2 recording?"
 
-    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
-        super().__init__(shown_path or path)
+    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
+        require_regular(path, shown_path)
+        super().__init__(shown_path or path, path.stat().st_size, meter)
         self._pages: list[tuple[int, int]] = []  # first and last row id
+        self._ends: list[int] = []  # bytes of the rows up to the end of each page
         self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._late: BudgetError | None = None
         self._db = self._connect(path)
-        self._db.text_factory = _text
         try:
-            self._read_topics()
-            self._read_pages()
+            self._db.text_factory = _text
+            self._db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(self.meter.budget.chunk_bytes, 2**31 - 1))
+            self._db.set_progress_handler(self._out_of_time, _STEPS_A_CHECK)
+            for pragma in ("trusted_schema = OFF", "mmap_size = 0", "cell_size_check = ON"):
+                self._db.execute(f"PRAGMA {pragma}")
+            with self.meter.running(self.account.size):
+                self._read_topics()
+                self._read_pages()
         except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
             self.close()
-            raise self.no_log("a readable rosbag2 database", str(error)) from error
+            raise self.no_log("a readable rosbag2 database", str(self._late or error)) from error
         except BaseException:
             self.close()
             raise
+
+    def _out_of_time(self) -> bool:
+        """Tell SQLite to stop: a query over a hostile database need not end."""
+        try:
+            self.meter.check()
+        except BudgetError as error:
+            self._late = error
+            return True
+        return False
 
     def _connect(self, path: Path) -> sqlite3.Connection:
         wal = path.with_name(path.name + "-wal")
@@ -62,6 +82,9 @@ class SqliteContainer(Container):
         return {str(row[0]) for row in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))}
 
     def _read_topics(self) -> None:
+        tables = {str(row[0]) for row in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"topics", "messages"} <= tables:  # a view can be a program that never ends
+            raise self.no_log("rosbag2's tables 'topics' and 'messages'", "a database without them")
         topic_columns = self._columns_of("topics")
         needed = {"id", "name", "type", "serialization_format"}
         if not needed <= topic_columns or not {"id", "topic_id", "timestamp", "data"} <= self._columns_of("messages"):
@@ -76,6 +99,7 @@ class SqliteContainer(Container):
         extra = [c for c in ("offered_qos_profiles", "type_description_hash") if c in topic_columns]
         query = f"SELECT {', '.join(['id', 'name', 'type', 'serialization_format', *extra])} FROM topics ORDER BY id"  # noqa: S608
         for id_, name, type_name, encoding, *rest in self._db.execute(query):
+            self.meter.budget.check("channels", len(self.channels) + 1, f"topic {id_}")
             schema_encoding, text = definitions.get(type_name, ("", ""))
             self.channels[int(id_)] = ChannelRecord(
                 id=int(id_),
@@ -89,22 +113,24 @@ class SqliteContainer(Container):
             )
 
     def _read_pages(self) -> None:
-        rows = self._db.execute("SELECT id, topic_id, timestamp, length(data) FROM messages ORDER BY id")
-        first = last = size = 0
+        rows = self._db.execute("SELECT id, topic_id, timestamp, length(data), typeof(data) FROM messages ORDER BY id")
+        first = last = size = total = 0
         times: list[int] = []
         counts: Counter[int] = Counter()
-        unknown = 0
+        unknown = found = 0
 
         def close_page() -> None:
             if times:
                 self.spans.append(Span(len(self.spans), min(times), max(times) + 1, dict(counts)))
                 self._pages.append((first, last))
+                self._ends.append(total)
             times.clear()
             counts.clear()
 
         try:
-            for id_, topic, timestamp, length in rows:
-                if topic not in self.channels or not isinstance(timestamp, int):
+            for id_, topic, timestamp, length, kind in rows:
+                found += 1
+                if topic not in self.channels or not isinstance(timestamp, int) or kind != "blob":
                     unknown += 1
                     continue
                 if not times:
@@ -112,16 +138,47 @@ class SqliteContainer(Container):
                 last = id_
                 times.append(timestamp)
                 counts[topic] += 1
-                size += length or 0
+                size += length
+                total += length
                 if len(times) >= _PAGE_ROWS or size >= _PAGE_BYTES:
                     close_page()
-        except sqlite3.DatabaseError as error:
-            what = f"the rows after id {last} cannot be read: {error}"
-            self.lose("truncated", what, max(times) + 1 if times else None)
+        except sqlite3.Error as error:
+            what = f"the rows after id {last} cannot be read: {told(self._late or error)[1]}"
+            self.lose("over-budget" if self._late else "truncated", what, max(times) + 1 if times else None)
+            self.account.lose(total, self.account.size)
+            self.account.cut = True
         close_page()
         if unknown:
-            what = f"{unknown} messages of topics that the database does not name, or without a time"
+            what = f"{unknown} messages of topics that the database does not name, or without a time or data"
             self.lose("unknown-channel", what, count=unknown)
+            self.account.lose(total, total + round(self.account.size * unknown / found))
+        if not self.lost:
+            self._check_indexes(found)
+
+    def _check_indexes(self, found: int) -> None:
+        """Hold the rows that were found against the indexes of the table: a damaged page can hide rows."""
+        names = [str(row[0]) for row in self._db.execute("SELECT name FROM pragma_index_list('messages')")]
+        counts = [0]
+        try:
+            for name in names:
+                quoted = name.replace('"', '""')
+                query = f'SELECT COUNT(*) FROM messages INDEXED BY "{quoted}"'  # noqa: S608 (quoted)
+                counts.append(int(self._db.execute(query).fetchone()[0]))
+        except sqlite3.Error as error:
+            if self._late:
+                raise
+            self.lose("bad-index", f"the index of the messages cannot be read: {error}")
+            self.account.lose(self.account.size - 1, self.account.size)
+        missing = max(counts) - found
+        if missing > 0:
+            what = f"the index of the messages names {max(counts)} rows, of which {found} are there"
+            self.lose("missing-messages", what, count=missing)
+            end = self._ends[-1] if self._ends else 0
+            self.account.lose(end, end + round(self.account.size * missing / max(counts)))
+
+    def extent(self, span: Span) -> tuple[int, int]:
+        """Return the bytes of the page's rows, as if the data of all rows lay one behind the other."""
+        return (self._ends[span.index - 1] if span.index else 0), self._ends[span.index]
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Read one page; see :class:`~pdhef_logtool.logs.container.Container`."""
@@ -143,7 +200,7 @@ class SqliteContainer(Container):
                 stamps.append(timestamp)
                 payloads.append(data)
         except sqlite3.Error as error:
-            raise SpanDamageError(str(error)) from error
+            raise self._late or SpanDamageError(str(error)) from error
         lengths = [len(p) for p in payloads]
         offsets = [0, *accumulate(lengths)][:-1]
         return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.drive_log import Columns, DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import ByteLedger, Columns, DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.errors import MappingError
@@ -214,6 +214,11 @@ class CanSignalLog:
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
         """Read only log and publish times of every topic of the log."""
         return self._log.read_stamps(start_ns, end_ns)
+
+    @property
+    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
+        """Where the bytes of each file went."""
+        return self._log.byte_ledgers
 
     def close(self) -> None:
         """Release the files."""

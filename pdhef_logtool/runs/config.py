@@ -59,6 +59,7 @@ class RunConfig:
     friction : ``auto`` is the log's own, else the car's, else estimated; ``file``, ``estimate``, or a number.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
+    budget : factor on what reading a log may cost before its claims count as damage.
     network : instead of the car's: a folder, ``default``, ``many-cars`` (the shipped one for any car), ``none``.
     intervals : instead of the car's: a file of ``pdhef calibrate``, ``none`` (intervals as they are), ``unsure`` (wide
         ones, for a car that may have changed since its file was made).
@@ -75,6 +76,7 @@ class RunConfig:
     friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
+    budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     thresholds: Path | None = None
     network: Path | None = None
     intervals: Path | None = None

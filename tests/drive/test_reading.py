@@ -14,6 +14,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
 from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.logs.budget import Budget
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping, SignalSource
@@ -111,8 +112,8 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
     closed: list[str] = []
     open_log = reading.open_log
 
-    def watched_log(path: Path) -> DriveLog:
-        log = open_log(path)
+    def watched_log(path: Path, budget: Budget) -> DriveLog:
+        log = open_log(path, budget)
         close = log.close
         monkeypatch.setattr(type(log), "close", lambda _self: closed.append(path.name) or close())
         return log

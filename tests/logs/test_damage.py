@@ -47,6 +47,20 @@ def _mcap_of_another_writer(folder: Path) -> bytes:
     return path.read_bytes()
 
 
+def _mcap_of_a_killed_recorder(folder: Path) -> bytes:
+    from mcap.writer import CompressionType, IndexType, Writer
+
+    path = folder / "killed.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000, compression=CompressionType.ZSTD, index_types=IndexType.NONE)
+        writer.start()
+        channel = writer.register_channel("/t", "json", writer.register_schema("T", "jsonschema", b"{}"))
+        for i in range(N):
+            writer.add_message(channel, T0 + i, b'{"a": %d}' % i, T0 + i, i)
+        writer.finish()
+    return path.read_bytes()
+
+
 def _bag(folder: Path) -> bytes:
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_typestore
@@ -81,6 +95,7 @@ def _database(folder: Path) -> bytes:
 _SOURCES: dict[str, Callable[[Path], bytes]] = {
     "mcap": _mcap,
     "mcap-lz4": _mcap_of_another_writer,
+    "mcap-no-index": _mcap_of_a_killed_recorder,
     "bag": _bag,
     "sqlite3": _database,
 }
@@ -119,6 +134,64 @@ def test_no_damage_escapes_as_another_error(
         _read_everything(path)
     except PdhefError as error:
         assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize("kind", sorted(_SOURCES))
+@settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_every_byte_ends_somewhere_and_no_message_is_missing_in_silence(
+    good: dict[str, bytes], tmp_path: Path, kind: str, data: st.DataObject
+) -> None:
+    content = bytearray(good[kind])
+    for at, mask in data.draw(st.lists(st.tuples(st.integers(0, len(content) - 1), st.integers(1, 255)), max_size=2)):
+        content[at] ^= mask
+    cut = data.draw(st.one_of(st.none(), st.integers(1, len(content))))
+    path = tmp_path / "damaged"
+    path.write_bytes(content[:cut])
+    try:
+        log = open_log(path)
+    except PdhefError:
+        return
+    count = sum(len(c) for c in log.read_stamps().values())
+    (ledger,) = log.byte_ledgers
+    claimed, lost = sum(t.messages for t in log.topics), any(loss.severity == "lost" for loss in log.lost)
+    log.close()
+    assert ledger.size == path.stat().st_size == ledger.decoded + ledger.unwanted + ledger.lost
+    assert min(ledger.decoded, ledger.unwanted, ledger.lost) >= 0
+    assert claimed == count
+    assert (ledger.lost > 0 or ledger.cut) == lost
+    assert lost or count >= N
+
+
+def test_what_was_not_asked_for_is_unwanted(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=2000)
+        writer.start()
+        for topic in ("/a", "/b"):
+            channel = writer.register_channel(topic, "json", 0)
+            for i in range(N):
+                writer.add_message(channel, T0 + i, b"{}", T0 + i)
+        writer.add_attachment(T0, T0, "video", "video/mp4", bytes(5000))
+        writer.finish()
+    log = open_log(path)
+    (before,) = log.byte_ledgers
+    spans = log.containers[0].spans  # type: ignore[attr-defined]
+    extents = [log.containers[0].extent(span) for span in spans]  # type: ignore[attr-defined]
+    log.read_stamps(T0, T0 + 10)
+    (after,) = log.byte_ledgers
+    begun = [end - at for span, (at, end) in zip(spans, extents, strict=True) if span.start_ns < T0 + 10]
+    assert after.decoded - before.decoded == before.unwanted - after.unwanted == sum(begun) > 0
+    log.read_stamps()
+    (whole,) = log.byte_ledgers
+    assert whole.decoded - before.decoded == sum(end - at for at, end in extents)
+    assert whole.unwanted > 5000
+    assert whole.lost == 0
+    assert not whole.cut
+    assert whole == log.byte_ledgers[0]
+    log.close()
 
 
 @pytest.mark.parametrize("kind", ["mcap", "mcap-lz4", "bag"])

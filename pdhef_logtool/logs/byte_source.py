@@ -1,0 +1,125 @@
+"""Bytes of a recording by offset and size: the one thing that containers know of where a file lies.
+
+Nothing is mapped into memory: a file that another process cuts while it is open ends a read with an error, never this
+process, and what was read stays valid after the file is closed.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from pdhef_logtool.records.errors import LogError
+
+#: Small reads come from a block read ahead, which grows while reads follow each other and shrinks where they jump.
+_LEAST_AHEAD_BYTES = 32 << 10
+_MOST_AHEAD_BYTES = 2 << 20
+_LARGE_READ_BYTES = 64 << 10
+_KINDS = {stat.S_IFIFO: "a FIFO", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device", stat.S_IFSOCK: "a socket"}
+
+
+class CutError(Exception):
+    """A file ends earlier than it did when it was opened; caught inside this package and turned into a loss."""
+
+
+class ByteSource(ABC):
+    """Bytes that can be read at any offset.
+
+    Attributes
+    ----------
+    size : bytes when it was opened.
+    """
+
+    size: int
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+        self._ahead_bytes = _LEAST_AHEAD_BYTES
+        self._block: tuple[int, bytes] = (0, b"")  # offset and bytes of the last block
+
+    @abstractmethod
+    def fetch(self, offset: int, size: int) -> bytes:
+        """Read up to ``size`` bytes where they lie; fewer only at the end of the file as it is now."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release what is open."""
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return exactly these bytes; raises :class:`CutError` where the file has less."""
+        start, block = self._block
+        at = offset - start
+        if at >= 0 and at + size <= len(block):
+            return block[at : at + size]
+        if size > _LARGE_READ_BYTES:
+            if offset + size > self.size:  # a claim must not be allocated
+                raise CutError(f"the file has no {size} bytes at byte {offset}")
+            found = self.fetch(offset, size)
+        else:
+            block, at = self.ahead(offset, size)
+            found = block[at : at + size]
+        if len(found) < size:
+            raise CutError(f"the file ends at byte {offset + len(found)}, before byte {offset + size}")
+        return found
+
+    def ahead(self, offset: int, size: int) -> tuple[bytes, int]:
+        """Return a block and the place in it where ``size`` bytes or more from an offset lie, if the file has them."""
+        start, block = self._block
+        at = offset - start
+        if at >= 0 and at + size <= len(block):
+            return block, at
+        follows = 0 <= at <= len(block)
+        self._ahead_bytes = min(2 * self._ahead_bytes, _MOST_AHEAD_BYTES) if follows else _LEAST_AHEAD_BYTES
+        block = self.fetch(offset, max(size, self._ahead_bytes))
+        self._block = (offset, block)
+        return block, 0
+
+
+class LocalFile(ByteSource):
+    """A regular file of this machine.
+
+    Raises
+    ------
+    LogError : it is a FIFO, a device or a socket. OSError : it cannot be opened.
+    """
+
+    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
+        require_regular(path, shown_path)
+        self._file = path.open("rb", buffering=0)
+        super().__init__(os.fstat(self._file.fileno()).st_size)
+
+    def fetch(self, offset: int, size: int) -> bytes:
+        """Read at an offset; the file has no position that somebody else could move."""
+        descriptor = self._file.fileno()
+        found = os.pread(descriptor, size, offset)
+        if 0 < len(found) < size and offset + len(found) < self.size:  # the system reads 2 GiB at a time
+            parts = [found]
+            missing = size - len(found)
+            while missing and (part := os.pread(descriptor, missing, offset + size - missing)):
+                parts.append(part)
+                missing -= len(part)
+            found = b"".join(parts)
+        return found
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def require_regular(path: Path, shown_path: Path | None = None) -> None:
+    """Refuse what is no regular file, without opening it: opening a FIFO waits for ever, some devices act on it.
+
+    Raises
+    ------
+    LogError : it is none. OSError : there is nothing, or nothing that may be looked at.
+    """
+    mode = path.stat().st_mode
+    if not stat.S_ISREG(mode):
+        raise LogError(
+            expected="a regular file",
+            got=_KINDS.get(stat.S_IFMT(mode), "a folder"),
+            where=str(shown_path or path),
+            remedy="record to a file, and give that",
+        )

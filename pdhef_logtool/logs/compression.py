@@ -1,0 +1,147 @@
+"""Undoing the compressions that recorders use, never further than a claim and a budget allow."""
+
+from __future__ import annotations
+
+import bz2
+from collections.abc import Callable
+from pathlib import Path
+from threading import local
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from pdhef_logtool.logs.budget import Budget, BudgetError, Meter
+from pdhef_logtool.logs.container import SpanDamageError
+
+if TYPE_CHECKING:
+    import zstandard
+
+_Bytes: TypeAlias = bytes | memoryview
+_OF_THREAD = local()
+_BLOCK_BYTES = 1 << 20
+_FRAME_HEAD_BYTES = 18
+#: A decompressed copy leaves this much of the disk to others.
+_DISK_RESERVE_BYTES = 256 << 20
+
+
+def decompress(compression: str, stored: _Bytes, size: int, budget: Budget) -> bytes:
+    """Decompress a chunk that claims ``size`` bytes.
+
+    Parameters
+    ----------
+    compression : ``zstd``, ``lz4`` (frames), ``bz2``; empty or ``none`` for none.
+
+    Raises
+    ------
+    SpanDamageError : unknown, damaged, or of another size. BudgetError : the claim is above the budget.
+    """
+    length = memoryview(stored).nbytes
+    if compression in ("", "none"):
+        budget.check("chunk_bytes", length, "a chunk")
+        content = bytes(stored)
+    else:
+        unpack = _UNPACK.get(compression)
+        if unpack is None:
+            raise SpanDamageError(f"unknown compression {compression!r}")
+        budget.check_unpacked(size, length, "a compressed chunk")
+        try:
+            content = unpack(stored, size)
+        except (OSError, RuntimeError, EOFError, ValueError, OverflowError, MemoryError) as error:
+            raise SpanDamageError(str(error)) from error
+    if len(content) != size:
+        more = "more" if len(content) > size else f"{len(content)}"
+        raise SpanDamageError(f"decompressed to {more} bytes instead of {size}")
+    return content
+
+
+def decompress_message(stored: _Bytes, budget: Budget) -> bytes:
+    """Decompress a message that is a zstd frame; errors as of :func:`decompress`."""
+    import zstandard
+
+    try:
+        size = zstandard.frame_content_size(stored)
+        limit = budget.chunk_bytes if size < 0 else size
+        if size > 0:
+            budget.check_unpacked(size, memoryview(stored).nbytes, "a compressed message")
+        return _zstd_decompressor().decompress(stored, max_output_size=limit)
+    except (zstandard.ZstdError, OverflowError, MemoryError) as error:
+        raise SpanDamageError(f"a compressed message is damaged: {error}") from error
+
+
+def decompress_file(source: Path, target: Path, meter: Meter) -> str:
+    """Decompress a zstd file into another; returns why it stopped early, empty at the end of a sound file."""
+    import shutil
+
+    import zstandard
+
+    allowed = max(_BLOCK_BYTES, meter.budget.chunk_ratio * source.stat().st_size)
+    free = shutil.disk_usage(target.parent).free - _DISK_RESERVE_BYTES
+    written = 0
+    with source.open("rb") as packed, target.open("wb") as unpacked:
+        claimed = zstandard.frame_content_size(packed.read(_FRAME_HEAD_BYTES))
+        packed.seek(0)
+        reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+        while True:
+            try:
+                meter.check()
+                block = reader.read(_BLOCK_BYTES)
+            except BudgetError as error:
+                return error.got
+            except zstandard.ZstdError as error:
+                return f"the compressed file is damaged: {error}"
+            if not block:
+                return "the compressed file ends early" if written < claimed else ""
+            written += len(block)
+            if written > allowed:
+                return f"the file decompresses to more than {allowed} bytes, above the budget (--budget)"
+            if written > free:
+                return "the disk has no room for the decompressed file (set TMPDIR to another)"
+            unpacked.write(block)
+
+
+def _zstd(stored: _Bytes, size: int) -> bytes:
+    import zstandard
+
+    try:
+        if zstandard.frame_content_size(stored) not in (-1, size):
+            raise SpanDamageError("its compressed content has another size")
+        return _zstd_decompressor().decompress(stored, max_output_size=size)
+    except zstandard.ZstdError as error:
+        raise SpanDamageError(str(error)) from error
+
+
+def _zstd_decompressor() -> zstandard.ZstdDecompressor:
+    """Return the one of this thread: it is no small thing to make, and serves one call at a time."""
+    import zstandard
+
+    if not hasattr(_OF_THREAD, "zstd"):
+        _OF_THREAD.zstd = zstandard.ZstdDecompressor()
+    found: zstandard.ZstdDecompressor = _OF_THREAD.zstd
+    return found
+
+
+def _lz4(stored: _Bytes, size: int) -> bytes:
+    import lz4.frame
+
+    return _in_turn(stored, size, lz4.frame.LZ4FrameDecompressor)
+
+
+def _bz2(stored: _Bytes, size: int) -> bytes:
+    return _in_turn(stored, size, bz2.BZ2Decompressor)
+
+
+def _in_turn(stored: _Bytes, size: int, decompressor: Callable[[], Any]) -> bytes:
+    """Decompress one stream after another to at most a byte more than ``size``."""
+    parts: list[bytes] = []
+    missing = size + 1
+    rest = bytes(stored)
+    while rest and missing:
+        stream = decompressor()
+        part = stream.decompress(rest, max_length=missing)
+        parts.append(part)
+        missing -= len(part)
+        if not stream.eof and missing:
+            raise EOFError("the compressed data end early")
+        rest = stream.unused_data or b""
+    return parts[0] if len(parts) == 1 else b"".join(parts)
+
+
+_UNPACK: dict[str, Callable[[_Bytes, int], bytes]] = {"zstd": _zstd, "lz4": _lz4, "bz2": _bz2}

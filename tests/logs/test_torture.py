@@ -1,0 +1,376 @@
+"""Hostile and unlucky files: claims that memory cannot hold, files that are none, files that shrink while open."""
+
+from __future__ import annotations
+
+import bz2
+import os
+import struct
+import threading
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zstandard
+from mcap.writer import CompressionType, IndexType, Writer
+
+from pdhef_logtool.inspection import inspect_log
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, BudgetError, Meter
+from pdhef_logtool.logs.compression import decompress, decompress_message
+from pdhef_logtool.logs.container import SpanDamageError
+from pdhef_logtool.logs.discovery import find_logs, hash_log
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.signals import Loss
+
+T0 = 1_700_000_000_000_000_000
+N = 300
+_MAGIC = b"\x89MCAP0\r\n"
+
+
+def _write(path: Path, *, chunk_size: int = 4000, chunked: bool = True, index: bool = True, padding: str = "") -> Path:
+    with path.open("wb") as stream:
+        writer = Writer(
+            stream,
+            chunk_size=chunk_size,
+            use_chunking=chunked,
+            compression=CompressionType.ZSTD,
+            index_types=IndexType.ALL if index else IndexType.NONE,
+            use_statistics=index,
+        )
+        writer.start()
+        schema = writer.register_schema("T", "jsonschema", b'{"type": "object"}')
+        channels = [writer.register_channel(topic, "json", schema) for topic in ("/a", "/b")]
+        for i in range(N):
+            for channel in channels:
+                writer.add_message(channel, T0 + i, f'{{"x": {i}, "p": "{padding}"}}'.encode(), T0 + i, i)
+        writer.finish()
+    return path
+
+
+def _records(data: bytes) -> list[tuple[int, int, int]]:
+    """Opcode and extent of the top-level records."""
+    found, at = [], len(_MAGIC)
+    while at < len(data) - len(_MAGIC):
+        opcode, length = struct.unpack_from("<BQ", data, at)
+        found.append((opcode, at, at + 9 + length))
+        at = found[-1][2]
+    return found
+
+
+def _outcome(path: Path, budget: Budget = DEFAULT_BUDGET) -> tuple[int, tuple[Loss, ...], int]:
+    """Return how many messages are read, what is lost, and how many messages the topics then claim."""
+    log = open_log(path, budget)
+    try:
+        read = sum(len(c) for c in log.read_stamps().values())
+        (ledger,) = log.byte_ledgers
+        assert ledger.size == ledger.decoded + ledger.unwanted + ledger.lost
+        assert (ledger.lost > 0 or ledger.cut) == any(loss.severity == "lost" for loss in log.lost)
+        return read, log.lost, sum(t.messages for t in log.topics)
+    finally:
+        log.close()
+
+
+def test_a_flipped_bit_in_a_chunk_without_indexes_is_a_loss_that_names_it(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mcap", index=False)
+    data = bytearray(path.read_bytes())
+    chunks = [(at, end) for op, at, end in _records(data) if op == 6]
+    at, end = chunks[1]
+    first, last = struct.unpack_from("<QQ", data, at + 9)
+    data[end - 30] ^= 4
+    path.write_bytes(data)
+    read, (loss,), claimed = _outcome(path)
+    assert len(chunks) > 4
+    assert 0 < read == claimed < 2 * N
+    assert (loss.kind, loss.start_ns, loss.end_ns, loss.count) == ("bad-chunk", first, last + 1, None)
+    assert f"at byte {at}:" in loss.what
+    assert inspect_log(path).is_partial
+
+
+@pytest.mark.parametrize("claim", [0xFFFFFFF0, 16 * 10_000])
+def test_an_index_is_not_believed(tmp_path: Path, claim: int) -> None:
+    path = _write(tmp_path / "a.mcap")
+    data = bytearray(path.read_bytes())
+    at = next(at for op, at, _ in _records(data) if op == 7)
+    struct.pack_into("<I", data, at + 11, claim)
+    path.write_bytes(data)
+    log = open_log(path)
+    assert {t.name: t.messages for t in log.topics} == {"/a": N, "/b": N}
+    assert log.lost
+    log.close()
+    assert _outcome(path)[0] == 2 * N
+
+
+@pytest.mark.parametrize("place", ["channel of an index", "kind of an index", "times of a chunk", "kind of a chunk"])
+def test_messages_that_an_index_or_a_header_hides_are_read_or_lost(tmp_path: Path, place: str) -> None:
+    path = _write(tmp_path / "a.mcap")
+    data = bytearray(path.read_bytes())
+    index = [at for op, at, _ in _records(data) if op == 7][2]
+    chunk = [at for op, at, _ in _records(data) if op == 6][1]
+    if place == "channel of an index":
+        struct.pack_into("<H", data, index + 9, 1 + data[index + 9] % 2)
+    elif place == "kind of an index":
+        data[index] = 0x87
+    elif place == "times of a chunk":
+        struct.pack_into("<QQ", data, chunk + 9, T0 + 2**50, T0 + 2**50 + 1)
+    else:
+        data[chunk] ^= 0x80
+    path.write_bytes(data)
+    log = open_log(path)
+    b = len(log.read({"/b": ["x"]})["/b"])
+    assert b == N or log.lost
+    assert log.end_ns <= T0 + N
+    log.close()
+    read, lost, claimed = _outcome(path)
+    assert read == claimed
+    assert (read == 2 * N) != (place == "kind of a chunk")
+    assert bool(lost) == (place in ("channel of an index", "kind of a chunk"))
+
+
+def _mcap_of_chunk(path: Path, size: int, compression: bytes, stored: bytes, crc: int = 0) -> Path:
+    head = struct.pack("<QQQI", T0, T0 + 1, size, crc) + struct.pack("<I", len(compression)) + compression
+    chunk = head + struct.pack("<Q", len(stored)) + stored
+    records = [(1, b"\0" * 8), (6, chunk), (15, b"\0" * 4), (2, b"\0" * 20)]
+    path.write_bytes(_MAGIC + b"".join(struct.pack("<BQ", op, len(d)) + d for op, d in records) + _MAGIC)
+    return path
+
+
+_BIG = 3 << 30
+
+
+def _lz4_of(size: int) -> bytes:
+    import lz4.frame
+
+    compressor = lz4.frame.LZ4FrameCompressor()
+    block = bytes(64 << 20)
+    parts = [compressor.begin(), *(compressor.compress(block) for _ in range(size >> 26)), compressor.flush()]
+    return b"".join(parts)
+
+
+def _bomb(kind: str) -> tuple[bytes, bytes]:
+    if kind == "zstd":
+        return b"zstd", zstandard.ZstdCompressor(write_content_size=False).compress(bytes(400 << 20))
+    if kind == "lz4":
+        return b"lz4", _lz4_of(256 << 20)
+    return b"bz2", bz2.compress(bytes(64 << 20))
+
+
+@pytest.mark.parametrize("claim", [1000, 100 << 30])
+@pytest.mark.parametrize("kind", ["zstd", pytest.param("lz4", marks=pytest.mark.slow)])
+def test_a_chunk_that_would_fill_memory_is_refused_by_name(tmp_path: Path, kind: str, claim: int) -> None:
+    compression, stored = _bomb(kind)
+    read, (loss,), _ = _outcome(_mcap_of_chunk(tmp_path / "a.mcap", claim, compression, stored))
+    assert read == 0
+    assert "chunk at byte 25" in loss.what
+    assert loss.kind == ("bad-chunk" if claim == 1000 else "over-budget")
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "bz2"])
+def test_decompression_stops_where_the_claim_ends(compression: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    import lz4.frame
+
+    content = np.random.default_rng(1).bytes(5000)
+    pack: dict[str, Callable[[bytes], bytes]] = {
+        "zstd": zstandard.ZstdCompressor(write_content_size=False).compress,
+        "lz4": lz4.frame.compress,
+        "bz2": bz2.compress,
+    }
+    stored = pack[compression](content)
+    assert decompress(compression, stored, 5000, DEFAULT_BUDGET) == content
+    for size in (4999, 5001, 0):
+        with pytest.raises(SpanDamageError):
+            decompress(compression, stored, size, DEFAULT_BUDGET)
+    with pytest.raises(SpanDamageError):
+        decompress(compression, stored[:-10], 5000, DEFAULT_BUDGET)
+    with pytest.raises(BudgetError, match="--budget"):
+        decompress(compression, stored, 5000, Budget(chunk_bytes=4999))
+    # By ratio: a hundred kilobytes of nothing may not become gigabytes, whatever is claimed.
+    with pytest.raises(BudgetError, match="chunk ratio"):
+        decompress(compression, stored, 200 << 20, DEFAULT_BUDGET)
+    with pytest.raises(BudgetError):
+        decompress_message(zstandard.ZstdCompressor().compress(bytes(8 << 20)), Budget(chunk_bytes=1 << 20))
+
+
+def test_a_file_that_unpacks_to_too_much_gives_its_beginning(tmp_path: Path) -> None:
+    plain = _write(tmp_path / "a.mcap").read_bytes()
+    path = tmp_path / "a.mcap.zst"
+    path.write_bytes(zstandard.ZstdCompressor().compress(plain + bytes(64 << 20)))
+    log = open_log(path, Budget(chunk_ratio=100))
+    assert [loss.what for loss in log.lost if "above the budget" in loss.what]
+    log.close()
+
+
+def test_a_sparse_length_near_the_largest_integer_is_a_loss(tmp_path: Path) -> None:
+    message = struct.pack("<BQHIQQ", 5, 2**63 - 8, 1, 0, T0, T0) + bytes(100)
+    read, lost, _ = _outcome(_mcap_of_chunk(tmp_path / "a.mcap", len(message), b"", message, zlib.crc32(message)))
+    assert (read, len(lost)) == (0, 1)
+
+
+def test_too_many_channels_cost_the_surplus_and_end(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=20_000)
+        writer.start()
+        for i in range(400):
+            channel = writer.register_channel(f"/t{i}", "json", 0)
+            writer.add_message(channel, T0 + i, b"{}", T0 + i)
+        writer.finish()
+    read, lost, claimed = _outcome(path, Budget(channels=300))
+    assert read == claimed == 300
+    assert {"over-budget", "unknown-channel"} <= {loss.kind for loss in lost}
+    assert len(lost) < 60  # and not one for each of them
+    assert all(len(loss.what) < 500 for loss in lost)
+    assert _outcome(path)[:2] == (400, ())
+
+
+def test_a_log_that_takes_too_long_loses_its_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = _write(tmp_path / "a.mcap")
+    now = [0.0]
+    monkeypatch.setattr("pdhef_logtool.logs.budget.time.thread_time", lambda: now[0])
+    log = open_log(path, Budget(seconds=10.0, seconds_per_mib=0.0))
+    container = log.containers[0]  # type: ignore[attr-defined]
+    load = container.load
+
+    def slow(span: object, want: object = None) -> object:
+        now[0] += 4.0
+        return load(span, want)
+
+    monkeypatch.setattr(container, "load", slow)
+    log.read_stamps()
+    (loss,) = log.lost
+    assert (loss.kind, loss.count) == ("over-budget", sum(sum(s.counts.values()) for s in container.spans[3:]))
+    assert "--budget" in loss.what
+    (ledger,) = log.byte_ledgers
+    assert ledger.lost == sum(end - at for at, end in map(container.extent, container.spans[3:]))
+    log.close()
+
+
+def test_a_sound_log_can_be_read_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("pdhef_logtool.logs.budget.time.thread_time", lambda: now[0])
+    meter = Meter(Budget(seconds=1.0, seconds_per_mib=2.0))
+    for _ in range(100):
+        with meter.running(1 << 20):
+            now[0] += 1.9
+        meter.check()
+    with meter.running():
+        now[0] += 20.0
+    with pytest.raises(BudgetError, match="longer than"):
+        meter.check()
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_a_file_that_is_cut_while_it_is_open_is_a_loss(tmp_path: Path, chunked: bool) -> None:
+    padding = np.random.default_rng(0).bytes(8000).hex()
+    path = _write(tmp_path / "a.mcap", chunked=chunked, chunk_size=70_000, padding=padding)
+    log = open_log(path)
+    os.truncate(path, 40_000)
+    assert sum(len(c) for c in log.read_stamps().values()) < N
+    assert all(loss.kind == "bad-chunk" and loss.severity == "lost" for loss in log.lost)
+    assert log.lost
+    assert log.byte_ledgers[0].lost > 0
+    log.close()
+
+
+def test_blocks_outlive_their_file(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mcap")
+    log = open_log(path)
+    container = log.containers[0]  # type: ignore[attr-defined]
+    block = container.load(container.spans[0])
+    before = bytes(block.buffer)
+    log.close()
+    path.unlink()
+    assert bytes(block.buffer) == before
+
+
+def test_whatever_escapes_a_container_is_the_loss_of_its_span(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = open_log(_write(tmp_path / "a.mcap"))
+    container = log.containers[0]  # type: ignore[attr-defined]
+    load, bad = container.load, container.spans[1]
+
+    def broken(span: object, want: object = None) -> object:
+        if span is bad:
+            raise ZeroDivisionError("a fault of ours")
+        return load(span, want)
+
+    monkeypatch.setattr(container, "load", broken)
+    count = sum(bad.counts.values())
+    assert sum(len(c) for c in log.read_stamps().values()) == 2 * N - count
+    (loss,) = log.lost
+    assert (loss.start_ns, loss.end_ns, loss.count) == (bad.start_ns, bad.end_ns, count)
+    assert "ZeroDivisionError: a fault of ours" in loss.what
+    log.close()
+
+
+def _within(seconds: float, action: Callable[[], object]) -> BaseException | None:
+    """Return what an action raises; fails if it does not end."""
+    caught: list[BaseException | None] = []
+
+    def run() -> None:
+        try:
+            action()
+            caught.append(None)
+        except BaseException as error:  # noqa: BLE001
+            caught.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    assert caught, "it waits for ever"
+    return caught[0]
+
+
+@pytest.mark.parametrize("name", ["x.mcap", "x.mcap.zstd"])
+def test_a_fifo_is_refused_at_once(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    os.mkfifo(path)
+    for action in (lambda: open_log(path), lambda: hash_log(path)):
+        error = _within(5, action)
+        assert isinstance(error, LogError)
+        assert "a FIFO" in str(error)
+    assert isinstance(_within(5, lambda: open_log("/dev/null")), LogError)
+    (tmp_path / "metadata.yaml").write_text(f"rosbag2_bagfile_information:\n  relative_file_paths: [{name}]\n")
+    assert isinstance(_within(5, lambda: open_log(tmp_path)), LogError)
+
+
+def test_links_that_lead_back_end_a_search(tmp_path: Path) -> None:
+    _write(tmp_path / "a.mcap")
+    for name in ("x", "y"):
+        (tmp_path / name).symlink_to(tmp_path, target_is_directory=True)
+    for argument in (str(tmp_path), f"{tmp_path}/**/*.mcap", f"{tmp_path}/*"):
+        found: list[str] = []
+        error = _within(10, lambda a=argument, f=found: f.extend(x.path.name for x in find_logs([a])))  # type: ignore[misc]
+        assert error is None
+        assert found == ["a.mcap"]
+
+
+def test_a_folder_does_not_lead_out_of_itself(tmp_path: Path) -> None:
+    _write(tmp_path / "outside.mcap")
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    (folder / "metadata.yaml").write_text("rosbag2_bagfile_information:\n  relative_file_paths: ['../outside.mcap']\n")
+    with pytest.raises(LogError, match="no readable storage file"):
+        open_log(folder)
+
+
+_ENDS = {
+    "noindex_flip.mcap": "at byte",
+    "index_claims_2e8.mcap": "names 2684",
+    "zstd_claims_100g.mcap": "chunk at byte",
+    "bz2_6g.bag": "chunk at byte",
+    "gather_overflow1.mcap": "chunk at byte",
+    "fuzz_02d558aee3_b_bag_LZ4.bag": "at byte",
+}
+
+
+@pytest.mark.parametrize("name", sorted(_ENDS))
+def test_every_case_that_did_harm_once_ends_as_it_must(shared_dir: Path, name: str) -> None:
+    path = shared_dir / "torture" / name
+    if not path.exists():
+        pytest.skip("the shared folder has no torture cases")
+    inspection = inspect_log(path)
+    assert inspection.is_partial
+    assert any(_ENDS[name] in loss.what for loss in inspection.lost)
+    read, _, claimed = _outcome(path)
+    assert read == claimed
