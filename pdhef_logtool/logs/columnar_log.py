@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
-from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves, resolve
+from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, Selection, leaves, resolve
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -87,6 +88,10 @@ class ColumnarLog:
             found.extend(container.lost)
             found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
             found.extend(self._undecodable_losses(c, container))
+            for (of, channel), schema in sorted(self._schemas.items(), key=itemgetter(0)):
+                if of == c and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
+                    what = f"its messages cannot be decoded: {schema}"
+                    found.append(Loss("bad-schema", what, container.channels[channel].topic))
         return tuple(found)
 
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
