@@ -136,7 +136,7 @@ def parsing(what: str) -> Iterator[None]:
     except PdhefError as error:  # the budget's
         raise SchemaError(f"{what}: expected {error.expected}, got {error.got}; {error.remedy}") from error
     except RecursionError as error:
-        raise SchemaError(f"{what} is nested too deeply") from error
+        raise SchemaError(f"{what}: nested too deeply") from error
     except Exception as error:
         reason = (str(error).splitlines() or [""])[0].rstrip(":") or type(error).__name__
         raise SchemaError(f"{what} cannot be parsed: {reason}") from error
@@ -169,7 +169,9 @@ _SEPARATOR = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
 
 
 #: Bytes of descriptors that cost what one byte of a text costs, which a grammar parses step by step.
-_BYTES_OF_TEXT = 16
+_BYTES_OF_MSG, _BYTES_OF_IDL = 16, 32
+#: An element of a fixed array of structs or texts is a line in each of the functions that rosbags writes for its type.
+_PLACES_AN_ELEMENT = 8
 
 
 @lru_cache(maxsize=256)
@@ -197,7 +199,7 @@ def ros_schema(
 
     what = f"the definition of {type_name}"
     with parsing(what):
-        budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
+        budget.check("schema_bytes", len(text) * (_BYTES_OF_IDL if encoding == "ros2idl" else _BYTES_OF_MSG), what)
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
         if text.strip():
             text = _SEPARATOR.sub("=" * 80, text)
@@ -283,7 +285,7 @@ def _field_node(defs: Mapping[str, Any], desc: Any, above: tuple[str, ...], time
         raise SchemaError(f"an array of {length} elements")
     item = _field_node(defs, args[0], above, times * _listed(length), unfolding)
     if length is not None and not (isinstance(item, Scalar) and item.kind != "string"):
-        unfolding.enter(length, len(above))  # its reader has a line of code an element
+        unfolding.enter(length * _PLACES_AN_ELEMENT, len(above))
     return Array(item, length)
 
 

@@ -51,13 +51,15 @@ def protobuf_schema(type_name: str, data: bytes, budget: Budget = DEFAULT_BUDGET
         files = descriptor_pb2.FileDescriptorSet.FromString(data)
         pool = descriptor_pool.DescriptorPool()
         by_name = {file.name: file for file in files.file}
+        unfolding = Unfolding(budget, what)
+        unfolding.enter(len(by_name), 0)
         for name in _in_order(by_name):
             pool.AddSerializedFile(by_name[name].SerializeToString())
         try:
             descriptor = pool.FindMessageTypeByName(type_name.removeprefix("."))
         except KeyError as error:
             raise SchemaError(f"the descriptors hold no message {type_name}") from error
-        root = _message_node(descriptor, (), Unfolding(budget, what))
+        root = _message_node(descriptor, (), unfolding)
         message_class = message_factory.GetMessageClass(descriptor)
     return MessageSchema(type_name, "protobuf", root, None, message_class, budget)
 
