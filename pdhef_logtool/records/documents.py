@@ -12,6 +12,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.shown import utf8
 
 if TYPE_CHECKING:
     from pydantic import AfterValidator, ValidationError
@@ -199,16 +200,18 @@ def jsonable(value: Any) -> Any:
     TypeError
         For anything else.
     """
-    if value is None or isinstance(value, str | bool | int):
+    if value is None or isinstance(value, bool | int):
         return value
+    if isinstance(value, str):
+        return utf8(value)
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, PurePath):
-        return str(value)
+        return utf8(str(value))
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
-        return {str(k): jsonable(v) for k, v in value.items()}
+        return {utf8(str(k)): jsonable(v) for k, v in value.items()}
     if isinstance(value, set | frozenset):
         return [jsonable(v) for v in sorted(value)]
     if isinstance(value, Sequence):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
+from pdhef_logtool.records.shown import shown
+
 EXIT_OK = 0
 EXIT_FAILURE = 1
 EXIT_USAGE = 2
@@ -37,11 +39,11 @@ class PdhefError(Exception):
         return partial(type(self), **parts), ()
 
     def __str__(self) -> str:
-        """One line, without a traceback's noise."""
-        text = f"{self.where}: expected {self.expected}, got {self.got}"
-        if self.remedy:
-            text += f"; {self.remedy}"
-        return " ".join(text.split())
+        """One line, without a traceback's noise and fit for a terminal, whatever its parts quote."""
+        where, expected, got, remedy = (
+            shown(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
+        )
+        return f"{where}: expected {expected}, got {got}" + (f"; {remedy}" if remedy else "")
 
 
 class UsageError(PdhefError):
