@@ -24,7 +24,7 @@ from numba.core import caching, config
 from numba.misc.appdirs import AppDirs
 
 #: What the first run with all estimators compiles on one core, in seconds; told to the user as a rough figure.
-COMPILING_S = 90
+COMPILING_S = 45
 
 
 def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
