@@ -146,7 +146,7 @@ def _read_metadata(path: Path) -> Mapping[str, Any]:
         document = YAML(typ="safe").load((path / "metadata.yaml").read_text(encoding="utf-8"))
         information = document["rosbag2_bagfile_information"]
         files = information["relative_file_paths"]
-    except (YAMLError, KeyError, TypeError, ValueError) as error:
+    except (YAMLError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise LogError(
             expected="rosbag2_bagfile_information with relative_file_paths",
             got=f"a file without ({type(error).__name__})",
@@ -154,20 +154,20 @@ def _read_metadata(path: Path) -> Mapping[str, Any]:
             remedy="re-index the folder with ros2 bag reindex, or give the storage file itself",
         ) from error
     if not isinstance(files, list) or not isinstance(information, dict):
-        raise LogError(expected="a list of relative_file_paths", got=repr(files), where=where, remedy=_REMEDY)
+        raise LogError(expected="a list of relative_file_paths", got=type(files).__name__, where=where, remedy=_REMEDY)
     return information
 
 
 def _open_rosbag2_folder(path: Path) -> ColumnarLog:
     information = _read_metadata(path)
-    per_message = str(information.get("compression_mode") or "").lower() == "message"
+    per_message = _text(information.get("compression_mode")).lower() == "message"
     encodings = _declared_encodings(information)
     containers: list[Container] = []
     forms: set[str] = set()
     lost: list[Loss] = []
     try:
-        for name in information["relative_file_paths"]:
-            file = _storage_file(path, str(name))
+        for name in map(_text, information["relative_file_paths"]):
+            file = _storage_file(path, name)
             if file is None:
                 lost.append(Loss("missing-file", f"{name} is named in metadata.yaml and absent", str(path)))
                 continue
@@ -185,7 +185,7 @@ def _open_rosbag2_folder(path: Path) -> ColumnarLog:
     if not containers:
         remedy = lost[0].what if lost else "metadata.yaml names no file"
         raise LogError(expected=_WHAT_IS_A_LOG, got="no readable storage file", where=str(path), remedy=remedy)
-    distro = str(information.get("ros_distro") or "")
+    distro = _text(information.get("ros_distro"))
     kind = "rosbag2-sqlite3" if forms == {"sqlite3"} else "rosbag2-mcap"
     return ColumnarLog(path, kind, containers, lost, distro or containers[0].distro)
 
@@ -202,11 +202,17 @@ def _storage_file(folder: Path, name: str) -> Path | None:
 def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
     """Return the serialization format that metadata.yaml declares for each topic."""
     found: dict[str, str] = {}
-    for entry in information.get("topics_with_message_count") or ():
+    topics = information.get("topics_with_message_count")
+    for entry in topics if isinstance(topics, list) else ():
         topic = entry.get("topic_metadata") if isinstance(entry, dict) else None
         if isinstance(topic, dict) and topic.get("serialization_format"):
-            found[str(topic.get("name"))] = str(topic["serialization_format"])
+            found[_text(topic.get("name"))] = _text(topic["serialization_format"])
     return found
+
+
+def _text(value: object) -> str:
+    """Return a scalar of a YAML document as a text: lists of lists of one anchor have no end when they are written."""
+    return str(value) if isinstance(value, str | int | float) else ""
 
 
 class _Wrapped(Container):

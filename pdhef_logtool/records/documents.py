@@ -21,6 +21,8 @@ ModelT = TypeVar("ModelT")
 
 #: Tables and lists inside one another: far more than any of our files has, far less than Python's stack.
 MAX_DEPTH = 32
+#: Twenty times the largest that is read.
+MAX_BYTES = 4 << 20
 #: TOML's whole numbers have 64 bits.
 _WHOLE = range(-(2**63), 2**64)
 
@@ -43,7 +45,7 @@ def read_json(path: Path, what: str, error: type[PdhefError], remedy: str = "") 
 
 def _read(path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefError], remedy: str) -> dict[str, Any]:
     try:
-        document = parse(path.read_text(encoding="utf-8"))
+        document = parse(read_text(path))
         got = _oddity(document)
     except FileNotFoundError:
         got = "no such file"
@@ -56,6 +58,15 @@ def _read(path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefE
     if got:
         raise error(expected=what, got=got, where=str(path), remedy=remedy)
     return dict(document)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a document; raises OSError, or ValueError if it is no UTF-8 or longer than any document."""
+    with path.open("rb") as file:
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"more than {MAX_BYTES >> 20} MiB")
+    return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _oddity(document: object) -> str:

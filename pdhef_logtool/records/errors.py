@@ -57,11 +57,19 @@ class LogError(PdhefError):
 
 
 class MappingError(PdhefError):
-    """A mapping file is wrong, or it names what the log does not hold."""
+    """A log does not hold what is to be mapped, or what is asked of it."""
+
+
+class MappingFileError(MappingError):
+    """A mapping file is wrong."""
+
+    exit_code = EXIT_USAGE
 
 
 class VehicleError(PdhefError):
     """A vehicle file is wrong."""
+
+    exit_code = EXIT_USAGE
 
 
 class EstimatorError(PdhefError):
@@ -78,3 +86,5 @@ class OutputError(PdhefError):
 
 class ModelError(PdhefError):
     """A model bundle is missing, wrong, or does not belong to its weights."""
+
+    exit_code = EXIT_USAGE
