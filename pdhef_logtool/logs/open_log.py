@@ -23,6 +23,7 @@ from pdhef_logtool.logs.container import (
     SpanDamageError,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
@@ -143,7 +144,7 @@ def _read_metadata(path: Path) -> Mapping[str, Any]:
 
     where = str(path / "metadata.yaml")
     try:
-        document = YAML(typ="safe").load((path / "metadata.yaml").read_text(encoding="utf-8"))
+        document = YAML(typ="safe").load(read_text(path / "metadata.yaml"))
         information = document["rosbag2_bagfile_information"]
         files = information["relative_file_paths"]
     except (YAMLError, LookupError, TypeError, ValueError, RecursionError) as error:
