@@ -199,7 +199,7 @@ def _kept(jobs: Sequence[Job], folder: Path) -> dict[int, dict[str, Any]]:
     try:
         old = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))["drives"]
         known = {entry["file"]: entry for entry in old}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         return {}
     kept: dict[int, dict[str, Any]] = {}
     for i, job in enumerate(jobs):

@@ -9,8 +9,8 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray
 from truthsim.driver import (
     MEMORY_SIZE,

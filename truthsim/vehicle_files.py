@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, create_model, model_validator
 
 from pdhef_logtool.records.documents import read_toml, validated
-from pdhef_logtool.records.errors import SimulationError
+from pdhef_logtool.records.errors import VehicleError
 from truthsim.tyres import Tyre
 from truthsim.vehicle import GRAVITY_M_S2, Vehicle
 
@@ -113,14 +113,14 @@ def load_vehicle(name_or_path: str | Path) -> Vehicle:
 
     Raises
     ------
-    SimulationError
+    VehicleError
         No such vehicle or file, or its content is wrong; the message names the value.
     """
     path = _FOLDER / f"{name_or_path}.toml" if str(name_or_path) in VEHICLES else Path(name_or_path)
     remedy = f"name one of {', '.join(VEHICLES)} or a file with the same values as truthsim/vehicles/sedan.toml"
-    raw = read_toml(path, "a vehicle TOML file", SimulationError, remedy)
+    raw = read_toml(path, "a vehicle TOML file", VehicleError, remedy)
     expected = "the entries of a simulated vehicle"
-    checked: Any = validated(_vehicle_model(), raw, str(path), SimulationError, expected=expected, remedy=remedy)
+    checked: Any = validated(_vehicle_model(), raw, str(path), VehicleError, expected=expected, remedy=remedy)
     values = {name: getattr(checked, name) for name in Vehicle._fields}
     for axle in ("front_tyre", "rear_tyre"):
         values[axle] = Tyre(**values[axle].model_dump())

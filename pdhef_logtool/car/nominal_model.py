@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit
-
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.records.compiled import njit
 
 #: Time constant with which the kinematic model is followed, s. Short against driving, long against a 10 ms step.
 KINEMATIC_TIME_CONSTANT_S = 0.1

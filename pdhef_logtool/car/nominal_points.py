@@ -11,9 +11,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit
-
 from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S
+from pdhef_logtool.records.compiled import njit
 
 #: Points of one inner loop: a constant, so that no remainder is left and every point is computed alike.
 WIDTH = 16

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 
 import typer
 
+from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import EXIT_OK
+from pdhef_logtool.records.shown import all_shown, shown
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,14 +25,21 @@ class _Result(Protocol):
 
 
 _Shown = TypeVar("_Shown", bound=_Result)
+#: A line on stderr is an error or a warning of several parts.
+_MOST_SIGNS = 5000
 
 
 def stdout() -> Console:
-    """Return a console of stdout."""
+    """Return a console of stdout; no text is read as markup."""
     from rich.console import Console
 
     # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS says otherwise.
-    return Console(highlight=False, width=None if sys.stdout.isatty() or os.environ.get("COLUMNS") else 160)
+    return Console(
+        highlight=False,
+        markup=False,
+        emoji=False,
+        width=None if sys.stdout.isatty() or os.environ.get("COLUMNS") else 160,
+    )
 
 
 def table(*heads: str, fold: int = 0) -> Table:
@@ -54,7 +63,7 @@ def cell(value: float | None, factor: float = 1.0, digits: int = 2) -> str:
 
 def say(text: str) -> None:
     """Print a line on stderr."""
-    print(text, file=sys.stderr)  # noqa: T201
+    print(shown(text, _MOST_SIGNS), file=sys.stderr)  # noqa: T201
 
 
 def warn(text: str) -> None:
@@ -63,14 +72,16 @@ def warn(text: str) -> None:
 
 
 def print_json(document: Any) -> None:
-    """Print one JSON document."""
-    print(json.dumps(document, indent=2, sort_keys=False, ensure_ascii=False, allow_nan=False))  # noqa: T201
+    """Print one JSON document; what a terminal would obey stands as JSON's escape of it."""
+    text = json.dumps(jsonable(document), indent=2, sort_keys=False, ensure_ascii=False, allow_nan=False)
+    signs = (c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
+    print(text if text.replace("\n", "").isprintable() else "".join(signs))  # noqa: T201
 
 
 def print_facts(facts: dict[str, Any]) -> None:
     """Print one fact a line."""
     for key, value in facts.items():
-        print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {value}")  # noqa: T201
+        print(f"{key}: {value:.4g}" if isinstance(value, float) else f"{key}: {shown(value)}")  # noqa: T201
 
 
 def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: bool) -> None:
@@ -78,7 +89,7 @@ def show(result: _Shown, render: Callable[[_Shown, Console], None], as_json: boo
     if as_json:
         print_json(result.to_dict())
     else:
-        render(result, stdout())
+        render(all_shown(result), stdout())
 
 
 def finish(
@@ -98,7 +109,7 @@ def progress() -> Iterator[Callable[[str, float], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        yield lambda text, share: bar.update(task, description=text, completed=share)
+        yield lambda text, share: bar.update(task, description=shown(text), completed=share)

@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rich.text import Text
+
 from pdhef_logtool.cli.console import cell, table
 from pdhef_logtool.sinks.report import diverged_line, friction_line, reasons_line
 
@@ -64,10 +66,10 @@ def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
 def _render_log(one: LogResult, console: Console) -> None:
     report = one.report
     if report is None:
-        console.print(f"[bold]{one.outcome.log}[/bold]  {one.outcome.outcome}\n")
+        console.print(Text.assemble((one.outcome.log, "bold"), f"  {one.outcome.outcome}\n"))
         return
     drive = f"{report['log']['kind']}, {report['log']['duration_s']:.1f} s, vehicle {report['vehicle']['name']}"
-    console.print(f"[bold]{one.outcome.log}[/bold]  {drive}")
+    console.print(Text.assemble((one.outcome.log, "bold"), f"  {drive}"))
     for loss in report["losses"]:
         word = "lost" if loss["severity"] == "lost" else "note"
         told = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
@@ -87,12 +89,12 @@ def _render_log(one: LogResult, console: Console) -> None:
     if report["truth"]["not_independent"]:
         console.print("  † the truth is an input or the estimate itself: no independent check")
     if found := friction_line(report):
-        console.print(f"  friction: {found}", markup=False)
+        console.print(f"  friction: {found}")
     for estimator in report["estimators"]:
         if estimator["outcome"] == "skipped":
             console.print(f"  {estimator['name']} skipped: {estimator['reason']}")
     for note, names in _notes(report).items():
-        console.print(f"  {', '.join(names)}: {note}", markup=False)
+        console.print(f"  {', '.join(names)}: {note}")
     console.print()
 
 

@@ -17,7 +17,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
@@ -25,6 +24,7 @@ from pdhef_logtool.estimators.checked_inputs import InputCarry, check_inputs, r_
 from pdhef_logtool.estimators.filter_shell import VX, VY, YAW_RATE, Z_AY, PosteriorSteps, sideslip_std
 from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.reasons import BURST_AY
 from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals

@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.unscented import unscented_weights
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import Release, StepColumns, last_stamp_ns, predictable, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track

@@ -21,7 +21,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.nominal_model import (
     measured_lateral_acceleration,
@@ -32,6 +31,7 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators.filter_shell import U_STEER, VX
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.nominal_model import (
     ModelParameters,
@@ -43,6 +42,7 @@ from pdhef_logtool.estimators.unscented import (
     kalman_update,
     mean_and_covariance,
 )
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from numba import njit
-
 from pdhef_logtool.estimators.stepwise import (
     AY,
     RESTART_GAP_S,
@@ -18,6 +16,7 @@ from pdhef_logtool.estimators.stepwise import (
     advance_speed,
     run_stepwise,
 )
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 

@@ -21,8 +21,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit
-
 from pdhef_logtool.car.nominal_model import (
     KINEMATIC_TIME_CONSTANT_S,
     MAX_STEP_TIMES_POLE,
@@ -32,6 +30,7 @@ from pdhef_logtool.car.nominal_model import (
     substeps,
 )
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.records.compiled import njit
 
 
 class ForceParameters(NamedTuple):

@@ -6,8 +6,6 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from numba import njit
-
 from pdhef_logtool.car.nominal_model import (
     model_parameters,
     planar_lateral_acceleration,
@@ -26,6 +24,7 @@ from pdhef_logtool.estimators.stepwise import (
     advance_speed,
     run_stepwise,
 )
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.filter_shell import U_FRICTION, U_SPEED, U_STEER, VX, PosteriorSteps, rolls_forward
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.features import make_features

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from numba import njit
-
 from pdhef_logtool.estimators.stepwise import StepCarry, advance_speed, run_stepwise
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 

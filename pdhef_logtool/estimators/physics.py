@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.nominal_model import (
     ModelParameters,
@@ -46,6 +45,7 @@ from pdhef_logtool.estimators.unscented import (
     kalman_update,
     mean_and_covariance,
 )
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
 from pdhef_logtool.car.parts import FilterNoise
@@ -36,6 +35,7 @@ from pdhef_logtool.estimators.unscented import (
     kalman_update,
     mean_and_covariance,
 )
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.speed_slip import believable

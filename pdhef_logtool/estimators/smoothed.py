@@ -25,7 +25,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters
@@ -34,6 +33,7 @@ from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
 from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
 from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, PhysicsUkf, StepLinks
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, cut_signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import StepColumns, last_stamp_ns, predictable, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track

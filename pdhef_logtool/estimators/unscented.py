@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray
 
 #: Smallest variance that a repaired covariance keeps on its diagonal.

@@ -7,8 +7,8 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from rich import box
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from pdhef_logtool.inspection.report import Inspection, SignalReport, TopicReport
 
@@ -20,7 +20,7 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
     """Print an inspection: topics, signals and truth, what is missing, and everything to look at."""
     start = datetime.fromtimestamp(inspection.start_ns * 1e-9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     messages = sum(t.messages for t in inspection.topics)
-    console.print(f"[bold]{escape(inspection.path)}[/]", soft_wrap=True)
+    console.print(Text(inspection.path, "bold"), soft_wrap=True)
     console.print(
         f"{inspection.kind}, {inspection.duration_s:.1f} s from {start}, {messages} messages on "
         f"{len(inspection.topics)} topics"
@@ -34,14 +34,14 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         line = Table.grid(padding=(0, 1))
         line.add_column(width=9)
         line.add_column(overflow="fold")
-        line.add_row(f"[{style}]{head}[/]", escape(text))
+        line.add_row(Text(head, style), Text(text))
         console.print(line)
 
 
-def _table(title: str, *headings: str, words: int) -> Table:
+def _table(title: str, *headings: str | Text, words: int) -> Table:
     """Return an empty table whose first ``words`` columns hold text and the others numbers."""
     table = Table(
-        title=title,
+        title=Text(title),
         title_justify="left",
         title_style="bold",
         box=box.SIMPLE_HEAD,
@@ -59,8 +59,15 @@ def _table(title: str, *headings: str, words: int) -> Table:
 
 def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
     encodings = sorted({t.encoding for t in topics})
-    headings = ("topic\n[dim]type[/]", "count", "Hz", "jitter\nms", "longest gap\ns @ s", "delay\nms")
-    table = _table(f"Topics ({escape(', '.join(encodings))})", *headings, words=1)
+    headings = (
+        Text.assemble("topic\n", ("type", "dim")),
+        "count",
+        "Hz",
+        "jitter\nms",
+        "longest gap\ns @ s",
+        "delay\nms",
+    )
+    table = _table(f"Topics ({', '.join(encodings)})", *headings, words=1)
     for topic in topics:
         gap = "-"
         if math.isfinite(topic.largest_gap_s):
@@ -68,7 +75,7 @@ def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
         delay, late = _text(topic.delay_median_s * 1e3), _text(topic.delay_p95_s * 1e3)
         kind = topic.type.replace("/msg/", "/") + (f" ({topic.encoding})" if len(encodings) > 1 else "")
         table.add_row(
-            f"{escape(topic.name)}\n[dim]{escape(kind)}[/]",
+            Text.assemble(f"{topic.name}\n", (kind, "dim")),
             str(topic.messages),
             _text(topic.rate_hz),
             _text(topic.jitter_p95_s * 1e3),
@@ -83,9 +90,9 @@ def _sources_table(inspection: Inspection) -> Table:
     table = _table(f"Mapping ({origin})", "signal", "topic", "field", words=3)
     for section in (inspection.signals, inspection.truth):
         for report in section.values():
-            table.add_row(report.name, escape(report.topic), escape(_short(report.field)))
+            table.add_row(report.name, Text(report.topic), Text(_short(report.field)))
         if section is inspection.signals and inspection.truth:
-            table.add_row("[bold]truth[/]", "", "")
+            table.add_row(Text("truth", "bold"), "", "")
     return table
 
 
@@ -96,7 +103,7 @@ def _statistics_table(inspection: Inspection) -> Table:
         for report in section.values():
             table.add_row(*_statistics_row(report))
         if section is inspection.signals and inspection.truth:
-            table.add_row("[bold]truth[/]", *[""] * 8)
+            table.add_row(Text("truth", "bold"), *[""] * 8)
     return table
 
 

@@ -152,7 +152,7 @@ def set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
     for name, parse in (("manifest.json", json.loads), ("manifest.toml", tomllib.loads)):
         try:
             documents.append(parse((folder / name).read_text(encoding="utf-8")))
-        except (OSError, ValueError):
+        except (OSError, ValueError, RecursionError):
             continue  # there is none, or it is somebody else's
     entries = [e for d in documents if isinstance(d, dict) for key in ("drives", "log") for e in _entries(d.get(key))]
     return {e["file"]: e for e in entries if isinstance(e.get("file"), str)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from pdhef_logtool.logs.decoding import (
     missing_column,
 )
 from pdhef_logtool.logs.drive_log import ByteLedger, Columns, FieldInfo, TopicInfo
-from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves, resolve
+from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, Selection, leaves, resolve
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -60,7 +61,6 @@ class ColumnarLog:
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
-        self._refused: dict[str, Loss] = {}  # topics whose schema no parser foresaw, or the budget refuses
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
 
@@ -99,7 +99,11 @@ class ColumnarLog:
             if c in self._late:
                 found.append(_out_of_time(container, list(self._late[c].values())))
             found.extend(self._undecodable_losses(c, container))
-        return (*found, *self._refused.values())
+            for (of, channel), schema in sorted(self._schemas.items(), key=itemgetter(0)):
+                if of == c and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
+                    what = f"its messages cannot be decoded: {schema}"
+                    found.append(Loss("bad-schema", what, container.channels[channel].topic))
+        return tuple(found)
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
@@ -223,7 +227,7 @@ class ColumnarLog:
         return self._schemas[key]
 
     def _parse_schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
-        """Parse a schema once. The boundary: what no parser foresaw, or the budget refuses, is a loss of the topic."""
+        """Parse a schema once, within the log's time; one that does not parse is a loss of its topic."""
         example = self._example(c, channel)
         names = (channel.encoding, channel.schema_encoding, channel.schema_name, channel.type_name)
         definition = (*names, channel.schema_data, example)
@@ -232,15 +236,12 @@ class ColumnarLog:
             meter.check()
             with meter.running():
                 if definition not in self._parsed:
-                    self._parsed[definition] = channel_schema(channel, self.distro, example)
+                    self._parsed[definition] = channel_schema(channel, self.distro, example, meter.budget)
                 return self._parsed[definition]
         except SchemaError as error:
             return self._parsed.setdefault(definition, error)
-        except Exception as error:  # noqa: BLE001
-            kind, text = told(error)
-            kind = "bad-schema" if kind == "bad-chunk" else kind
-            self._refused.setdefault(channel.topic, Loss(kind, f"its schema cannot be used: {text}", channel.topic))
-            return SchemaError(text)
+        except BudgetError as error:  # of time
+            return SchemaError(told(error)[1])
 
     def _example(self, c: int, channel: ChannelRecord) -> bytes | None:
         """Return a channel's first message if its schema has to be taken from it."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial as bind
@@ -20,29 +19,39 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, BudgetError
 from pdhef_logtool.logs.container import Block, ChannelRecord
 from pdhef_logtool.logs.message_schema import (
     TIME_MEMBERS,
     VECTOR_ORDERS,
+    Array,
     MessageSchema,
-    SchemaError,
+    Node,
+    NoSchemaError,
+    Scalar,
     Selection,
     Step,
+    Struct,
     bytes_of_text,
-    example_node,
     json_schema,
+    json_schema_of_message,
     ros_schema,
     value_at,
 )
-from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, layout_of_message
+from pdhef_logtool.logs.wire_layout import LayoutReader, NoLayoutError, WireLayout, layout_of_message
 from pdhef_logtool.records.signals import IntArray
 
 #: Stands in a time column where the message lacks the time (NaN of int64).
 NO_TIME_NS = int(np.iinfo(np.int64).min)
 _LAYOUTS_PER_CHANNEL = 8
+#: Columns of an array are as many as its longest value has: at most so many cells, or columns where values are many.
+_CELLS = 1 << 26
+_COLUMNS = 64
 
 
-def channel_schema(channel: ChannelRecord, distro: str = "", example: bytes | None = None) -> MessageSchema:
+def channel_schema(
+    channel: ChannelRecord, distro: str = "", example: bytes | None = None, budget: Budget = DEFAULT_BUDGET
+) -> MessageSchema:
     """Parse the schema of a channel.
 
     Parameters
@@ -50,34 +59,33 @@ def channel_schema(channel: ChannelRecord, distro: str = "", example: bytes | No
     channel : channel to decode.
     distro : ROS distribution for types without a definition.
     example : first message, for JSON without a schema.
+    budget : what the schema may cost.
 
     Raises
     ------
-    SchemaError : the encoding is not supported, or the schema does not parse.
+    NoSchemaError : the encoding is not one that is decoded, or there is no schema.
+    SchemaError : the schema does not parse, or it costs too much.
     """
     if channel.encoding in ("cdr", "ros1"):
         if channel.schema_encoding not in ("ros2msg", "ros2idl", "ros1msg", ""):
-            raise SchemaError(f"{channel.encoding} messages with a {channel.schema_encoding!r} schema")
+            raise NoSchemaError(f"{channel.encoding} messages with a {channel.schema_encoding!r} schema")
         text = channel.schema_data.decode("utf-8", errors="replace")
         if not channel.type_name:
-            raise SchemaError("no type name")
-        return ros_schema(channel.type_name, channel.schema_encoding, text, channel.encoding, distro)
+            raise NoSchemaError("no type name")
+        return ros_schema(channel.type_name, channel.schema_encoding, text, channel.encoding, distro, budget)
     if channel.encoding == "json":
         if channel.schema_encoding == "jsonschema" and channel.schema_data.strip():
-            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"))
+            return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), budget)
         if example is not None:
-            try:
-                return MessageSchema(channel.type_name, "json", example_node(json.loads(example)))
-            except ValueError as error:
-                raise SchemaError(f"the first message is no JSON: {error}") from error
-        raise SchemaError("JSON without a schema and without a message")
+            return json_schema_of_message(channel.type_name, example, budget)
+        raise NoSchemaError("JSON without a schema and without a message")
     if channel.encoding == "protobuf":
         if channel.schema_encoding != "protobuf":
-            raise SchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
+            raise NoSchemaError(f"protobuf messages with a {channel.schema_encoding!r} schema")
         from pdhef_logtool.logs.protobuf_schema import protobuf_schema
 
-        return protobuf_schema(channel.schema_name, channel.schema_data)
-    raise SchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
+        return protobuf_schema(channel.schema_name, channel.schema_data, budget)
+    raise NoSchemaError(f"messages encoded as {channel.encoding!r} are not decoded")
 
 
 @dataclass(slots=True)
@@ -126,6 +134,7 @@ class ChannelDecoder:
                 at, n = int(offset[left[0]]), int(length[left[0]])
                 try:
                     layout = layout_of_message(self.schema.root, self.schema.wire, bytes(block.buffer[at : at + n]))
+                    self._check_widths(layout, len(rows))
                 except NoLayoutError:
                     no_layout.append(left[:1])
                     left = left[1:]
@@ -138,6 +147,13 @@ class ChannelDecoder:
             tried += 1
             left = self._read_layout(reader, block, offset, length, left, partial)
         return np.concatenate([*no_layout, left]) if no_layout else left
+
+    def _check_widths(self, layout: WireLayout, n: int) -> None:
+        """Refuse a layout one of whose arrays has too many elements for N rows of columns."""
+        most = min(self.schema.budget.array_width, _most_columns(n))
+        found = (layout.leaves.get(s.components[0]) for s in self.selections if s.shape == "array")
+        if any((leaf.count or 0) > most for leaf in found if leaf is not None):
+            raise NoLayoutError("an array is too wide for columns")
 
     def _read_layout(
         self,
@@ -171,12 +187,17 @@ class ChannelDecoder:
         decode = self._single_decoder()
         getters = [(s.path, self._getter(s)) for s in self.selections]
         values: dict[str, list[object]] = {s.path: [] for s in self.selections}
+        most = min(self.schema.budget.array_width, _most_columns(len(rows)))
         for row, at, n in zip(rows.tolist(), block.offset[rows].tolist(), block.length[rows].tolist(), strict=True):
             message = decode(bytes(block.buffer[at : at + n]))
             if message is None:
                 self.undecodable.append(row)
             for path, get in getters:
-                values[path].append(get(message))
+                value = get(message)
+                if isinstance(value, (list, np.ndarray)) and len(value) > most:
+                    self.undecodable.append(row)
+                    value = None
+                values[path].append(value)
         return {s.path: self._single_column(s, values[s.path]) for s in self.selections}
 
     def _getter(self, selection: Selection) -> Callable[[object], object]:
@@ -191,19 +212,14 @@ class ChannelDecoder:
         return lambda message: bytes_of_text(plain(message), selection.text)
 
     def _single_decoder(self) -> Callable[[bytes], object]:
-        """Return what decodes one message; None where its payload does not fit the type."""
-        if self.schema.wire == "protobuf":
-            from google.protobuf.message import DecodeError
-
-            return _none_on((DecodeError,), self.schema.message_class.FromString)
-        store = self.schema.store
-        if store is None:
-            return _none_on((ValueError,), json.loads)
-        from rosbags.serde import SerdeError
-
-        function = store.deserialize_cdr if self.schema.wire == "cdr" else store.deserialize_ros1
-        errors = (SerdeError, struct.error, ValueError, IndexError, MemoryError, OverflowError)
-        return _none_on(errors, bind(function, typename=self.schema.type_name))
+        """Return what decodes one message; None where its payload does not fit the type, or costs too much."""
+        schema = self.schema
+        if schema.wire == "protobuf":
+            return _tolerant(schema.message_class.FromString, schema)
+        if schema.store is None:
+            return _tolerant(json.loads, schema)
+        function = schema.store.deserialize_cdr if schema.wire == "cdr" else schema.store.deserialize_ros1
+        return _tolerant(bind(function, typename=schema.type_name), schema)
 
     def _single_column(self, selection: Selection, values: list[object]) -> NDArray[Any]:
         if selection.shape == "dynamic":
@@ -217,24 +233,76 @@ class ChannelDecoder:
         return _column(selection.shape, values, width_known)
 
 
-def _none_on(errors: tuple[type[Exception], ...], decode: Callable[[bytes], object]) -> Callable[[bytes], object]:
+def _tolerant(decode: Callable[[bytes], object], schema: MessageSchema) -> Callable[[bytes], object]:
+    most = _affordable_bytes(schema)
+
     def tolerant(data: bytes) -> object:
         try:
-            return decode(data)
-        except errors:
+            return decode(data) if len(data) <= most else None
+        except Exception:  # noqa: BLE001 (somebody else's bytes and somebody else's decoder)
             return None
 
     return tolerant
 
 
+def _affordable_bytes(schema: MessageSchema) -> float:
+    """Return the bytes of a message whose objects fit a memory: one of a byte or two takes a hundred."""
+    if schema.wire == "protobuf":
+        return schema.budget.chunk_bytes / 4
+    if schema.wire == "json":
+        return schema.budget.chunk_bytes / 16
+    return schema.budget.chunk_bytes / 128 * _bytes_an_object(schema.root)
+
+
+def _bytes_an_object(node: Node) -> float:
+    """Return the fewest bytes of a ROS message that become an object, for arrays of objects."""
+    if isinstance(node, Struct):
+        return min((_bytes_an_object(m) for m in node.members.values()), default=math.inf)
+    if isinstance(node, Array) and (isinstance(node.item, Struct) or node.item == Scalar("string")):
+        size, objects = _least_size(node.item)
+        return min(max(size, 1) / objects, _bytes_an_object(node.item))
+    return math.inf
+
+
+def _least_size(node: Node) -> tuple[int, int]:
+    """Return the fewest bytes of a place, and the objects that it becomes."""
+    if isinstance(node, Struct):
+        parts = [_least_size(m) for m in node.members.values()]
+        return sum(size for size, _ in parts), 1 + sum(n for _, n in parts)
+    if isinstance(node, Array):
+        size, objects = _least_size(node.item) if node.length is not None else (4, 1)
+        return (size * node.length, objects * node.length) if node.length is not None else (size, objects)
+    if isinstance(node, Scalar) and node.kind != "string":
+        return np.dtype(node.code).itemsize, 0
+    return 4, 1
+
+
+def _most_columns(rows: int) -> int:
+    """Return how many columns so many rows may have."""
+    return max(_COLUMNS, _CELLS // max(rows, 1))
+
+
 def concatenate_columns(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Join parts of one column; arrays of unequal width are filled up with NaN on the right."""
+    """Join parts of one column; arrays of unequal width are filled up with NaN on the right.
+
+    Raises
+    ------
+    BudgetError : some arrays are so wide, and the others so many, that they would fill the memory.
+    """
     if len(parts) == 1:
         return parts[0]
     filled = [p for p in parts if p.shape[0]] or list(parts[:1])
     width = max((p.shape[1] for p in filled if p.ndim == 2), default=None)
     if width is None:
         return np.concatenate(filled)
+    rows = sum(p.shape[0] for p in filled)
+    if width > _most_columns(rows):
+        raise BudgetError(
+            expected=f"at most {_most_columns(rows)} elements in an array of {rows} messages",
+            got=str(width),
+            where="an array as columns",
+            remedy="map single elements of it, such as data[0]",
+        )
     wide = []
     for part in filled:
         columns = part if part.ndim == 2 else part[:, None]

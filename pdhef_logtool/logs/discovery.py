@@ -6,8 +6,9 @@ import glob
 import hashlib
 import os
 import re
+import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,13 +19,20 @@ from pdhef_logtool.records.errors import UsageError
 LOG_SUFFIXES = (".mcap", ".bag", ".db3")
 COMPRESSED_SUFFIXES = (".zstd", ".zst")
 ROSBAG2_METADATA = "metadata.yaml"
+#: Stems are folder names on whatever system the outputs go to.
+_STEM_BYTES = 100
+_NOT_IN_NAMES = frozenset('<>:"/\\|?*')
+_DEVICE = re.compile(r"CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³]", re.IGNORECASE)
 #: A folder with this file is an output of ours, and its recordings are no input.
 RUN_FILE = "run.json"
 
 
 @dataclass(frozen=True, slots=True)
 class LogInput:
-    """A log and its ``stem``: unique in a run, fit for a folder name, equal to ``log`` in the tables."""
+    """A log and its ``stem``: unique in a run, fit for a folder name on any system, equal to ``log`` in the tables.
+
+    The stem is the log's name; where that is none for a folder, or another log's too, hash digits end it.
+    """
 
     path: Path
     stem: str
@@ -136,9 +144,34 @@ def _with_stems(paths: list[Path]) -> list[LogInput]:
     parents = [os.path.realpath(p.parent) for p in paths]
     root = os.path.commonpath(parents)
     relative = [Path(os.path.relpath(Path(parent) / p.name, root)) for parent, p in zip(parents, paths, strict=True)]
-    stems = ["__".join([*r.parts[:-1], _bare_name(r.name)]) for r in relative]
-    counts = Counter(stems)
-    return [
-        LogInput(p, s if counts[s] == 1 else f"{s}-{hashlib.sha256(str(r).encode()).hexdigest()[:8]}")
-        for p, s, r in zip(paths, stems, relative, strict=True)
-    ]
+    names = ["__".join([*r.parts[:-1], _bare_name(r.name)]) for r in relative]
+    counts = Counter(map(_on_any_system, names))
+    taken: set[str] = set()
+    stems: dict[int, str] = {}
+    # Names that stay as they are come first, so that no other name can take theirs.
+    for i in sorted(range(len(names)), key=lambda i: not _stays(names[i], counts)):
+        stems[i] = names[i]
+        if not _stays(names[i], counts):
+            digits = hashlib.sha256(os.fsencode(relative[i])).hexdigest()
+            made = (_portable(names[i], digits[:n]) for n in range(8, len(digits) + 1))
+            stems[i] = next(stem for stem in made if _on_any_system(stem) not in taken)
+        taken.add(_on_any_system(stems[i]))
+    return [LogInput(p, stems[i]) for i, p in enumerate(paths)]
+
+
+def _stays(name: str, counts: Mapping[str, int]) -> bool:
+    return counts[_on_any_system(name)] == 1 and _portable(name) == name
+
+
+def _on_any_system(name: str) -> str:
+    """Return what two names share that some file system takes for one."""
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _portable(name: str, digits: str = "") -> str:
+    """Return a name that can be a folder on any system: printable, not hidden, no way out, of at most 100 bytes."""
+    kept = "".join("_" if not c.isprintable() or c in _NOT_IN_NAMES else c for c in name).strip(". ")
+    if not kept or _DEVICE.fullmatch(kept.partition(".")[0].rstrip()):
+        kept = f"log-{kept}".rstrip("-")
+    end = f"-{digits}" if digits else ""
+    return kept.encode()[: _STEM_BYTES - len(end)].decode(errors="ignore").rstrip(". ") + end

@@ -7,12 +7,14 @@ import difflib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import FieldInfo
-from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.errors import MappingError, PdhefError
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -81,7 +83,7 @@ class MessageSchema:
     """A message type: its tree, and what its messages are decoded with.
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` holds the definitions of ROS types,
-    ``message_class`` is the class of a protobuf type.
+    ``message_class`` is the class of a protobuf type; ``budget`` holds for its messages, too.
     """
 
     type_name: str
@@ -89,6 +91,7 @@ class MessageSchema:
     root: Node
     store: Typestore | None = None
     message_class: Any = None
+    budget: Budget = DEFAULT_BUDGET
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +113,47 @@ class Selection:
 #: Endings of a path that read a text as the bytes that it encodes.
 TEXT_ENDINGS = {"|hex": "hex", "|base64": "base64"}
 
-#: Member that stands in a message type without members.
+#: Member that stands in a message type without members, and its description by rosbags.
 _FILLER = "structure_needs_at_least_one_member"
+_NO_MEMBERS = ((_FILLER, (1, ("uint8", 0))),)
 
 
 class SchemaError(Exception):
     """A schema cannot be parsed; the topic stays countable, its fields are unknown."""
+
+
+class NoSchemaError(SchemaError):
+    """A channel brings no schema of a kind that is read here; nothing of the recording is lost by that."""
+
+
+@contextmanager
+def parsing(what: str) -> Iterator[None]:
+    """Turn whatever escapes the parser of somebody else's text into a :class:`SchemaError`."""
+    try:
+        yield
+    except SchemaError:
+        raise
+    except PdhefError as error:  # the budget's
+        raise SchemaError(f"{what}: expected {error.expected}, got {error.got}; {error.remedy}") from error
+    except RecursionError as error:
+        raise SchemaError(f"{what}: nested too deeply") from error
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0].rstrip(":") or type(error).__name__
+        raise SchemaError(f"{what} cannot be parsed: {reason}") from error
+
+
+class Unfolding:
+    """Counts the places of a schema while its tree is built: a short text can describe an endless one."""
+
+    def __init__(self, budget: Budget, what: str) -> None:
+        self.budget, self.what = budget, what
+        self.places = 0
+
+    def enter(self, times: int, depth: int) -> None:
+        """Count a node that stands ``times`` times in the tree, below ``depth`` others; raises BudgetError."""
+        self.places += times
+        self.budget.check("schema_leaves", self.places, self.what)
+        self.budget.check("schema_depth", depth, self.what)
 
 
 _CODES = {
@@ -130,8 +168,16 @@ _CODES = {
 _SEPARATOR = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
 
 
+#: Bytes of descriptors that cost what one byte of a text costs, which a grammar parses step by step.
+_BYTES_OF_MSG, _BYTES_OF_IDL = 16, 32
+#: An element of a fixed array of structs or texts is a line in each of the functions that rosbags writes for its type.
+_PLACES_AN_ELEMENT = 8
+
+
 @lru_cache(maxsize=256)
-def ros_schema(type_name: str, encoding: str, text: str, wire: str, distro: str = "") -> MessageSchema:
+def ros_schema(
+    type_name: str, encoding: str, text: str, wire: str, distro: str = "", budget: Budget = DEFAULT_BUDGET
+) -> MessageSchema:
     """Parse a ROS message definition.
 
     Parameters
@@ -141,36 +187,36 @@ def ros_schema(type_name: str, encoding: str, text: str, wire: str, distro: str 
     text : concatenated definitions; empty takes the type from the distribution's own packages.
     wire : ``cdr`` or ``ros1``.
     distro : ROS distribution for a type without a text; the latest one if empty or unknown.
+    budget : what the schema may cost.
 
     Raises
     ------
-    SchemaError : the text does not parse, or the type is not known.
+    SchemaError : the text does not parse, the type is not known, or it costs too much.
     """
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-    from rosbags.typesys.base import TypesysError
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
-    try:
+    from pdhef_logtool.logs.idl_parser import idl_types
+
+    what = f"the definition of {type_name}"
+    with parsing(what):
+        budget.check("schema_bytes", len(text) * (_BYTES_OF_IDL if encoding == "ros2idl" else _BYTES_OF_MSG), what)
+        base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
         if text.strip():
             text = _SEPARATOR.sub("=" * 80, text)
-            types = get_types_from_idl(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
+            types = idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
             store = get_typestore(Stores.EMPTY)
             missing = _referenced(types) - set(types)
             if missing:
                 default = get_typestore(base)
                 types = {**_closure(default.fielddefs, missing), **types}
+            root = _ros_root(types, type_name, budget)
             store.register(types)
         else:
             store = get_typestore(base)
-        if type_name not in store.fielddefs:
-            raise SchemaError(f"no definition of {type_name}")
-        root = _ros_node(store.fielddefs, type_name, ())
-    except SchemaError:
-        raise
-    except (TypesysError, KeyError, ValueError, TypeError, IndexError, SyntaxError, RecursionError) as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(":")
-        raise SchemaError(f"the definition of {type_name} does not parse: {reason}") from error
-    return MessageSchema(type_name, wire, root, store)
+            if type_name not in store.fielddefs:
+                raise NoSchemaError(f"no definition of {type_name}")
+            root = _ros_root(store.fielddefs, type_name, budget)
+    return MessageSchema(type_name, wire, root, store, budget=budget)
 
 
 def _store_of(distro: str) -> Any:
@@ -203,18 +249,27 @@ def _closure(defs: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
     return found
 
 
-def _ros_node(defs: Mapping[str, Any], name: str, above: tuple[str, ...]) -> Struct:
+def _ros_root(defs: Mapping[str, Any], type_name: str, budget: Budget) -> Struct:
+    if type_name not in defs:
+        raise SchemaError(f"no definition of {type_name}")
+    members = defs[type_name][1]
+    if not members or [field for field, _ in members] == [_FILLER]:
+        return Struct({})
+    return _ros_node(defs, type_name, (), 1, Unfolding(budget, f"the definition of {type_name}"))
+
+
+def _ros_node(defs: Mapping[str, Any], name: str, above: tuple[str, ...], times: int, unfolding: Unfolding) -> Struct:
     if name in above:
         raise SchemaError(f"{name} contains itself")
-    members = defs[name][1]
-    if not above and [field for field, _ in members] == [_FILLER]:
-        return Struct({})
-    return Struct({field: _field_node(defs, desc, (*above, name)) for field, desc in members})
+    above = (*above, name)
+    members = defs[name][1] or _NO_MEMBERS
+    return Struct({field: _field_node(defs, desc, above, times, unfolding) for field, desc in members})
 
 
-def _field_node(defs: Mapping[str, Any], desc: Any, above: tuple[str, ...]) -> Node:
+def _field_node(defs: Mapping[str, Any], desc: Any, above: tuple[str, ...], times: int, unfolding: Unfolding) -> Node:
     from rosbags.interfaces import Nodetype
 
+    unfolding.enter(times, len(above))
     kind, args = desc
     if kind == Nodetype.BASE:
         base = args[0]
@@ -224,29 +279,52 @@ def _field_node(defs: Mapping[str, Any], desc: Any, above: tuple[str, ...]) -> N
             raise SchemaError(f"type {base} is not supported")
         return Scalar("bool" if base == "bool" else "number", _CODES[base])
     if kind == Nodetype.NAME:
-        return _ros_node(defs, args, above)
-    item = _field_node(defs, args[0], above)
-    return Array(item, args[1] if kind == Nodetype.ARRAY else None)
+        return _ros_node(defs, args, above, times, unfolding)
+    length = args[1] if kind == Nodetype.ARRAY else None
+    if length is not None and length < 0:
+        raise SchemaError(f"an array of {length} elements")
+    item = _field_node(defs, args[0], above, times * _listed(length), unfolding)
+    if length is not None and not (isinstance(item, Scalar) and item.kind != "string"):
+        unfolding.enter(length * _PLACES_AN_ELEMENT, len(above))
+    return Array(item, length)
 
 
-def json_schema(type_name: str, text: str) -> MessageSchema:
+def _listed(length: int | None) -> int:
+    """Return how many times an array's element is listed."""
+    return length if length is not None and length <= LISTED_ELEMENTS else 1
+
+
+def json_schema(type_name: str, text: str, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
     """Parse a JSON Schema; raises :class:`SchemaError`."""
-    try:
+    what = f"the JSON Schema of {type_name}"
+    with parsing(what):
+        budget.check("schema_bytes", len(text), what)
         document = json.loads(text)
-    except ValueError as error:
-        raise SchemaError(f"the JSON Schema of {type_name} does not parse: {error}") from error
-    return MessageSchema(type_name, "json", _json_node(document, document, 0))
+        root = _json_node(document, _Json(document, Unfolding(budget, what)), 1, (), 0)
+    return MessageSchema(type_name, "json", root, budget=budget)
 
 
-def _json_node(schema: Any, document: Any, depth: int) -> Node:
-    if not isinstance(schema, dict) or depth > 32:
+@dataclass(frozen=True, slots=True)
+class _Json:
+    """A JSON Schema that is being unfolded."""
+
+    document: Any
+    unfolding: Unfolding
+
+
+def _json_node(schema: Any, whole: _Json, times: int, inside: tuple[str, ...], depth: int) -> Node:
+    """Return a schema's tree; ``inside`` holds the references that lead here: what contains itself is left open."""
+    if not isinstance(schema, dict) or depth > whole.unfolding.budget.schema_depth:
         return Unknown()
+    whole.unfolding.enter(times, 0)
     reference = schema.get("$ref")
     if isinstance(reference, str) and reference.startswith("#/"):
-        target: Any = document
+        if reference in inside:
+            return Unknown()
+        target: Any = whole.document
         for part in reference[2:].split("/"):
             target = target.get(part) if isinstance(target, dict) else None
-        return _json_node(target, document, depth + 1)
+        return _json_node(target, whole, times, (*inside, reference), depth + 1)
     declared = schema.get("type")
     types = [t for t in declared if t != "null"] if isinstance(declared, list) else [declared]
     kind = types[0] if len(types) == 1 else None
@@ -254,11 +332,11 @@ def _json_node(schema: Any, document: Any, depth: int) -> Node:
         properties = schema.get("properties")
         if not isinstance(properties, dict) or not properties:
             return Unknown()
-        return Struct({str(k): _json_node(v, document, depth + 1) for k, v in properties.items()})
+        return Struct({k: _json_node(v, whole, times, inside, depth + 1) for k, v in properties.items()})
     if kind == "array":
         least, most = schema.get("minItems"), schema.get("maxItems")
-        length = least if isinstance(least, int) and least == most else None
-        return Array(_json_node(schema.get("items"), document, depth + 1), length)
+        length = least if isinstance(least, int) and least == most and least >= 0 else None
+        return Array(_json_node(schema.get("items"), whole, times * _listed(length), inside, depth + 1), length)
     if kind in ("number", "integer"):
         return Scalar("number")
     if kind == "boolean":
@@ -268,12 +346,21 @@ def _json_node(schema: Any, document: Any, depth: int) -> Node:
     return Unknown()
 
 
-def example_node(value: object) -> Node:
-    """Take the tree from a decoded JSON message."""
+def json_schema_of_message(type_name: str, message: bytes, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
+    """Take the schema from a JSON message; raises :class:`SchemaError`."""
+    what = "the first message"
+    with parsing(what):
+        budget.check("schema_bytes", len(message), what)
+        root = _example_node(json.loads(message), Unfolding(budget, what), 0)
+    return MessageSchema(type_name, "json", root, budget=budget)
+
+
+def _example_node(value: object, unfolding: Unfolding, depth: int) -> Node:
+    unfolding.enter(1, depth)
     if isinstance(value, dict):
-        return Struct({str(k): example_node(v) for k, v in value.items()})
+        return Struct({k: _example_node(v, unfolding, depth + 1) for k, v in value.items()})
     if isinstance(value, list):
-        return Array(example_node(value[0]) if value else Unknown(), None)
+        return Array(_example_node(value[0], unfolding, depth + 1) if value else Unknown(), None)
     if isinstance(value, bool):
         return Scalar("bool")
     if isinstance(value, (int, float)):
@@ -372,6 +459,8 @@ def resolve(schema: MessageSchema, topic: str, path: str) -> Selection:
             return Selection(path, "dynamic", (steps,))
         if not isinstance(node.item, Scalar) or node.item.kind == "string":
             raise _no_number(schema, topic, path, "an array of structs or texts")
+        if node.length is not None and node.length > schema.budget.array_width:
+            raise _no_number(schema, topic, path, f"an array of {node.length} elements, too many for columns")
         return Selection(path, "array", (steps,), node.length)
     if node.time:
         return Selection(path, "time", tuple((*steps, part) for part in node.time))

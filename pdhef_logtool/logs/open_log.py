@@ -26,6 +26,7 @@ from pdhef_logtool.logs.container import (
     told,
 )
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import Loss
 
@@ -151,9 +152,11 @@ def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
     file = path / "metadata.yaml"
     budget.check("metadata_bytes", file.stat().st_size, str(file))
     try:
-        document = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
+        document = YAML(typ="safe").load(read_text(file))
         information = document["rosbag2_bagfile_information"]
         files = information["relative_file_paths"]
+    except OSError:
+        raise
     except Exception as error:
         raise LogError(
             expected="rosbag2_bagfile_information with relative_file_paths",
@@ -175,8 +178,8 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
     forms: set[str] = set()
     lost: list[Loss] = []
     try:
-        for name in information["relative_file_paths"]:
-            file = _storage_file(path, str(name))
+        for name in map(_text, information["relative_file_paths"]):
+            file = _storage_file(path, name)
             if file is None:
                 lost.append(Loss("missing-file", f"{name} is named in metadata.yaml and absent", str(path)))
                 continue
@@ -197,7 +200,7 @@ def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
     if not containers:
         remedy = lost[0].what if lost else "metadata.yaml names no file"
         raise LogError(expected=_WHAT_IS_A_LOG, got="no readable storage file", where=str(path), remedy=remedy)
-    distro = str(information.get("ros_distro") or "")
+    distro = _text(information.get("ros_distro"))
     kind = "rosbag2-sqlite3" if forms == {"sqlite3"} else "rosbag2-mcap"
     return ColumnarLog(path, kind, containers, lost, distro or containers[0].distro)
 
@@ -219,11 +222,17 @@ def _storage_file(folder: Path, name: str) -> Path | None:
 def _declared_encodings(information: Mapping[str, Any]) -> dict[str, str]:
     """Return the serialization format that metadata.yaml declares for each topic."""
     found: dict[str, str] = {}
-    for entry in information.get("topics_with_message_count") or ():
+    topics = information.get("topics_with_message_count")
+    for entry in topics if isinstance(topics, list) else ():
         topic = entry.get("topic_metadata") if isinstance(entry, dict) else None
         if isinstance(topic, dict) and topic.get("serialization_format"):
-            found[str(topic.get("name"))] = str(topic["serialization_format"])
+            found[_text(topic.get("name"))] = _text(topic["serialization_format"])
     return found
+
+
+def _text(value: object) -> str:
+    """Return a scalar of a YAML document as a text: lists of lists of one anchor have no end when they are written."""
+    return str(value) if isinstance(value, str | int | float) else ""
 
 
 class _Wrapped(Container):

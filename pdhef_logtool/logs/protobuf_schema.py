@@ -11,7 +11,19 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
-from pdhef_logtool.logs.message_schema import Array, MessageSchema, Node, Scalar, SchemaError, Selection, Step, Struct
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.message_schema import (
+    Array,
+    MessageSchema,
+    Node,
+    Scalar,
+    SchemaError,
+    Selection,
+    Step,
+    Struct,
+    Unfolding,
+    parsing,
+)
 
 #: Protobuf nests by reference, so that a small file can describe an endless tree.
 _MAX_DEPTH = 16
@@ -19,7 +31,7 @@ _WELL_KNOWN = "google/protobuf/"
 
 
 @lru_cache(maxsize=256)
-def protobuf_schema(type_name: str, data: bytes) -> MessageSchema:
+def protobuf_schema(type_name: str, data: bytes, budget: Budget = DEFAULT_BUDGET) -> MessageSchema:
     """Parse a serialized ``FileDescriptorSet``.
 
     Parameters
@@ -29,33 +41,32 @@ def protobuf_schema(type_name: str, data: bytes) -> MessageSchema:
 
     Raises
     ------
-    SchemaError : the set does not parse, lacks a file, or does not hold the type.
+    SchemaError : the set does not parse, lacks a file, does not hold the type, or costs too much.
     """
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-    from google.protobuf.message import DecodeError
 
-    files = descriptor_pb2.FileDescriptorSet()
-    try:
-        files.ParseFromString(data)
-    except DecodeError as error:
-        raise SchemaError(f"the descriptors of {type_name} do not parse: {error}") from error
-    pool = descriptor_pool.DescriptorPool()
-    by_name = {file.name: file for file in files.file}
-    try:
+    what = f"the descriptors of {type_name}"
+    with parsing(what):
+        budget.check("schema_bytes", len(data), what)
+        files = descriptor_pb2.FileDescriptorSet.FromString(data)
+        pool = descriptor_pool.DescriptorPool()
+        by_name = {file.name: file for file in files.file}
+        unfolding = Unfolding(budget, what)
+        unfolding.enter(len(by_name), 0)
         for name in _in_order(by_name):
             pool.AddSerializedFile(by_name[name].SerializeToString())
-        descriptor = pool.FindMessageTypeByName(type_name.removeprefix("."))
+        try:
+            descriptor = pool.FindMessageTypeByName(type_name.removeprefix("."))
+        except KeyError as error:
+            raise SchemaError(f"the descriptors hold no message {type_name}") from error
+        root = _message_node(descriptor, (), unfolding)
         message_class = message_factory.GetMessageClass(descriptor)
-    except KeyError as error:
-        raise SchemaError(f"the descriptors hold no message {type_name}") from error
-    except (TypeError, ValueError, RecursionError) as error:
-        raise SchemaError(f"the descriptors of {type_name} are not consistent: {error}") from error
-    return MessageSchema(type_name, "protobuf", _message_node(descriptor, ()), None, message_class)
+    return MessageSchema(type_name, "protobuf", root, None, message_class, budget)
 
 
 def _in_order(files: dict[str, Any]) -> list[str]:
     """Return the files' names, imported ones first; well-known files that are not there are added."""
-    ordered: list[str] = []
+    ordered: dict[str, None] = {}
     open_: set[str] = set()
 
     def visit(name: str, importer: str) -> None:
@@ -68,11 +79,11 @@ def _in_order(files: dict[str, Any]) -> list[str]:
         open_.add(name)
         for dependency in files[name].dependency:
             visit(dependency, name)
-        ordered.append(name)
+        ordered[name] = None
 
     for name in list(files):
         visit(name, "")
-    return ordered
+    return list(ordered)
 
 
 def _well_known_file(name: str, importer: str) -> Any:
@@ -92,26 +103,27 @@ def _well_known_file(name: str, importer: str) -> Any:
     raise SchemaError(f"{importer} imports {name}, which the descriptors lack")
 
 
-def _message_node(descriptor: Any, above: tuple[str, ...]) -> Struct:
+def _message_node(descriptor: Any, above: tuple[str, ...], unfolding: Unfolding) -> Struct:
     inside = (*above, descriptor.full_name)
     members: dict[str, Node] = {}
     for field in descriptor.fields:
-        node = _field_node(field, inside)
+        node = _field_node(field, inside, unfolding)
         if node is not None:
             members[field.name] = node
     return Struct(members)
 
 
-def _field_node(field: Any, inside: tuple[str, ...]) -> Node | None:
+def _field_node(field: Any, inside: tuple[str, ...], unfolding: Unfolding) -> Node | None:
     """Return a field's node; None where it has no place among columns."""
     from google.protobuf.descriptor import FieldDescriptor
 
+    unfolding.enter(1, len(inside))
     node: Node
     if field.message_type is not None:
         kind = field.message_type
         if kind.GetOptions().map_entry or kind.full_name in inside or len(inside) >= _MAX_DEPTH:
             return None
-        node = _message_node(kind, inside)
+        node = _message_node(kind, inside, unfolding)
     elif field.type == FieldDescriptor.TYPE_STRING:
         node = Scalar("string")
     elif field.type == FieldDescriptor.TYPE_BYTES:

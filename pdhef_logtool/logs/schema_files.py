@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
 _MESSAGE_SEPARATOR = "=" * 80
+#: A type name in ROS 2 form: it may come from a log, and becomes a path.
+_TYPE_NAME = re.compile(r"[A-Za-z]\w*/(msg|srv|action)/[A-Za-z]\w*", re.ASCII)
 
 
 def schema_file(name: str) -> Traversable:
@@ -28,8 +31,10 @@ def message_definition(type_name: str) -> str:
 
     Raises
     ------
-    KeyError : the type is in neither.
+    KeyError : the type is in neither, or the name is none of a type.
     """
+    if not _TYPE_NAME.fullmatch(type_name):
+        raise KeyError(type_name)
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)

@@ -18,7 +18,7 @@ from pdhef_logtool.logs.columnar_log import ColumnarLog, in_window
 from pdhef_logtool.logs.container import Attachment, Block, ChannelRecord, MetadataRecord, RawChunk, Span
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.mcap_log import McapContainer
-from pdhef_logtool.logs.message_schema import SchemaError, ros_schema
+from pdhef_logtool.logs.message_schema import SchemaError, parsing, ros_schema
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.logs.writer import McapLogWriter, RawMessage
 from pdhef_logtool.records.errors import LogError
@@ -332,7 +332,6 @@ def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], b
     ------
     SchemaError : its definition does not parse.
     """
-    from rosbags.serde import SerdeError
     from rosbags.typesys import Stores, get_typestore
 
     text = channel.schema_data.decode("utf-8", errors="replace")
@@ -345,16 +344,17 @@ def _as_ros2(channel: ChannelRecord) -> tuple[ChannelRecord, Callable[[bytes], b
     if _HEADER in types:
         types[_HEADER] = get_typestore(Stores.LATEST).fielddefs[_HEADER]
     source = get_typestore(Stores.EMPTY)
-    source.register(types)
+    with parsing(f"the definition of {name}"):
+        source.register(types)
+        definition = source.generate_msgdef(name, ros_version=2)[0]
 
     def convert(data: bytes) -> bytes | None:
         try:
             return bytes(source.ros1_to_cdr(data, name))
-        except (SerdeError, ValueError, IndexError):
+        except Exception:  # noqa: BLE001 (somebody else's bytes and somebody else's converter)
             return None
 
     members = parsed.fielddefs[name][1]
-    definition = source.generate_msgdef(name, ros_version=2)[0]
     return (
         replace(
             channel,

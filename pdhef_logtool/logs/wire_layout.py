@@ -8,6 +8,7 @@ size counted from after the 4-byte encapsulation header. ROS 1 packs without ali
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -19,6 +20,8 @@ from pdhef_logtool.logs.message_schema import Array, Node, Scalar, Step, Struct,
 
 #: Arrays of structs (or of texts) are unrolled up to this many elements.
 UNROLLED_ELEMENTS = 64
+#: Leaves and structs of one layout.
+_MOST_PLACES = 1 << 16
 
 _CDR_HEAD = np.dtype("<u2")
 _LITTLE_ENDIAN_CDR = 0x0100  # the bytes 0, 1
@@ -79,28 +82,31 @@ def layout_of_message(root: Node, wire: str, message: bytes) -> WireLayout:
             raise NoLayoutError("a length exceeds the message")
         return int(length)
 
-    layout = build_layout(root, wire, length_of)
-    if layout.size > len(message):
-        raise NoLayoutError("the message ends early")
-    return layout
+    return _Builder(wire, length_of, len(message)).built(root)
 
 
 def build_layout(root: Node, wire: str, length_of: LengthOf) -> WireLayout:
     """Lay out a message type whose variable lengths ``length_of`` tells; raises :class:`NoLayoutError`."""
-    builder = _Builder(wire, length_of)
-    builder.place(root, ())
-    return WireLayout(builder.at, builder.leaves, tuple(builder.guards), builder.texts)
+    return _Builder(wire, length_of, sys.maxsize).built(root)
 
 
 class _Builder:
-    def __init__(self, wire: str, length_of: LengthOf) -> None:
+    def __init__(self, wire: str, length_of: LengthOf, end: int) -> None:
         self.aligned = wire == "cdr"
         self.origin = 4 if self.aligned else 0
         self.at = self.origin
         self.length_of = length_of
+        self.end = end
+        self.places = 0
         self.leaves: dict[Steps, Leaf] = {}
         self.guards: list[tuple[int, int]] = []
         self.texts: dict[Steps, tuple[int, int]] = {}
+
+    def built(self, root: Node) -> WireLayout:
+        self.place(root, ())
+        if self.at > self.end:
+            raise NoLayoutError("the message ends early")
+        return WireLayout(self.at, self.leaves, tuple(self.guards), self.texts)
 
     def align(self, size: int) -> None:
         if self.aligned:
@@ -114,6 +120,10 @@ class _Builder:
         return length
 
     def place(self, node: Node, steps: Steps) -> None:
+        # Arrays in arrays multiply.
+        self.places += 1
+        if self.at > self.end or self.places > _MOST_PLACES:
+            raise NoLayoutError("the message ends early" if self.at > self.end else "too many places")
         if isinstance(node, Struct):
             for name, member in node.members.items():
                 self.place(member, (*steps, name))

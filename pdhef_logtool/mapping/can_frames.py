@@ -10,6 +10,7 @@ most significant bit.
 
 from __future__ import annotations
 
+import stat
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -23,11 +24,13 @@ from numpy.typing import NDArray
 from pdhef_logtool.logs.drive_log import ByteLedger, Columns, DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
-from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.errors import MappingError, MappingFileError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Loss
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message, Signal
+
+_MAX_DBC_BYTES = 32 << 20
 
 # Where frames keep their parts, best first; names are compared in lower case without underscores.
 ID_NAMES = ("id", "canid", "arbitrationid", "address", "identifier", "frameid", "msgid", "messageid")
@@ -391,9 +394,16 @@ def _load_dbc(path: Path) -> Database:
     try:
         state = path.stat()
     except OSError as error:
-        raise MappingError(
+        raise MappingFileError(
             expected="a DBC file", got=error.strerror or str(error), where=str(path), remedy="correct [can] dbc"
         ) from None
+    if not stat.S_ISREG(state.st_mode) or state.st_size > _MAX_DBC_BYTES:
+        raise MappingFileError(
+            expected=f"a DBC file of at most {_MAX_DBC_BYTES >> 20} MiB",
+            got=f"{state.st_size} bytes" if stat.S_ISREG(state.st_mode) else "no file",
+            where=str(path),
+            remedy="correct [can] dbc",
+        )
     return _load_cached(path, state.st_mtime_ns, state.st_size)
 
 
@@ -407,8 +417,10 @@ def _load_cached(path: Path, _modified_ns: int, _size: int) -> Database:
         # Overlapping signals are an error of the file, not of the signals that are asked for.
         found = cantools.database.load_file(path, strict=False)
     except Exception as error:  # noqa: BLE001  cantools' parsers raise whatever a malformed file leads them to.
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
-        raise MappingError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
+        reason = (str(error).splitlines() or [""])[0] or type(error).__name__
+        raise MappingFileError(expected=expected, got=reason, where=str(path), remedy="correct [can] dbc") from None
     if not isinstance(found, Database):
-        raise MappingError(expected=expected, got="a file of another kind", where=str(path), remedy="correct [can] dbc")
+        raise MappingFileError(
+            expected=expected, got="a file of another kind", where=str(path), remedy="correct [can] dbc"
+        )
     return found

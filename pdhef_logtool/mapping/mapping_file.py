@@ -25,7 +25,7 @@ from pdhef_logtool.mapping.records import (
     StampUnit,
 )
 from pdhef_logtool.records.documents import checked, read_toml, unknown
-from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.errors import MappingError, MappingFileError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 
 #: Names in the tables that are no estimator's.
@@ -107,10 +107,10 @@ def load_mapping(path: Path) -> Mapping:
 
     Raises
     ------
-    MappingError
+    MappingFileError
         The file is missing, is no TOML, or holds wrong, unknown, missing or contradicting entries; all are named.
     """
-    raw = read_toml(path, "a mapping TOML file", MappingError)
+    raw = read_toml(path, "a mapping TOML file", MappingFileError)
     return mapping_from_dict(raw, where=str(path), folder=path.parent)
 
 
@@ -119,7 +119,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
 
     Raises
     ------
-    MappingError : Entries are wrong, unknown, missing or contradict one another.
+    MappingFileError : Entries are wrong, unknown, missing or contradict one another.
     """
     sections = ("signals", "truth", "truth_quality", "estimates", "can", "fill_recognised")
     problems = [unknown(key, sections) for key in raw if key not in sections]
@@ -140,7 +140,7 @@ def mapping_from_dict(raw: dict[str, Any], *, where: str, folder: Path = Path())
         problems += [f"{name}: field = {CAN_PREFIX}... needs [can] with a dbc" for name in names]
     problems += _contradictions(mapping)
     if problems:
-        raise MappingError(
+        raise MappingFileError(
             expected="the entries of mapping.toml",
             got="; ".join(problems),
             where=where,

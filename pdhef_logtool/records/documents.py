@@ -12,6 +12,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
 
 from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.shown import utf8
 
 if TYPE_CHECKING:
     from pydantic import AfterValidator, ValidationError
@@ -20,6 +21,8 @@ ModelT = TypeVar("ModelT")
 
 #: Tables and lists inside one another: far more than any of our files has, far less than Python's stack.
 MAX_DEPTH = 32
+#: Twenty times the largest that is read.
+MAX_BYTES = 4 << 20
 #: TOML's whole numbers have 64 bits.
 _WHOLE = range(-(2**63), 2**64)
 
@@ -42,7 +45,7 @@ def read_json(path: Path, what: str, error: type[PdhefError], remedy: str = "") 
 
 def _read(path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefError], remedy: str) -> dict[str, Any]:
     try:
-        document = parse(path.read_text(encoding="utf-8"))
+        document = parse(read_text(path))
         got = _oddity(document)
     except FileNotFoundError:
         got = "no such file"
@@ -55,6 +58,15 @@ def _read(path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefE
     if got:
         raise error(expected=what, got=got, where=str(path), remedy=remedy)
     return dict(document)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a document; raises OSError, or ValueError if it is no UTF-8 or longer than any document."""
+    with path.open("rb") as file:
+        data = file.read(MAX_BYTES + 1)
+    if len(data) > MAX_BYTES:
+        raise ValueError(f"more than {MAX_BYTES >> 20} MiB")
+    return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _oddity(document: object) -> str:
@@ -199,16 +211,18 @@ def jsonable(value: Any) -> Any:
     TypeError
         For anything else.
     """
-    if value is None or isinstance(value, str | bool | int):
+    if value is None or isinstance(value, bool | int):
         return value
+    if isinstance(value, str):
+        return utf8(value)
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, PurePath):
-        return str(value)
+        return utf8(str(value))
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):
-        return {str(k): jsonable(v) for k, v in value.items()}
+        return {utf8(str(k)): jsonable(v) for k, v in value.items()}
     if isinstance(value, set | frozenset):
         return [jsonable(v) for v in sorted(value)]
     if isinstance(value, Sequence):

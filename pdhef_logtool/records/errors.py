@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from functools import partial
 
+from pdhef_logtool.records.shown import shown
+
 EXIT_OK = 0
 EXIT_FAILURE = 1
 EXIT_USAGE = 2
@@ -37,11 +39,11 @@ class PdhefError(Exception):
         return partial(type(self), **parts), ()
 
     def __str__(self) -> str:
-        """One line, without a traceback's noise."""
-        text = f"{self.where}: expected {self.expected}, got {self.got}"
-        if self.remedy:
-            text += f"; {self.remedy}"
-        return " ".join(text.split())
+        """One line, without a traceback's noise and fit for a terminal, whatever its parts quote."""
+        where, expected, got, remedy = (
+            shown(" ".join(str(part).split())) for part in (self.where, self.expected, self.got, self.remedy)
+        )
+        return f"{where}: expected {expected}, got {got}" + (f"; {remedy}" if remedy else "")
 
 
 class UsageError(PdhefError):
@@ -55,11 +57,19 @@ class LogError(PdhefError):
 
 
 class MappingError(PdhefError):
-    """A mapping file is wrong, or it names what the log does not hold."""
+    """A log does not hold what is to be mapped, or what is asked of it."""
+
+
+class MappingFileError(MappingError):
+    """A mapping file is wrong."""
+
+    exit_code = EXIT_USAGE
 
 
 class VehicleError(PdhefError):
     """A vehicle file is wrong."""
+
+    exit_code = EXIT_USAGE
 
 
 class EstimatorError(PdhefError):
@@ -76,3 +86,5 @@ class OutputError(PdhefError):
 
 class ModelError(PdhefError):
     """A model bundle is missing, wrong, or does not belong to its weights."""
+
+    exit_code = EXIT_USAGE

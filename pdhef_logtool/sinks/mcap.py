@@ -188,7 +188,7 @@ def _is_our_report(attachment: Attachment) -> bool:
         return False
     try:
         document = json.loads(attachment.data)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
     return isinstance(document, dict) and document.get("format") == "pdhef.report"
 

@@ -23,9 +23,9 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals

@@ -25,9 +25,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s

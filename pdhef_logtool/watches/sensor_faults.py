@@ -26,10 +26,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, BURST_YAW_RATE, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s

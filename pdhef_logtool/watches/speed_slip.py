@@ -23,8 +23,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, Signals

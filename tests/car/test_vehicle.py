@@ -78,7 +78,7 @@ def problem(path: Path) -> str:
     text = str(caught.value)
     assert "\n" not in text
     assert str(path) in text
-    assert caught.value.exit_code == 1
+    assert caught.value.exit_code == 2
     return text
 
 

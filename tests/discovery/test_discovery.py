@@ -1,8 +1,11 @@
 from __future__ import annotations
 
+import unicodedata
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import UsageError
@@ -67,3 +70,52 @@ def test_nothing_found_is_a_usage_error_that_names_the_argument(tmp_path: Path, 
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match=r"empty|mcap"):
         find_logs([str(tmp_path / argument)])
+
+
+_HOSTILE = ["..mcap", "...mcap", ".mcap", "a\nb.mcap", "a\\b.mcap", "\x1b[31m.mcap", "\udcff.mcap", "x" * 250 + ".mcap"]
+_HOSTILE += ["CON.mcap", "com1.x.mcap", "end. .mcap", " .mcap", "ü" * 120 + ".mcap", "a:b.mcap", "\u202e.mcap"]
+
+
+def _check_stems(root: Path, names: list[str]) -> list[str]:
+    stems = [f.stem for f in find_logs([str(root / name) for name in names])]
+    for stem in stems:
+        assert stem.isprintable()
+        assert 0 < len(stem.encode()) <= 100
+        assert stem == stem.strip(". ")
+        assert not set(stem) & set('<>:"/\\|?*')
+        assert (root / stem).parent == root
+        assert stem.split(".")[0].upper() not in ("CON", "NUL", "COM1", "LPT9", "AUX", "PRN")
+    assert len({unicodedata.normalize("NFC", s).casefold() for s in stems}) == len(stems)
+    return stems
+
+
+@pytest.mark.parametrize("name", _HOSTILE)
+def test_any_name_gives_a_folder_name_that_any_system_takes(tmp_path: Path, name: str) -> None:
+    _touch(tmp_path, name)
+    (stem,) = _check_stems(tmp_path, [name])
+    assert stem[-9] == "-"
+
+
+_SIGNS = st.characters(exclude_characters="/\0*?[") | st.sampled_from("\udcff\udc80 ._aA")
+
+
+@given(st.lists(st.text(_SIGNS, min_size=1, max_size=40)))
+def test_stems_are_unique_and_portable_whatever_the_names(names: list[str]) -> None:
+    logs = sorted({f"{name}.mcap" for name in names if name != "."})
+    if logs:
+        _check_stems(Path("/nowhere"), logs)
+
+
+def test_names_that_some_system_takes_for_one_are_told_apart(tmp_path: Path) -> None:
+    stems = _check_stems(tmp_path, ["A.mcap", "a.mcap", "ä.mcap", "a\u0308.mcap", "b.mcap"])
+    assert stems[-1] == "b"
+    assert all(stem[1] == "-" or stem[2] == "-" for stem in stems[:-1])
+    # A log whose own name is what another one would get keeps it.
+    assert _check_stems(tmp_path, ["A.mcap", "a.mcap", f"{stems[0]}.mcap"])[-1] == stems[0]
+
+
+def test_links_to_a_folder_above_are_followed_once(tmp_path: Path) -> None:
+    _touch(tmp_path, "day/a.mcap")
+    for number in range(12):
+        (tmp_path / "day" / f"link{number}").symlink_to(tmp_path)
+    assert [f.stem for f in find_logs([str(tmp_path)])] == ["a"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pdhef_logtool.records.errors import SimulationError
+from pdhef_logtool.records.errors import VehicleError
 from truthsim.linear_theory import steady_roll, understeer_gradient_rad_per_m_s2
 from truthsim.manoeuvres import Plan
 from truthsim.motion import simulate_motion
@@ -65,7 +65,7 @@ def test_a_wrong_file_is_one_clear_line(tmp_path: Path, old: str, new: str, word
     assert old in SEDAN
     path = tmp_path / "car.toml"
     path.write_text(SEDAN.replace(old, new, 1))
-    with pytest.raises(SimulationError) as caught:
+    with pytest.raises(VehicleError) as caught:
         load_vehicle(path)
     assert "\n" not in str(caught.value) and "car.toml" in str(caught.value)
     assert all(word in str(caught.value) for word in words)
@@ -75,7 +75,7 @@ def test_an_own_file_is_read_and_a_missing_one_named(tmp_path: Path) -> None:
     path = tmp_path / "car.toml"
     path.write_text(SEDAN.replace("mass_kg = 1440.0", "mass_kg = 1500"))
     assert load_vehicle(path) == Vehicle()._replace(mass_kg=1500.0)
-    with pytest.raises(SimulationError, match="sedan, suv, hatchback"):
+    with pytest.raises(VehicleError, match="sedan, suv, hatchback"):
         load_vehicle("lorry")
 
 

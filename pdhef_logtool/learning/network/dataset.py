@@ -95,7 +95,7 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     try:
         metadata = pq.read_metadata(path).metadata or {}
         entry = json.loads(metadata[_ENTRY])
-    except (OSError, KeyError, ValueError, pa.ArrowException):
+    except (OSError, KeyError, ValueError, RecursionError, pa.ArrowException):
         return None
     return entry if isinstance(entry, dict) else None
 
@@ -308,7 +308,7 @@ def read_dataset(folder: Path) -> Dataset:
             ),
             manifest=document,
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise OutputError(
             expected=f"a residual dataset with its {MANIFEST}",
             got=str(error) or type(error).__name__,

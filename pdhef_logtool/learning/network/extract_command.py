@@ -237,7 +237,7 @@ def _check_output(output: Path) -> None:
         ours = isinstance(document, dict) and document.get("format") == FORMAT
     except FileNotFoundError:
         return
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         ours = False
     if not ours:
         raise UsageError(

@@ -22,7 +22,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
 from pdhef_logtool.car.vehicle import VehicleParameters
@@ -30,6 +29,7 @@ from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.filter_shell import U_FRICTION
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry
+from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 

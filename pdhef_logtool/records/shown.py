@@ -1,0 +1,58 @@
+"""What comes from outside, as a person may see it: nothing in it moves a cursor, begins a line or turns text around.
+
+Names of topics, files, cars and whatever a document holds are somebody else's: a terminal escape in one would paint
+over a warning, a line break would forge one. Results and errors go through here on their way to a person, in one place.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from pathlib import PurePath
+from typing import Any, TypeVar
+
+#: Longer texts lose their middle.
+MOST_SIGNS = 1000
+
+_T = TypeVar("_T")
+
+
+def shown(text: object, most: int = MOST_SIGNS) -> str:
+    r"""Return a text in one line of at most so many signs; what cannot be printed stands as its escape, ``\x1b``."""
+    line = str(text)
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    if len(line) > most:
+        half = (most - 1) // 2
+        line = f"{line[:half]}…{line[-half:]}"
+    return line
+
+
+def all_shown(value: _T) -> _T:
+    """Return a copy of a record, a document or a list of them in which every text is :func:`shown`."""
+    return _all_shown(value)  # type: ignore[no-any-return]
+
+
+def _all_shown(value: Any) -> Any:
+    if type(value) is str:
+        return shown(value)
+    if isinstance(value, PurePath):
+        return type(value)(shown(value))
+    if isinstance(value, Mapping):
+        return {_all_shown(k): _all_shown(v) for k, v in value.items()}
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return type(value)(*map(_all_shown, value))
+    if isinstance(value, list | tuple | set | frozenset):
+        return type(value)(map(_all_shown, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        record = copy.copy(value)
+        for f in fields(value):
+            object.__setattr__(record, f.name, _all_shown(getattr(value, f.name)))
+        return record
+    return value
+
+
+def utf8(text: str) -> str:
+    r"""Return a text that UTF-8 can hold: bytes of a file name that is none stand as ``\udcff``."""
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")

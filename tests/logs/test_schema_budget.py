@@ -1,0 +1,252 @@
+"""Schemas and messages that cost more than they hold: refused in time, as a loss that names the channel."""
+
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET
+from pdhef_logtool.logs.container import Block, ChannelRecord
+from pdhef_logtool.logs.decoding import ChannelDecoder, channel_schema
+from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, leaves, resolve
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.schema_files import message_definition
+from pdhef_logtool.records.errors import MappingError
+
+_NEXT = "=" * 80 + "\n"
+_HEAD, _TAIL = "module p { module msg { module A_Constants { ", " }; struct A { long x; }; }; };"
+
+
+def _schema(encoding: str, text: str | bytes, name: str = "p/msg/A", example: bytes | None = None) -> MessageSchema:
+    data = text if isinstance(text, bytes) else text.encode()
+    wire = {"ros1msg": "ros1", "jsonschema": "json", "": "json", "protobuf": "protobuf"}.get(encoding, "cdr")
+    return channel_schema(ChannelRecord(1, "/t", name, wire, name, encoding, data), example=example)
+
+
+def _columns(schema: MessageSchema, path: str, *messages: bytes) -> tuple[np.ndarray, list[int]]:
+    decoder = ChannelDecoder(schema, (resolve(schema, "/t", path),))
+    length = np.array([len(m) for m in messages])
+    none = np.zeros(len(messages), dtype=np.int64)
+    block = Block(b"".join(messages), none, none, none, none, np.cumsum(length) - length, length)
+    return decoder.columns(block, np.arange(len(messages)))[path], decoder.undecodable
+
+
+def _descriptors(*files: dict) -> bytes:
+    found = descriptor_pb2.FileDescriptorSet()
+    for file in files:
+        messages = file.pop("messages", {})
+        made = found.file.add(package="p", syntax="proto3", **file)
+        for name, kinds in messages.items():
+            message = made.message_type.add(name=name)
+            for number, kind in enumerate(kinds, 1):
+                message.field.add(name=f"f{number}", number=number, type=11, type_name=f".p.{kind}", label=1)
+    return found.SerializeToString()
+
+
+def _nested(levels: int, fields: int) -> str:
+    steps = {f"d{i}": {"properties": {f"p{j}": {"$ref": f"#/d{i + 1}"} for j in range(fields)}} for i in range(levels)}
+    return json.dumps({"$ref": "#/d0", **steps, f"d{levels}": {"type": "number"}})
+
+
+_LISTED = "".join(f"{_NEXT}MSG: p/B{i}\nB{i + 1}[16] x\n" for i in range(6))
+_LAST = f"{_NEXT}MSG: p/B99\nint8 x\n"
+_TWELVE = [f"M{i}" for i in range(12)]
+_BOMBS = {
+    "arrays in arrays": ("ros2msg", f"B0 x\n{_LISTED}{_NEXT}MSG: p/B6\nint8 x\n", "schema leaves"),
+    "an endless array of texts": ("ros2msg", "string[4294967295] x\n", "schema leaves"),
+    "an array of less than nothing": ("ros2msg", "float64[-3] x\n", "-3 elements"),
+    "itself": ("ros2msg", "p/A[] x\n", "contains itself"),
+    "deep": (
+        "ros2msg",
+        "B0 x\n" + "".join(f"{_NEXT}MSG: p/B{i}\nB{i + 1} x\n" for i in range(99)) + _LAST,
+        "schema depth",
+    ),
+    "a long text": ("ros1msg", "".join(f"int8 a{i}\n" for i in range(40_000)), "schema bytes"),
+    "brackets": ("ros2idl", f"{_HEAD}const long X = {'(' * 60}1{')' * 60};{_TAIL}", "nested too deeply"),
+    "a number of gigabytes": ("ros2idl", f"{_HEAD}const long X = 1 << 99999999999;{_TAIL}", "cannot be parsed"),
+    "squares": (
+        "ros2idl",
+        f"{_HEAD}const long X0 = 99;{''.join(f'const long X{i + 1} = X{i} * X{i};' for i in range(60))}{_TAIL}",
+        "cannot be parsed",
+    ),
+    "references": ("jsonschema", _nested(13, 10), "schema leaves"),
+    "brackets in JSON": ("jsonschema", "[" * 90_000, "nested too deeply"),
+    "messages in messages": (
+        "protobuf",
+        _descriptors({"name": "a", "messages": dict.fromkeys(_TWELVE, _TWELVE)}),
+        "leaves",
+    ),
+    "imports": (
+        "protobuf",
+        _descriptors(*({"name": f"f{i}", "dependency": [f"f{i + 1}"]} for i in range(3000))),
+        "nested too deeply",
+    ),
+    "files": ("protobuf", _descriptors(*({"name": f"f{i}"} for i in range(30_000))), "schema leaves"),
+}
+
+
+@pytest.mark.parametrize("case", _BOMBS)
+def test_a_schema_that_costs_too_much_is_refused_in_time(case: str) -> None:
+    encoding, text, says = _BOMBS[case]
+    started = time.process_time()
+    with pytest.raises(SchemaError, match=says):
+        _schema(encoding, text, "p.M0" if encoding == "protobuf" else "p/msg/A")
+    assert time.process_time() - started < 5.0
+
+
+def test_a_higher_budget_reads_what_is_sound_and_large() -> None:
+    channel = ChannelRecord(1, "/t", "p/msg/A", "cdr", "A", "ros2msg", b"string[4000] x\n")
+    with pytest.raises(SchemaError, match="--budget"):
+        channel_schema(channel)
+    assert len(list(leaves(channel_schema(channel, budget=DEFAULT_BUDGET.times(2.0)).root))) == 1
+
+
+def test_a_schema_that_refers_to_itself_is_open_there() -> None:
+    schema = _schema(
+        "jsonschema", '{"$ref": "#/d", "d": {"properties": {"a": {"$ref": "#/d"}, "b": {"type": "number"}}}}'
+    )
+    assert [leaf.path for leaf in leaves(schema.root)] == ["b"]
+    values, _ = _columns(schema, "a.a.b", b'{"a": {"a": {"b": 2}}}')
+    np.testing.assert_array_equal(values, [2.0])
+
+
+def test_the_texts_of_ros_parse_as_before_and_quickly() -> None:
+    constants = "".join(f"const long C{i} = (({i})) + 1;" for i in range(200))
+    struct = 'struct A { @default(value=3) long x; @verbatim(language="c", text="a (b") sequence<double, 4> y; };'
+    text = f"module p {{ module msg {{ module A_Constants {{ {constants} }}; {struct} }}; }};"
+    started = time.process_time()
+    assert [leaf.path for leaf in leaves(_schema("ros2idl", text).root)] == ["x", "y[]"]
+    assert time.process_time() - started < 2.0
+
+
+def test_an_array_without_end_does_not_take_its_neighbours_along() -> None:
+    schema = _schema("ros2msg", "int8 y\nfloat64[4294967295] x\n")
+    with pytest.raises(MappingError, match="4294967295 elements, too many"):
+        resolve(schema, "/t", "x")
+    assert _columns(schema, "y", b"\0\1\0\0" + bytes(99))[1] == [0]
+
+
+@pytest.mark.parametrize(
+    "message",
+    [b'{"a": ' * 900 + b"1" + b"}" * 900, b"[" * 50_000, b'{"a": ' + b"9" * 100_000 + b"}", b"\xff", b"", b"null"],
+    ids=["deep", "deeper", "a long number", "no text", "nothing", "null"],
+)
+def test_a_hostile_json_message_is_one_that_does_not_decode(message: bytes) -> None:
+    schema = _schema("jsonschema", '{"properties": {"a": {"type": "number"}}}')
+    values, undecodable = _columns(schema, "a", b'{"a": 1}', message, b'{"a": ' + b"9" * 4000 + b"}")
+    assert values[0] == 1.0
+    assert np.isnan(values[1])
+    assert np.isinf(values[2])
+    assert set(undecodable) <= {1}
+    if message.startswith((b"[", b"{")) and message.count(b"9") == 0:
+        with pytest.raises(SchemaError):
+            _schema("", b"", example=message)
+
+
+@pytest.mark.parametrize(("wire", "head"), [("ros2msg", b"\0\1\0\0"), ("ros2msg", b"\0\0\0\0"), ("ros1msg", b"")])
+def test_a_claimed_length_allocates_nothing(wire: str, head: bytes) -> None:
+    schema = _schema(wire, f"int8 y\nE[] x\nfloat64[] z\nstring s\n{_NEXT}MSG: p/E\nuint8 a\n")
+    for at in (4, 8, 12):
+        message = bytearray(head + bytes(40))
+        message[at : at + 4] = b"\xff\xff\xff\xff"
+        assert _columns(schema, "y", bytes(message))[1] == [0]
+
+
+def test_a_message_of_objects_without_end_is_not_turned_into_them() -> None:
+    many = 40_000_000
+    schema = _schema("ros2msg", f"E[] x\nint8 y\n{_NEXT}MSG: p/E\nuint8 a\n")
+    assert _columns(schema, "y", b"\0\1\0\0" + many.to_bytes(4, "little") + bytes(many + 1))[1] == [0]
+    # An image has as many bytes and is one object.
+    image = _schema("ros2msg", "uint8[] x\nint8 y\n")
+    assert _columns(image, "y", b"\0\1\0\0" + many.to_bytes(4, "little") + bytes(many) + b"\5")[0].tolist() == [5.0]
+
+
+def test_one_wide_array_does_not_widen_all_the_others() -> None:
+    def message(n: int) -> bytes:
+        return b'{"x": [' + b",".join([b"1"] * n) + b"]}"
+
+    schema = _schema("jsonschema", '{"properties": {"x": {"type": "array", "items": {"type": "number"}}}}')
+    values, undecodable = _columns(schema, "x", message(70_000), *[message(3)] * 20)
+    assert values.shape == (21, 3)
+    assert undecodable == [0]
+
+
+def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="test")
+        for topic, encoding, text, messages in [
+            ("/bomb", "jsonschema", _nested(13, 10).encode(), "json"),
+            ("/sound", "jsonschema", b'{"properties": {"x": {"type": "number"}}}', "json"),
+            ("/other", "flatbuffer", b"\1\2", "flatbuffer"),
+        ]:
+            schema = writer.register_schema(topic, encoding, text)
+            channel = writer.register_channel(topic, messages, schema)
+            writer.add_message(channel, 5, b'{"x": 1}', 5)
+        writer.finish()
+    log = open_log(path)
+    assert [len(log.fields(topic)) for topic in ("/bomb", "/bomb", "/sound", "/other")] == [0, 0, 1, 0]
+    (loss,) = log.lost
+    assert (loss.kind, loss.where, loss.severity) == ("bad-schema", "/bomb", "lost")
+    log.close()
+
+
+@pytest.mark.parametrize(
+    "name", ["../../x", "p/msg/../../../x", "/etc/x", "p/msg/T\n", "p/T", "", "p/msg/", "sensor_msgs/msg/Imu/../Imu"]
+)
+def test_a_type_name_becomes_no_path(name: str) -> None:
+    with pytest.raises(KeyError):
+        message_definition(name)
+
+
+def test_a_type_without_a_definition_is_no_loss() -> None:
+    with pytest.raises(NoSchemaError):
+        _schema("", b"", "p/msg/Nowhere", None)
+    with pytest.raises(NoSchemaError):
+        channel_schema(ChannelRecord(1, "/t", "p/msg/Nowhere", "cdr", "x", "", b""))
+
+
+_TEXTS = {
+    "ros2msg": message_definition("sensor_msgs/msg/Imu"),
+    "ros1msg": "Header header\nfloat64[3] a\nB[] b\n" + _NEXT + "MSG: p/B\nstring s\ntime t\n",
+    "ros2idl": f"{_HEAD}const long C = -(1) + 2;{_TAIL}",
+    "jsonschema": _nested(2, 2),
+}
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    st.sampled_from(list(_TEXTS)),
+    st.lists(
+        st.tuples(
+            st.integers(0, 5000),
+            st.integers(0, 20),
+            st.sampled_from(
+                ["", "[", "]", "(", "<", '"', "\n", "\0", "9" * 30, "string", "[99999999]", "$ref", "{", "}"]
+            ),
+        ),
+        max_size=5,
+    ),
+    st.binary(max_size=60),
+)
+def test_a_mutated_schema_is_read_or_refused(encoding: str, cuts: list[tuple[int, int, str]], message: bytes) -> None:
+    text = _TEXTS[encoding]
+    for at, n, new in cuts:
+        text = text[: at % (len(text) + 1)] + new + text[at % (len(text) + 1) + n :]
+    try:
+        schema = _schema(encoding, text)
+    except SchemaError as error:
+        assert "\n" not in str(error)
+        return
+    for leaf in list(leaves(schema.root))[:2]:
+        try:
+            _columns(schema, leaf.path, message, b"\0\1\0\0" + message)
+        except MappingError:
+            continue
