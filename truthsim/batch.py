@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.errors import OutputError, SimulationError, UsageError
+from pdhef_logtool.records.errors import SimulationError, UsageError
+from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.version import __version__
 from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
@@ -124,7 +125,6 @@ def make_drive(job: Job, folder: Path) -> dict[str, Any]:
             dropped.append({"spec": asdict(spec), "reason": str(error)})
             continue
         path = folder / job.file
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_drive(drive, path, without=spec.without)
         data = path.read_bytes()
         return {
@@ -172,10 +172,8 @@ def run_jobs(
     """
     if processes < 1:
         raise UsageError(expected="at least one process", got=str(processes), where="--jobs")
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(expected="a folder", got=error.strerror or str(error), where=str(folder)) from error
     entries = _kept(jobs, folder)
     todo = [i for i in range(len(jobs)) if i not in entries]
     try:
@@ -242,12 +240,5 @@ def _write_manifest(
     manifest = {"format": 1, **head, "complete": complete, "drives": entries}
     # Through JSON, so that a fresh manifest and one read back are the same.
     text = json.dumps(manifest, indent=1, allow_nan=False)
-    temporary = folder / f".{MANIFEST}.part"
-    try:
-        temporary.write_text(text + "\n", encoding="utf-8")
-        temporary.replace(folder / MANIFEST)
-    except OSError as error:
-        raise OutputError(
-            expected="a writable folder", got=error.strerror or str(error), where=str(folder / MANIFEST)
-        ) from error
+    write_bytes(folder / MANIFEST, (text + "\n").encode())
     return dict(json.loads(text))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 
 import typer
 
+from pdhef_logtool.cli import stopping
 from pdhef_logtool.records.errors import EXIT_OK
 
 if TYPE_CHECKING:
@@ -29,8 +30,12 @@ def stdout() -> Console:
     """Return a console of stdout."""
     from rich.console import Console
 
+    class Piped(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # as for what is printed without rich
+
     # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS says otherwise.
-    return Console(highlight=False, width=None if sys.stdout.isatty() or os.environ.get("COLUMNS") else 160)
+    return Piped(highlight=False, width=None if sys.stdout.isatty() or os.environ.get("COLUMNS") else 160)
 
 
 def table(*heads: str, fold: int = 0) -> Table:
@@ -91,9 +96,9 @@ def finish(
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, float], None]]:
-    """Yield ``update(text, share)``: a bar on a terminal's stderr, silence elsewhere."""
+    """Yield ``update(text, share)``: a bar on a terminal's stderr, silence elsewhere; it notices a request to end."""
     if not sys.stderr.isatty():
-        yield lambda _text, _share: None
+        yield lambda _text, _share: stopping.check()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -101,4 +106,9 @@ def progress() -> Iterator[Callable[[str, float], None]]:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        yield lambda text, share: bar.update(task, description=text, completed=share)
+
+        def update(text: str, share: float) -> None:
+            stopping.check()
+            bar.update(task, description=text, completed=share)
+
+        yield update

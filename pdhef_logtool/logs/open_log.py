@@ -24,6 +24,7 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import Loss
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -106,7 +107,7 @@ def _open_compressed(path: Path) -> Container:
     """Decompress a file to a temporary one and open that."""
     import zstandard
 
-    folder = tempfile.TemporaryDirectory(prefix="pdhef-")
+    folder = scratch_folder()
     try:
         copy = Path(folder.name) / path.stem
         cut: Loss | None = None

@@ -42,6 +42,7 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.store import Change, check_output, update_car, write_change
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.cautious import strongest_physics
+from pdhef_logtool.records import outputs
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 
@@ -498,10 +499,8 @@ def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
     if place == "file":
         change = Change("tune", NOISE_FILE, {**change.files, "noise.png": _raise(error)})
     else:
-        monkeypatch.setattr(store, {"log": "_log", "exchange": "_exchanged"}[place], _raise(error))
+        monkeypatch.setattr(*{"log": (store, "_log"), "exchange": (outputs, "_exchanged")}[place], _raise(error))
     output = folder.with_name("new") if new else folder
-    if place == "exchange" and new:
-        monkeypatch.setattr(Path, "rename", _raise(error))
     with pytest.raises(OutputError if isinstance(error, OSError) else type(error)):
         update_car(car, output, change)
     assert files_of(folder) == before
@@ -512,7 +511,7 @@ def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
 def test_a_file_system_without_exchange_keeps_a_car_under_its_name(
     folder: Path, monkeypatch: pytest.MonkeyPatch, back: bool
 ) -> None:
-    monkeypatch.setattr(store, "_exchanged", lambda *_: False)
+    monkeypatch.setattr(outputs, "_exchanged", lambda *_: False)
     car, before = load(folder), files_of(folder)
     if not back:
         update_car(car, folder, noise_change(NEW))
@@ -521,7 +520,7 @@ def test_a_file_system_without_exchange_keeps_a_car_under_its_name(
         rename = Path.rename
 
         def fails_for_the_new_one(self: Path, target: Path) -> Path:
-            if self.suffix == ".partial":
+            if self.name == "new":
                 raise OSError(5, "input/output error")
             return rename(self, target)
 
