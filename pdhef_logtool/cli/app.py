@@ -92,8 +92,10 @@ def _run() -> int:
         return int(error.exit_code)
     except (KeyboardInterrupt, typer.Abort) as error:
         return stopping.tell(stopping.Stopped(signal.SIGINT), error)
-    except BrokenPipeError:
-        _drop_stdout()
+    except (BrokenPipeError, SystemExit) as error:
+        if isinstance(error, SystemExit) and not isinstance(error.__context__, BrokenPipeError):
+            raise
+        _drop_stdout()  # click has made an exit of it where it came up in a command
         return _NOT_READ
     except Exception as error:
         stopping.check()

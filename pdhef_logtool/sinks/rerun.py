@@ -348,8 +348,8 @@ class RerunSink(Sink):
 class _Outlet:
     """Writes to a file what Rerun sends into a pipe, so that Rerun itself never meets a disk that is full or hangs.
 
-    Rerun writes from a thread of its own that says little of its errors and that others wait for without end. What
-    cannot be written is dropped here, and the error kept.
+    Rerun writes from a thread of its own that ends on an error, and others may then wait for it without end. Here
+    what cannot be written is read and dropped, and the error kept.
 
     Attributes
     ----------
@@ -360,28 +360,9 @@ class _Outlet:
         self.error: OSError | None = None
         self._file, self._dropped = file, False
         self._from, self._to = os.pipe()
-        self._closing = threading.Lock()
         self.name = f"/dev/fd/{self._to}"
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
-
-    def drop(self) -> None:
-        """Write no more of what comes."""
-        self._dropped = True
-
-    def give_up(self) -> None:
-        """Wait no longer: whoever writes into the pipe gets an error."""
-        if self.error is None:
-            self.error = TimeoutError(errno.ETIMEDOUT, f"nothing could be written for {LONGEST_WAIT_S:g} s")
-        self._dropped = True
-        self._close_from()
-
-    def close(self) -> None:
-        """Wait until all is written that Rerun has sent, whose own end must be closed by then."""
-        self.opened()
-        self._thread.join(LONGEST_WAIT_S if self.error is None else 0.0)
-        if self._thread.is_alive():
-            self.give_up()
 
     def opened(self) -> None:
         """Close our own writing end: Rerun has its own now."""
@@ -389,30 +370,43 @@ class _Outlet:
             os.close(self._to)
             self._to = -1
 
-    def _close_from(self) -> None:
-        with self._closing:
-            if self._from >= 0:
-                os.close(self._from)
-                self._from = -1
+    def drop(self) -> None:
+        """Write no more of what comes."""
+        self._dropped = True
+
+    def give_up(self) -> None:
+        """Wait no longer for the disk: the thread that does is left alone, and another one drops what comes."""
+        if self.error is None:
+            self.error = TimeoutError(errno.ETIMEDOUT, f"nothing could be written for {LONGEST_WAIT_S:g} s")
+            self._dropped = True
+            self._thread = threading.Thread(target=self._carry, daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Wait until all is written that Rerun has sent, whose own end must be closed by then."""
+        self.opened()
+        self._thread.join(LONGEST_WAIT_S)
+        if self._thread.is_alive():
+            self.give_up()
+            self._thread.join(LONGEST_WAIT_S)
 
     def _carry(self) -> None:
-        try:
-            while self._from >= 0 and (data := os.read(self._from, 1 << 20)):
-                if not self._dropped:
-                    self._write(data)
-            self._write(None)
-        except OSError as error:
-            self.error = self.error or error
-        finally:
-            self._close_from()
+        while data := os.read(self._from, 1 << 20):
+            if not self._dropped:
+                self._write(data)
+            if self._thread is not threading.current_thread():
+                return  # given up while it was writing: another one reads on
+        self._write(None)
+        if self._thread is threading.current_thread():
+            os.close(self._from)
 
     def _write(self, data: bytes | None) -> None:
         """Write, or at the end (None) close the file; what cannot be written is dropped from then on."""
         try:
-            if data is None:
-                self._file.close()
-            else:
+            if data is not None:
                 self._file.write(data)
+            elif not isinstance(self.error, TimeoutError):  # else it would hang as well
+                self._file.close()
         except OSError as error:
             self.error, self._dropped = self.error or error, True
 
