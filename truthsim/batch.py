@@ -19,6 +19,7 @@ import numpy as np
 
 from pdhef_logtool.records.errors import SimulationError, UsageError
 from pdhef_logtool.records.files import write_bytes, writing
+from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.version import __version__
 from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
@@ -221,7 +222,7 @@ def _workers(processes: int) -> Iterator[_Work]:
         yield lambda todo, folder: ((i, make_drive(job, folder)) for i, job in todo)
         return
     # A fresh interpreter each: threads of the parent would not survive a fork.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=follow_parent) as pool:
 
         def work(todo: list[tuple[int, Job]], folder: Path) -> Iterator[tuple[int, dict[str, Any]]]:
             futures = {pool.submit(make_drive, job, folder): i for i, job in todo}

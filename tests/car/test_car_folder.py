@@ -7,6 +7,7 @@ import os
 import shutil
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -623,3 +624,23 @@ def test_a_place_that_cannot_be_written_is_one_line(folder: Path, tmp_path: Path
         with pytest.raises(PdhefError) as caught:
             write_change(load(folder), load(folder), output, noise_change(NEW))
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_changes_by_several_commands_at_once_are_all_there(folder: Path, new: bool) -> None:
+    car = load(folder)
+    output = folder.with_name("new") if new else folder
+    changes = [Change("tune", f"part-{i}.toml", {f"part-{i}.toml": b"x = 1\n"}) for i in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda change: update_car(car, output, change), changes))
+    assert {f"part-{i}.toml" for i in range(8)} <= set(files_of(output))
+    assert len([line for line in read_history(output) if line["part"].startswith("part-")]) == 8
+    assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]
+
+
+def test_a_car_that_stays_held_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "LONGEST_WAIT_S", 0.1)
+    before = files_of(folder)
+    with outputs.OutputFolder(folder), pytest.raises(OutputError, match="another command is writing to"):
+        update_car(load(folder), folder, noise_change(NEW))
+    assert files_of(folder) == before

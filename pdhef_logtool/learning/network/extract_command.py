@@ -57,6 +57,7 @@ from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
@@ -296,7 +297,7 @@ def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[D
             yield _extract_guarded(job, of_all) if len(work) > 1 else _extract(job, of_all)
         return
     broken: list[_Job] = []
-    with ProcessPoolExecutor(min(jobs, len(work)), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(jobs, len(work)), mp_context=get_context("spawn"), initializer=follow_parent) as pool:
         futures = {pool.submit(_extract_guarded, job): job for job in work}
         try:
             for future in as_completed(futures):
@@ -309,7 +310,7 @@ def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[D
             raise
     # A dead process takes the whole pool with it: who it was is found out one by one.
     for job in broken:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=follow_parent) as pool:
             try:
                 yield pool.submit(_extract_guarded, job).result()
             except BrokenProcessPool:

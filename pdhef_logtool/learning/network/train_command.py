@@ -16,7 +16,14 @@ from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, 
 from pdhef_logtool.records.errors import ModelError, UsageError
 from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
-from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, RESIDUAL, WEIGHTS_FILE, ModelBundle, open_model
+from pdhef_logtool.residual_model.bundle import (
+    DOCUMENT_FILE,
+    RESIDUAL,
+    WEIGHTS_FILE,
+    ModelBundle,
+    model_folder,
+    open_model,
+)
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"
@@ -76,7 +83,8 @@ def run_training(
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
     data = read_dataset(dataset)
     bundle = None if init is None else open_model(init)
-    check_no_input([init, *(d.path for d in data.drives)], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
+    start = None if init is None else model_folder(init)
+    check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
 
