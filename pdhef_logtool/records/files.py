@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
 import re
 import shutil
@@ -17,6 +18,8 @@ from pdhef_logtool.records.processes import NAME, is_alive, own_name
 
 _PARTIAL = re.compile(rf"\..+\.({NAME})\.partial")
 _SCRATCH = re.compile(rf"pdhef-({NAME})-.+")
+#: Bytes of a name that leave room for what a temporary one adds; file systems take 255.
+_LONGEST_NAME = 200
 #: Folders in which this process has looked for what killed ones left.
 _swept: set[Path] = set()
 
@@ -51,7 +54,8 @@ class PendingFile:
 
     def __init__(self, target: Path) -> None:
         self.target = target
-        self.path = target.with_name(f".{target.name}.{own_name()}.partial")
+        name = target.name if len(os.fsencode(target.name)) <= _LONGEST_NAME else _digest(target.name)
+        self.path = target.with_name(f".{name}.{own_name()}.partial")
         with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             self._remove()
@@ -88,6 +92,10 @@ class PendingFile:
             self.commit()
         else:
             self.discard()
+
+
+def _digest(name: str) -> str:
+    return hashlib.sha256(os.fsencode(name)).hexdigest()
 
 
 def open_new(path: Path) -> IO[bytes]:

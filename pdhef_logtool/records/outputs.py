@@ -181,8 +181,10 @@ class OutputFolder:
         self.sweep()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Let go of it."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Let go of it; what a request to end has kept from being cleaned up is swept."""
+        if kind is not None:
+            self.sweep()
         self._lock.release()
 
 
@@ -299,8 +301,8 @@ def check_no_input(inputs: Iterable[Path | None], files: Iterable[Path], folders
 
 
 def _identities(path: Path) -> Iterator[tuple[tuple[int, int], Path]]:
-    """Yield what identifies a file, or a folder and all files in it."""
-    for one in [path, *(p for p in path.rglob("*") if p.is_file())] if path.is_dir() else [path]:
+    """Yield what identifies a file, or a folder and the files in it."""
+    for one in [path, *(p for p in path.iterdir() if p.is_file())] if path.is_dir() else [path]:
         if (identity := _identity(one)) is not None:
             yield identity, one
 

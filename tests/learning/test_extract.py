@@ -398,7 +398,7 @@ def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tm
         file = tmp_path / "out" / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.symlink_to(log)
-        with pytest.raises(UsageError, match="replace the input|another manifest"):
+        with pytest.raises(UsageError, match=r"replace the input|another manifest"):
             extract([str(log)], tmp_path / "out", ExtractSettings(RunConfig()))
         file.unlink()
     assert log.read_bytes() == (sample_logs_dir / "dlc.mcap").read_bytes()

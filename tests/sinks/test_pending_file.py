@@ -130,6 +130,11 @@ def test_a_temporary_file_that_cannot_be_removed_does_not_hide_the_failure(tmp_p
         raise ValueError("mine")
 
 
+def test_the_longest_name_is_written(tmp_path: Path) -> None:
+    write_bytes(tmp_path / ("n" * 255), b"new")
+    assert folder(tmp_path) == {"n" * 255: b"new"}
+
+
 def test_missing_folders_are_made(tmp_path: Path) -> None:
     write_bytes(tmp_path / "a" / "b" / "out.bin", b"new")
     assert folder(tmp_path / "a" / "b") == DONE
