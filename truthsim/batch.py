@@ -17,7 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.errors import OutputError, SimulationError, UsageError
+from pdhef_logtool.records.errors import SimulationError, UsageError
+from pdhef_logtool.records.files import write_bytes, writing
+from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.version import __version__
 from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
@@ -124,7 +126,6 @@ def make_drive(job: Job, folder: Path) -> dict[str, Any]:
             dropped.append({"spec": asdict(spec), "reason": str(error)})
             continue
         path = folder / job.file
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_drive(drive, path, without=spec.without)
         data = path.read_bytes()
         return {
@@ -172,10 +173,8 @@ def run_jobs(
     """
     if processes < 1:
         raise UsageError(expected="at least one process", got=str(processes), where="--jobs")
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(expected="a folder", got=error.strerror or str(error), where=str(folder)) from error
     entries = _kept(jobs, folder)
     todo = [i for i in range(len(jobs)) if i not in entries]
     try:
@@ -223,7 +222,7 @@ def _workers(processes: int) -> Iterator[_Work]:
         yield lambda todo, folder: ((i, make_drive(job, folder)) for i, job in todo)
         return
     # A fresh interpreter each: threads of the parent would not survive a fork.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=follow_parent) as pool:
 
         def work(todo: list[tuple[int, Job]], folder: Path) -> Iterator[tuple[int, dict[str, Any]]]:
             futures = {pool.submit(make_drive, job, folder): i for i, job in todo}
@@ -242,12 +241,5 @@ def _write_manifest(
     manifest = {"format": 1, **head, "complete": complete, "drives": entries}
     # Through JSON, so that a fresh manifest and one read back are the same.
     text = json.dumps(manifest, indent=1, allow_nan=False)
-    temporary = folder / f".{MANIFEST}.part"
-    try:
-        temporary.write_text(text + "\n", encoding="utf-8")
-        temporary.replace(folder / MANIFEST)
-    except OSError as error:
-        raise OutputError(
-            expected="a writable folder", got=error.strerror or str(error), where=str(folder / MANIFEST)
-        ) from error
+    write_bytes(folder / MANIFEST, (text + "\n").encode())
     return dict(json.loads(text))

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.files import write_bytes
 from truthsim.drive import Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
@@ -170,14 +171,7 @@ def write_samples(folder: Path) -> None:
             f"size_bytes = {size}",
             f'vehicle = "{sample.vehicle}"',
         ]
-    temporary = folder / f".{MANIFEST}.part"
-    try:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        temporary.replace(folder / MANIFEST)
-    except OSError as error:
-        raise OutputError(
-            expected="a writable folder", got=error.strerror or str(error), where=str(folder / MANIFEST)
-        ) from error
+    write_bytes(folder / MANIFEST, ("\n".join(lines) + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -5,13 +5,10 @@ The folder is made beside the old one and takes its place by exchange, so that w
 
 from __future__ import annotations
 
-import ctypes
-import errno
 import json
-import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,9 +17,12 @@ from pdhef_logtool.car.car import HISTORY_FILE, VEHICLE_FILE, Car
 from pdhef_logtool.car.flat import flat_toml, vehicle_toml
 from pdhef_logtool.car.parts import HistoryLine, LearntOn, digest
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.files import PendingFile, cannot_write, write_bytes
+from pdhef_logtool.records.files import PendingFile, write_bytes, writing
+from pdhef_logtool.records.outputs import LOCK_FILE, FolderLock, FolderTransaction
 from pdhef_logtool.records.version import __version__
 
+#: How long a change waits for another command that is changing the same car: such a change takes a moment.
+LONGEST_WAIT_S = 60.0
 #: Writes one file at the path that it is given, or is its content.
 Content = bytes | Callable[[Path], object]
 
@@ -95,15 +95,17 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
         See :func:`check_output`.
     """
     check_output(source, output)
-    base = output if (output / VEHICLE_FILE).is_file() else source.source
+    new = not output.exists()
+    lock = FolderLock(output)
+    lock.acquire(wait_s=LONGEST_WAIT_S)
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=f".{output.name}.", suffix=".partial", dir=output.parent))
-        try:
+        base = output if (output / VEHICLE_FILE).is_file() else source.source
+        with writing(output), FolderTransaction(output, keep=False) as transaction:
+            fresh = transaction.file(".")
             if base is not None and base.is_dir():
-                shutil.copytree(base, fresh, dirs_exist_ok=True)
+                shutil.copytree(base, fresh, dirs_exist_ok=True, ignore=shutil.ignore_patterns(f"{LOCK_FILE}*"))
             else:
-                (fresh / VEHICLE_FILE).write_bytes(vehicle_file(source))
+                write_bytes(fresh / VEHICLE_FILE, vehicle_file(source))
             for name, folder in change.folders.items():
                 if (fresh / name).exists() and folder.resolve() != (output / name).resolve():
                     shutil.rmtree(fresh / name)
@@ -111,12 +113,13 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
             for name, content in change.files.items():
                 _write(fresh / name, content)
             _log(fresh, change)
-            fresh.chmod(0o777 & ~_umask())
-            _take_place(fresh, output)
-        finally:
-            shutil.rmtree(fresh, ignore_errors=True)
-    except OSError as error:
-        raise cannot_write(output, error) from error
+    except BaseException:
+        if new:
+            with suppress(OSError):
+                output.rmdir()
+        raise
+    finally:
+        lock.release()
     return output / change.part
 
 
@@ -144,14 +147,14 @@ def write_change(
     write_bytes(output, flat.encode())
     for name, content in change.files.items():
         if name != change.part:
-            with PendingFile(output.with_name(f"{output.stem}.{name}")) as pending:
+            with PendingFile(output.with_name(f"{output.stem}.{name}")) as pending, writing(pending.target):
                 _write(pending.path, content)
     return output
 
 
 def _write(path: Path, content: Content) -> None:
     if isinstance(content, bytes):
-        path.write_bytes(content)
+        write_bytes(path, content)
     else:
         content(path)
 
@@ -167,43 +170,3 @@ def _log(folder: Path, change: Change) -> None:
     )
     with (folder / HISTORY_FILE).open("a", encoding="utf-8") as file:
         file.write(json.dumps(line.model_dump(mode="json"), sort_keys=True, ensure_ascii=False) + "\n")
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _take_place(fresh: Path, target: Path) -> None:
-    """Give ``fresh`` the target's name; what stood there is at ``fresh`` afterwards."""
-    for path in fresh.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-    if not target.exists():
-        fresh.rename(target)
-        return
-    if not _exchanged(fresh, target):
-        # A file system without exchange: for a moment nothing stands under the car's name.
-        old = fresh.with_suffix(".old")
-        target.rename(old)
-        try:
-            fresh.rename(target)
-        except BaseException:
-            old.rename(target)
-            raise
-        old.rename(fresh)
-
-
-def _exchanged(one: Path, other: Path) -> bool:
-    """Exchange two names at once where system and file system can (Linux renameat2); False where they cannot."""
-    at_cwd, exchange = -100, 2
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
-        return False
-    if rename(at_cwd, os.fsencode(one), at_cwd, os.fsencode(other), exchange) == 0:
-        return True
-    if ctypes.get_errno() in (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP):
-        return False
-    raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()), str(other))

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn, Protocol, TypeVar
 
 import typer
 
+from pdhef_logtool.cli import stopping
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import EXIT_OK
 from pdhef_logtool.records.shown import all_shown, shown
@@ -33,8 +34,12 @@ def stdout() -> Console:
     """Return a console of stdout; no text is read as markup."""
     from rich.console import Console
 
+    class Piped(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # as for what is printed without rich
+
     # A pipe has no width of its own: tables are then as wide as they need to be, unless COLUMNS says otherwise.
-    return Console(
+    return Piped(
         highlight=False,
         markup=False,
         emoji=False,
@@ -102,9 +107,9 @@ def finish(
 
 @contextmanager
 def progress() -> Iterator[Callable[[str, float], None]]:
-    """Yield ``update(text, share)``: a bar on a terminal's stderr, silence elsewhere."""
+    """Yield ``update(text, share)``: a bar on a terminal's stderr, silence elsewhere; it notices a request to end."""
     if not sys.stderr.isatty():
-        yield lambda _text, _share: None
+        yield lambda _text, _share: stopping.check()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -112,4 +117,9 @@ def progress() -> Iterator[Callable[[str, float], None]]:
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        yield lambda text, share: bar.update(task, description=shown(text), completed=share)
+
+        def update(text: str, share: float) -> None:
+            stopping.check()
+            bar.update(task, description=shown(text), completed=share)
+
+        yield update

@@ -36,6 +36,7 @@ from pdhef_logtool.mapping.clocks import sources_by_clock
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
 
 WINDOW_NS = 600_000_000_000
@@ -407,15 +408,7 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
             expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
         )
     text = mapping_to_toml(inspection.mapping, comments=mapping_comments(inspection))
-    unfinished = path.with_name(f".{path.name}.part")
-    try:
-        unfinished.write_text(text, encoding="utf-8", newline="\n")
-        unfinished.replace(path)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise OutputError(
-            expected="a mapping file that can be written", got=error.strerror or str(error), where=str(path)
-        ) from None
+    write_bytes(path, text.encode())
 
 
 def _number(value: float) -> str:

@@ -23,6 +23,7 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError, UsageError
+from pdhef_logtool.records.outputs import check_no_input
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
@@ -94,6 +95,19 @@ def open_car(config: RunConfig, output: Path | None, warn: Tell) -> Car:
     for note in car.notes:
         warn(note)
     return car
+
+
+def check_file_output(inputs: Sequence[LogInput], config: RunConfig, output: Path) -> None:
+    """Refuse a single file (.toml, .json) as output that the command reads; that of the car itself may be one.
+
+    Raises
+    ------
+    UsageError
+        ``output`` is a log or another file of the command.
+    """
+    if output.suffix:
+        read = [*(i.path for i in inputs), *config.files]
+        check_no_input([path for path in read if path != config.car], [output])
 
 
 def open_mapping(config: RunConfig) -> SignalMapping | None:

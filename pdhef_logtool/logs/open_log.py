@@ -28,6 +28,7 @@ from pdhef_logtool.logs.container import (
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError, PdhefError
+from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import Loss
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -121,7 +122,7 @@ def _open_plain(path: Path, shown_path: Path, head: bytes, meter: Meter) -> Cont
 
 def _open_compressed(path: Path, meter: Meter) -> Container:
     """Decompress a file to a temporary one and open that."""
-    folder = tempfile.TemporaryDirectory(prefix="pdhef-")
+    folder = scratch_folder()
     try:
         copy = Path(folder.name) / path.stem
         with meter.running(path.stat().st_size):

@@ -14,6 +14,7 @@ from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError, block_from_lists, told
 from pdhef_logtool.logs.type_names import ros2_type_name
+from pdhef_logtool.records.files import scratch_folder
 
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
@@ -70,7 +71,7 @@ class SqliteContainer(Container):
     def _connect(self, path: Path) -> sqlite3.Connection:
         wal = path.with_name(path.name + "-wal")
         if wal.is_file() and wal.stat().st_size > 0:
-            self._folder = tempfile.TemporaryDirectory(prefix="pdhef-")
+            self._folder = scratch_folder()
             copy = Path(self._folder.name) / path.name
             shutil.copyfile(path, copy)
             shutil.copyfile(wal, copy.with_name(wal.name))

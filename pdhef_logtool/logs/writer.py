@@ -6,7 +6,7 @@ schemas stand before the first chunk that uses them and again in the summary.
 
 from __future__ import annotations
 
-import os
+import contextlib
 import struct
 import zlib
 from collections import Counter
@@ -40,6 +40,7 @@ from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
+from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import __version__
 
@@ -127,7 +128,7 @@ class McapLogWriter:
 
     Parameters
     ----------
-    path : file to write; its folder must exist.
+    path : file to write; its folder is made when it is missing.
     profile : MCAP profile.
 
     Raises
@@ -137,7 +138,6 @@ class McapLogWriter:
 
     def __init__(self, path: Path, *, profile: str = "ros2") -> None:
         self._path = path
-        self._temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
         self._schemas: dict[int, Schema] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, Channel] = {}
@@ -151,10 +151,9 @@ class McapLogWriter:
         self._last_ns = 0
         self._crc = 0
         self._at = 0
-        try:
-            self._file: IO[bytes] = self._temporary.open("wb")
-        except OSError as error:
-            raise self._failed(error) from error
+        self._pending = PendingFile(path)
+        with writing(path):
+            self._file: IO[bytes] = open_new(self._pending.path)
         self._emit(MCAP_MAGIC)
         self._emit_record(Header(profile=profile, library=LIBRARY))
 
@@ -168,14 +167,6 @@ class McapLogWriter:
             self.close()
         else:
             self.abort()
-
-    def _failed(self, error: OSError) -> OutputError:
-        return OutputError(
-            expected="a writable file",
-            got=error.strerror or str(error),
-            where=str(self._path),
-            remedy="check the folder, its permissions and the space left",
-        )
 
     def add_topic(
         self,
@@ -444,19 +435,21 @@ class McapLogWriter:
         """Write the summary and give the file its name."""
         if self._file.closed:
             return
+        self._emit_record(DataEnd(data_section_crc=self._crc))
+        self._emit_summary()
         try:
-            self._emit_record(DataEnd(data_section_crc=self._crc))
-            self._emit_summary()
-            self._file.close()
-            self._temporary.replace(self._path)
-        except OSError as error:
+            with writing(self._path):
+                self._file.close()
+        except BaseException:
             self.abort()
-            raise self._failed(error) from error
+            raise
+        self._pending.commit()
 
     def abort(self) -> None:
         """Remove what was written."""
-        self._file.close()
-        self._temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # what is still buffered may not fit the disk either
+            self._file.close()
+        self._pending.discard()
 
     def _emit_summary(self) -> None:
         start = self._at
@@ -510,10 +503,11 @@ class McapLogWriter:
 
     def _emit(self, data: bytes) -> None:
         try:
-            self._file.write(data)
-        except OSError as error:
+            with writing(self._path):
+                self._file.write(data)
+        except BaseException:
             self.abort()
-            raise self._failed(error) from error
+            raise
         self._crc = zlib.crc32(data, self._crc)
         self._at += len(data)
 

@@ -1,19 +1,50 @@
-"""The file that appears only when it is complete."""
+"""The file that appears only when it is complete, and the one line for a place that cannot be written."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import hashlib
 import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Self
+from typing import IO, Self
 
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.processes import NAME, is_alive, own_name
+
+_PARTIAL = re.compile(rf"\..+\.({NAME})\.partial")
+_SCRATCH = re.compile(rf"pdhef-({NAME})-.+")
+#: Bytes of a name that leave room for what a temporary one adds; file systems take 255.
+_LONGEST_NAME = 200
+#: Folders in which this process has looked for what killed ones left.
+_swept: set[Path] = set()
+
+#: Errors that only writing has, whatever the code was doing.
+OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+_REMEDIES = {
+    errno.ENOSPC: "free some space or choose another place",
+    errno.EDQUOT: "free some space within the quota or choose another place",
+    errno.EFBIG: "raise the limit on the size of a file (ulimit -f)",
+    errno.EROFS: "choose a place that can be written",
+    errno.EACCES: "choose a place that you may write to",
+    errno.EPERM: "choose a place that you may write to",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ENOTDIR: "something else has that name: move it or choose another place",
+    errno.EISDIR: "something else has that name: move it or choose another place",
+    errno.EEXIST: "something else has that name: move it or choose another place",
+    errno.EIO: "the disk fails: check it or choose another place",
+}
 
 
 class PendingFile:
     """A file that is written beside its target and takes the target's name when it is complete.
 
-    The temporary name depends on the target alone, so that what a killed run left behind is overwritten by the next.
+    The temporary name holds that of the process, so that two never write to one file, and so that what a killed one
+    left is found and removed by the next that writes to the folder.
 
     Raises
     ------
@@ -23,22 +54,25 @@ class PendingFile:
 
     def __init__(self, target: Path) -> None:
         self.target = target
-        self.path = target.with_name(f".{target.name}.partial")
-        try:
+        name = target.name if len(os.fsencode(target.name)) <= _LONGEST_NAME else _digest(target.name)
+        self.path = target.with_name(f".{name}.{own_name()}.partial")
+        with writing(target):
             target.parent.mkdir(parents=True, exist_ok=True)
             self._remove()
-        except OSError as error:
-            raise cannot_write(target, error) from error
+        if target.parent not in _swept:
+            _swept.add(target.parent)
+            sweep_files(target.parent)
 
     def commit(self) -> None:
         """Give the written file its final name; it is on the disk before the name is."""
         try:
-            with self.path.open("rb") as file:
-                os.fsync(file.fileno())
-            self.path.replace(self.target)
-        except OSError as error:
+            with writing(self.target):
+                sync(self.path)
+                self.path.replace(self.target)
+                sync(self.target.parent)
+        except BaseException:
             self.discard()
-            raise cannot_write(self.target, error) from error
+            raise
 
     def discard(self) -> None:
         """Remove the temporary file, if there is one."""
@@ -60,20 +94,75 @@ class PendingFile:
             self.discard()
 
 
+def _digest(name: str) -> str:
+    return hashlib.sha256(os.fsencode(name)).hexdigest()
+
+
+def open_new(path: Path) -> IO[bytes]:
+    """Open a file to write; all content of our outputs goes through files that this opens."""
+    return path.open("wb")
+
+
 def write_bytes(target: Path, data: bytes) -> None:
     """Write a whole file through a temporary name; raises OutputError when it cannot be written."""
-    with PendingFile(target) as pending:
-        try:
-            pending.path.write_bytes(data)
-        except OSError as error:
-            raise cannot_write(target, error) from error
+    with PendingFile(target) as pending, writing(target), open_new(pending.path) as file:
+        file.write(data)
+
+
+@contextlib.contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Turn what the system says of a place that cannot be written into an OutputError."""
+    try:
+        yield
+    except OSError as error:
+        raise cannot_write(target, error) from error
 
 
 def cannot_write(target: Path, error: OSError) -> OutputError:
     """Return the error for a place that cannot be written."""
     return OutputError(
         expected="a place to write to",
-        got=error.strerror or type(error).__name__,
+        got=error.strerror or str(error) or type(error).__name__,
         where=str(target),
-        remedy="choose another output folder or free some space",
+        remedy=_REMEDIES.get(error.errno or 0, "choose another place"),
     )
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a folder's names, are on the disk."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if path.is_dir() and error.errno in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):
+            return  # a file system whose folders cannot be waited for
+        raise
+    finally:
+        os.close(descriptor)
+
+
+def sweep_files(folder: Path, *, held: bool = False) -> None:
+    """Remove what killed processes left of files in a folder.
+
+    ``held``: no other process of ours writes here, so that files of other hosts are left over too.
+    """
+    with contextlib.suppress(OSError):
+        for path in list(folder.iterdir()):
+            if found := _PARTIAL.fullmatch(path.name):
+                alive = is_alive(found[1])
+                if alive is False or (held and alive is None):
+                    with contextlib.suppress(OSError):
+                        path.unlink()
+
+
+def scratch_folder() -> tempfile.TemporaryDirectory[str]:
+    """Return a new folder in the system's place for such; those of killed processes are removed."""
+    root = Path(tempfile.gettempdir())
+    if root not in _swept:
+        _swept.add(root)
+        with contextlib.suppress(OSError):
+            for path in list(root.iterdir()):
+                found = _SCRATCH.fullmatch(path.name)
+                if found and is_alive(found[1]) is False and path.stat().st_uid == os.getuid():
+                    shutil.rmtree(path, ignore_errors=True)
+    return tempfile.TemporaryDirectory(prefix=f"pdhef-{own_name()}-")

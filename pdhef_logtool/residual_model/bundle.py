@@ -12,6 +12,7 @@ import numpy as np
 
 from pdhef_logtool.records.documents import read_json
 from pdhef_logtool.records.errors import ModelError
+from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
@@ -112,25 +113,17 @@ class ModelBundle:
 
         Raises
         ------
-        ModelError
+        OutputError
             The folder cannot be written.
         """
         from safetensors.numpy import save
 
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            pending = []
-            document = json.dumps({**self._document(), "sha256": self.sha256, "provenance": self.provenance}, indent=2)
-            for name, data in ((WEIGHTS_FILE, save(self.weights)), (DOCUMENT_FILE, (document + "\n").encode())):
-                partial = folder / f".{name}.partial"
-                partial.write_bytes(data)
-                pending.append((partial, folder / name))
-            for partial, target in pending:
-                partial.replace(target)
-        except OSError as error:
-            raise ModelError(
-                expected="a folder to write to", got=error.strerror or str(error), where=str(folder)
-            ) from None
+        document = json.dumps({**self._document(), "sha256": self.sha256, "provenance": self.provenance}, indent=2)
+        # The inner one is committed first.
+        with PendingFile(folder / DOCUMENT_FILE) as described, PendingFile(folder / WEIGHTS_FILE) as weights:
+            for pending, data in ((described, (document + "\n").encode()), (weights, save(self.weights))):
+                with writing(pending.target), open_new(pending.path) as file:
+                    file.write(data)
 
 
 def open_model(model: Path | None) -> ModelBundle | None:

@@ -86,6 +86,11 @@ class RunConfig:
         """What of it decides how a log is read."""
         return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
 
+    @property
+    def files(self) -> list[Path]:
+        """The files and folders that it names, with what may stand in place of one."""
+        return [path for key in _FILES if (path := getattr(self, key)) is not None]
+
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
-from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, find_logs
 from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
 from pdhef_logtool.records.errors import (
     EXIT_FAILURE,
@@ -23,10 +23,10 @@ from pdhef_logtool.records.errors import (
     EXIT_OK,
     EXIT_PARTIAL,
     EstimatorError,
-    OutputError,
     PdhefError,
     UsageError,
 )
+from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals, join_signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
@@ -55,6 +55,11 @@ if TYPE_CHECKING:
 
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
+
+#: Folder of a log's outputs within those of a run, what a run writes into it, and the figures of all logs.
+LOGS = "logs"
+LOG_FILES = ("annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.json")
+METRICS_FILE = "metrics.parquet"
 
 #: Units of truth quantities that have no channel of their own name.
 _DERIVED_UNITS = {"position_m": "m"}
@@ -134,9 +139,9 @@ def run_logs(
     Raises
     ------
     UsageError, VehicleError, MappingError
-        What holds for all logs is wrong: arguments, vehicle or mapping file.
+        What holds for all logs is wrong: arguments, vehicle or mapping file, or an output would replace an input.
     OutputError
-        The output folder cannot be written.
+        The output folder cannot be written, or another command is writing to it.
     """
     inputs = find_logs(arguments)
     car = Car.load(config.car, network=config.network, intervals=config.intervals)
@@ -146,26 +151,34 @@ def run_logs(
         warn(f"no --car: the default {car.vehicle.name} is assumed, so the model-based estimates are of another car")
     for note in car.notes:
         warn(note)
-    make_folder(output)
+    check_places(inputs, output, config, mapping, junit)
     results: list[LogResult] = []
-    for number, log_input in enumerate(inputs):
+    with OutputFolder(output, (LOGS,)) as outputs:
+        for number, log_input in enumerate(inputs):
 
-        def of_all(text: str, share: float, number: int = number) -> None:
-            progress(text, (number + share) / len(inputs))
+            def of_all(text: str, share: float, number: int = number) -> None:
+                progress(text, (number + share) / len(inputs))
 
-        try:
-            result = run_log(log_input, output, config, car, mapping, progress=of_all, warn=warn)
-        except Exception as error:  # one bad log never stops the others, whatever is wrong with it
-            if len(inputs) == 1:
+            try:
+                result = run_log(log_input, outputs, config, car, mapping, progress=of_all, warn=warn)
+            except Exception as error:  # one bad log never stops the others, whatever is wrong with it
+                if len(inputs) == 1:
+                    raise
+                result = _failed(log_input, error)
+                warn(result.outcome.failed or "")
+            except BaseException as stop:
+                stop.add_note(f"{number} of {len(inputs)} logs are done")
                 raise
-            reason = str(error) if isinstance(error, PdhefError) else f"internal error, {type(error).__name__}: {error}"
-            warn(reason)
-            outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
-            result = LogResult(outcome, None, None, ())
-        results.append(judge(result, thresholds))
-    write_run(output, config.to_dict(), results, car)
-    write_verdicts(junit, results)
+            results.append(judge(result, thresholds))
+        write_run(output, config.to_dict(), results, car)
+        write_verdicts(junit, results)
     return RunResult(output, tuple(results))
+
+
+def _failed(log_input: LogInput, error: Exception) -> LogResult:
+    reason = str(error) if isinstance(error, PdhefError) else f"internal error, {type(error).__name__}: {error}"
+    outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
+    return LogResult(outcome, None, None, ())
 
 
 def read_thresholds(config: RunConfig, junit: Path | None) -> tuple[Threshold, ...] | None:
@@ -201,7 +214,7 @@ def write_verdicts(junit: Path | None, results: Sequence[LogResult]) -> None:
 
 def run_log(
     log_input: LogInput,
-    output: Path,
+    outputs: OutputFolder,
     config: RunConfig,
     car: Car,
     mapping: Mapping | None,
@@ -209,7 +222,7 @@ def run_log(
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> LogResult:
-    """Run one log and write its folder ``output/logs/<stem>``.
+    """Run one log and replace its folder ``logs/<stem>`` of the outputs.
 
     Raises
     ------
@@ -221,10 +234,8 @@ def run_log(
         ready, skipped = _choose_estimators(drive, config, car)
         algorithms = {e.name: resolve(e) for e in ready}
         intervals = calibrator(car, ready)
-        folder = output / "logs" / drive.name
-        sinks = _open_sinks(folder, drive, config, car)
-        try:
-            with TrackStore(folder) as store:
+        with outputs.begin(log_place(drive.name)) as change, _open_sinks(change, drive, config, car) as sinks:
+            with TrackStore(change.scratch / "tracks") as store:
                 signals = _estimate(drive, ready, intervals, sinks, store, progress)
                 rows, events, reasons = evaluate(drive, [e.name for e in ready], store.read, signals)
             rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in rows]
@@ -248,17 +259,11 @@ def run_log(
 
             for sink in sinks:
                 sink.finish(report, events)
-            write_metrics(folder / "metrics.parquet", rows)
-            write_json(folder / "report.json", report)
-        except BaseException:
-            for sink in sinks:
-                sink.abort()
-            with suppress(OSError):
-                folder.rmdir()
-            raise
+            write_metrics(change.file("metrics.parquet"), rows)
+            write_json(change.file("report.json"), report)
         outcome = outcome_of(drive, losses)
     progress(drive.name, 1.0)
-    return LogResult(outcome, folder, report, tuple(rows))
+    return LogResult(outcome, change.target, report, tuple(rows))
 
 
 def _short(algorithm: Algorithm | None) -> str:
@@ -285,19 +290,22 @@ def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[
     return estimators, skipped
 
 
-def _open_sinks(folder: Path, drive: Drive, config: RunConfig, car: Car) -> list[Sink]:
+@contextmanager
+def _open_sinks(change: Transaction, drive: Drive, config: RunConfig, car: Car) -> Iterator[list[Sink]]:
+    """Yield the outputs of a run that are fed window by window; on an exception they are aborted."""
     from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
     from pdhef_logtool.sinks.parquet import EstimatesSink
     from pdhef_logtool.sinks.rerun import RerunSink
 
     sinks: list[Sink] = []
     try:
-        sinks.append(EstimatesSink(folder / "estimates.parquet"))
+        sinks.append(EstimatesSink(change.file("estimates.parquet")))
         if config.annotate != "none":
-            sinks.append(AnnotatedMcapSink(folder / "annotated.mcap", drive.log if config.annotate == "full" else None))
+            source = drive.log if config.annotate == "full" else None
+            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source))
         sinks.append(
             RerunSink(
-                folder / "recording.rrd",
+                change.file("recording.rrd"),
                 log_name=drive.name,
                 input_hash=drive.sha256,
                 start_ns=drive.plan.start_ns,
@@ -305,11 +313,11 @@ def _open_sinks(folder: Path, drive: Drive, config: RunConfig, car: Car) -> list
                 colours={s.name: s.colour for s in SPECS},
             )
         )
+        yield sinks
     except BaseException:
         for sink in sinks:
             sink.abort()
         raise
-    return sinks
 
 
 def _estimate(
@@ -425,14 +433,22 @@ def _truth_quantity(name: str, how: str, mapping: Mapping, samples: dict[str, in
     return SourceFacts(name, source.label, TRUTH_UNITS[name], samples.get(source.label, 0), derivation=derivation)
 
 
-def make_folder(output: Path) -> None:
-    """Make an output folder; raises OutputError."""
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            expected="a folder to write to", got=error.strerror or str(error), where=str(output)
-        ) from None
+def log_place(stem: str) -> str:
+    """Return the folder of a log within the outputs."""
+    return f"{LOGS}/{stem}"
+
+
+def check_places(
+    inputs: Sequence[LogInput], output: Path | None, config: RunConfig, mapping: Mapping | None, junit: Path | None
+) -> None:
+    """Refuse to write over what is read; raises UsageError."""
+    can = () if mapping is None or mapping.can is None else mapping.can.dbc
+    files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE)]
+    folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
+    files += [folder / name for folder in folders for name in LOG_FILES]
+    check_no_input(
+        [*(i.path for i in inputs), *config.files, *can], files if junit is None else [*files, junit], folders
+    )
 
 
 def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult], car: Car | None = None) -> None:
@@ -441,5 +457,5 @@ def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult]
 
     network = None if car is None else car.network
     used = None if car is None or network is None else {"name": Path(car.network_name).name, "sha256": network.sha256}
-    write_metrics(output / "metrics.parquet", [row for r in results for row in r.rows])
-    write_json(output / "run.json", build_run(tool_versions(), config, used, [r.outcome for r in results]))
+    write_metrics(output / METRICS_FILE, [row for r in results for row in r.rows])
+    write_json(output / RUN_FILE, build_run(tool_versions(), config, used, [r.outcome for r in results]))

@@ -7,6 +7,7 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,7 @@ from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import check_mapping, join_channels, load_mapping, merge_losses, read_signals
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.outputs import OutputFolder, Transaction
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
     TRUTH_UNITS,
@@ -41,11 +43,13 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
 from pdhef_logtool.runs.pipeline import (
+    LOGS,
     LogResult,
     Progress,
     RunResult,
+    check_places,
     judge,
-    make_folder,
+    log_place,
     outcome_of,
     read_thresholds,
     report_facts,
@@ -99,13 +103,15 @@ def score_log(
             f"no --car: the truth is taken to be measured at the centre of gravity, sideslip is scored above "
             f"{slow:g} m/s, and segments are cut at friction {car.vehicle.assumed_friction:g}"
         )
+    check_places([log_input], output, config, mapping, junit)
     scoring = _Scoring(config, car, warn, estimates, truth, name)
-    with scoring.read(log_input, mapping) as drive:
-        result = judge(scoring.score(drive, output, progress), thresholds)
-    if output is not None:
-        document = _config_document(config, drive, scoring.estimates)
-        write_run(output, document, [result])
-    write_verdicts(junit, [result])
+    with nullcontext() if output is None else OutputFolder(output, (LOGS,)) as outputs:
+        with scoring.read(log_input, mapping) as drive:
+            result = judge(scoring.score(drive, outputs, progress), thresholds)
+        if output is not None:
+            document = _config_document(config, drive, scoring.estimates)
+            write_run(output, document, [result])
+        write_verdicts(junit, [result])
     return RunResult(output, (result,))
 
 
@@ -161,7 +167,7 @@ class _Scoring:
         options = replace(self.config.read_options, friction=None)
         return read_drive(log_input, self.car, mapping, options, tell=self.warn, adjust=choose, require_sensors=False)
 
-    def score(self, drive: Drive, output: Path | None, progress: Progress) -> LogResult:
+    def score(self, drive: Drive, outputs: OutputFolder | None, progress: Progress) -> LogResult:
         """Read, compare and, with a folder, write."""
         plan = drive.plan
         progress(drive.name, 0.1)
@@ -196,10 +202,10 @@ class _Scoring:
         )
         report = build_report(facts)
         folder = None
-        if output is not None:
-            make_folder(output)
-            folder = output / "logs" / drive.name
-            _write(folder, report, rows, [truth_track, *(r.track for r in recorded)], plan)
+        if outputs is not None:
+            with outputs.begin(log_place(drive.name)) as change:
+                _write(change, report, rows, [truth_track, *(r.track for r in recorded)], plan)
+            folder = change.target
         progress(drive.name, 1.0)
         return LogResult(outcome_of(drive, all_losses), folder, report, tuple(rows))
 
@@ -290,12 +296,16 @@ def _same_column(estimate: FloatArray, truth: FloatArray) -> bool:
 
 
 def _write(
-    folder: Path, report: dict[str, Any], rows: Sequence[MetricRow], tracks: Sequence[StateTrack], plan: DrivePlan
+    change: Transaction,
+    report: dict[str, Any],
+    rows: Sequence[MetricRow],
+    tracks: Sequence[StateTrack],
+    plan: DrivePlan,
 ) -> None:
     from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
 
     start = first_pose(tracks[0])
-    sink = EstimatesSink(folder / "estimates.parquet")
+    sink = EstimatesSink(change.file("estimates.parquet"))
     try:
         for track in tracks:
             has_pose = track.name == TRUTH and plan.has_truth_pose
@@ -304,8 +314,8 @@ def _write(
     except BaseException:
         sink.abort()
         raise
-    write_metrics(folder / "metrics.parquet", rows)
-    write_json(folder / "report.json", report)
+    write_metrics(change.file("metrics.parquet"), rows)
+    write_json(change.file("report.json"), report)
 
 
 def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int]]:

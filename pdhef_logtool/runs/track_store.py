@@ -3,29 +3,37 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from dataclasses import fields
 from pathlib import Path
 from typing import Self
 
 import numpy as np
 
+from pdhef_logtool.records.files import open_new, writing
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 
 class TrackStore:
-    """Append-only store of track windows in a temporary folder beside the outputs; gone when the context ends."""
+    """Append-only store of track windows in a folder of their own; gone when the context ends.
 
-    def __init__(self, beside: Path) -> None:
-        beside.mkdir(parents=True, exist_ok=True)
-        self._folder = Path(tempfile.mkdtemp(prefix=".tracks-", dir=beside))
+    Raises
+    ------
+    OutputError
+        The folder, which is made, or a file in it cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        with writing(folder):
+            folder.mkdir(parents=True)
         self._windows: dict[str, list[Path]] = {}
 
     def append(self, track: StateTrack) -> None:
         """Add the next window of a track."""
         files = self._windows.setdefault(track.name, [])
         file = self._folder / f"{track.name}-{len(files)}.npz"
-        np.savez(file, **{f.name: getattr(track, f.name) for f in fields(track) if f.name != "name"})
+        with writing(file), open_new(file) as made:
+            np.savez(made, **{f.name: getattr(track, f.name) for f in fields(track) if f.name != "name"})
         files.append(file)
 
     def read(self, name: str) -> StateTrack | None:

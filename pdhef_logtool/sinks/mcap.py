@@ -86,12 +86,6 @@ class AnnotatedMcapSink(Sink):
         self._window: dict[str, list[TopicBatch]] = {}
         self._raws: Iterator[RawMessage | RawChunk] = iter(())
         self._next: RawMessage | RawChunk | None = None
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise OutputError(
-                expected="a place to write to", got=error.strerror or str(error), where=str(path)
-            ) from error
         self._writer = McapLogWriter(path, profile="ros2" if source is None else source_profile(source))
         if source is None:
             return

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.files import PendingFile, cannot_write
+from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import OPTIONAL_COLUMNS, TRACK_COLUMNS, StateTrack, diagonal_covariance, make_track
 from pdhef_logtool.sinks.base import Event, Sink
@@ -37,8 +37,13 @@ class RowGroups:
     Parameters
     ----------
     path : where the finished file stands. rows_a_group : rows of one row group.
-    dictionaries : columns of few values. failed : error for a file that cannot be written.
+    dictionaries : columns of few values.
     joined : every row group is written from one piece, so that the same rows give the same bytes.
+
+    Raises
+    ------
+    OutputError
+        When the file cannot be written.
     """
 
     def __init__(
@@ -47,17 +52,20 @@ class RowGroups:
         schema: pa.Schema,
         rows_a_group: int,
         dictionaries: list[str],
-        failed: Callable[[OSError], OutputError],
         *,
         joined: bool = False,
     ) -> None:
-        self._rows_a_group, self._failed, self._joined = rows_a_group, failed, joined
+        self._path, self._rows_a_group, self._joined = path, rows_a_group, joined
         self._waiting: dict[str, list[pa.Table]] = {}
         self._pending = PendingFile(path)
+        with writing(path):
+            self._file = open_new(self._pending.path)
         try:
-            self._writer = pq.ParquetWriter(self._pending.path, schema, compression="zstd", use_dictionary=dictionaries)
-        except OSError as error:
-            raise failed(error) from error
+            with writing(path):
+                self._writer = pq.ParquetWriter(self._file, schema, compression="zstd", use_dictionary=dictionaries)
+        except BaseException:
+            self._drop()
+            raise
 
     def append(self, key: str, table: pa.Table) -> None:
         """Take the next rows of a key."""
@@ -78,7 +86,9 @@ class RowGroups:
             self._waiting.clear()
             if metadata:
                 self._writer.add_key_value_metadata(dict(metadata))
-            self._writer.close()
+            with writing(self._path):
+                self._writer.close()
+                self._file.close()
         except BaseException:
             self.abort()
             raise
@@ -87,17 +97,21 @@ class RowGroups:
     def abort(self) -> None:
         """Remove what was written."""
         self._waiting.clear()
-        self._writer.close()
+        with suppress(OSError, ValueError):  # its last words may not fit the disk either, or come after the file's end
+            self._writer.close()
+        self._drop()
+
+    def _drop(self) -> None:
+        with suppress(OSError):
+            self._file.close()
         self._pending.discard()
 
     def _write(self, table: pa.Table) -> None:
-        try:
+        with writing(self._path):
             if self._joined:
                 self._writer.write_table(table.combine_chunks(), row_group_size=self._rows_a_group)
             elif table.num_rows:
                 self._writer.write_table(table, row_group_size=self._rows_a_group)
-        except OSError as error:
-            raise self._failed(error) from error
 
 
 class EstimatesSink(Sink):
@@ -115,7 +129,7 @@ class EstimatesSink(Sink):
 
     def __init__(self, path: Path, rows_a_group: int = ROWS_A_GROUP) -> None:
         schema = arrow_schema("estimates.parquet.json")
-        self._file = RowGroups(path, schema, rows_a_group, ["estimator"], partial(cannot_write, path))
+        self._file = RowGroups(path, schema, rows_a_group, ["estimator"])
 
     def append(self, track: StateTrack) -> None:
         """Take one track of this window; [N] rows."""
@@ -256,11 +270,8 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     """Write metrics.parquet, rows in the order given; NaN becomes null; raises OutputError."""
     schema = arrow_schema("metrics.parquet.json")
     arrays = [pa.array([getattr(r, f.name) for r in rows], type=f.type, from_pandas=True) for f in schema]
-    with PendingFile(path) as pending:
-        try:
-            pq.write_table(pa.Table.from_arrays(arrays, schema=schema), pending.path, compression="zstd")
-        except OSError as error:
-            raise cannot_write(path, error) from error
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
 
 
 def read_metrics(path: Path) -> list[MetricRow]:

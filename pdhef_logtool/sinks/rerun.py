@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import errno
+import os
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import rerun as rr
@@ -13,7 +17,7 @@ import rerun.blueprint as rrb
 
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.files import PendingFile
+from pdhef_logtool.records.files import PendingFile, cannot_write, open_new, writing
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -35,6 +39,12 @@ MOST_TRAJECTORY_POINTS = 20_000
 
 #: Steps of the moving dot in the plan view.
 DOT_STEP_NS = 50_000_000
+
+#: How long Rerun may keep one call waiting before the recording is given up.
+LONGEST_WAIT_S = 60.0
+
+#: Stands near the end of a recording that was finished.
+_FOOTER = b"RRF2FOOT"
 
 _DEG = float(np.rad2deg(1.0))
 
@@ -123,26 +133,58 @@ class RerunSink(Sink):
                 where=str(path),
                 remedy="unset RERUN",
             )
+        self._path = path
+        with writing(path):
+            self._outlet = _Outlet(open_new(self._pending.path))
         try:
-            self._recording.save(self._pending.path, default_blueprint=_blueprint())
-        except (OSError, RuntimeError) as error:
-            raise OutputError(expected="a place to write to", got=str(error), where=str(path)) from error
-        self._recording.send_recording_name(log_name)
-        self._recording.send_recording_start_time_nanos(start_ns)
+            with self._calling():
+                self._recording.save(self._outlet.name, default_blueprint=_blueprint())
+                self._outlet.opened()
+                self._recording.send_recording_name(log_name)
+                self._recording.send_recording_start_time_nanos(start_ns)
+        except BaseException:
+            self.abort()
+            raise
+
+    @contextmanager
+    def _calling(self) -> Iterator[None]:
+        """Call Rerun, for a limited time; raises OutputError for what could not be written since the last call."""
+        limit = threading.Timer(LONGEST_WAIT_S, self._outlet.give_up)
+        limit.daemon = True
+        limit.start()
+        try:
+            yield
+        except RuntimeError as error:
+            if self._outlet.error is None:
+                raise OutputError(
+                    expected="a recording by Rerun", got=str(error), where=str(self._path), remedy="run the log again"
+                ) from error
+        finally:
+            limit.cancel()
+        if self._outlet.error is not None:
+            raise cannot_write(self._path, self._outlet.error) from self._outlet.error
 
     def append_signals(self, signals: Signals) -> None:
         """Draw what the estimators saw in this window."""
+        with self._calling():
+            self._append_signals(signals)
+
+    def _append_signals(self, signals: Signals) -> None:
         for entity, column, factor in _INPUTS:
             values = np.asarray(getattr(signals, column)) * factor
             self._draw(f"/inputs/{entity}", entity, _INPUT_RGB, signals.stamps_ns, values, sparse=True)
 
     def append(self, track: StateTrack) -> None:
         """Draw one track of this window."""
+        with self._calling():
+            self._append(track)
+
+    def _append(self, track: StateTrack) -> None:
         if track.name in self._window:
             self._window.clear()
             self._compared.clear()
             # Without this the file falls behind and the difference waits in memory: 380 MB more after one hour.
-            self._recording.flush()
+            self._recording.flush(timeout_sec=LONGEST_WAIT_S)
         self._window[track.name] = track
         rgb = colour_rgb(track.name, self._colours)
         fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
@@ -168,28 +210,43 @@ class RerunSink(Sink):
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:
         """Add trajectories, events and the text report, and give the recording its name."""
         try:
-            for name, path in self._paths.items():
-                self._log_static(
-                    f"/plan/{name}",
-                    rr.LineStrips2D(
-                        path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
-                    ),
+            with self._calling():
+                self._draw_whole(report, events)
+                self._recording.disconnect()
+                self._outlet.close()
+            if _FOOTER not in _tail(self._pending.path):
+                raise OutputError(
+                    expected="a recording that Rerun has finished",
+                    got="one without its end",
+                    where=str(self._path),
+                    remedy="run the log again",
                 )
-            found = self._draw_reasons()
-            if events or found:
-                ordered = sorted([*events, *found], key=lambda e: (e.start_ns, e.end_ns, e.name))
-                text = rr.TextLog.columns(text=[_event_text(e) for e in ordered], level=["INFO"] * len(ordered))
-                self._send("/events", np.array([e.start_ns for e in ordered], dtype=np.int64), text)
-            self._log_static("/report", rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN))
-            self._recording.disconnect()
         except BaseException:
             self.abort()
             raise
         self._pending.commit()
 
+    def _draw_whole(self, report: Mapping[str, Any], events: Sequence[Event]) -> None:
+        for name, path in self._paths.items():
+            self._log_static(
+                f"/plan/{name}",
+                rr.LineStrips2D(
+                    path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
+                ),
+            )
+        found = self._draw_reasons()
+        if events or found:
+            ordered = sorted([*events, *found], key=lambda e: (e.start_ns, e.end_ns, e.name))
+            text = rr.TextLog.columns(text=[_event_text(e) for e in ordered], level=["INFO"] * len(ordered))
+            self._send("/events", np.array([e.start_ns for e in ordered], dtype=np.int64), text)
+        self._log_static("/report", rr.TextDocument(report_markdown(report), media_type=rr.MediaType.MARKDOWN))
+
     def abort(self) -> None:
         """Remove what was written."""
-        self._recording.disconnect()
+        with suppress(OutputError), self._calling():
+            self._outlet.drop()
+            self._recording.disconnect()
+            self._outlet.close()
         self._pending.discard()
 
     def _send(self, entity: str, stamps_ns: IntArray, columns: Iterable[rr.ComponentColumn]) -> None:
@@ -288,6 +345,72 @@ class RerunSink(Sink):
                 )
 
 
+class _Outlet:
+    """Writes to a file what Rerun sends into a pipe, so that Rerun itself never meets a disk that is full or hangs.
+
+    Rerun writes from a thread of its own that ends on an error, and others may then wait for it without end. Here
+    what cannot be written is read and dropped, and the error kept.
+
+    Attributes
+    ----------
+    name : where Rerun is to write. error : the first one of writing, None so far.
+    """
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.error: OSError | None = None
+        self._file, self._dropped = file, False
+        self._from, self._to = os.pipe()
+        self.name = f"/dev/fd/{self._to}"
+        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread.start()
+
+    def opened(self) -> None:
+        """Close our own writing end: Rerun has its own now."""
+        if self._to >= 0:
+            os.close(self._to)
+            self._to = -1
+
+    def drop(self) -> None:
+        """Write no more of what comes."""
+        self._dropped = True
+
+    def give_up(self) -> None:
+        """Wait no longer for the disk: the thread that does is left alone, and another one drops what comes."""
+        if self.error is None:
+            self.error = TimeoutError(errno.ETIMEDOUT, f"nothing could be written for {LONGEST_WAIT_S:g} s")
+            self._dropped = True
+            self._thread = threading.Thread(target=self._carry, daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Wait until all is written that Rerun has sent, whose own end must be closed by then."""
+        self.opened()
+        self._thread.join(LONGEST_WAIT_S)
+        if self._thread.is_alive():
+            self.give_up()
+            self._thread.join(LONGEST_WAIT_S)
+
+    def _carry(self) -> None:
+        while data := os.read(self._from, 1 << 20):
+            if not self._dropped:
+                self._write(data)
+            if self._thread is not threading.current_thread():
+                return  # given up while it was writing: another one reads on
+        self._write(None)
+        if self._thread is threading.current_thread():
+            os.close(self._from)
+
+    def _write(self, data: bytes | None) -> None:
+        """Write, or at the end (None) close the file; what cannot be written is dropped from then on."""
+        try:
+            if data is not None:
+                self._file.write(data)
+            elif not isinstance(self.error, TimeoutError):  # else it would hang as well
+                self._file.close()
+        except OSError as error:
+            self.error, self._dropped = self.error or error, True
+
+
 @dataclass(slots=True)
 class _Line:
     """Where a line stands between windows: its last known stamp, and whether unknown rows followed it."""
@@ -346,6 +469,12 @@ class _Trajectory:
         known = np.isfinite(points).all(axis=1)
         pieces = np.split(points, np.flatnonzero(np.diff(known)) + 1)
         return [p for p in pieces if len(p) > 1 and np.isfinite(p[0]).all()]
+
+
+def _tail(path: Path) -> bytes:
+    with path.open("rb") as file:
+        file.seek(-min(64, path.stat().st_size), os.SEEK_END)
+        return file.read()
 
 
 def _event_text(event: Event) -> str:

@@ -7,6 +7,7 @@ import os
 import shutil
 import tomllib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.store import Change, check_output, update_car, write_change
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.cautious import strongest_physics
+from pdhef_logtool.records import outputs
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 
@@ -498,10 +500,8 @@ def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
     if place == "file":
         change = Change("tune", NOISE_FILE, {**change.files, "noise.png": _raise(error)})
     else:
-        monkeypatch.setattr(store, {"log": "_log", "exchange": "_exchanged"}[place], _raise(error))
+        monkeypatch.setattr(*{"log": (store, "_log"), "exchange": (outputs, "_exchanged")}[place], _raise(error))
     output = folder.with_name("new") if new else folder
-    if place == "exchange" and new:
-        monkeypatch.setattr(Path, "rename", _raise(error))
     with pytest.raises(OutputError if isinstance(error, OSError) else type(error)):
         update_car(car, output, change)
     assert files_of(folder) == before
@@ -512,7 +512,7 @@ def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
 def test_a_file_system_without_exchange_keeps_a_car_under_its_name(
     folder: Path, monkeypatch: pytest.MonkeyPatch, back: bool
 ) -> None:
-    monkeypatch.setattr(store, "_exchanged", lambda *_: False)
+    monkeypatch.setattr(outputs, "_exchanged", lambda *_: False)
     car, before = load(folder), files_of(folder)
     if not back:
         update_car(car, folder, noise_change(NEW))
@@ -521,7 +521,7 @@ def test_a_file_system_without_exchange_keeps_a_car_under_its_name(
         rename = Path.rename
 
         def fails_for_the_new_one(self: Path, target: Path) -> Path:
-            if self.suffix == ".partial":
+            if self.name == "new":
                 raise OSError(5, "input/output error")
             return rename(self, target)
 
@@ -624,3 +624,23 @@ def test_a_place_that_cannot_be_written_is_one_line(folder: Path, tmp_path: Path
         with pytest.raises(PdhefError) as caught:
             write_change(load(folder), load(folder), output, noise_change(NEW))
         assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_changes_by_several_commands_at_once_are_all_there(folder: Path, new: bool) -> None:
+    car = load(folder)
+    output = folder.with_name("new") if new else folder
+    changes = [Change("tune", f"part-{i}.toml", {f"part-{i}.toml": b"x = 1\n"}) for i in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda change: update_car(car, output, change), changes))
+    assert {f"part-{i}.toml" for i in range(8)} <= set(files_of(output))
+    assert len([line for line in read_history(output) if line["part"].startswith("part-")]) == 8
+    assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]
+
+
+def test_a_car_that_stays_held_is_one_line(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "LONGEST_WAIT_S", 0.1)
+    before = files_of(folder)
+    with outputs.OutputFolder(folder), pytest.raises(OutputError, match="another command is writing to"):
+        update_car(load(folder), folder, noise_change(NEW))
+    assert files_of(folder) == before

@@ -157,9 +157,12 @@ def test_the_written_mapping_loads_and_names_the_candidates(tmp_path: Path) -> N
 
 
 def test_a_mapping_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
     with pytest.raises(OutputError) as caught:
-        write_mapping(inspect_drive_log(small_log()), tmp_path / "none" / "m.toml")
+        write_mapping(inspect_drive_log(small_log()), tmp_path / "file" / "m.toml")
     assert "\n" not in str(caught.value)
+    write_mapping(inspect_drive_log(small_log()), tmp_path / "none" / "m.toml")
+    assert (tmp_path / "none" / "m.toml").is_file()
 
 
 # --------------------------------------------------------------------------------------------- real drives

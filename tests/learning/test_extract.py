@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from pdhef_logtool.learning.network.dataset import MANIFEST, SPLITS, read_datase
 from pdhef_logtool.learning.network.extract_command import ExtractResult, ExtractSettings, choose_split, extract
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.records.errors import LogError, OutputError, UsageError
+from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
 
@@ -386,3 +389,51 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
     assert result.returncode != 0
     assert result.stderr.splitlines()[-1].startswith("pdhef: ")
     assert "Traceback" not in result.stderr
+
+
+def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log = tmp_path / "dlc.mcap"
+    shutil.copy(sample_logs_dir / "dlc.mcap", log)
+    for name in ("drives/dlc.parquet", "manifest.json"):
+        file = tmp_path / "out" / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.symlink_to(log)
+        with pytest.raises(UsageError, match=r"replace the input|another manifest"):
+            extract([str(log)], tmp_path / "out", ExtractSettings(RunConfig()))
+        file.unlink()
+    assert log.read_bytes() == (sample_logs_dir / "dlc.mcap").read_bytes()
+
+
+def test_a_dataset_is_written_by_one_command_at_a_time(sample_logs_dir: Path, tmp_path: Path) -> None:
+    with OutputFolder(tmp_path), pytest.raises(OutputError, match="another command is writing to"):
+        extract([str(sample_logs_dir / "dlc.mcap")], tmp_path, ExtractSettings(RunConfig()))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_a_command_that_is_ended_takes_its_processes_with_it(
+    dataset: ExtractResult, sample_logs_dir: Path, tmp_path: Path, number: int
+) -> None:
+    out = tmp_path / "out"
+    logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
+    command = [sys.executable, "-m", "pdhef_logtool", "extract", *logs, "-o", str(out), "--seed", "4", "--jobs", "2"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        children: list[int] = []
+        while len(children) < 2 or not list((out / "drives").glob(".*.partial")):
+            assert process.poll() is None
+            time.sleep(0.01)
+            children = [int(c) for c in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+        process.send_signal(number)
+        said = process.communicate(timeout=30)[1]
+    assert process.returncode == (143 if number == signal.SIGTERM else -number)
+    assert said.endswith("final name\n") or number == signal.SIGKILL
+    ends = time.monotonic() + 20.0
+    while any(Path(f"/proc/{child}/stat").exists() for child in children) and time.monotonic() < ends:
+        time.sleep(0.05)
+    assert not any(Path(f"/proc/{child}/stat").exists() for child in children)
+    assert extract(logs, out, ExtractSettings(RunConfig(), seed=4)).manifest == dataset.manifest
+    assert {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()} == {
+        "manifest.json", "drives/dlc.parquet", "drives/sweep.parquet",
+    }  # fmt: skip

@@ -60,6 +60,8 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     again = run_training(joined, tmp_path / "again", epochs=2)
     assert again.bundle.sha256 == bundle.sha256
     assert again.bundle.provenance["fine_tuned_on"] is None
+    with pytest.raises(UsageError, match="would replace the input"):
+        run_training(joined, tmp_path / "model", init=tmp_path / "model", epochs=1)
     tuned = run_training(joined, tmp_path / "tuned", init=tmp_path / "model", epochs=1)
     assert tuned.bundle.provenance["fine_tuned_from"] == bundle.sha256
     assert tuned.bundle.provenance["fine_tuned_on"] == load_vehicle(sample_logs_dir / "vehicle.toml").name

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -50,10 +52,11 @@ def test_a_failure_before_anything_was_written_is_not_hidden(tmp_path: Path) -> 
 
 
 def test_what_a_killed_run_left_is_gone_from_the_start(tmp_path: Path) -> None:
-    killed = PendingFile(tmp_path / "out.bin")
-    killed.path.write_bytes(b"half of an old one")
+    script = "import sys, pathlib; from pdhef_logtool.records.files import PendingFile as P\n"
+    script += "P(pathlib.Path(sys.argv[1])).path.write_bytes(b'half of an old one')"
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "out.bin")], check=True)
+    assert len(folder(tmp_path)) == 1
     pending = PendingFile(tmp_path / "out.bin")
-    assert pending.path == killed.path  # else it would never be found
     assert folder(tmp_path) == {}
     with pending, pending.path.open("ab") as file:  # a writer that appends must not continue the old one
         file.write(b"new")
@@ -69,12 +72,14 @@ def test_two_targets_in_a_folder_do_not_share_a_temporary_name(tmp_path: Path) -
 
 def test_the_content_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     events: list[str] = []
-    partial = tmp_path / ".out.bin.partial"
+    partial = PendingFile(tmp_path / "out.bin").path
     fsync, rename = os.fsync, Path.replace
 
     def note_fsync(descriptor: int) -> None:
-        if os.path.samestat(os.fstat(descriptor), partial.stat()):
+        if partial.exists() and os.path.samestat(os.fstat(descriptor), partial.stat()):
             events.append("fsync")
+        elif os.path.samestat(os.fstat(descriptor), tmp_path.stat()):
+            events.append("fsync of the folder")
         fsync(descriptor)
 
     def note_rename(self: Path, target: Path) -> Path:
@@ -84,7 +89,7 @@ def test_the_content_is_on_the_disk_before_the_name_is(tmp_path: Path, monkeypat
     monkeypatch.setattr(os, "fsync", note_fsync)
     monkeypatch.setattr(Path, "replace", note_rename)
     write_bytes(tmp_path / "out.bin", b"new")
-    assert events == ["fsync", ".out.bin.partial -> out.bin"]
+    assert events == ["fsync", f"{partial.name} -> out.bin", "fsync of the folder"]
     assert folder(tmp_path) == DONE
 
 
@@ -123,6 +128,11 @@ def test_a_temporary_file_that_cannot_be_removed_does_not_hide_the_failure(tmp_p
     with pytest.raises(ValueError, match="mine"), PendingFile(tmp_path / "out.bin") as pending:
         pending.path.mkdir()  # no file: unlink refuses
         raise ValueError("mine")
+
+
+def test_the_longest_name_is_written(tmp_path: Path) -> None:
+    write_bytes(tmp_path / ("n" * 255), b"new")
+    assert folder(tmp_path) == {"n" * 255: b"new"}
 
 
 def test_missing_folders_are_made(tmp_path: Path) -> None:

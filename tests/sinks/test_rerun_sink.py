@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import itertools
 import os
 import subprocess
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.sinks import rerun
 from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.rerun import LONGEST_BRIDGE_NS, RerunSink, _Line, _Trajectory
@@ -351,6 +353,76 @@ def run_script(tmp_path: Path, **env: str) -> str:
 
 def test_writing_starts_no_analytics_and_a_switched_off_rerun_is_said(tmp_path):
     assert "unset RERUN" in run_script(tmp_path, RERUN="off")
+
+
+@pytest.mark.parametrize("call", [0, 1, 3, "close"])
+def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, circle, circle_signals, monkeypatch, call):
+    class Full(io.BytesIO):
+        calls = 0
+
+        def write(self, data):
+            self.calls += 1
+            if call != "close" and self.calls > call:
+                raise OSError(28, "No space left on device")
+            return len(data)
+
+        def close(self):
+            if call == "close":
+                raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(rerun, "open_new", lambda _path: Full())
+    with pytest.raises(OutputError, match=r"recording\.rrd: .*No space left on device; free some space"):
+        write(tmp_path / "recording.rrd", circle, circle_signals)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_recording_without_its_end_is_none(tmp_path, circle, circle_signals, monkeypatch):
+    monkeypatch.setattr(rerun, "_FOOTER", b"something that Rerun does not write")
+    with pytest.raises(OutputError, match="got one without its end"):
+        write(tmp_path / "recording.rrd", circle, circle_signals)
+    assert list(tmp_path.iterdir()) == []
+
+
+HANGING = """
+import sys, threading
+from pathlib import Path
+import numpy as np
+from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.sinks import rerun
+
+class Hangs:
+    left = int(sys.argv[2])
+    def write(self, data):
+        self.left -= 1
+        if self.left < 0:
+            threading.Event().wait()
+    def close(self):
+        threading.Event().wait()
+
+rerun.LONGEST_WAIT_S = 1.0
+rerun.open_new = lambda path: Hangs()
+try:
+    sink = rerun.RerunSink(Path(sys.argv[1]), log_name="d", input_hash="ab" * 32, start_ns=0)
+    for k in range(6):
+        stamps_ns = (np.arange(20000) + 20000 * k) * 10_000_000
+        vy = np.sin(stamps_ns * 1.0)
+        sink.append(make_track("zero", stamps_ns, vx_m_s=10 + vy, vy_m_s=vy, valid=np.ones(20000, dtype=bool)))
+    sink._draw_whole = lambda *_: None
+    sink.finish({})
+except OutputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("writes", [0, 5, 1000])
+def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
+    done = subprocess.run(
+        [sys.executable, "-c", HANGING, str(tmp_path / "recording.rrd"), str(writes)],
+        capture_output=True, text=True, check=True, timeout=30,
+    )  # fmt: skip
+    assert "recording.rrd: expected a place to write to, got nothing could be written for 1 s" in done.stdout
 
 
 @settings(max_examples=200, derandomize=True, deadline=None)

@@ -17,6 +17,7 @@ from pdhef_logtool.learning.car.identify import Identification, Identified, fit_
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     LearnResult,
+    check_file_output,
     config_document,
     no_drive,
     open_mapping,
@@ -113,6 +114,7 @@ def identify(
     held_out: list[FitDrive] = []
     records: list[DriveRecord] = []
     logs = find_logs(arguments)
+    check_file_output(logs, config, output)
     for number, log_input in enumerate(logs):
         progress(f"reading {log_input.stem}", 0.2 * number / len(logs))
         record, drive = load_fit_drive(log_input, Car.of(start), given, config.read_options)

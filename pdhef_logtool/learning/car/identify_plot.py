@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.car.identify import Identification
-from pdhef_logtool.records.files import PendingFile
+from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import FloatArray
 
 _POINTS = 6000
@@ -45,8 +45,8 @@ def plot_identification(found: Identification, path: Path) -> None:
         axes.legend(loc="upper left", frameon=False)
     _plot_parameters(top[1][0], found)
     _plot_scores(top[1][1], found)
-    with PendingFile(path) as pending:
-        figure.savefig(pending.path, format="png", metadata={"Software": None})
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})
 
 
 def _force(vehicle: VehicleParameters, is_front: bool, slip_rad: FloatArray) -> FloatArray:

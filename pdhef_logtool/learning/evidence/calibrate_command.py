@@ -24,6 +24,7 @@ from pdhef_logtool.learning.drives import (
     LearnResult,
     LearnSettings,
     Refusal,
+    check_file_output,
     choose_drives,
     load_drive,
     open_car,
@@ -129,6 +130,7 @@ def calibrate(
     car = open_car(config, None if alone else output, warn)
     mapping = open_mapping(config)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    check_file_output(inputs, config, output)
     if car.network is not None and "train" in splits.values():
         warn("drives of split train: a network is better there than in service, and its intervals will be too narrow")
     samples: dict[str, list[Samples]] = {}

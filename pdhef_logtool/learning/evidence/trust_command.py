@@ -21,6 +21,7 @@ from pdhef_logtool.learning.drives import (
     LearnResult,
     LearnSettings,
     Refusal,
+    check_file_output,
     choose_drives,
     drives_document,
     load_drive,
@@ -127,6 +128,7 @@ def trust(
     if car.network is None:
         raise UsageError(expected="a network", got="none", where="--network", remedy="give a folder of pdhef train")
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    check_file_output(inputs, config, output)
     mapping = open_mapping(config)
 
     def lacking(drive: Drive) -> str:

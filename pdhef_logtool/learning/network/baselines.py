@@ -18,6 +18,7 @@ from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
 from pdhef_logtool.learning.network.train_command import TrainResult, gap_free_runs, make_recipe, train_on
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
 from pdhef_logtool.residual_model.features import FEATURES
@@ -82,12 +83,13 @@ def run_baselines(
     """
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
     data = read_dataset(dataset)
-    regression = fit_dataset(data, recipe.feature_names)
     file = output / LINEAR_REGRESSION_FILE
-    write_bytes(file, regression.to_json().encode())
-    lstm = train_on(
-        data, output / PURE_LSTM_FOLDER, replace(recipe, target=LATERAL_VELOCITY), device=device, progress=progress
-    )
+    with OutputFolder(output):
+        regression = fit_dataset(data, recipe.feature_names)
+        write_bytes(file, regression.to_json().encode())
+        lstm = train_on(
+            data, output / PURE_LSTM_FOLDER, replace(recipe, target=LATERAL_VELOCITY), device=device, progress=progress
+        )
     return BaselinesResult(lstm, file, regression)
 
 

@@ -55,11 +55,8 @@ class DriveWriter:
     """
 
     def __init__(self, path: Path, split: str, rows_a_group: int = ROWS_A_GROUP) -> None:
-        def failed(error: OSError) -> OutputError:
-            return OutputError(expected="a place to write to", got=error.strerror or str(error), where=str(path))
-
         self._schema, self._split = arrow_schema(_SCHEMA), split
-        self._file = RowGroups(path, self._schema, rows_a_group, ["split", "segment"], failed, joined=True)
+        self._file = RowGroups(path, self._schema, rows_a_group, ["split", "segment"], joined=True)
 
     def append(self, rows: ResidualRows) -> None:
         """Take the next rows of the drive."""

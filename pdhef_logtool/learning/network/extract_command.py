@@ -32,6 +32,7 @@ from pdhef_logtool.learning.drives import (
     tell_drive,
 )
 from pdhef_logtool.learning.network.dataset import (
+    DRIVES,
     FORMAT,
     FORMAT_VERSION,
     MANIFEST,
@@ -53,7 +54,10 @@ from pdhef_logtool.learning.variation import vary
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
-from pdhef_logtool.records.errors import EstimatorError, OutputError, PdhefError, UsageError
+from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
+from pdhef_logtool.records.files import writing
+from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
@@ -200,34 +204,36 @@ def extract(
     mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
     _check_output(output)
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        # Until the new manifest stands, what the old one says of the files here is no longer true.
-        (output / MANIFEST).unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(
-            expected="a folder to write to", got=error.strerror or str(error), where=str(output)
-        ) from None
+    files = [output / MANIFEST, *(drive_file(output, i.stem) for i in inputs)]
+    check_no_input([*(i.path for i in inputs), *settings.config.files, *(j.car.source for j in work)], files)
+    with OutputFolder(output, (DRIVES,)):
+        with writing(output):
+            # Until the new manifest stands, what the old one says of the files here is no longer true.
+            (output / MANIFEST).unlink(missing_ok=True)
+        results = _extract_all(work, jobs, progress, warn)
+        used = {r.entry["vehicle_sha256"] for r in results if r.entry is not None}
+        vehicles = {job.car.physics_sha256: job.car.vehicle for job in work}
+        manifest = write_manifest(
+            output,
+            [r.entry for r in results if r.entry is not None],
+            [{"log": r.name, "file": r.file, "reason": r.left_out} for r in (x.record for x in results) if r.left_out],
+            settings=settings.to_dict(),
+            seed=settings.seed,
+            vehicles=sorted((sha, v) for sha, v in vehicles.items() if sha in used),
+        )
+    if settings.split is None and len(used) and not all(manifest["splits"][s]["drives"] for s in SPLITS):
+        empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
+        warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
+    return ExtractResult(output, manifest, results)
+
+
+def _extract_all(work: Sequence[_Job], jobs: int, progress: Progress, warn: Tell) -> tuple[DriveResult, ...]:
     by_log: dict[str, DriveResult] = {}
     for done, result in enumerate(_run_jobs(work, jobs, progress), start=1):
         by_log[result.record.name] = result
         tell_drive(result.record, warn)
         progress(result.record.name, done / len(work))
-    results = tuple(by_log[job.log_input.stem] for job in work)
-    used = {r.entry["vehicle_sha256"] for r in results if r.entry is not None}
-    vehicles = {job.car.physics_sha256: job.car.vehicle for job in work}
-    manifest = write_manifest(
-        output,
-        [r.entry for r in results if r.entry is not None],
-        [{"log": r.name, "file": r.file, "reason": r.left_out} for r in (x.record for x in results) if r.left_out],
-        settings=settings.to_dict(),
-        seed=settings.seed,
-        vehicles=sorted((sha, v) for sha, v in vehicles.items() if sha in used),
-    )
-    if settings.split is None and len(used) and not all(manifest["splits"][s]["drives"] for s in SPLITS):
-        empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
-        warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
-    return ExtractResult(output, manifest, results)
+    return tuple(by_log[job.log_input.stem] for job in work)
 
 
 def _check_output(output: Path) -> None:
@@ -291,7 +297,7 @@ def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[D
             yield _extract_guarded(job, of_all) if len(work) > 1 else _extract(job, of_all)
         return
     broken: list[_Job] = []
-    with ProcessPoolExecutor(min(jobs, len(work)), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(min(jobs, len(work)), mp_context=get_context("spawn"), initializer=follow_parent) as pool:
         futures = {pool.submit(_extract_guarded, job): job for job in work}
         try:
             for future in as_completed(futures):
@@ -304,7 +310,7 @@ def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[D
             raise
     # A dead process takes the whole pool with it: who it was is found out one by one.
     for job in broken:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=follow_parent) as pool:
             try:
                 yield pool.submit(_extract_guarded, job).result()
             except BrokenProcessPool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
@@ -12,9 +13,17 @@ import numpy as np
 
 from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
-from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
-from pdhef_logtool.records.files import PendingFile
-from pdhef_logtool.residual_model.bundle import RESIDUAL, ModelBundle, open_model
+from pdhef_logtool.records.errors import ModelError, UsageError
+from pdhef_logtool.records.files import PendingFile, open_new, writing
+from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.residual_model.bundle import (
+    DOCUMENT_FILE,
+    RESIDUAL,
+    WEIGHTS_FILE,
+    ModelBundle,
+    model_folder,
+    open_model,
+)
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"
@@ -65,19 +74,19 @@ def run_training(
     Raises
     ------
     UsageError
-        The device is not there, or the number of epochs is none.
+        The device is not there, the number of epochs is none, or ``output`` is ``init`` itself.
+    OutputError
+        The folder cannot be written, or another command is writing to it.
     ModelError
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
-    return train_on(
-        read_dataset(dataset),
-        output,
-        recipe,
-        init=None if init is None else open_model(init),
-        device=device,
-        progress=progress,
-    )
+    data = read_dataset(dataset)
+    bundle = None if init is None else open_model(init)
+    start = None if init is None else model_folder(init)
+    check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
+    with OutputFolder(output):
+        return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
 
 
 def make_recipe(*, paper: bool, seed: int, epochs: int | None, device: str) -> Recipe:
@@ -179,8 +188,10 @@ def _sequences(drives: Iterable[DatasetDrive], target: str = RESIDUAL) -> Iterab
 def _write_history(path: Path, history: Iterable[Epoch]) -> None:
     import polars as pl
 
-    with PendingFile(path) as pending:
-        pl.DataFrame([asdict(e) for e in history]).write_parquet(pending.path)
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        whole = io.BytesIO()  # polars has errors of its own for a disk that is full
+        pl.DataFrame([asdict(e) for e in history]).write_parquet(whole)
+        file.write(whole.getvalue())
 
 
 def _plot_history(path: Path, history: list[Epoch]) -> None:
@@ -196,8 +207,5 @@ def _plot_history(path: Path, history: list[Epoch]) -> None:
     axes.set(xlabel="epoch", ylabel="mean square of normalised targets")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    try:
-        with PendingFile(path) as pending:
-            figure.savefig(pending.path, format="png", metadata={"Software": None})
-    except OSError as error:
-        raise OutputError(expected="a place to write to", got=error.strerror or str(error), where=str(path)) from None
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})

@@ -21,6 +21,7 @@ from pdhef_logtool.learning.drives import (
     LearnResult,
     LearnSettings,
     Refusal,
+    check_file_output,
     choose_drives,
     drives_document,
     no_drive,
@@ -49,6 +50,7 @@ from pdhef_logtool.learning.noise.search import (
 from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.files import open_new, writing
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
@@ -154,6 +156,7 @@ def tune(
     names = choose_names(settings.names, car, with_network=config.network is not None or car.trust is not None)
     has_network = any(spec_of(n).network for n in names)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
+    check_file_output(inputs, config, output)
     if has_network and "train" in splits.values():
         warn(
             "drives of split train: a network is better there than in service, and its filter's noise is tuned to that"
@@ -315,4 +318,5 @@ def _plot(result: TuneResult, path: Path) -> None:
     )
     axes.grid(alpha=0.3, which="both")
     axes.legend(frameon=False)
-    figure.savefig(path, format="png", metadata={"Software": None})
+    with writing(path), open_new(path) as file:
+        figure.savefig(file, format="png", metadata={"Software": None})

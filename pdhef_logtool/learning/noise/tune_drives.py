@@ -24,6 +24,7 @@ from pdhef_logtool.learning.noise.search import DriveError, drive_error
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.service import RememberingNetwork
@@ -205,6 +206,7 @@ _here: dict[str, DriveBench] = {}
 
 
 def _open_bench(setup: TuneSetup) -> None:
+    follow_parent()
     _here["bench"] = DriveBench(setup)
 
 

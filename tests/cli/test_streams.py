@@ -1,0 +1,90 @@
+"""Readers that go, terminals that are full, streams that are closed, and requests to end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool.cli import stopping
+
+PDHEF = [sys.executable, "-m", "pdhef_logtool"]
+FULL = Path("/dev/full")
+
+
+@pytest.mark.parametrize("arguments", [["inspect", "LOG"], ["inspect", "LOG", "--json"], ["simulate", "--list"]])
+def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path, arguments: list[str]) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [a.replace("LOG", str(sample_logs_dir / "dlc.mcap")) for a in arguments]
+    done = subprocess.run([*PDHEF, *command], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
+@pytest.mark.parametrize("arguments", [["simulate", "--list"], ["estimators", "--json"], ["--help"], ["--version"]])
+def test_an_output_that_takes_nothing_is_one_line(arguments: list[str]) -> None:
+    with FULL.open("w") as full:
+        done = subprocess.run([*PDHEF, *arguments], stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr == (
+        "pdhef: standard output: expected a place to write to, got No space left on device; "
+        "free some space or choose another place\n"
+    )
+
+
+@pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
+def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path: Path, closed: tuple[int, ...]) -> None:
+    log = tmp_path / "x.mcap"
+    shell = " ".join([*PDHEF, "simulate", "dlc", "--duration", "5", "-o", str(log), *(f"{n}>&-" for n in closed)])
+    done = subprocess.run(["sh", "-c", shell], capture_output=True, check=False)
+    assert done.returncode == 0
+    assert log.read_bytes().endswith(b"\x89MCAP0\r\n")
+
+
+STOP = """
+import os, signal, sys
+import pdhef_logtool.runs.pipeline as p
+def run(*a, **k):
+    try:
+        os.kill(os.getpid(), signal.{name})
+    except BaseException as error:
+        if "{way}" == "swallowed":
+            k["progress"]("", 0.5)
+        if "{way}" == "changed":
+            raise ImportError("what a module makes of it")
+        raise
+p.run_logs = run
+sys.argv = ["pdhef", "run", "x", "-o", "y"]
+from pdhef_logtool.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize("way", ["raised", "swallowed", "changed"])
+@pytest.mark.parametrize(("name", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
+def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name: str, code: int, said: str, way: str) -> None:
+    script = STOP.format(name=name, way=way)
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (code, "")
+    assert done.stderr == f"pdhef: {said}; nothing half-written was left under its final name\n"
+
+
+def test_the_second_request_ends_at_once_and_what_is_ignored_stays_so() -> None:
+    script = "import signal; from pdhef_logtool.cli import stopping\n"
+    script += "signal.signal(signal.SIGTERM, signal.SIG_IGN)\nstopping.watch()\n"
+    script += "signal.raise_signal(signal.SIGTERM)\n"
+    script += "try: signal.raise_signal(signal.SIGINT)\nexcept BaseException: pass\n"
+    script += "signal.raise_signal(signal.SIGINT)\nprint('still here')"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (-signal.SIGINT, "")
+
+
+def test_nothing_came_here() -> None:
+    assert stopping.came() is None
+    stopping.check()

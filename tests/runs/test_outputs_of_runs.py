@@ -1,0 +1,233 @@
+"""Runs that are killed, meet full disks or each other, or would write over what they read."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import LOG_FILES, run_logs
+from pdhef_logtool.runs.recorded_estimates import score_log
+from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
+from tests.failing_writes import failing_writes
+
+
+def config(sample_logs_dir: Path, **changes: Any) -> RunConfig:
+    """Return what runs in a moment: one second of driving, without the compiler."""
+    car = sample_logs_dir / "vehicle.toml"
+    return RunConfig(
+        **{"car": car, "estimators": ("zero",), "annotate": "sidecar", "start": "2", "end": "3", **changes}
+    )
+
+
+@pytest.fixture
+def log(sample_logs_dir: Path) -> str:
+    return str(sample_logs_dir / "dlc.mcap")
+
+
+# ------------------------------------------------------------------------------------- outputs that are inputs
+
+
+def test_a_run_never_replaces_what_it_reads(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+    folder = tmp_path / "d" / "logs" / "annotated"
+    folder.mkdir(parents=True)
+    recording = folder / "annotated.mcap"
+    shutil.copy(log, recording)
+    thresholds = tmp_path / "limits.toml"
+    thresholds.write_text('[[threshold]]\nmetric = "rmse"\nsignal = "sideslip_rad"\nmax = 1.0\n')
+    (tmp_path / "link").symlink_to(tmp_path / "d")
+    (tmp_path / "annotated.mcap").symlink_to(recording)
+    before = contents(tmp_path)
+    plain = config(sample_logs_dir)
+    for argument, output in ((recording, tmp_path / "d"), (recording, tmp_path / "link")):
+        for act in (run_logs, lambda a, o, c: score_log(a[0], c, estimates=["/x"], output=o)):
+            with pytest.raises(UsageError, match="would replace the input"):
+                act([str(argument)], output, plain)
+    with pytest.raises(UsageError, match="would replace the input"):
+        run_logs([str(tmp_path / "annotated.mcap")], tmp_path / "d", plain)
+    with pytest.raises(UsageError, match=r"limits\.toml"):
+        run_logs([log], tmp_path / "o", config(sample_logs_dir, thresholds=thresholds), junit=thresholds)
+    assert contents(tmp_path) == before
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_mapping_in_a_folder_that_is_replaced_is_refused(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+    mapping = tmp_path / "logs" / "dlc" / "mapping.toml"
+    mapping.parent.mkdir(parents=True)
+    mapping.write_text("[truth.vy_m_s]\ntopic = 't'\nfield = 'f'\n")
+    with pytest.raises(UsageError, match=r"mapping\.toml"):
+        run_logs([log], tmp_path, config(sample_logs_dir, mapping=mapping))
+
+
+# ------------------------------------------------------------------------------------------------- what stays
+
+
+def test_a_persons_files_and_what_the_run_does_not_write_stay(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+    run_logs([log], tmp_path, config(sample_logs_dir))
+    folder = tmp_path / "logs" / "dlc"
+    (folder / "notes.txt").write_text("mine")
+    (folder / ".estimates.parquet.partial").write_text("of a killed run of long ago")
+    before = contents(tmp_path)
+    run_logs([log], tmp_path, config(sample_logs_dir, estimators=("kinematic",), annotate="none"))
+    after = contents(tmp_path)
+    assert {p.name for p in folder.iterdir()} == {*LOG_FILES, "notes.txt"}
+    same = {"logs/dlc/annotated.mcap", "logs/dlc/notes.txt", "logs/dlc/recording.rrd"}
+    assert {p for p in after if after[p] == before[p]} == same
+
+
+# ------------------------------------------------------------------------------------------- disks that fail
+
+
+@pytest.mark.slow
+def test_whichever_write_fails_a_log_is_whole_and_the_error_one_line(
+    sample_logs_dir: Path, tmp_path: Path, log: str
+) -> None:
+    before, after = config(sample_logs_dir), config(sample_logs_dir, estimators=("zero", "kinematic"))
+    out, old = tmp_path / "out", tmp_path / "old"
+    run_logs([log], out, before)
+    (out / "logs" / "dlc" / "notes.txt").write_text("mine")
+    shutil.copytree(out, old)
+    with failing_writes(0) as counted:
+        run_logs([log], out, after)
+    states = {"old": contents(old), "new": contents(out)}
+    in_log = {k: {p: c for p, c in s.items() if p.startswith("logs")} for k, s in states.items()}
+    number, ended = 0, ""
+    # Threads make the number of calls differ by some.
+    while ended != "new" or number < counted.count:
+        number += 1
+        shutil.rmtree(out)
+        shutil.copytree(old, out)
+        try:
+            with failing_writes(number):
+                run_logs([log], out, after)
+            ended = "new"
+        except OutputError as error:
+            ended = "old"
+            assert str(error).startswith(str(out)), number
+            assert "No space left on device; free some space" in str(error), number
+        found = contents(out)
+        assert {p: c for p, c in found.items() if p.startswith("logs")} in in_log.values(), number
+        assert {found["run.json"], states["old"]["run.json"], states["new"]["run.json"]} == {
+            states["old"]["run.json"],
+            states["new"]["run.json"],
+        }, number
+        assert found == states["new"] or ended == "old", number
+        assert leftovers(out) == [], number
+    assert number > 100
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """A file system of its own with as many bytes as the test says."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = shutil.which("mount") and subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={request.param}", "none", str(disk)], capture_output=True, check=False
+    )
+    if not mounted or mounted.returncode != 0:
+        pytest.skip("a file system that can be filled needs root: mount -t tmpfs")
+    yield disk
+    subprocess.run(["umount", str(disk)], check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("small_disk", ["40k", "300k", "1m"], indirect=True)
+def test_a_full_disk_is_one_line_and_leaves_nothing(sample_logs_dir: Path, small_disk: Path, log: str) -> None:
+    command = [sys.executable, "-m", "pdhef_logtool", "run", log, "-o", str(small_disk / "out"), "-e", "zero"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 1
+    errors = [line for line in done.stderr.splitlines() if not line.startswith("warning: ")]
+    assert len(errors) == 1
+    assert errors[0].startswith(f"pdhef: {small_disk}/out/")
+    assert "No space left on device; free some space" in errors[0]
+    assert [p for p in small_disk.rglob("*") if not p.is_dir()] == []
+
+
+@pytest.mark.parametrize("small_disk", ["2m"], indirect=True)
+def test_a_disk_that_was_full_keeps_the_run_before(sample_logs_dir: Path, small_disk: Path, log: str) -> None:
+    out = small_disk / "out"
+    run_logs([log], out, config(sample_logs_dir))
+    before = contents(out)
+    room = os.statvfs(small_disk)
+    (small_disk / "filler").write_bytes(b"x" * (room.f_bavail * room.f_frsize - 20_000))
+    with pytest.raises(OutputError, match="No space left on device; free some space"):
+        run_logs([log], out, config(sample_logs_dir, estimators=("kinematic",)))
+    assert contents(out) == before
+    assert leftovers(out) == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_may_not_be_written_is_one_line(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(OutputError, match="choose a place that you may write to"):
+        run_logs([log], tmp_path, config(sample_logs_dir))
+
+
+def test_a_file_in_the_place_of_a_folder_is_one_line(sample_logs_dir: Path, tmp_path: Path, log: str) -> None:
+    (tmp_path / "logs").write_text("mine")
+    with pytest.raises(OutputError, match="move it or choose another place"):
+        run_logs([log], tmp_path, config(sample_logs_dir))
+    assert contents(tmp_path) == {"logs": b"mine"}
+
+
+# --------------------------------------------------------------------------------------------- kills, two runs
+
+
+@pytest.mark.slow
+def test_kills_leave_whole_logs_and_the_next_run_the_same_results(sample_logs_dir: Path, tmp_path: Path) -> None:
+    logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
+    arguments = [*logs, "--car", str(sample_logs_dir / "vehicle.toml"), "-e", "zero,kinematic"]
+    undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
+    started = time.monotonic()
+    assert kill_run(arguments, undisturbed, after_s=120.0).exit_code is None
+    lasts_s = time.monotonic() - started
+    for killed in kill_many(arguments, out, count=6, lasts_s=lasts_s, writes_s=1.0, seed=11):
+        if out.is_dir():
+            assert faults(out) == [], killed
+        if killed.exit_code == 130:
+            said = "pdhef: interrupted; nothing half-written was left under its final name"
+            assert killed.said.splitlines()[-1].startswith(said)
+            assert not out.is_dir() or leftovers(out) == []
+        else:
+            assert killed.exit_code in (None, 0, -signal.SIGKILL, -signal.SIGINT), killed
+    assert kill_run(arguments, out, after_s=120.0).exit_code is None
+    assert contents(out) == contents(undisturbed)
+    assert leftovers(out) == []
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_says_how_far_it_came(sample_logs_dir: Path, tmp_path: Path) -> None:
+    arguments = [str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "sweep.mcap"), "-e", "zero"]
+    killed = kill_run(arguments, tmp_path, after_s=0.0, number=signal.SIGTERM, writing=True)
+    assert killed.exit_code == 143
+    assert killed.said.splitlines()[-1].startswith("pdhef: terminated; nothing half-written")
+    assert killed.said.splitlines()[-1].endswith("; 0 of 2 logs are done")
+    assert leftovers(tmp_path) == []
+
+
+@pytest.mark.slow
+def test_two_runs_in_one_folder_end_with_one_refusal(sample_logs_dir: Path, tmp_path: Path) -> None:
+    log, other = str(sample_logs_dir / "dlc.mcap"), str(sample_logs_dir / "sweep.mcap")
+    command = [sys.executable, "-m", "pdhef_logtool", "run", "-o", str(tmp_path / "out"), "-e", "zero,kinematic"]
+    runs = [
+        subprocess.Popen([*command, one], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        for one in (log, other)
+    ]
+    said = [run.communicate(timeout=120)[1] for run in runs]
+    codes = [run.returncode for run in runs]
+    assert sorted(codes) == [0, 1]
+    refused = said[codes.index(1)].splitlines()
+    assert [line for line in refused if "another command is writing to" in line] == [refused[-1]]
+    winner = (log, other)[codes.index(0)]
+    run_logs([winner], tmp_path / "alone", RunConfig(estimators=("zero", "kinematic")))
+    assert contents(tmp_path / "out") == contents(tmp_path / "alone")
