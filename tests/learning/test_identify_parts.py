@@ -83,6 +83,7 @@ def test_a_drive_is_loaded_without_what_the_file_takes_off(monkeypatch: pytest.M
     assert found is not None
     assert (record.name, found.name, found.log_start_ns) == ("a", "a", 7)
     assert (found.independent_yaw_rate, found.steering_wheel) == (False, False)
+    assert found.signals is DRIVE.signals and found.truth is DRIVE.truth
     ((vehicle, options),) = asked
     plain = sensors.model_copy(update={"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0})
     assert vehicle == car.vehicle.model_copy(update={"steer_offset_rad": 0.0, "sensors": plain})
@@ -276,7 +277,7 @@ def test_the_vehicle_has_the_values_of_the_parameters() -> None:
     assert noise.r_std == {"ay_m_s2": value["r a_y"], "yaw_rate_rad_s": value["r yaw rate"], "speed_m_s": 0.08}
     short, _ = build_vehicle(CAR, priors, theta, digits=3)
     assert short.yaw_inertia_kg_m2 == float(f"{value['yaw inertia']:.3g}")
-    assert short.tyres.front.B == float(f"{short.tyres.front.B:.3g}")
+    assert float(f"{short.tyres.front.B:.3g}") == short.tyres.front.B
     fixed = [p for p in priors if p.name != "steering ratio"]
     assert build_vehicle(CAR, fixed, np.zeros(len(fixed)))[0].steering_ratio == 16.0
 
@@ -336,9 +337,11 @@ def test_a_linear_error_is_minimised_in_closed_form(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(identify, "_sideslip_errors", errors)
     theta, std, rmse = identify._minimise([DRIVE, DRIVE], CAR, priors, first, active, sigma)
     rows = np.concatenate([w[:, None] * m / s for m, w, s in zip(maps, weights, sigma, strict=True)])
-    right = np.concatenate([w * (m @ (first * ~active) + o) / s for m, o, w, s in zip(maps, offsets, weights, sigma, strict=True)])  # fmt: skip
+    offset = np.concatenate(
+        [w * (m @ (first * ~active) + o) / s for m, o, w, s in zip(maps, offsets, weights, sigma, strict=True)]
+    )
     normal = rows[:, active].T @ rows[:, active] + np.eye(3)
-    np.testing.assert_allclose(theta[active], -np.linalg.solve(normal, rows[:, active].T @ right), atol=1e-5)
+    np.testing.assert_allclose(theta[active], -np.linalg.solve(normal, rows[:, active].T @ offset), atol=1e-5)
     assert theta[2] == 0.7
     np.testing.assert_allclose(std[active], np.sqrt(np.diag(np.linalg.inv(normal))), rtol=1e-4)
     assert std[2] == 1.0
@@ -477,7 +480,8 @@ def test_notes_say_what_the_drives_could_not_tell() -> None:
         _parameter("filter", prior=9.0, tuning=True),
     ]
     notes = identify._notes(parameters, [gyro], 20.0)[1:]
-    assert [n.rpartition(": ")[2] for n in notes] == ["kept", "its bias is known through the sideslip alone", "below, above"]  # fmt: skip
+    gyro_said = "its bias is known through the sideslip alone"
+    assert [n.rpartition(": ")[2] for n in notes] == ["kept", gyro_said, "below, above"]
     assert len(identify._notes(parameters, [gyro, DRIVE], 20.0)) == 3
 
 
