@@ -1,4 +1,4 @@
-"""What the learning commands do around their fits, on drives that stand in memory: progress, records, words, figures."""
+"""What the learning commands do around their fits, on drives in memory: progress, records, words, figures."""
 
 from __future__ import annotations
 
@@ -400,7 +400,10 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
 # ---- trust ----
 
 
-def test_trust_tells_its_progress_warns_and_keeps_its_evidence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shipped = LearnSettings(config=RunConfig(car=sample_logs_dir / "vehicle.toml", network=Path("default")))
     asked: list[Any] = []
 
     def load(log: LogInput, *_: Any, split: str | None, refuse: Any, least_scored: int) -> Any:
@@ -422,7 +425,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(tmp_path: Path, m
     result = trust_command.trust(
         arguments,
         tmp_path / "car",
-        LearnSettings(config=SALOON),
+        shipped,
         progress=lambda *x: told.append(x),
         warn=warned.append,
     )
@@ -449,7 +452,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(tmp_path: Path, m
         "unconfirmed_cap": 0.5, "level": 0.95, "resamples": 4000,
     }  # fmt: skip
     monkeypatch.setattr(trust_command, "errors_by_trust", lambda *_, **__: replace(blocks, lost=0))
-    trust_command.trust(arguments[:1], tmp_path / "other", LearnSettings(config=SALOON), warn=warned.append)
+    trust_command.trust(arguments[:1], tmp_path / "other", shipped, warn=warned.append)
     assert len(warned) == 2
 
 
@@ -467,9 +470,9 @@ def test_the_evidence_is_one_sentence_with_its_figures() -> None:
     )
     said = trust_command.evidence(decision, 2, "0123456789abcdef" * 4)
     assert said == (
-        "a gain on the mean; 3 blocks are too few: 2 drives with truth, 62 s scored, 20 s of them above 2 m/s²; sideslip "
-        "RMSE 0.500° at trust 0, 0.410° at trust 0.25, 0.300° at trust 0.5, 0.700° at trust 1; squared error at 1 less "
-        f"that at 0 0.24 (95 %: -0.1 to 0.5) deg² over 3 blocks; network {'0123456789abcdef'[: trust_command.SHOWN_DIGITS]}"
+        "a gain on the mean; 3 blocks are too few: 2 drives with truth, 62 s scored, 20 s of them above 2 m/s²; "
+        "sideslip RMSE 0.500° at trust 0, 0.410° at trust 0.25, 0.300° at trust 0.5, 0.700° at trust 1; squared error "
+        "at 1 less that at 0 0.24 (95 %: -0.1 to 0.5) deg² over 3 blocks; network 0123456789ab"
     )
     few = replace(decision, against_zero=(Bound(0.24, math.nan, math.nan),) * 5)
     assert "at 0 0.24 deg² over" in trust_command.evidence(few, 1, "0" * 64)
@@ -684,10 +687,10 @@ def test_drives_are_dealt_out_in_turn_within_the_memory(monkeypatch: pytest.Monk
     inputs = [LogInput(Path(n), n) for n in "abcde"]
     setup: Any = None
     for jobs in (1, 2):
-        told: list[str] = []
+        told: list[DriveRecord] = []
         with Benches(setup, jobs) as benches:
-            loaded = benches.load(inputs, {"b": "test"}, lambda r: told.append(r.name))
-            assert [r.name for r in loaded] == told == list("abcde")
+            loaded = benches.load(inputs, {"b": "test"}, told.append)
+            assert loaded == told and [r.name for r in told] == list("abcde")
             assert benches.score({"x": FilterNoise()}) == {"x": [0, 1, 2, 3, 4]}
             if jobs == 1:
                 seen = benches._local.loaded  # type: ignore[union-attr]
@@ -698,7 +701,7 @@ def test_drives_are_dealt_out_in_turn_within_the_memory(monkeypatch: pytest.Monk
     assert [one[3] for one in FakePool.made[0].bench.loaded] == [200, 200, 120]
     assert [pool.ended for pool in FakePool.made] == [{"wait": True, "cancel_futures": True}] * 2
     monkeypatch.setattr(tune_drives, "MAX_BYTES", 199)
-    with pytest.raises(EstimatorError, match="where e|e:"), Benches(setup, 2) as benches:
+    with pytest.raises(EstimatorError, match="e: expected"), Benches(setup, 2) as benches:
         benches.load(inputs, {}, lambda _: None)
     assert FakePool.made[-1].ended == {"wait": False, "cancel_futures": True}
 

@@ -394,7 +394,12 @@ def _identification(monkeypatch: pytest.MonkeyPatch, std: dict[str, float], **na
 
     monkeypatch.setattr(identify, "_minimise", minimise)
     monkeypatch.setattr(identify, "axle_samples", lambda *_: NO_SAMPLES)
-    monkeypatch.setattr(identify, "_score", lambda part, drives, *_: PartScore(part, len(drives), 3.0, 2.0, 1.0))
+
+    def score(part: str, drives: Any, start: Any, vehicle: Any, noise: Any) -> PartScore:
+        assert start is CAR and noise.q_std and vehicle.tyres.front.B
+        return PartScore(part, len(drives), 3.0, 2.0, 1.0)
+
+    monkeypatch.setattr(identify, "_score", score)
     found = fit_car(
         [fit_drive(25.0, 0.05)], named.pop("held_out", []), CAR, progress=lambda *x: told.append(x), **named
     )
@@ -414,6 +419,8 @@ def test_what_is_not_excited_goes_back_to_its_prior_and_the_rest_is_fitted_again
     assert by_name["roll gradient"].high == pytest.approx(0.0105 + 0.004 * (1 + 1.96 * 0.79))
     assert by_name["q v_y"].tuning and not by_name["roll gradient"].tuning
     assert found.vehicle.roll_gradient_rad_per_m_s2 == 0.0145
+    tyre = found.vehicle.tyres.front
+    assert [float(f"{x:.6g}") for x in (tyre.B, tyre.D_n)] == [tyre.B, tyre.D_n]  # six digits are written
     assert len(calls) == 3
     assert not calls[0][0].any() and calls[0][1].all()
     np.testing.assert_allclose(calls[0][2], math.radians(0.4))
