@@ -16,7 +16,7 @@ import pytest
 from matplotlib.figure import Figure
 from reference_car import drive, slalom
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.car import Car, read_history
 from pdhef_logtool.car.parts import FilterNoise, Inflation, LearntOn, SideslipCoefficients, YawRateCoefficients
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import WholeDrive
@@ -293,6 +293,13 @@ def test_samples_stand_every_twentieth_of_a_second_where_all_is_known() -> None:
     blind = replace(truth, ay_m_s2=np.full(n, np.nan))
     same = drive_samples(track, signals, signals, blind, VEHICLE, 4, wrong=True)
     np.testing.assert_array_equal(same.bin, found.bin)
+    holed = truth.ay_m_s2.copy()
+    holed[200:211] = np.nan  # no bin there
+    without = drive_samples(track, signals, signals, replace(truth, ay_m_s2=holed), VEHICLE, 4, wrong=True)
+    assert len(without) == len(found) - 2
+    late = [replace(one, stamps_ns=one.stamps_ns + 13_000_000) for one in (track, signals, truth)]
+    shifted = drive_samples(late[0], late[1], late[1], late[2], VEHICLE, 4, wrong=True)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(shifted.sideslip_error, found.sideslip_error)
     none = replace(track, sideslip_std_rad=np.full(n, np.nan))
     assert len(drive_samples(none, signals, signals, truth, VEHICLE, 4, wrong=True)) == 0
 
@@ -302,12 +309,13 @@ def test_a_drive_is_run_as_told_and_twice_with_a_wrong_vehicle(monkeypatch: pyte
     monkeypatch.setattr(calibrate_command, "load_drive", lambda *_, **__: (kept, WHOLE))
     seen: list[Any] = []
 
-    def samples(track: Any, told: Any, signals: Any, _truth: Any, vehicle: Any, number: int, *, wrong: bool) -> Any:
+    def samples(track: Any, told: Any, signals: Any, truth: Any, vehicle: Any, number: int, *, wrong: bool) -> Any:
+        assert truth is WHOLE.truth
         seen.append((track.name, told.friction, signals.friction, vehicle, number, wrong))
         return range(20)
 
     monkeypatch.setattr(calibrate_command, "drive_samples", samples)
-    settings = CalibrateSettings(config=replace(SALOON, estimators=("phy-ukf",)), spread=0.1, seed=2)
+    settings = CalibrateSettings(config=replace(SALOON, estimators=("phy-ukf",), friction=0.5), spread=0.1, seed=2)
     car, log = Car.of(VEHICLE), LogInput(Path("a.mcap"), "a")
     told, found = calibrate_command._run_drive(log, 5, settings, car, None)
     assert told.counts == {"scored_stamps": 601, "runs": 3}
@@ -316,8 +324,8 @@ def test_a_drive_is_run_as_told_and_twice_with_a_wrong_vehicle(monkeypatch: pyte
     assert {(one[3] is VEHICLE, one[4]) for one in seen} == {(True, 5)}
     assert len({a.physics_sha256 for _, a, _ in found}) == 3
     # The bins know the best that is known of the drive, whatever a run was told.
-    for one in seen:
-        np.testing.assert_array_equal(one[2], seen[0][1])
+    assert all((one[2] == 0.5).all() for one in seen)
+    assert (seen[0][1] == 0.5).all() and all((one[1] != 0.5).all() for one in seen[1:])
     monkeypatch.setattr(calibrate_command, "drive_samples", lambda *_, **__: range(19))
     told, found = calibrate_command._run_drive(log, 5, replace(settings, spread=0.0), car, None)
     assert found == [] and told.left_out.startswith("no estimate with an interval")
@@ -350,7 +358,8 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     one, other = (resolve(make_estimator(n, car)) for n in ("phy-ukf", "kinematic"))
     fitted: list[Samples] = []
 
-    def run(log: LogInput, number: int, *_: Any) -> Any:
+    def run(log: LogInput, number: int, used: CalibrateSettings, saloon: Car, _mapping: Any) -> Any:
+        assert used.spread == 0.1 and saloon.vehicle.name
         if log.stem == "f":
             return record("f", left_out="no true sideslip"), []
         parts = [("phy-ukf", one, _samples(number)), ("phy-ukf", one, _samples(number, wrong=True))]
@@ -391,6 +400,10 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     assert document["roll_gradient_rad_per_m_s2"] == Car.load("saloon").vehicle.roll_gradient_rad_per_m_s2
     assert [r.split for r in result.records] == ["train", None, None, None, None, None]
     assert result.to_dict()["file"] == str(tmp_path / "i.json") and result.exit_code == 3
+    folder_result = calibrate_command.calibrate(arguments, tmp_path / "car", settings)
+    (line,) = read_history(tmp_path / "car")[-1:]
+    assert (line["command"], line["part"]) == ("calibrate", "intervals.json")
+    assert folder_result.file == tmp_path / "car/intervals.json"
     with pytest.raises(EstimatorError, match=r"at least 5 drives .*, got 4"):
         calibrate_command.calibrate(arguments[:4], tmp_path / "j.json", settings)
     with pytest.raises(UsageError, match="--vary"):
@@ -447,6 +460,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
     assert (document["scored_s"], document["excited_s"], document["blocks"]) == (400.247, 100.0, 40)
     assert document["trust_1_against_best_lower"]["value_deg2"] == pytest.approx(0.01 - 0.04)
     record_json = json.loads((tmp_path / "car/network.record.json").read_text())
+    assert record_json["network_sha256"] == car.trust.network_sha256
     assert record_json["rule"] == {
         "block_s": 10.0, "min_blocks": 8, "excited_m_s2": 2.0, "min_excited_s": 20.0, "tolerance": 0.05,
         "unconfirmed_cap": 0.5, "level": 0.95, "resamples": 4000,

@@ -251,7 +251,7 @@ def test_no_peak_lies_below_a_force_that_was_seen() -> None:
     low = identify._low_theta([by_name["rear peak force"], by_name["rear shape"], by_name["yaw inertia"]])
     assert low[0] == pytest.approx(by_name["rear peak force"].theta(least))
     assert low[1] == pytest.approx(max(-6.0, (1.0 - by_name["rear shape"].mean) / 0.05))
-    assert low[2] == -6.0
+    assert low[2] == identify._low_theta([Prior("far", "1", 2.0, 0.1, low=1.0)])[0] == -6.0
 
 
 def test_the_vehicle_has_the_values_of_the_parameters() -> None:
@@ -311,6 +311,7 @@ def test_errors_are_the_filters_at_20_hz_after_it_has_settled() -> None:
     coarse = fit_drive(6.0, 0.04)
     ((error, weight),) = identify._sideslip_errors([coarse], CAR, priors, theta)
     assert len(error) == len(coarse.truth)
+    assert np.flatnonzero(weight)[0] == 76  # 3.04 s
     assert weight[-1] == pytest.approx(0.2)
 
 
@@ -331,7 +332,8 @@ def test_a_linear_error_is_minimised_in_closed_form(monkeypatch: pytest.MonkeyPa
     weights = [rng.uniform(0.1, 0.3, 30), np.where(np.arange(30) < 20, 0.2, 0.0)]
     sigma, active, first = np.array([40.0, 60.0]), np.array([True, True, False, True]), np.array([0.0, 0.1, 0.7, 0.0])
 
-    def errors(_drives: Any, _start: Any, _priors: Any, theta: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    def errors(_drives: Any, start: Any, known: Any, theta: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+        assert start is CAR and known is priors
         return [(m @ theta + o, w) for m, o, w in zip(maps, offsets, weights, strict=True)]
 
     monkeypatch.setattr(identify, "_sideslip_errors", errors)
