@@ -75,7 +75,6 @@ class RowGroups:
         try:
             for tables in self._waiting.values():
                 self._write(pa.concat_tables(tables))
-            self._waiting.clear()
             if metadata:
                 self._writer.add_key_value_metadata(dict(metadata))
             self._writer.close()
@@ -86,7 +85,6 @@ class RowGroups:
 
     def abort(self) -> None:
         """Remove what was written."""
-        self._waiting.clear()
         self._writer.close()
         self._pending.discard()
 
