@@ -427,7 +427,7 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
         return record(log.stem), WHOLE
 
     squares = np.radians(np.array([0.5, 0.4, 0.3, 0.2, 0.1]))[:, None] ** 2 * np.full(20, 100.0)
-    blocks = BlockErrors(squares, np.full(20, 100.0), 200.1234, 50.0, lost=3)
+    blocks = BlockErrors(squares, np.full(20, 100.0), 200.1234, 50.1234, lost=3)
     monkeypatch.setattr(trust_command, "load_drive", load)
     monkeypatch.setattr(trust_command, "errors_by_trust", lambda *_, **__: blocks)
     folder = tmp_path / "set"
@@ -457,9 +457,10 @@ def test_trust_tells_its_progress_warns_and_keeps_its_evidence(
     assert [d.name for d in car.trust.drives] == ["a", "b"]
     document = result.to_dict()
     assert document["drives"][0]["rmse_deg"] == pytest.approx([0.5, 0.4, 0.3, 0.2, 0.1])
-    assert (document["scored_s"], document["excited_s"], document["blocks"]) == (400.247, 100.0, 40)
+    assert (document["scored_s"], document["excited_s"], document["blocks"]) == (400.247, 100.247, 40)
     assert document["trust_1_against_best_lower"]["value_deg2"] == pytest.approx(0.01 - 0.04)
     record_json = json.loads((tmp_path / "car/network.record.json").read_text())
+    assert (record_json["format"], record_json["version"]) == ("pdhef-trust", 2)
     assert record_json["network_sha256"] == car.trust.network_sha256
     assert record_json["rule"] == {
         "block_s": 10.0, "min_blocks": 8, "excited_m_s2": 2.0, "min_excited_s": 20.0, "tolerance": 0.05,
@@ -538,7 +539,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "train"}]}))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    settings = TuneSettings(config=SALOON, names=("pd-hef", "phy-ukf-tuned"), trials=6, seed=1)
+    settings = TuneSettings(config=SALOON, trials=6, seed=1)
     result = tune_command.tune(
         arguments, tmp_path / "car", settings, jobs=5, progress=lambda *x: told.append(x), warn=warned.append
     )
@@ -548,7 +549,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     )
     assert told[-1] == ("trial 6 of 6", pytest.approx(1.0))
     ((setup, jobs),) = FakeBenches.made
-    assert jobs == 3 and setup.names == ("phy-ukf-tuned", "pd-hef")
+    assert jobs == 3 and setup.names == ("physics-plus", "phy-ukf-tuned", "pd-hef")
     assert warned[0].startswith("drives of split train: a network is better there")
     assert warned[1] == "c is left out: no true sideslip"
     assert list(result.notes) == warned[2:]
@@ -581,7 +582,11 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     assert lines[2].get_ydata()[0] == pytest.approx(result.tuned[0].before.objective_deg)  # type: ignore[union-attr]
     assert lines[-1].get_xdata()[0] == 3.5  # between the third trial, the last that explores, and the fourth
     shown = result.to_dict()["estimators"]["pd-hef"]
-    assert (shown["trials"], shown["best_trial"]) == (6, result.tuned[1].best.number)
+    assert (shown["trials"], shown["best_trial"]) == (6, result.tuned[2].best.number)
+    warned.clear()
+    physics = replace(settings, names=("physics-plus",))
+    tune_command.tune(arguments[:2], tmp_path / "physics", physics, warn=warned.append)
+    assert not [w for w in warned if "split train" in w]
     with pytest.raises(EstimatorError, match="tune"):
         tune_command.tune(arguments[2:], tmp_path / "other", settings)
     for wrong in ({"trials": 3}, {"jobs": 0}):

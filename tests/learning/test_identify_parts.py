@@ -562,7 +562,7 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
 
     monkeypatch.setattr(identify_command, "load_fit_drive", load)
     monkeypatch.setattr(identify_command, "fit_car", fit)
-    monkeypatch.setattr(identify_command, "_plot", lambda _: lambda path: path.write_bytes(b"png"))
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"png"))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
     result = identify_command.identify(
@@ -581,6 +581,7 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
     ]
     assert asked == [(2, 0, default_vehicle(), True)]
     car = Car.load(tmp_path / "car")
+    assert (tmp_path / "car/fit.png").read_bytes() == b"png"
     # To the hundredth of a second, which is what two slices are compared by.
     assert [(d.name, d.sha256[0], d.start_s, d.end_s) for d in car.learnt_on] == [
         ("made", "0", 1.23, 6.62),
@@ -610,6 +611,8 @@ def test_the_plot_shows_samples_curves_intervals_and_errors(tmp_path: Path, monk
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: (figures.append(self), Path(path).write_bytes(b"")))
     identify_plot.plot_identification(FOUND, tmp_path / "fit.png")
     front, rear, parameters, scores = figures[0].axes
+    assert [a.get_title() for a in figures[0].axes] == ["front axle", "rear axle", "parameters", "error of the filter"]
+    assert (front.get_xlabel(), scores.get_ylabel()) == ("slip angle (°)", "sideslip RMSE (°)")
     for axes, is_front, slip, force in ((front, True, 0.1, 5.0), (rear, False, 0.05, 4.0)):
         dots, curve = axes.get_lines()
         assert len(dots.get_xdata()) == 6000
@@ -623,6 +626,8 @@ def test_the_plot_shows_samples_curves_intervals_and_errors(tmp_path: Path, monk
     lines = parameters.get_lines()
     np.testing.assert_allclose(lines[0].get_xdata(), [-1500 / 55, 500 / 55])  # per cent of the prior
     assert lines[0].get_ydata().tolist() == [7, 7]
+    (kept,) = [line for line in lines if list(line.get_ydata()) == [1]]
+    assert list(kept.get_xdata()) == [0.0]  # yaw inertia stands at its prior
     np.testing.assert_allclose(lines[-2].get_xdata(), [0.05 / 0.11 * 100])  # a prior of 0 has no per cent
     assert [[round(p.get_height(), 3) for p in bars] for bars in scores.containers] == [
         [3.0, 2.0, 1.0],
