@@ -83,7 +83,6 @@ class RowGroups:
         try:
             for tables in self._waiting.values():
                 self._write(pa.concat_tables(tables))
-            self._waiting.clear()
             if metadata:
                 self._writer.add_key_value_metadata(dict(metadata))
             with writing(self._path):
@@ -96,7 +95,6 @@ class RowGroups:
 
     def abort(self) -> None:
         """Remove what was written."""
-        self._waiting.clear()
         with suppress(OSError, ValueError):  # its last words may not fit the disk either, or come after the file's end
             self._writer.close()
         self._drop()

@@ -176,6 +176,43 @@ def test_the_covering_factor_is_the_weighted_quantile() -> None:
     assert covering_factor(error, std, np.where(error <= 10.0, 0.1, 0.0)) == pytest.approx(10.0)
 
 
+def test_the_covering_factor_is_the_least_that_covers_whatever_the_weights_add_up_to() -> None:
+    rng = np.random.default_rng(8)
+    error, std, known = 3.0 * rng.standard_normal(400), rng.uniform(0.5, 1.5, 400), np.full(400, 0.4)
+    for scale in (1.0, 7.0, 1e-3):
+        weight = scale * rng.uniform(0.1, 1.0, 400)
+        for covered in (0.5, 0.85):
+            factor = covering_factor(error, std, weight, covered, known)
+
+            def share(g: float, weight: FloatArray = weight) -> float:
+                inside = np.abs(error) <= 1.959963984540054 * np.hypot(known, g * std)
+                return float(np.sum(weight[inside]) / np.sum(weight))
+
+            assert share(factor * (1 - 1e-9)) < covered <= share(factor * (1 + 1e-9))
+    # What is there already may be enough for all.
+    assert covering_factor(np.ones(9), np.ones(9), np.ones(9), 0.95, 0.6) == 0.0
+
+
+def test_the_fit_minimises_the_pinball_loss_of_the_files_head() -> None:
+    rng = np.random.default_rng(9)
+    terms = rng.uniform(0.5, 2.0, (500, 2))
+    error, known = np.hypot(2.0 * terms[:, 0], 1.0) * rng.standard_normal(500), np.full(500, 1.0)
+    error[0] = 0.0
+    weight = rng.uniform(0.5, 1.5, 500)
+    k = np.array(fit_coefficients(terms, error, weight, 0.85, known))
+
+    def loss(k: FloatArray) -> float:
+        s = np.sqrt(known**2 + np.square(terms) @ np.square(k))
+        r = np.log(np.maximum(np.abs(error), 1e-6)) - np.log(1.959963984540054 * s)
+        return float(np.sum(weight * np.where(r > 0.0, 0.85 * r, -0.15 * r)))
+
+    assert k[0] > 0.5
+    for i, factor in ((i, f) for i in range(2) for f in (0.9, 1.1)):
+        aside = np.maximum(k, 0.05)
+        aside[i] *= factor
+        assert loss(aside) > loss(k)
+
+
 def test_few_drives_must_be_covered_further() -> None:
     assert share_for(0.95, 10**6) == pytest.approx(0.95, abs=1e-5)
     assert share_for(0.95, 60) == pytest.approx(0.95 * 61 / 60)
@@ -208,6 +245,20 @@ def test_bins_and_coverage() -> None:
         assert row.covered_before == pytest.approx(0.95, abs=0.01)
         assert row.covered_after > 0.999
         assert (row.width_before, row.width_after) == pytest.approx((1.0, 2.0), rel=0.03)
+    hand = replace(
+        samples.where(np.arange(n) < 4),
+        sideslip_error=np.array([1.0, -3.0, 0.1, 0.0]),
+        own_std=np.array([1.0, 1.0, 2.0, 2.0]),
+        bin=np.array([0, 0, 2, 1]),
+        drive=np.array([3, 4, 3, 3]),
+        wrong=np.array([False, False, False, True]),
+    )
+    low, high, middle = coverage_rows(hand, np.array([1.0, 2.0, 0.01, 1.0]))
+    assert (low.bin, low.wrong_vehicle, low.drives, low.samples) == ("low", False, 2, 2)
+    assert (low.covered_before, low.covered_after, low.rmse_rad) == (0.5, 1.0, pytest.approx(5.0**0.5))
+    assert (low.width_before, low.width_after) == pytest.approx((5.0**-0.5, 1.5 * 5.0**-0.5))
+    assert (high.bin, high.covered_before, high.covered_after) == ("high", 1.0, 0.0)
+    assert (middle.bin, middle.wrong_vehicle, middle.width_before) == ("middle", True, pytest.approx(2e6))
 
 
 def test_few_drives_are_refused() -> None:

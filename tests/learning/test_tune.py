@@ -34,8 +34,10 @@ from pdhef_logtool.learning.noise.search import (
     best_trial,
     drive_error,
     filter_tuning,
+    local_steps,
     score_drives,
     search,
+    sobol_points,
 )
 from pdhef_logtool.learning.noise.tune_command import REFUSED, TuneSettings, tune
 from pdhef_logtool.learning.noise.tune_drives import choose_names
@@ -102,10 +104,44 @@ def test_exploration_is_spread_over_every_range() -> None:
         assert np.bincount(quarter.astype(int), minlength=4).tolist() == [8, 8, 8, 8]
 
 
+def test_a_factor_is_a_share_of_its_logarithmic_range_in_four_digits() -> None:
+    factor = Factor("p", "1", 0.002, 2.0)
+    assert [factor.value(s) for s in (0.0, 0.5, 1.0)] == [0.002, 0.06325, 2.0]
+    assert factor.share(0.2) == pytest.approx(2 / 3)
+
+
+def test_steps_shrink_and_follow_the_first_half_of_the_trials() -> None:
+    steps = local_steps(4, 2000, 3)
+    widths = [float(np.std(part)) for part in np.array_split(steps, 20)]
+    assert widths[0] == pytest.approx(0.146, rel=0.15) and widths[-1] == pytest.approx(0.0205, rel=0.15)
+    assert local_steps(4, 0, 3).shape == (0, 4)
+    assert not np.array_equal(local_steps(4, 9, 3), local_steps(4, 9, 4))
+    assert sobol_points(4, 5, 0).shape == (5, 4) and sobol_points(4, 1, 0).shape == (1, 4)
+    np.testing.assert_array_equal(sobol_points(4, 5, 0), sobol_points(4, 8, 0)[:5])
+    told: list[int] = []
+    found = search(_bowl, ("a",), trials=7, seed=0, progress=told.append)["a"]
+    assert told == [1, 2, 3, 4, 5, 6, 7] == [t.number + 1 for t in found]
+    assert [t.stage for t in found] == ["sobol"] * 4 + ["refine"] * 3
+    tied = [Trial(n, "sobol", (), Score(1.0, 0.0, 0.0)) for n in (3, 1, 2)]
+    assert best_trial(tied).number == 1
+
+
+def test_a_refined_trial_is_a_step_from_the_best_so_far() -> None:
+    found = search(_bowl, ("a",), trials=6, seed=2)["a"]
+    steps = local_steps(len(FACTORS), 3, 2)
+    for i, trial in enumerate(found[3:]):
+        best = best_trial(found[: 3 + i])
+        at = [np.clip(f.share(v) + s, 0, 1) for f, v, s in zip(FACTORS, best.values, steps[i], strict=True)]
+        assert trial.values == tuple(f.value(float(x)) for f, x in zip(FACTORS, at, strict=True))
+
+
 def test_a_best_value_at_an_end_is_named() -> None:
     factors = (Factor("p", "1", 0.1, 10.0), Factor("q", "1", 0.1, 10.0))
     trial = Trial(0, "sobol", (0.1, 1.0), Score(0.0, 0.0, 0.0))
     assert at_an_end(trial, factors) == ("p",)
+    shares = (0.0199, 0.0201, 0.9799, 0.9801)
+    ends = [at_an_end(replace(trial, values=(0.1 * 100**s, 1.0)), factors) for s in shares]
+    assert ends == [("p",), (), (), ("p",)]
 
 
 def _error(rmse_deg: float, *, truth_deg: float = 5.0, scored: int = 1000, expected: int = 1000) -> DriveError:

@@ -244,6 +244,31 @@ def test_an_empty_log_maps_to_nothing() -> None:
 
 
 @pytest.mark.parametrize(
+    ("type_name", "lacks", "has"),
+    [
+        ("sensor_msgs/msg/NavSatFix", "longitude", {"latitude": S}),
+        ("foxglove.LocationFix", "latitude", {"longitude": S, "altitude": S}),
+        ("autoware_vehicle_msgs/msg/SteeringReport", "steering_tire_angle", {"angle": S}),
+        ("autoware_vehicle_msgs/msg/VelocityReport", "longitudinal_velocity", {"lateral_velocity": S}),
+        ("sensor_msgs/msg/Imu", "angular_velocity.z", {"orientation.w": S}),
+        ("nav_msgs/msg/Odometry", "twist and pose", {"twist.twist.angular.z": S}),
+        ("geometry_msgs/msg/PoseStamped", "pose.position.x", {"pose.orientation.w": S}),
+    ],
+)
+def test_a_types_name_promises_nothing(type_name: str, lacks: str, has: dict[str, np.ndarray]) -> None:
+    """A topic without the fields of its type is not used, and does not hide one that has them."""
+    name = "/ins/speed"
+    bare = topic(type_name)
+    bare.fields |= has
+    auto = found({name: bare, "/truth/odometry": odometry()})
+    assert {s.topic for s in (*auto.mapping.signals.values(), *auto.mapping.truth.values())} == {"/truth/odometry"}, (
+        lacks
+    )
+    assert f"{name} is not used: its fields are not those of {type_name}" in auto.mapping.notes
+    assert auto.ambiguities == ()
+
+
+@pytest.mark.parametrize(
     ("drive", "reference", "unmapped"),
     [
         ("revs_250lm_a.mcap", "revs_250lm", set()),
