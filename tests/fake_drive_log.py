@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.records.signals import IntArray, Loss
 
 
@@ -43,6 +44,10 @@ class FakeLog:
     @property
     def end_ns(self) -> int:
         return max((int(t.log_time_ns.max()) + 1 for t in self.contents.values() if len(t.log_time_ns)), default=0)
+
+    @property
+    def occupied(self) -> OccupiedTime:
+        return OccupiedTime(((self.start_ns, self.end_ns),) if self.end_ns else ())
 
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         out = []

@@ -201,7 +201,7 @@ def inspect_drive_log(
     gathered: dict[tuple[str, str], _Gathered] = {}
     thinned: dict[str, list[Channel]] = {name: [] for name in mapping.signals}
     losses: list[tuple[Loss, ...]] = []
-    for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS):
+    for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
         for name, columns in log.read_stamps(start, end).items():
             steps[name].add(columns.log_time_ns)
             delays[name].add(columns.log_time_ns, columns.publish_time_ns)

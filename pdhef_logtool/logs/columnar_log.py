@@ -19,6 +19,7 @@ from pdhef_logtool.logs.decoding import (
 )
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
 from pdhef_logtool.logs.message_schema import MessageSchema, SchemaError, Selection, leaves, resolve
+from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -52,6 +53,7 @@ class ColumnarLog:
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
+        self._occupied: OccupiedTime | None = None
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -71,18 +73,31 @@ class ColumnarLog:
 
     @property
     def start_ns(self) -> int:
-        """First log time; 0 for a log without messages."""
-        return min((s.start_ns for c in self.containers for s in c.spans), default=0)
+        """First log time that counts; 0 for a log without messages."""
+        return self.occupied.start_ns
 
     @property
     def end_ns(self) -> int:
-        """Last log time + 1; 0 for a log without messages."""
-        return max((s.end_ns for c in self.containers for s in c.spans), default=0)
+        """Last log time that counts + 1; 0 for a log without messages."""
+        return self.occupied.end_ns
+
+    @property
+    def occupied(self) -> OccupiedTime:
+        """When the log was recorded, found when it is first asked for."""
+        if self._occupied is None:
+            self._occupied = survey(self.containers, self._times, str(self.path))
+        return self._occupied
+
+    def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
+        try:
+            return self.containers[c].times(span)
+        except SpanDamageError:
+            return None  # a read of the span reports the damage
 
     @property
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now."""
-        found = list(self._opened_lost)
+        found = [*self._opened_lost, *self.occupied.losses]
         for c, container in enumerate(self.containers):
             found.extend(container.lost)
             found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
@@ -234,6 +249,7 @@ class ColumnarLog:
 
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
+        occupied = self.occupied
         overlapping = (
             (c, container, span)
             for c, container in enumerate(self.containers)
@@ -250,6 +266,9 @@ class ColumnarLog:
             keep = in_window(block.log_time_ns, start_ns, end_ns)
             for id_, topic in topic_of.items():
                 mine = block.channel == id_
+                unused = occupied.unused(topic, c, span, block.log_time_ns[mine]) if occupied.left_out else None
+                if unused is not None:
+                    mine[mine] = ~unused
                 rows = np.flatnonzero(mine if keep is None else mine & keep)
                 if rows.size:
                     parts[topic].append(self._decode(topic, plans[topic], c, span, id_, block, rows))

@@ -12,8 +12,9 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -21,6 +22,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Metadata, Schema
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.container import (
     MAX_TIME_NS,
@@ -40,6 +42,8 @@ from pdhef_logtool.records.signals import IntArray
 
 if TYPE_CHECKING:
     import zstandard
+
+UintArray: TypeAlias = NDArray[np.uint64]
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
@@ -260,21 +264,35 @@ class McapContainer(MappedContainer):
 
     def _indexed_messages(self, content: bytes, start: int, end: int) -> Block | None:
         """Return the chunk's messages through its message indexes; None if these do not name all of them."""
-        offsets: list[IntArray] = []
+        indexes = self._message_indexes(start, end)
+        if not indexes:
+            return None
+        # Each channel's offsets ascend already, which the stable sort makes use of.
+        offset = np.sort(np.concatenate([offsets.astype(np.int64) for _, _, offsets in indexes]), kind="stable")
+        return _gather_messages(content, offset)
+
+    def _message_indexes(self, start: int, end: int) -> list[tuple[int, UintArray, UintArray]] | None:
+        """Return channel, log times [N] and offsets [N] of the message indexes in [start, end); None if one is bad."""
+        found: list[tuple[int, UintArray, UintArray]] = []
         at = start
         while at < end:
             _, length = _RECORD.unpack_from(self._data, at)
-            (n,) = struct.unpack_from("<I", self._data, at + 11)
+            channel, n = struct.unpack_from("<HI", self._data, at + 9)
             if n % 16 or n + 6 > length:
                 return None
-            pairs = np.frombuffer(self._data, dtype="<u8", count=n // 8, offset=at + 15)
-            offsets.append(pairs[1::2].astype(np.int64))
+            pairs = np.frombuffer(self._data[at + 15 : at + 15 + n], dtype="<u8")
+            found.append((channel, pairs[0::2], pairs[1::2]))
             at += 9 + length
-        if not offsets:
-            return None
-        # Each channel's offsets ascend already, which the stable sort makes use of.
-        offset = np.sort(np.concatenate(offsets), kind="stable")
-        return _gather_messages(content, offset)
+        return found
+
+    def times(self, span: Span) -> tuple[IntArray, IntArray]:
+        """Return a span's channels and log times; a chunk's from its message indexes, where it has them."""
+        indexes = self._message_indexes(*self._extents[span.index][3])
+        if not indexes:
+            return super().times(span)
+        channel = np.concatenate([np.full(len(times), id_, dtype=np.int64) for id_, times, _ in indexes])
+        log_time = np.minimum(np.concatenate([times for _, times, _ in indexes]), np.uint64(MAX_TIME_NS))
+        return channel, log_time.astype(np.int64)
 
     def crc_up_to(self, end: int) -> int:
         """Return the CRC of the file's first bytes."""
@@ -408,7 +426,8 @@ class _Walk:
         of = self.of
         times = self.run_times
         of._extents.append((*self.run, False, (0, 0)))
-        of.spans.append(Span(len(of.spans), min(times), max(times) + 1, dict(self.run_counts)))
+        ordered = all(a <= b for a, b in pairwise(times))
+        of.spans.append(Span(len(of.spans), min(times), max(times) + 1, dict(self.run_counts), ordered))
         self.last_ns = max(times)
         self.run, self.run_times, self.run_counts = None, [], Counter()
 

@@ -24,7 +24,7 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.records.errors import LogError
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _MAGIC_BYTES = 16
@@ -220,6 +220,9 @@ class _Wrapped(Container):
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         return self.container.load(span, want)
+
+    def times(self, span: Span) -> tuple[IntArray, IntArray]:
+        return self.container.times(span)
 
     def attachments(self) -> Iterator[Attachment]:
         return self.container.attachments()

@@ -11,6 +11,7 @@ import mmap
 import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -49,12 +50,14 @@ class Rosbag1Container(MappedContainer):
         pending: list[tuple[str, int, int, int]] = []  # the chunk whose index records are being read
         times: list[int] = []
         counts: Counter[int] = Counter()
+        disordered: set[int] = set()
         header_seen = False
 
         def close_chunk() -> None:
             if pending:
-                self._add_chunk(pending.pop(), times, counts)
+                self._add_chunk(pending.pop(), times, counts, not disordered)
             times.clear()
+            disordered.clear()
             counts.clear()
 
         while at < size:
@@ -83,6 +86,8 @@ class Rosbag1Container(MappedContainer):
                     connection, stamps = _index_record(fields, data[start:end])
                     counts[connection] += len(stamps)
                     times.extend(stamps)
+                    if any(a > b for a, b in pairwise(stamps)):
+                        disordered.add(connection)
                 elif op == _OP_CONNECTION:
                     self._add_connection(fields, data[start:end])
             except (KeyError, struct.error, ValueError, IndexError) as error:
@@ -130,11 +135,13 @@ class Rosbag1Container(MappedContainer):
             ),
         )
 
-    def _add_chunk(self, chunk: tuple[str, int, int, int], times: Sequence[int], counts: Mapping[int, int]) -> None:
+    def _add_chunk(
+        self, chunk: tuple[str, int, int, int], times: Sequence[int], counts: Mapping[int, int], ordered: bool
+    ) -> None:
         index = len(self.spans)
         self._chunks.append(chunk)
         if times:
-            self.spans.append(Span(index, min(times), max(times) + 1, dict(counts)))
+            self.spans.append(Span(index, min(times), max(times) + 1, dict(counts), ordered))
             return
         try:
             block = self._decode(chunk, declare=True)

@@ -321,7 +321,8 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
     losses: tuple[Loss, ...] = ()
     samples: dict[str, int] = {}
     done_ns: int | None = None
-    for a, b in windows(plan.start_ns, plan.end_ns, round(window_s * 1e9)):
+    ends = list(windows(plan.start_ns, plan.end_ns, round(window_s * 1e9), log.occupied))
+    for a, b in ends:
         if plan.truth is None:
             break
         part = read_signals(log, alone, plan.clocks, a, b)
@@ -333,7 +334,7 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
         if not stamps:
             continue
         newest = max(int(s[-1]) for s in stamps) + 1
-        until = newest if b >= plan.end_ns else min(newest, b) - plan.truth.margin_ns
+        until = newest if (a, b) == ends[-1] else min(newest, b) - plan.truth.margin_ns
         if done_ns is not None and until <= done_ns:
             continue
         tracks.append(derive_truth(channels, plan=plan.truth).track.between(done_ns, until))
