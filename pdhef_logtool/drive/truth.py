@@ -44,6 +44,11 @@ MAX_LATENCY_S = 0.5
 SAME_SHARE = 0.99
 SAME_RELATIVE = 1e-6
 
+#: Columns of a track by what a derivation calls them; sideslip is known wherever the velocities are.
+_COLUMNS = {
+    **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
+    "position_m": ("x_m", "y_m"),
+}
 _SURVEY_NS = 600_000_000_000
 _CHUNK = 16384
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
@@ -233,18 +238,22 @@ def derive_truth(
     return TruthTrack(track=track, max_gap_s=plan.max_gap_s[plan.base], derivation=says)
 
 
-def truth_at(truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0) -> StateTrack:
+def truth_at(
+    truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0, *, standstill_m_s: float = 0.0
+) -> StateTrack:
     """Bring the truth to other stamps by linear interpolation, angles along the shorter way.
 
     Parameters
     ----------
     stamps_ns : int64 [N], the stamps to score at, on the sensors' clock.
     latency_s : the truth shows at t + latency what the sensors show at t.
+    standstill_m_s : below this speed there is no sideslip.
 
     Returns
     -------
-    StateTrack "truth" with ``stamps_ns``; NaN and ``valid`` False outside the data and across steps of more than
-    ``truth.max_gap_s``. Sideslip is recomputed from the interpolated velocities where both are known.
+    StateTrack "truth" with ``stamps_ns``; NaN outside the data and across steps of more than ``truth.max_gap_s``.
+    ``valid`` where everything is known that this truth consists of; at standstill that is without sideslip. Single
+    quantities may be known elsewhere. Sideslip is recomputed from the interpolated velocities where both are known.
     """
     track = truth.track
     bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
@@ -252,20 +261,24 @@ def truth_at(truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0) -> 
     beta = bracket.angle(track.sideslip_rad)
     known = np.isfinite(vx) & np.isfinite(vy)
     beta[known] = np.arctan2(vy[known], vx[known])
-    rate, ay = bracket.linear(track.yaw_rate_rad_s), bracket.linear(track.ay_m_s2)
-    return make_track(
+    at_stamps = make_track(
         "truth",
         stamps_ns,
         vx_m_s=vx,
         vy_m_s=vy,
-        yaw_rate_rad_s=rate,
+        yaw_rate_rad_s=bracket.linear(track.yaw_rate_rad_s),
         sideslip_rad=beta,
-        ay_m_s2=ay,
+        ay_m_s2=bracket.linear(track.ay_m_s2),
         x_m=bracket.linear(track.x_m),
         y_m=bracket.linear(track.y_m),
         yaw_rad=bracket.angle(track.yaw_rad),
-        valid=bracket.inside & np.isfinite(np.stack([vx, vy, rate, beta, ay])).any(axis=0),
     )
+    known = bracket.inside & np.isfinite(at_stamps.sideslip_rad if "sideslip_rad" in truth.derivation else stamps_ns)
+    at_stamps = at_stamps.without_sideslip_below(standstill_m_s)
+    for name in truth.derivation:
+        for column in _COLUMNS.get(name, ()):
+            known &= np.isfinite(getattr(at_stamps, column))
+    return replace(at_stamps, valid=known)
 
 
 def yaw_rate_channel(truth: TruthTrack) -> Channel:

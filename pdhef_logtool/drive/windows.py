@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
+from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -172,6 +173,7 @@ class DriveReader:
     losses: tuple[Loss, ...] = ()
     samples: dict[str, int] | None = None
     counts: dict[tuple[Role, str], Counter[str]] = field(default_factory=dict)
+    _done: bool = False
 
     def windows(self) -> Iterator[DriveWindow]:
         """Yield the drive's windows in order; joined, they are bit-identical to one window over all."""
@@ -214,6 +216,7 @@ class DriveReader:
             done_ns = until
             signals = {n: c.between(until - margin) for n, c in signals.items()}
             truth = {n: c.between(until - margin) for n, c in truth.items()}
+        self._done = True
 
     def _count_joined(
         self, role: Role, name: str, parts: tuple[Channel | None, Channel, Channel], back: int, done_ns: int | None
@@ -228,30 +231,8 @@ class DriveReader:
         self.counts[role, name].update({"time-jump": back, "late": behind - back, "duplicate-stamp": seam})
 
     def ledger(self) -> tuple[SampleCount, ...]:
-        """Return what became of every sample of the mapped topics; complete once all windows were read."""
-        plan, log = self.plan, self.log
-        messages = {t.name: t.messages for t in log.topics}
-        whole = plan.start_ns <= log.start_ns and plan.end_ns >= log.end_ns
-        aligned = {c.name for c in plan.alignment.channels}
-        samples = []
-        for (role, name), count in self.counts.items():
-            source = (plan.mapping.signals if role == "signal" else plan.mapping.truth)[name]
-            read = count["read"]
-            dropped = Counter({reason: n for reason, n in count.items() if reason != "read"})
-            total = read
-            if source.read_topic in messages:  # a signal of raw CAN frames is read of some of its topic's messages
-                dropped.update(log.occupied.left_out.get(source.topic, {}))
-                total = messages[source.topic]
-                rest = total - read - sum(log.occupied.left_out.get(source.topic, {}).values())
-                dropped["not-read" if whole else "outside-slice"] += rest
-            used = total - sum(dropped.values())
-            if role == "signal" and name not in aligned:
-                dropped[_NOT_NEEDED], used = used, 0
-            clock = plan.clocks.get(clock_key(source))
-            stamp = "log_time" if clock is not None and clock.unusable else source.stamp
-            known = {reason: n for reason, n in sorted(dropped.items()) if n}
-            samples.append(SampleCount(role, name, source.label, stamp, total, used, known))
-        return tuple(samples)
+        """Return what became of every sample of the mapped topics; empty until all windows were read."""
+        return sample_ledger(self.log, self.plan, self.counts) if self._done else ()
 
     def _window(
         self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int, share: float
@@ -265,8 +246,40 @@ class DriveReader:
         self.losses = merge_losses([self.losses, late, _impossible(aligned)])
         at_stamps = None
         if plan.truth is not None:
-            at_stamps = truth_at(derive_truth(truth, plan=plan.truth), aligned.stamps_ns, plan.truth_latency_s)
+            at_stamps = truth_at(
+                derive_truth(truth, plan=plan.truth),
+                aligned.stamps_ns,
+                plan.truth_latency_s,
+                standstill_m_s=plan.vehicle.standstill_m_s,
+            )
         return DriveWindow(aligned, at_stamps, share)
+
+
+def sample_ledger(
+    log: DriveLog, plan: DrivePlan, counts: Mapped[tuple[Role, str], Counter[str]]
+) -> tuple[SampleCount, ...]:
+    """Return what became of every sample of the mapped topics, of the counts of all windows of the plan's slice."""
+    messages = {t.name: t.messages for t in log.topics}
+    whole = plan.start_ns <= log.start_ns and plan.end_ns >= log.end_ns
+    aligned = {c.name for c in plan.alignment.channels}
+    samples = []
+    for (role, name), count in counts.items():
+        source = (plan.mapping.signals if role == "signal" else plan.mapping.truth)[name]
+        dropped = Counter({reason: n for reason, n in count.items() if reason != "read"})
+        total = count["read"]
+        if source.read_topic in messages:  # a signal of raw CAN frames is read of some of its topic's messages
+            left_out = log.occupied.left_out.get(source.topic, {})
+            rest = messages[source.topic] - total - sum(left_out.values())
+            total = messages[source.topic]
+            dropped.update({**left_out, ("not-read" if whole else "outside-slice"): rest})
+        used = total - sum(dropped.values())
+        if role == "signal" and name not in aligned:
+            dropped[_NOT_NEEDED], used = used, 0
+        clock = plan.clocks.get(clock_key(source), ClockModel())
+        known = {reason: n for reason, n in sorted(dropped.items()) if n}
+        stamp = "log_time" if clock.unusable else source.stamp
+        samples.append(SampleCount(role, name, source.label, stamp, total, used, known))
+    return tuple(samples)
 
 
 def _by_role(

@@ -33,7 +33,7 @@ STRAY_MESSAGES = 3
 EPOCH_NS = 86_400_000_000_000
 #: Recorders with several threads write up to a second out of order; a clock that is set back falls further...
 STEP_BACK_NS = 1_000_000_000
-#: ... and stays behind for at least this many messages, where a late message stands alone.
+#: ... for at least this many messages, behind the middle one of as many before, where wrong times stand alone.
 STEP_BACK_MESSAGES = 5
 #: Left out beside times that were recorded twice: nothing says how much time really passed at the step.
 BREAK_NS = 1_000_000_000
@@ -133,11 +133,11 @@ def find_epochs(
 def steps_back(times_ns: IntArray) -> IntArray:
     """Return the places i ≥ 1 [K] at which times [N] fall back by more than ``STEP_BACK_NS`` and stay behind."""
     falls: IntArray = np.flatnonzero(np.diff(times_ns) < -STEP_BACK_NS) + 1
-    falls = falls[falls + STEP_BACK_MESSAGES <= times_ns.shape[0]]
-    if falls.size == 0:
-        return falls
-    before = np.maximum.accumulate(times_ns)[falls - 1]
-    following = times_ns[falls[:, None] + np.arange(STEP_BACK_MESSAGES)]
+    n = STEP_BACK_MESSAGES
+    falls = falls[(falls >= n) & (falls + n <= times_ns.shape[0])]
+    around = np.arange(n)
+    before = np.sort(times_ns[falls[:, None] - 1 - around], axis=1)[:, n // 2]
+    following = times_ns[falls[:, None] + around]
     behind: BoolArray = (following < before[:, None] - STEP_BACK_NS).all(axis=1)
     return np.asarray(falls[behind], dtype=np.int64)
 
@@ -180,7 +180,7 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Occ
         if count[which].any():
             rows = np.flatnonzero(which)
             losses.append(_loss(reason, where, start[rows], end[rows], int(count[rows].sum()), total))
-    cuts = _cuts(look)
+    cuts = _cuts(look, intervals)
     span_of: dict[tuple[int, int], Span] = {(c, s.index): s for c, of in enumerate(containers) for s in of.spans}
     twice: list[IntArray] = []
     within = OccupiedTime(tuple(intervals), tuple(cuts), {"": {}})
@@ -217,8 +217,8 @@ class _Looked:
         """Yield start, end, messages, and messages by topic; one piece a stretch."""
         if self.found is None:
             counts: Counter[str] = Counter()
-            for id_, n in self.span.counts.items():
-                counts[self.topics[id_]] += n
+            for id_, messages in self.span.counts.items():
+                counts[self.topics[id_]] += messages
             yield self.span.start_ns, self.span.end_ns, sum(counts.values()), counts
             return
         channel, times = self.found
@@ -265,7 +265,7 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
     return looked
 
 
-def _cuts(looked: Sequence[_Looked]) -> list[Cut]:
+def _cuts(looked: Sequence[_Looked], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
     """Return what was recorded twice, of all topics, if the time of one of them clearly stepped back."""
     if all(of.found is None for of in looked):
         return []
@@ -274,7 +274,10 @@ def _cuts(looked: Sequence[_Looked]) -> list[Cut]:
     for of in looked:
         for id_ in of.span.counts:
             own = of.of_channel(id_)
-            if own.size:
+            inside = _inside(own, intervals)
+            if inside.any():  # what is left out anyway stands for its neighbour, so that rows keep their places
+                last = np.maximum.accumulate(np.where(inside, np.arange(own.shape[0]), -1))
+                own = own[np.where(last >= 0, last, int(np.argmax(inside)))]
                 parts.setdefault(of.topics[id_], []).append((own, of.c, of.span.index))
     for topic, those in parts.items():
         at = np.cumsum([0, *(own.shape[0] for own, _, _ in those)]).tolist()

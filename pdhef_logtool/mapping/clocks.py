@@ -177,7 +177,23 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
             clocks[key] = replace(clock, unusable=unusable)
         else:
             clocks[key] = _clock_of(source, raw, log_time, steps)
+    for key, why in _of_other_clocks(clocks).items():
+        source = wanted[key]
+        _, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
+        clocks[key] = replace(_clock_of(replace(source, clock="utc"), log_time, log_time, steps), unusable=why)
     return clocks
+
+
+def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
+    """Return why the stamps of some topics cannot be set against those of the others, by key; all may be off as one."""
+    delays_s = {key: clock.median_delay_s for key, clock in clocks.items() if clock.samples}
+    if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * 1e-9:
+        return {}
+    return {
+        key: f"it is {abs(delay_s):.1f} s {'behind' if delay_s > 0.0 else 'ahead of'} log time, other topics are not"
+        for key, delay_s in delays_s.items()
+        if delay_s * 1e9 < -MAX_CREDIBLE_DELAY_NS or delay_s * 1e9 > STRAY_STAMP_NS
+    }
 
 
 def _survey(
@@ -219,7 +235,7 @@ def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
     back = steps_back(stamps_ns)
     if back.size:
         by_s = float(stamps_ns[back[0] - 1] - stamps_ns[back[0]]) * 1e-9
-        return f"its stamps step back by {by_s:.3g} s while log time goes on"
+        return f"its stamps step back by {by_s:.1f} s while log time goes on"
     order = np.argsort(stamps_ns, kind="stable")
     repeats = np.flatnonzero(np.diff(stamps_ns[order]) == 0)
     if repeats.size > UNUSABLE_SHARE * n:

@@ -46,11 +46,13 @@ class SampleCount:
 
 
 def damage(samples: Iterable[SampleCount]) -> list[Loss]:
-    """Return a loss for each source of which more than ``DAMAGED_SHARE`` was dropped for damage."""
-    losses = []
+    """Return the losses of sources of which more than ``DAMAGED_SHARE`` was dropped; those of one kind are one."""
+    found: dict[str, list[SampleCount]] = {}
     for s in samples:
         if s.damaged > DAMAGED_SHARE * s.total:
             why = ", ".join(f"{n} {reason}" for reason, n in sorted(s.dropped.items()) if reason in DAMAGE)
-            what = f"{s.damaged} of {s.total} samples of {s.name} are not used ({why})"
-            losses.append(Loss("dropped-samples", what, s.source, count=s.damaged))
-    return losses
+            found.setdefault(f"{s.damaged} of {s.total} samples are not used ({why})", []).append(s)
+    return [
+        Loss("dropped-samples", what, ", ".join(dict.fromkeys(s.source for s in of)), count=sum(s.damaged for s in of))
+        for what, of in found.items()
+    ]

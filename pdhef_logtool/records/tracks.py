@@ -111,6 +111,15 @@ class StateTrack:
         columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
         return StateTrack(name=self.name, **{c: v[part] if len(v) == len(self) else v for c, v in columns.items()})
 
+    def without_sideslip_below(self, speed_m_s: float) -> StateTrack:
+        """Return the track with its sideslip unknown (NaN) where its own speed is lower: it has no direction there."""
+        vy = np.where(np.isfinite(self.vy_m_s), self.vy_m_s, 0.0)
+        slow = np.hypot(self.vx_m_s, vy) < speed_m_s
+        if not slow.any():
+            return self
+        beta, std = (np.where(slow, np.nan, c) for c in (self.sideslip_rad, self.sideslip_std_rad))
+        return replace(self, sideslip_rad=beta, sideslip_std_rad=std)
+
     def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
         """Return a copy with another pose."""
         return replace(self, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad)

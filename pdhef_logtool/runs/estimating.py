@@ -73,6 +73,7 @@ def estimate_windows(
             track, carries[estimator.name] = run_window(estimator, signals, carries.get(estimator.name), ahead)
             track = track if watch is None else watch.add(track, signals)
             track = track if intervals is None else intervals.add(track, signals)
+            track = track.without_sideslip_below(drive.plan.vehicle.standstill_m_s)
             tracks.append(poses[estimator.name].add(track, start) if drawn else track)
         yield Estimated(signals, truth, drawn_truth, tuple(tracks), window.share_done)
     if start is None:

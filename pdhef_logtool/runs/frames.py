@@ -95,6 +95,6 @@ def score(estimates: Estimates) -> pl.DataFrame:
     from pdhef_logtool.runs.scoring import evaluate
 
     names = [name for name in estimates.tracks if name != TRUTH]
-    rows, _, _ = evaluate(estimates.drive, names, estimates.tracks.get, estimates.signals)
+    rows = evaluate(estimates.drive, names, estimates.tracks.get, estimates.signals).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

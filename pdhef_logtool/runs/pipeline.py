@@ -27,6 +27,7 @@ from pdhef_logtool.records.errors import (
     PdhefError,
     UsageError,
 )
+from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals, join_signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
@@ -56,6 +57,9 @@ if TYPE_CHECKING:
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
 
+_SILENT = "{} has no valid row although the car moves"
+_ALL_SILENT = "no estimator has a valid row although the car moves"
+_NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
 #: Units of truth quantities that have no channel of their own name.
 _DERIVED_UNITS = {"position_m": "m"}
 
@@ -84,7 +88,7 @@ class RunResult:
     @property
     def exit_code(self) -> int:
         """0 if all is well, 4 if a threshold failed, 3 if input was lost or some logs failed, 1 if all failed."""
-        if all(r.report is None for r in self.results):
+        if all(r.outcome.failed is not None for r in self.results):
             return EXIT_FAILURE
         if any(v.failed for v in self.verdicts):
             return EXIT_GATE
@@ -226,17 +230,21 @@ def run_log(
         try:
             with TrackStore(folder) as store:
                 signals = _estimate(drive, ready, intervals, sinks, store, progress)
-                rows, events, reasons = evaluate(drive, [e.name for e in ready], store.read, signals)
-            rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in rows]
+                found = evaluate(drive, [e.name for e in ready], store.read, signals)
+            rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
+            events = found.events
+            if not found.moves:
+                drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
             if drive.friction.bank is not None:
                 events = sorted([*events, *friction_events(drive.friction, signals.stamps_ns)], key=in_time)
-            losses = merge_losses([drive.losses, *(sink.lost for sink in sinks)])
+            silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
+            losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent])
             ran = [
                 EstimatorFacts(
                     e.name,
                     causal=e.causal,
                     notes=(*notes_of(e), *intervals.notes(e.name)),
-                    reasons=reasons[e.name],
+                    reasons=found.reasons[e.name],
                     algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
                 )
                 for e, a in zip(ready, algorithms.values(), strict=True)
@@ -257,6 +265,8 @@ def run_log(
                 folder.rmdir()
             raise
         outcome = outcome_of(drive, losses)
+        if len(found.silent) == len(ready):
+            outcome = replace(outcome, failed=_ALL_SILENT)
     progress(drive.name, 1.0)
     return LogResult(outcome, folder, report, tuple(rows))
 
@@ -356,8 +366,9 @@ def report_facts(
     events: Sequence[Event],
     losses: Sequence[Loss],
     samples: dict[str, int] | None = None,
+    ledger: Sequence[SampleCount] | None = None,
 ) -> ReportFacts:
-    """Gather what report.json says of one log; ``samples`` by source, None: those that the drive has read."""
+    """Gather what report.json says of one log; ``samples`` by source, ``ledger``: None is what the drive has read."""
     plan, log = drive.plan, drive.log
     samples = drive.samples if samples is None else samples
     mapping = plan.mapping
@@ -401,6 +412,7 @@ def report_facts(
         metrics=rows,
         segments=events,
         losses=losses,
+        samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
         versions=tool_versions(),
     )

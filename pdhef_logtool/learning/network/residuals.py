@@ -287,6 +287,4 @@ def _true_state(window: DriveWindow) -> FloatArray:
     truth = window.truth
     if truth is None:
         return np.full((len(window.signals), 3), np.nan)
-    state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
-    valid: BoolArray = truth.valid
-    return np.where(valid[:, None], state, np.nan)
+    return np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
