@@ -44,7 +44,7 @@ MAX_LATENCY_S = 0.5
 SAME_SHARE = 0.99
 SAME_RELATIVE = 1e-6
 
-#: Columns of a track by what a derivation calls them; sideslip is known wherever the velocities are.
+#: Columns of a track by what a derivation calls them.
 _COLUMNS = {
     **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
     "position_m": ("x_m", "y_m"),
@@ -251,9 +251,8 @@ def truth_at(
 
     Returns
     -------
-    StateTrack "truth" with ``stamps_ns``; NaN outside the data and across steps of more than ``truth.max_gap_s``.
-    ``valid`` where everything is known that this truth consists of; at standstill that is without sideslip. Single
-    quantities may be known elsewhere. Sideslip is recomputed from the interpolated velocities where both are known.
+    StateTrack "truth" with ``stamps_ns``; NaN and ``valid`` False outside the data and across steps of more than
+    ``truth.max_gap_s``. Sideslip is recomputed from the interpolated velocities where both are known.
     """
     track = truth.track
     bracket = Bracket(track.stamps_ns, stamps_ns + round(latency_s * 1e9), round(truth.max_gap_s * 1e9))
@@ -261,24 +260,33 @@ def truth_at(
     beta = bracket.angle(track.sideslip_rad)
     known = np.isfinite(vx) & np.isfinite(vy)
     beta[known] = np.arctan2(vy[known], vx[known])
-    at_stamps = make_track(
+    rate, ay = bracket.linear(track.yaw_rate_rad_s), bracket.linear(track.ay_m_s2)
+    return make_track(
         "truth",
         stamps_ns,
         vx_m_s=vx,
         vy_m_s=vy,
-        yaw_rate_rad_s=bracket.linear(track.yaw_rate_rad_s),
+        yaw_rate_rad_s=rate,
         sideslip_rad=beta,
-        ay_m_s2=bracket.linear(track.ay_m_s2),
+        ay_m_s2=ay,
         x_m=bracket.linear(track.x_m),
         y_m=bracket.linear(track.y_m),
         yaw_rad=bracket.angle(track.yaw_rad),
-    )
-    known = bracket.inside & np.isfinite(at_stamps.sideslip_rad if "sideslip_rad" in truth.derivation else stamps_ns)
-    at_stamps = at_stamps.without_sideslip_below(standstill_m_s)
-    for name in truth.derivation:
+        valid=bracket.inside & np.isfinite(np.stack([vx, vy, rate, beta, ay])).any(axis=0),
+    ).without_sideslip_below(standstill_m_s)
+
+
+def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstill_m_s: float) -> StateTrack:
+    """Return the truth [N] as it is written: valid where all is known that it consists of by its derivation.
+
+    At standstill that is without sideslip. Figures count each quantity where it is known itself.
+    """
+    standing = np.hypot(truth.vx_m_s, truth.vy_m_s) < standstill_m_s
+    known = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
+    for name in derivation:
         for column in _COLUMNS.get(name, ()):
-            known &= np.isfinite(getattr(at_stamps, column))
-    return replace(at_stamps, valid=known)
+            known &= np.isfinite(getattr(truth, column))
+    return replace(truth, valid=known)
 
 
 def yaw_rate_channel(truth: TruthTrack) -> Channel:

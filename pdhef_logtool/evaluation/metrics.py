@@ -1,8 +1,7 @@
 """Figures of an estimate against the truth, as rows of metrics.parquet.
 
-Definitions. e = estimate − truth (angles wrapped), over the stamps of a segment at which the estimate is valid and
-finite, and the truth finite; ``n`` is their number. Sideslip counts only where the truth's speed exceeds the low-speed
-blend.
+Definitions. e = estimate − truth (angles wrapped), over the stamps of a segment at which the estimate and the truth are
+valid and finite; ``n`` is their number. Sideslip counts only where the truth's speed exceeds the low-speed blend.
 
 ========================  ==============================================================================================
 ``rmse``                  √ mean e²
@@ -237,7 +236,7 @@ def _check_shapes(estimate: StateTrack, truth: StateTrack, masks: Mapping[str, B
 
 
 def _scorable(truth: StateTrack, signal: str, low_speed_m_s: float) -> BoolArray:
-    scorable: BoolArray = np.isfinite(getattr(truth, signal))
+    scorable: BoolArray = truth.valid & np.isfinite(getattr(truth, signal))
     if signal == "sideslip_rad":
         scorable = scorable & (truth_speed(truth) > low_speed_m_s)
     return scorable
@@ -318,7 +317,7 @@ def _nees_rows(estimate: StateTrack, truth: StateTrack, masks: Mapping[str, Bool
     if truth.covariance.shape[0]:
         covariance = covariance + truth.covariance
     error = np.stack([getattr(estimate, s) - getattr(truth, s) for s in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")], axis=1)
-    value = nees(np.where(estimate.valid[:, None], error, np.nan), covariance)
+    value = nees(np.where((estimate.valid & truth.valid)[:, None], error, np.nan), covariance)
     return [
         MetricRow(log, estimate.name, "state", segment, "nees", float(np.mean(inside)), "1", int(inside.size))
         for segment, inside in known_by_segment(value, masks)
@@ -326,8 +325,7 @@ def _nees_rows(estimate: StateTrack, truth: StateTrack, masks: Mapping[str, Bool
 
 
 def _pose_known(truth: StateTrack) -> BoolArray:
-    moving = np.isfinite(np.stack([getattr(truth, signal) for signal in SCORED_SIGNALS])).any(axis=0)
-    known: BoolArray = moving & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
+    known: BoolArray = truth.valid & np.isfinite(truth.x_m) & np.isfinite(truth.y_m) & np.isfinite(truth.yaw_rad)
     return known
 
 

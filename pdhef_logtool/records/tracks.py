@@ -120,6 +120,11 @@ class StateTrack:
         beta, std = (np.where(slow, np.nan, c) for c in (self.sideslip_rad, self.sideslip_std_rad))
         return replace(self, sideslip_rad=beta, sideslip_std_rad=std)
 
+    def valid_where_known(self) -> StateTrack:
+        """Return the track valid wherever one of its quantities is known: each of them then counts by itself."""
+        columns = (self.vx_m_s, self.vy_m_s, self.yaw_rate_rad_s, self.sideslip_rad, self.ay_m_s2)
+        return replace(self, valid=np.logical_or.reduce([np.isfinite(c) for c in columns]))
+
     def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
         """Return a copy with another pose."""
         return replace(self, x_m=x_m, y_m=y_m, yaw_rad=yaw_rad)

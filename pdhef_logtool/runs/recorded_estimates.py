@@ -17,7 +17,15 @@ import numpy as np
 from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
-from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
+from pdhef_logtool.drive.truth import (
+    SAME_SHARE,
+    TruthTrack,
+    dependent_signals,
+    derive_truth,
+    share_equal,
+    truth_at,
+    valid_as_a_whole,
+)
 from pdhef_logtool.drive.windows import DrivePlan, sample_ledger
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
@@ -202,7 +210,8 @@ class _Scoring:
         if output is not None:
             make_folder(output)
             folder = output / "logs" / drive.name
-            _write(folder, report, rows, [truth_track, *(r.track for r in recorded)], plan)
+            written = valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s)
+            _write(folder, report, rows, [written, *(r.track for r in recorded)], plan)
         progress(drive.name, 1.0)
         return LogResult(outcome_of(drive, all_losses), folder, report, tuple(rows))
 

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.records.signals import BoolArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -53,6 +51,7 @@ def evaluate(
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
     stem, truth, vehicle = drive.name, read(TRUTH), drive.car.vehicle
+    truth = None if truth is None else truth.valid_where_known()
     masks = segment_masks(signals, truth, vehicle)
     moving = moving_mask(signals, truth, vehicle)
     silent = []
@@ -63,7 +62,7 @@ def evaluate(
     for name in names:
         track = read(name)
         assert track is not None
-        if moving.any() and not (moving & track.valid & _says_something(track)).any():
+        if moving.any() and not (moving & track.valid & track.valid_where_known().valid).any():
             silent.append(name)
         if truth is not None:
             rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
@@ -78,12 +77,6 @@ def evaluate(
             rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
     rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
     return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()))
-
-
-def _says_something(track: StateTrack) -> BoolArray:
-    """Return where a track knows any of its quantities, [N]."""
-    known = [np.isfinite(c) for c in (track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s, track.sideslip_rad)]
-    return np.asarray(np.logical_or.reduce(known), dtype=np.bool_)
 
 
 def in_time(event: Event) -> tuple[int, int, str]:

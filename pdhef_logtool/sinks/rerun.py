@@ -146,12 +146,11 @@ class RerunSink(Sink):
         self._window[track.name] = track
         rgb = colour_rgb(track.name, self._colours)
         fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
-        valid = _drawn(track)
         for plot in _STATES + _HEALTH:
             values = np.asarray(getattr(track, plot.column)) * plot.factor
             if len(values) != len(track):
                 continue  # a column that this track has not
-            known = valid if plot.from_low_speed else valid & fast
+            known = track.valid if plot.from_low_speed else track.valid & fast
             values = np.where(known, values, np.nan)
             entity = f"/{plot.entity}/{track.name}"
             self._draw(entity, track.name, rgb, track.stamps_ns, values, sparse=plot.sparse)
@@ -237,7 +236,7 @@ class RerunSink(Sink):
     def _draw_path(self, track: StateTrack, rgb: tuple[int, int, int]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
         plan = np.stack([track.x_m, -track.y_m], axis=1)
-        known = np.isfinite(plan).all(axis=1) & _drawn(track)
+        known = np.isfinite(plan).all(axis=1) & track.valid
         if not known.any():
             return
         if track.name not in self._paths:
@@ -274,7 +273,7 @@ class RerunSink(Sink):
             _, of_track, of_truth = np.intersect1d(
                 track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True
             )
-            valid = track.valid[of_track]
+            valid = track.valid[of_track] & truth.valid[of_truth]
             fast = np.hypot(truth.vx_m_s, truth.vy_m_s)[of_truth] >= self._min_speed_m_s
             for plot in _STATES:
                 error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
@@ -287,11 +286,6 @@ class RerunSink(Sink):
                     track.stamps_ns[of_track],
                     np.where(known, error, np.nan),
                 )
-
-
-def _drawn(track: StateTrack) -> BoolArray:
-    """Return where a track's known values are drawn, [N]: of the truth all, also where others of it are not known."""
-    return np.ones(len(track), dtype=np.bool_) if track.name == TRUTH else track.valid
 
 
 @dataclass(slots=True)

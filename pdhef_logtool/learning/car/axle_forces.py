@@ -60,7 +60,7 @@ class AxleCurve:
 def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
     """Return where truth and signals can be used for identification, [N]."""
     truth = drive.truth
-    known = np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s + truth.ay_m_s2)
+    known = truth.valid & np.isfinite(truth.vx_m_s + truth.vy_m_s + truth.yaw_rate_rad_s + truth.ay_m_s2)
     moving = truth.vx_m_s > SPEED_FACTOR * vehicle.low_speed_blend_m_s
     tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
     use: BoolArray = known & moving & tame & np.isfinite(drive.signals.steer_rad)

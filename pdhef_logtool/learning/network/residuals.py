@@ -287,4 +287,6 @@ def _true_state(window: DriveWindow) -> FloatArray:
     truth = window.truth
     if truth is None:
         return np.full((len(window.signals), 3), np.nan)
-    return np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
+    state = np.stack([truth.vx_m_s, truth.vy_m_s, truth.yaw_rate_rad_s], axis=1)
+    valid: BoolArray = truth.valid
+    return np.where(valid[:, None], state, np.nan)
