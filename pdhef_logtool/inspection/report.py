@@ -38,6 +38,8 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
 
 WINDOW_NS = 600_000_000_000
+#: Signals are held against one another over so much of a log's beginning.
+PLAUSIBILITY_NS = 12 * WINDOW_NS
 #: Kinds of loss that are counted by topic and concern all its signals.
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.
@@ -208,7 +210,7 @@ def inspect_drive_log(
         channels = read_signals(log, mapping, clocks, start, end)
         losses.append(channels.losses)
         _gather(channels, gathered)
-        for name, channel in channels.signals.items():
+        for name, channel in channels.signals.items() if start < log.start_ns + PLAUSIBILITY_NS else ():
             thinned[name].append(_thin(channel))
     reading = merge_losses(losses)
     signals, truth = (

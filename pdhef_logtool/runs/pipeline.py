@@ -28,7 +28,7 @@ from pdhef_logtool.records.errors import (
     UsageError,
 )
 from pdhef_logtool.records.ledger import SampleCount
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals, join_signals
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.scoring import evaluate, in_time
@@ -231,12 +231,13 @@ def run_log(
             with TrackStore(folder) as store:
                 signals = _estimate(drive, ready, intervals, sinks, store, progress)
                 found = evaluate(drive, [e.name for e in ready], store.read, signals)
+                if drive.friction.bank is not None:
+                    observable = friction_events(drive.friction, signals.stamps_ns)
+                    found = replace(found, events=sorted([*found.events, *observable], key=in_time))
             rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
             events = found.events
             if not found.moves:
                 drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
-            if drive.friction.bank is not None:
-                events = sorted([*events, *friction_events(drive.friction, signals.stamps_ns)], key=in_time)
             silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
             losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent])
             ran = [
@@ -331,9 +332,8 @@ def _estimate(
     progress: Progress,
 ) -> Signals:
     """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
-    seen: list[Signals] = []
     for window in estimate_windows(drive, estimators, intervals=intervals):
-        seen.append(window.signals)
+        store.append_signals(window.signals)
         for sink in sinks:
             sink.append_signals(window.signals)
         if window.truth is not None:
@@ -347,7 +347,7 @@ def _estimate(
                 sink.append(track)
         progress(drive.name, 0.8 * window.share_done)
     progress(drive.name, 0.8)
-    return join_signals(seen)
+    return store.signals()
 
 
 def friction_events(friction: FrictionSource, stamps_ns: IntArray) -> list[Event]:

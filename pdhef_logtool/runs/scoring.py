@@ -51,7 +51,6 @@ def evaluate(
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
     stem, truth, vehicle = drive.name, read(TRUTH), drive.car.vehicle
-    truth = None if truth is None else truth.valid_where_known()
     masks = segment_masks(signals, truth, vehicle)
     moving = moving_mask(signals, truth, vehicle)
     silent = []
@@ -62,7 +61,7 @@ def evaluate(
     for name in names:
         track = read(name)
         assert track is not None
-        if moving.any() and not (moving & track.valid & track.valid_where_known().valid).any():
+        if moving.any() and not (moving & track.valid & track.something_known).any():
             silent.append(name)
         if truth is not None:
             rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
