@@ -39,7 +39,7 @@ from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Lo
 
 WINDOW_NS = 600_000_000_000
 #: Signals are held against one another over so much of a log's beginning.
-PLAUSIBILITY_NS = 12 * WINDOW_NS
+PLAUSIBILITY_NS = 6 * WINDOW_NS
 #: Kinds of loss that are counted by topic and concern all its signals.
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.

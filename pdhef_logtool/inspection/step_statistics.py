@@ -11,7 +11,7 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 #: Each window adds at most this many values to the quantiles; counts, extremes and gaps see all of them.
 KEPT_PER_WINDOW = 20_000
 #: When a stream has kept more, every second value of it goes, now and from then on: hours take no more memory.
-MOST_KEPT = 200_000
+MOST_KEPT = 120_000
 #: A gap is more than this many median steps, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
@@ -26,9 +26,10 @@ class Thinned:
 
     def add(self, values: FloatArray) -> None:
         """Add a window's values, float64 [N]."""
-        self.parts.append(thin(values)[:: self.stride])
+        # Copies: a view would keep all of the window.
+        self.parts.append(thin(values)[:: self.stride].copy())
         while sum(p.shape[0] for p in self.parts) > MOST_KEPT:
-            self.parts = [p[::2] for p in self.parts]
+            self.parts = [p[::2].copy() for p in self.parts]
             self.stride *= 2
 
     @property

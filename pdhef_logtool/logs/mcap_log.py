@@ -287,9 +287,11 @@ class McapContainer(MappedContainer):
 
     def times(self, span: Span) -> tuple[IntArray, IntArray]:
         """Return a span's channels and log times; a chunk's from its message indexes, where it has them."""
-        indexes = self._message_indexes(*self._extents[span.index][3])
+        start, end = self._extents[span.index][3]
+        indexes = self._message_indexes(start, end)
         if not indexes:
             return super().times(span)
+        self._touched(end - start + _PAGES_AROUND_BYTES)
         channel = np.concatenate([np.full(len(times), id_, dtype=np.int64) for id_, times, _ in indexes])
         log_time = np.minimum(np.concatenate([times for _, times, _ in indexes]), np.uint64(MAX_TIME_NS))
         return channel, log_time.astype(np.int64)
