@@ -49,6 +49,7 @@ _COLUMNS = {
     **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
     "position_m": ("x_m", "y_m"),
 }
+_AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate"
 _SURVEY_NS = 600_000_000_000
 _CHUNK = 16384
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
@@ -279,12 +280,13 @@ def truth_at(
 def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstill_m_s: float) -> StateTrack:
     """Return the truth [N] as it is written: valid where all is known that it consists of by its derivation.
 
-    At standstill that is without sideslip. Figures count each quantity where it is known itself.
+    At standstill that is without sideslip, and always without an a_y that is a derivative of the velocities: it ends
+    earlier than they do. Figures count each quantity where it is known itself.
     """
     standing = np.hypot(truth.vx_m_s, truth.vy_m_s) < standstill_m_s
     known = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
-    for name in derivation:
-        for column in _COLUMNS.get(name, ()):
+    for name, how in derivation.items():
+        for column in () if how == _AY_DERIVED else _COLUMNS.get(name, ()):
             known &= np.isfinite(getattr(truth, column))
     return replace(truth, valid=known)
 
@@ -718,7 +720,7 @@ def _lateral_acceleration(
             ay = ay - source.derivative(rate) * x + rate * rate * y
         return ay
     if "vy_m_s" in says and "yaw_rate_rad_s" in says:
-        says["ay_m_s2"] = "smoothing derivative of v_y plus v_x times yaw rate"
+        says["ay_m_s2"] = _AY_DERIVED
         return source.derivative(vy) + vx * rate
     return np.full(source.stamps_ns.shape[0], np.nan)
 
