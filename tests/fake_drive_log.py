@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import ByteLedger, Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.records.signals import IntArray, Loss
 
 
@@ -47,6 +48,10 @@ class FakeLog:
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
         return ()
+
+    @property
+    def occupied(self) -> OccupiedTime:
+        return OccupiedTime(((self.start_ns, self.end_ns),) if self.end_ns else ())
 
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         out = []

@@ -14,6 +14,8 @@ from pdhef_logtool.records.errors import VehicleError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.records.signals import Signals
 
+#: A car is taken to stand below this share of its low-speed blend.
+STANDSTILL_SHARE = 0.1
 GRAVITY_M_S2 = 9.80665
 
 Positive = Annotated[float, Field(gt=0)]
@@ -183,6 +185,11 @@ class VehicleParameters(Record):
     def wheelbase_m(self) -> float:
         """Distance between the axles."""
         return self.cg_to_front_axle_m + self.cg_to_rear_axle_m
+
+    @property
+    def standstill_m_s(self) -> float:
+        """Speed below which the car stands: the direction of its velocity is noise."""
+        return STANDSTILL_SHARE * self.low_speed_blend_m_s
 
     @property
     def assumed_friction(self) -> float:

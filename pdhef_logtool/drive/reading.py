@@ -18,6 +18,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, check_mapping, choose_mapping, merge_losses
 from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
@@ -110,7 +111,9 @@ class Drive:
     @property
     def losses(self) -> tuple[Loss, ...]:
         """What could not be used; complete once all windows were read. Files are named without their folder."""
-        found = merge_losses([self.log.lost, () if self._reader is None else self._reader.losses])
+        found = merge_losses(
+            [self.log.lost, () if self._reader is None else self._reader.losses, damage(self.sample_ledger)]
+        )
         folder = f"{self.path.parent}/"
         return tuple(replace(x, where=x.where.removeprefix(folder)) for x in found)
 
@@ -118,6 +121,11 @@ class Drive:
     def samples(self) -> dict[str, int]:
         """Messages that were used so far, by source."""
         return {} if self._reader is None else dict(self._reader.samples or {})
+
+    @property
+    def sample_ledger(self) -> tuple[SampleCount, ...]:
+        """What became of every sample of the mapped topics; complete once all windows were read."""
+        return () if self._reader is None else self._reader.ledger()
 
     def tell(self, text: str) -> None:
         """Say what a user must know of this drive, and keep it in the notes."""

@@ -44,6 +44,12 @@ MAX_LATENCY_S = 0.5
 SAME_SHARE = 0.99
 SAME_RELATIVE = 1e-6
 
+#: Columns of a track by what a derivation calls them.
+_COLUMNS = {
+    **{name: (name,) for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "yaw_rad")},
+    "position_m": ("x_m", "y_m"),
+}
+_AY_DERIVED = "smoothing derivative of v_y plus v_x times yaw rate"
 _SURVEY_NS = 600_000_000_000
 _CHUNK = 16384
 _ANGLES = frozenset({"yaw_rad", "course_rad", "sideslip_rad"})
@@ -233,13 +239,16 @@ def derive_truth(
     return TruthTrack(track=track, max_gap_s=plan.max_gap_s[plan.base], derivation=says)
 
 
-def truth_at(truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0) -> StateTrack:
+def truth_at(
+    truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0, *, standstill_m_s: float = 0.0
+) -> StateTrack:
     """Bring the truth to other stamps by linear interpolation, angles along the shorter way.
 
     Parameters
     ----------
     stamps_ns : int64 [N], the stamps to score at, on the sensors' clock.
     latency_s : the truth shows at t + latency what the sensors show at t.
+    standstill_m_s : below this speed there is no sideslip.
 
     Returns
     -------
@@ -265,7 +274,21 @@ def truth_at(truth: TruthTrack, stamps_ns: IntArray, latency_s: float = 0.0) -> 
         y_m=bracket.linear(track.y_m),
         yaw_rad=bracket.angle(track.yaw_rad),
         valid=bracket.inside & np.isfinite(np.stack([vx, vy, rate, beta, ay])).any(axis=0),
-    )
+    ).without_sideslip_below(standstill_m_s)
+
+
+def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstill_m_s: float) -> StateTrack:
+    """Return the truth [N] as it is written: valid where all is known that it consists of by its derivation.
+
+    At standstill that is without sideslip, and always without an a_y that is a derivative of the velocities: it ends
+    earlier than they do. Figures count each quantity where it is known itself.
+    """
+    standing = np.hypot(truth.vx_m_s, truth.vy_m_s) < standstill_m_s
+    known = truth.valid & (np.isfinite(truth.sideslip_rad) | standing | ("sideslip_rad" not in derivation))
+    for name, how in derivation.items():
+        for column in () if how == _AY_DERIVED else _COLUMNS.get(name, ()):
+            known &= np.isfinite(getattr(truth, column))
+    return replace(truth, valid=known)
 
 
 def yaw_rate_channel(truth: TruthTrack) -> Channel:
@@ -697,7 +720,7 @@ def _lateral_acceleration(
             ay = ay - source.derivative(rate) * x + rate * rate * y
         return ay
     if "vy_m_s" in says and "yaw_rate_rad_s" in says:
-        says["ay_m_s2"] = "smoothing derivative of v_y plus v_x times yaw rate"
+        says["ay_m_s2"] = _AY_DERIVED
         return source.derivative(vy) + vx * rate
     return np.full(source.stamps_ns.shape[0], np.nan)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Mapping as Mapped
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,7 +30,17 @@ from pdhef_logtool.drive.truth import (
     yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog, windows
-from pdhef_logtool.mapping import ClockModel, Mapping, fit_clocks, join_channels, merge_losses, read_signals
+from pdhef_logtool.mapping import (
+    ClockModel,
+    MappedChannels,
+    Mapping,
+    clock_key,
+    fit_clocks,
+    join_channels,
+    merge_losses,
+    read_signals,
+)
+from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
 from pdhef_logtool.records.signals import Channel, Loss, Signals, cut_signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -37,6 +48,8 @@ from pdhef_logtool.records.tracks import StateTrack
 #: A silence of a channel is told from here on, and from this many of its periods.
 TOLD_GAP_S = 1.0
 TOLD_GAP_PERIODS = 10.0
+#: Why a signal's samples are not used although nothing is wrong with them.
+_NOT_NEEDED = "not-needed"
 _JUMP = "samples whose stamps jump back behind what had been processed were dropped"
 _IMPOSSIBLE = "readings that no vehicle can have were taken as missing by the estimators"
 _LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
@@ -149,13 +162,18 @@ def plan_drive(
 
 @dataclass(slots=True)
 class DriveReader:
-    """Reads a planned drive once from start to end; ``losses`` and ``samples`` grow while it does."""
+    """Reads a planned drive once from start to end; ``losses``, ``samples`` and ``counts`` grow while it does.
+
+    ``counts`` are those of :class:`~pdhef_logtool.mapping.channels.MappedChannels`, of all windows so far.
+    """
 
     log: DriveLog
     plan: DrivePlan
     window_s: float
     losses: tuple[Loss, ...] = ()
     samples: dict[str, int] | None = None
+    counts: dict[tuple[Role, str], Counter[str]] = field(default_factory=dict)
+    _done: bool = False
 
     def windows(self) -> Iterator[DriveWindow]:
         """Yield the drive's windows in order; joined, they are bit-identical to one window over all."""
@@ -165,10 +183,13 @@ class DriveReader:
         truth: dict[str, Channel] = {}
         counts: dict[str, int] = {}
         done_ns: int | None = None
-        for a, b in windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9)):
+        ends = list(windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9), self.log.occupied))
+        for a, b in ends:
             part = read_signals(self.log, plan.mapping, plan.clocks, a, b)
             self.losses = merge_losses([self.losses, part.losses])
-            for store, new in ((signals, part.signals), (truth, part.truth)):
+            for key, count in part.counts.items():
+                self.counts.setdefault(key, Counter()).update(count)
+            for role, store, new in _by_role(signals, truth, part):
                 for name, channel in new.items():
                     self.losses = merge_losses([self.losses, _gaps(store.get(name), channel)])
                     back = 0 if done_ns is None else int(np.searchsorted(channel.stamps_ns, done_ns - margin))
@@ -177,9 +198,11 @@ class DriveReader:
                         jump = Loss("time-jump", _JUMP, channel.source, first, last_back, back)
                         self.losses = merge_losses([self.losses, [jump]])
                     counts[channel.source] = counts.get(channel.source, 0) + len(channel)
-                    store[name] = join_channels([store[name], channel]) if name in store else channel
+                    joined = join_channels([store[name], channel]) if name in store else channel
+                    self._count_joined(role, name, (store.get(name), channel, joined), back, done_ns)
+                    store[name] = joined
             self.samples = counts
-            last = b >= plan.end_ns
+            last = (a, b) == ends[-1]
             stamps = [c.stamps_ns for c in signals.values() if len(c)]
             if not stamps:
                 continue
@@ -193,22 +216,76 @@ class DriveReader:
             done_ns = until
             signals = {n: c.between(until - margin) for n, c in signals.items()}
             truth = {n: c.between(until - margin) for n, c in truth.items()}
+        self._done = True
+
+    def _count_joined(
+        self, role: Role, name: str, parts: tuple[Channel | None, Channel, Channel], back: int, done_ns: int | None
+    ) -> None:
+        """Count what of a window's channel comes too late: ``back`` samples of it, or for a stamp that is there."""
+        before, channel, joined = parts
+        if before is None or done_ns is None:
+            seam, behind = (0 if before is None else len(before) + len(channel) - len(joined)), 0
+        else:
+            seam = sum(len(c.between(done_ns)) for c in (before, channel)) - len(joined.between(done_ns))
+            behind = int(np.searchsorted(channel.stamps_ns, done_ns))
+        self.counts[role, name].update({"time-jump": back, "late": behind - back, "duplicate-stamp": seam})
+
+    def ledger(self) -> tuple[SampleCount, ...]:
+        """Return what became of every sample of the mapped topics; empty until all windows were read."""
+        return sample_ledger(self.log, self.plan, self.counts) if self._done else ()
 
     def _window(
         self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int, share: float
     ) -> DriveWindow:
         plan = self.plan
         aligned = correct_signals(align(signals, plan.alignment, start_ns, end_ns), plan.vehicle)
-        late = [
-            Loss("late", _LATE, signals[name].source, start_ns, end_ns, count, "note")
-            for name, count in count_late(signals, plan.alignment, start_ns, end_ns).items()
-            if count
-        ]
+        found = count_late(signals, plan.alignment, start_ns, end_ns)
+        late = [Loss("late", _LATE, signals[n].source, start_ns, end_ns, count, "note") for n, count in found.items()]
+        for name, count in found.items():
+            self.counts["signal", name]["late"] += count
         self.losses = merge_losses([self.losses, late, _impossible(aligned)])
         at_stamps = None
         if plan.truth is not None:
-            at_stamps = truth_at(derive_truth(truth, plan=plan.truth), aligned.stamps_ns, plan.truth_latency_s)
+            at_stamps = truth_at(
+                derive_truth(truth, plan=plan.truth),
+                aligned.stamps_ns,
+                plan.truth_latency_s,
+                standstill_m_s=plan.vehicle.standstill_m_s,
+            )
         return DriveWindow(aligned, at_stamps, share)
+
+
+def sample_ledger(
+    log: DriveLog, plan: DrivePlan, counts: Mapped[tuple[Role, str], Counter[str]]
+) -> tuple[SampleCount, ...]:
+    """Return what became of every sample of the mapped topics, of the counts of all windows of the plan's slice."""
+    messages = {t.name: t.messages for t in log.topics}
+    whole = plan.start_ns <= log.start_ns and plan.end_ns >= log.end_ns
+    aligned = {c.name for c in plan.alignment.channels}
+    samples = []
+    for (role, name), count in counts.items():
+        source = (plan.mapping.signals if role == "signal" else plan.mapping.truth)[name]
+        dropped = Counter({reason: n for reason, n in count.items() if reason != "read"})
+        total = count["read"]
+        if source.read_topic in messages:  # a signal of raw CAN frames is read of some of its topic's messages
+            left_out = log.occupied.left_out.get(source.topic, {})
+            rest = messages[source.topic] - total - sum(left_out.values())
+            total = messages[source.topic]
+            dropped.update({**left_out, ("not-read" if whole else "outside-slice"): rest})
+        used = total - sum(dropped.values())
+        if role == "signal" and name not in aligned:
+            dropped[_NOT_NEEDED], used = used, 0
+        clock = plan.clocks.get(clock_key(source), ClockModel())
+        known = {reason: n for reason, n in sorted(dropped.items()) if n}
+        stamp = "log_time" if clock.unusable else source.stamp
+        samples.append(SampleCount(role, name, source.label, stamp, total, used, known))
+    return tuple(samples)
+
+
+def _by_role(
+    signals: dict[str, Channel], truth: dict[str, Channel], part: MappedChannels
+) -> tuple[tuple[Role, dict[str, Channel], dict[str, Channel]], ...]:
+    return ("signal", signals, part.signals), ("truth", truth, part.truth)
 
 
 def with_look_ahead(

@@ -52,6 +52,8 @@ MAX_LAG_S = 0.3
 MIN_LAG_CORRELATION = 0.5
 NORMAL_95 = 1.959963984540054
 ANCHOR_S = 1.0
+#: Rows of which covariances are in memory at once.
+NEES_ROWS = 1 << 16
 #: No second of dead reckoning may hold a longer step between stamps.
 MAX_STEP_S = 0.2
 
@@ -311,17 +313,24 @@ def _score_position(estimate: StateTrack, truth: StateTrack, log: str) -> list[M
 
 
 def _nees_rows(estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray], log: str) -> list[MetricRow]:
-    if estimate.covariance.shape[0] == 0:
+    n = len(estimate)
+    if estimate.rows(0, 1).covariance.shape[0] == 0:
         return []
-    covariance = estimate.covariance
-    if truth.covariance.shape[0]:
-        covariance = covariance + truth.covariance
-    error = np.stack([getattr(estimate, s) - getattr(truth, s) for s in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")], axis=1)
-    value = nees(np.where((estimate.valid & truth.valid)[:, None], error, np.nan), covariance)
+    starts = range(0, n, NEES_ROWS)
+    blocks = [_nees_of(*(t.rows(a, a + NEES_ROWS) for t in (estimate, truth))) for a in starts]
+    value = np.concatenate(blocks)
     return [
         MetricRow(log, estimate.name, "state", segment, "nees", float(np.mean(inside)), "1", int(inside.size))
         for segment, inside in known_by_segment(value, masks)
     ]
+
+
+def _nees_of(estimate: StateTrack, truth: StateTrack) -> FloatArray:
+    covariance = estimate.covariance
+    if truth.covariance.shape[0]:
+        covariance = covariance + truth.covariance
+    error = np.stack([getattr(estimate, s) - getattr(truth, s) for s in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")], axis=1)
+    return nees(np.where((estimate.valid & truth.valid)[:, None], error, np.nan), covariance)
 
 
 def _pose_known(truth: StateTrack) -> BoolArray:

@@ -47,7 +47,7 @@ LINEAR_SHARE, NONLINEAR_SHARE = 0.3, 0.5
 GRIP_SMOOTHING_HZ, MANOEUVRE_SMOOTHING_HZ = 4.0, 1.0
 #: A longer step between stamps ends every run and every interval.
 RUN_GAP_S = 0.5
-STANDSTILL_SHARE, STANDSTILL_YAW_RATE_RAD_S, STANDSTILL_S = 0.1, 0.05, 0.5
+STANDSTILL_YAW_RATE_RAD_S, STANDSTILL_S = 0.05, 0.5
 STRAIGHT_M_S2, STRAIGHT_S = 0.5, 2.0
 CORNERING_M_S2, CORNERING_S = 1.0, 1.5
 SWING_M_S2, SLALOM_M_S2, SLALOM_PEAKS, SLALOM_SPACING_S = 0.5, 1.5, 3, 2.5
@@ -74,7 +74,7 @@ def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehiclePa
     n = len(signals)
     ay = _preferred(truth.ay_m_s2 if truth else None, signals.ay_m_s2)
     rate = _preferred(truth.yaw_rate_rad_s if truth else None, signals.yaw_rate_rad_s)
-    speed = _preferred(np.abs(truth.vx_m_s) if truth else None, _last_known(stamps, signals.speed_m_s))
+    speed = _speed(signals, truth)
     friction = np.where(np.isfinite(signals.friction), signals.friction, vehicle.assumed_friction)
 
     grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ)) / (friction * GRAVITY_M_S2)
@@ -82,7 +82,7 @@ def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehiclePa
     ax = smooth(stamps, signals.ax_m_s2, MANOEUVRE_SMOOTHING_HZ)
     slow = vehicle.low_speed_blend_m_s
     slalom = _slalom(stamps, ay)
-    standing = (speed < STANDSTILL_SHARE * slow) & (np.abs(rate) < STANDSTILL_YAW_RATE_RAD_S)
+    standing = (speed < vehicle.standstill_m_s) & (np.abs(rate) < STANDSTILL_YAW_RATE_RAD_S)
     standing = _lasting(stamps, standing, STANDSTILL_S)
     moving = ~standing
     return {
@@ -97,6 +97,21 @@ def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehiclePa
         "braking": _lasting(stamps, (ax < BRAKING_M_S2) & moving, PEDAL_S),
         "accelerating": _lasting(stamps, (ax > ACCELERATING_M_S2) & moving, PEDAL_S),
     }
+
+
+def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehicleParameters) -> BoolArray:
+    """Return where the car is faster than the low-speed blend, [N]; everywhere if its speed is known nowhere.
+
+    ``signals``, ``truth`` as for :func:`segment_masks`.
+    """
+    speed = _speed(signals, truth)
+    known = np.isfinite(speed).any()
+    return np.asarray(speed > vehicle.low_speed_blend_m_s if known else np.ones(len(signals)), dtype=np.bool_)
+
+
+def _speed(signals: Signals, truth: StateTrack | None) -> FloatArray:
+    """Return the speed [N] in m/s, of one source."""
+    return _preferred(np.abs(truth.vx_m_s) if truth else None, _last_known(signals.stamps_ns, signals.speed_m_s))
 
 
 def find_intervals(stamps_ns: IntArray, masks: Mapping[str, BoolArray]) -> list[Segment]:

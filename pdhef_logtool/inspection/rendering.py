@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -11,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.inspection.report import Inspection, SignalReport, TopicReport
+from pdhef_logtool.logs.occupied_time import shown_time
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,12 +18,11 @@ if TYPE_CHECKING:
 
 def render_inspection(inspection: Inspection, console: Console) -> None:
     """Print an inspection: topics, signals and truth, what is missing, and everything to look at."""
-    start = datetime.fromtimestamp(inspection.start_ns * 1e-9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     messages = sum(t.messages for t in inspection.topics)
     console.print(Text(inspection.path, "bold"), soft_wrap=True)
     console.print(
-        f"{inspection.kind}, {inspection.duration_s:.1f} s from {start}, {messages} messages on "
-        f"{len(inspection.topics)} topics"
+        f"{inspection.kind}, {inspection.duration_s:.1f} s from {shown_time(inspection.start_ns)}, {messages} messages "
+        f"on {len(inspection.topics)} topics"
     )
     if inspection.topics:
         console.print(_topics_table(inspection.topics))

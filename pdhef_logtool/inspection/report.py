@@ -40,6 +40,8 @@ from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
 
 WINDOW_NS = 600_000_000_000
+#: Signals are held against one another over so much of a log's beginning.
+PLAUSIBILITY_NS = 6 * WINDOW_NS
 #: Kinds of loss that are counted by topic and concern all its signals.
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.
@@ -207,14 +209,14 @@ def inspect_drive_log(
     gathered: dict[tuple[str, str], _Gathered] = {}
     thinned: dict[str, list[Channel]] = {name: [] for name in mapping.signals}
     losses: list[tuple[Loss, ...]] = []
-    for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS):
+    for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
         for name, columns in log.read_stamps(start, end).items():
             steps[name].add(columns.log_time_ns)
             delays[name].add(columns.log_time_ns, columns.publish_time_ns)
         channels = read_signals(log, mapping, clocks, start, end)
         losses.append(channels.losses)
         _gather(channels, gathered)
-        for name, channel in channels.signals.items():
+        for name, channel in channels.signals.items() if start < log.start_ns + PLAUSIBILITY_NS else ():
             thinned[name].append(_thin(channel))
     reading = merge_losses(losses)
     signals, truth = (

@@ -10,9 +10,32 @@ from pdhef_logtool.records.signals import FloatArray, IntArray
 
 #: Each window adds at most this many values to the quantiles; counts, extremes and gaps see all of them.
 KEPT_PER_WINDOW = 20_000
+#: When a stream has kept more, every second value of it goes, now and from then on: hours take no more memory.
+MOST_KEPT = 120_000
 #: A gap is more than this many median steps, and more than ``MIN_GAP_S``.
 GAP_PERIODS = 5.0
 MIN_GAP_S = 0.1
+
+
+@dataclass(slots=True)
+class Thinned:
+    """Evenly spread values of a stream, at most ``KEPT_PER_WINDOW`` a window and ``MOST_KEPT`` in all."""
+
+    parts: list[FloatArray] = field(default_factory=list)
+    stride: int = 1
+
+    def add(self, values: FloatArray) -> None:
+        """Add a window's values, float64 [N]."""
+        # Copies: a view would keep all of the window.
+        self.parts.append(thin(values)[:: self.stride].copy())
+        while sum(p.shape[0] for p in self.parts) > MOST_KEPT:
+            self.parts = [p[::2].copy() for p in self.parts]
+            self.stride *= 2
+
+    @property
+    def values(self) -> FloatArray:
+        """All that is kept, in order."""
+        return np.concatenate(self.parts) if self.parts else np.empty(0)
 
 
 @dataclass(slots=True)
@@ -26,7 +49,7 @@ class StepStatistics:
 
     count: int = 0
     last_ns: int | None = None
-    steps_s: list[FloatArray] = field(default_factory=list)
+    steps_s: Thinned = field(default_factory=Thinned)
     long_steps: list[tuple[float, int]] = field(default_factory=list)
 
     def add(self, times_ns: IntArray) -> None:
@@ -39,7 +62,7 @@ class StepStatistics:
         steps = np.diff(joined) * 1e-9
         if steps.shape[0] == 0:
             return
-        self.steps_s.append(thin(steps))
+        self.steps_s.add(steps)
         # All steps that can count as gaps once the median is known, the longest first, within bounds.
         longest = np.argsort(-steps, kind="stable")[:1000]
         longest = longest[steps[longest] > MIN_GAP_S]
@@ -68,15 +91,15 @@ class StepStatistics:
         return sorted((s for s in self.long_steps if s[0] > limit), key=lambda s: s[1])
 
     def _steps(self) -> FloatArray:
-        return np.concatenate(self.steps_s) if self.steps_s else np.empty(0)
+        return self.steps_s.values
 
 
 @dataclass(slots=True)
 class DelayStatistics:
     """Delays of messages: log time less another time of theirs."""
 
-    times_s: list[FloatArray] = field(default_factory=list)
-    delays_s: list[FloatArray] = field(default_factory=list)
+    times_s: Thinned = field(default_factory=Thinned)
+    delays_s: Thinned = field(default_factory=Thinned)
     count: int = 0
     negative: int = 0
 
@@ -85,20 +108,18 @@ class DelayStatistics:
         delays = (log_time_ns - other_ns).astype(np.float64) * 1e-9
         self.count += int(delays.shape[0])
         self.negative += int(np.count_nonzero(delays < 0.0))
-        self.times_s.append(thin(log_time_ns.astype(np.float64) * 1e-9))
-        self.delays_s.append(thin(delays))
+        self.times_s.add(log_time_ns.astype(np.float64) * 1e-9)
+        self.delays_s.add(delays)
 
     def quantile(self, q: float) -> float:
         """Return a quantile of the delays in s; NaN without messages."""
-        delays = np.concatenate(self.delays_s) if self.delays_s else np.empty(0)
+        delays = self.delays_s.values
         return float(np.quantile(delays, q)) if delays.shape[0] else float("nan")
 
     @property
     def drift_ppm(self) -> float:
         """Slope of the delay over time by least squares, in parts per million; NaN without a span."""
-        if not self.delays_s:
-            return float("nan")
-        times, delays = np.concatenate(self.times_s), np.concatenate(self.delays_s)
+        times, delays = self.times_s.values, self.delays_s.values
         times = times - times.mean() if times.shape[0] else times
         spread = float(np.dot(times, times))
         return float(np.dot(times, delays - delays.mean()) / spread * 1e6) if spread > 0.0 else float("nan")

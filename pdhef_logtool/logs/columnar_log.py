@@ -21,6 +21,7 @@ from pdhef_logtool.logs.decoding import (
 )
 from pdhef_logtool.logs.drive_log import ByteLedger, Columns, FieldInfo, TopicInfo
 from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, Selection, leaves, resolve
+from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -63,6 +64,7 @@ class ColumnarLog:
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
+        self._occupied: OccupiedTime | None = None
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -80,18 +82,35 @@ class ColumnarLog:
 
     @property
     def start_ns(self) -> int:
-        """First log time; 0 for a log without messages."""
-        return min((s.start_ns for c in self.containers for s in c.spans), default=0)
+        """First log time that counts; 0 for a log without messages."""
+        return self.occupied.start_ns
 
     @property
     def end_ns(self) -> int:
-        """Last log time + 1; 0 for a log without messages."""
-        return max((s.end_ns for c in self.containers for s in c.spans), default=0)
+        """Last log time that counts + 1; 0 for a log without messages."""
+        return self.occupied.end_ns
+
+    @property
+    def occupied(self) -> OccupiedTime:
+        """When the log was recorded, found when it is first asked for."""
+        if self._occupied is None:
+            self._occupied = survey(self.containers, self._times, str(self.path))
+        return self._occupied
+
+    def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
+        """Return channels and log times of a span's messages [N]; None if they cannot be read."""
+        meter = self.containers[c].meter
+        try:
+            meter.check()
+            with meter.running():
+                return self.containers[c].times(span)
+        except Exception:  # noqa: BLE001 (a read of the span reports the damage)
+            return None
 
     @property
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now."""
-        found = list(self._opened_lost)
+        found = [*self._opened_lost, *self.occupied.losses]
         for c, container in enumerate(self.containers):
             found.extend(container.lost)
             found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
@@ -329,7 +348,11 @@ class ColumnarLog:
         # By what the block holds: the span's counts may have come from an index that is wrong.
         for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
             topic = channels[id_].topic if id_ in channels else ""
-            rows = block.rows[id_] if keep is None else block.rows[id_][keep[block.rows[id_]]]
+            rows = block.rows[id_]
+            unused = self.occupied.unused(topic, c, span, block.log_time_ns[rows])
+            if unused is not None:
+                rows = rows[~unused]
+            rows = rows if keep is None else rows[keep[rows]]
             if topic in plans and rows.size:
                 columns = self._decode(topic, plans[topic], c, span, id_, block, rows)
                 if columns is not None:

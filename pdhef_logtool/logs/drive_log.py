@@ -9,6 +9,7 @@ from typing import Protocol
 
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.records.signals import IntArray, Loss
 
 
@@ -98,11 +99,15 @@ class DriveLog(Protocol):
 
     @property
     def start_ns(self) -> int:
-        """First log time; 0 for a log without messages."""
+        """First log time that counts; 0 for a log without messages."""
 
     @property
     def end_ns(self) -> int:
-        """Last log time + 1 (intervals are [start, end)); 0 for a log without messages."""
+        """Last log time that counts + 1 (intervals are [start, end)); 0 for a log without messages."""
+
+    @property
+    def occupied(self) -> OccupiedTime:
+        """When the log was recorded; what was recorded at other times is never read."""
 
     @property
     def lost(self) -> tuple[Loss, ...]:
@@ -130,9 +135,13 @@ class DriveLog(Protocol):
         """Release the files."""
 
 
-def windows(start_ns: int, end_ns: int, length_ns: int) -> Iterator[tuple[int, int]]:
-    """Cut [start, end) into consecutive windows of at most ``length_ns``."""
+def windows(
+    start_ns: int, end_ns: int, length_ns: int, occupied: OccupiedTime | None = None
+) -> Iterator[tuple[int, int]]:
+    """Cut [start, end) into consecutive windows of at most ``length_ns``; those in a silence are left out."""
     at = start_ns
-    while at < end_ns:
-        yield at, min(at + length_ns, end_ns)
-        at += length_ns
+    for begin, end in ((start_ns, end_ns),) if occupied is None else occupied.intervals:
+        at += max(0, (begin - at) // length_ns) * length_ns
+        while at < min(end, end_ns):
+            yield at, min(at + length_ns, end_ns)
+            at += length_ns

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -22,6 +23,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment as AttachmentRecord
 from mcap.records import Channel, Metadata, Schema
+from numpy.typing import NDArray
 
 from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.compression import decompress
@@ -41,6 +43,8 @@ from pdhef_logtool.logs.container import (
 )
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
+
+UintArray: TypeAlias = NDArray[np.uint64]
 
 _RECORD = struct.Struct("<BQ")
 _MESSAGE_RECORD = struct.Struct("<BQHIQ")
@@ -331,6 +335,16 @@ class McapContainer(FileContainer):
             return False
         return True
 
+    def times(self, span: Span) -> tuple[IntArray, IntArray]:
+        """Return a span's channels and log times; a chunk's from its message indexes, where it has them."""
+        extent = self._extents[span.index]
+        indexes = _message_indexes(self.source.read(extent.end, extent.index_end - extent.end), 0)
+        if not indexes:
+            return super().times(span)
+        channel = np.concatenate([np.full(len(times), id_, dtype=np.int64) for id_, times, _ in indexes])
+        log_time = np.minimum(np.concatenate([times for _, times, _ in indexes]), np.uint64(MAX_TIME_NS))
+        return channel, log_time.astype(np.int64)
+
     def crc_up_to(self, end: int) -> int:
         """Return the CRC of the file's first bytes."""
         return self._crc(0, end)
@@ -471,6 +485,7 @@ class _Walk:
         self.run: tuple[int, int] | None = None  # extent of consecutive unchunked messages
         self.run_times = (0, 0)
         self.run_counts: Counter[int] = Counter()
+        self.run_ordered = True  # whether no log time of it steps back
         self.chunk: tuple[int, int] | None = None  # extent of the chunk whose message indexes are being read
         self.index_end = 0
         self.head = (0, 0, 0)  # of the chunk: first and last log time, size
@@ -544,6 +559,8 @@ class _Walk:
                 first_ns = log_time
             if log_time > last_ns:
                 last_ns = log_time
+            elif log_time < last_ns:
+                self.run_ordered = False
             counts[channel] += 1
             place = end
             if base + place - start >= _UNCHUNKED_RUN_BYTES:
@@ -596,8 +613,8 @@ class _Walk:
         """Return the first and the last time in the chunk's indexes, which need not be in order."""
         assert self.chunk is not None
         record = self.of.source.read(self.chunk[1], self.index_end - self.chunk[1])
-        pairs = _index_pairs(record, 0)
-        times = np.concatenate([p[::2] for p in pairs or ()] or [np.zeros(1, dtype=np.uint64)])
+        indexes = _message_indexes(record, 0)
+        times = np.concatenate([own for _, own, _ in indexes or ()] or [np.zeros(1, dtype=np.uint64)])
         return int(times.min()), int(times.max())
 
     def _data_end(self, at: int, end: int) -> None:
@@ -629,8 +646,9 @@ class _Walk:
         if self.run is None:
             return
         first, last = (min(t, MAX_TIME_NS) for t in self.run_times)
-        self.of.add_span(_Extent(*self.run, False, self.run[1]), Span(0, first, last + 1, dict(self.run_counts)))
-        self.run, self.run_counts = None, Counter()
+        span = Span(0, first, last + 1, dict(self.run_counts), self.run_ordered)
+        self.of.add_span(_Extent(*self.run, False, self.run[1]), span)
+        self.run, self.run_counts, self.run_ordered = None, Counter(), True
 
     def _end_chunk(self, index_complete: bool = True) -> None:
         """Close a chunk; open it now if only its content tells its channels or its messages."""
@@ -701,26 +719,27 @@ def _chunk_head(record: bytes) -> tuple[int, int, str, int, int]:
     return size, crc, compression, 49 + n, stored
 
 
-def _index_pairs(record: bytes, at: int) -> list[IntArray] | None:
-    """Return time and offset in turn (uint64) of each message index from a byte on; None if one is malformed."""
-    found: list[IntArray] = []
+def _message_indexes(record: bytes, at: int) -> list[tuple[int, UintArray, UintArray]] | None:
+    """Return channel, log times [N] and offsets [N] of each message index from a byte on; None if one is malformed."""
+    found: list[tuple[int, UintArray, UintArray]] = []
     while at < len(record):
         opcode, length = _RECORD.unpack_from(record, at)
-        (n,) = _U32.unpack_from(record, at + 11)
+        (channel,), (n,) = _U16.unpack_from(record, at + 9), _U32.unpack_from(record, at + 11)
         if opcode != _OP_MESSAGE_INDEX or n % 16 or n + 6 > length:
             return None
-        found.append(np.frombuffer(record, dtype="<u8", count=n // 8, offset=at + 15))
+        pairs = np.frombuffer(record, dtype="<u8", count=n // 8, offset=at + 15)
+        found.append((channel, pairs[0::2], pairs[1::2]))
         at += 9 + length
     return found
 
 
 def _indexed_messages(content: bytes, record: bytes, at: int) -> Block | None:
     """Return a chunk's messages through its message indexes; None if these do not name all of them."""
-    pairs = _index_pairs(record, at)
-    if not pairs:
+    indexes = _message_indexes(record, at)
+    if not indexes:
         return None
     # Each channel's offsets ascend already, which the stable sort makes use of.
-    offset = np.sort(np.concatenate([p[1::2].astype(np.int64) for p in pairs]), kind="stable")
+    offset = np.sort(np.concatenate([offsets.astype(np.int64) for _, _, offsets in indexes]), kind="stable")
     return _gather_messages(content, offset) if offset.size else None
 
 

@@ -29,7 +29,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.files import scratch_folder
-from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.signals import IntArray, Loss
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _MAGIC_BYTES = 16
@@ -251,6 +251,9 @@ class _Wrapped(Container):
 
     def extent(self, span: Span) -> tuple[int, int]:
         return self.container.extent(span)
+
+    def times(self, span: Span) -> tuple[IntArray, IntArray]:
+        return self.container.times(span)
 
     def attachments(self) -> Iterator[Attachment]:
         return self.container.attachments()

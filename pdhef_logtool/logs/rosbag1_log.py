@@ -50,6 +50,7 @@ class _Chunk:
     counts: Counter[int] = field(default_factory=Counter)
     first_ns: int = 0
     last_ns: int = 0
+    ordered: bool = True  # whether no log time of a connection steps back
 
 
 class Rosbag1Container(FileContainer):
@@ -190,6 +191,7 @@ class Rosbag1Container(FileContainer):
             chunk.first_ns = min(chunk.first_ns, first) if chunk.counts else first
             chunk.last_ns = max(chunk.last_ns, last)
             chunk.counts[connection] += count
+            chunk.ordered &= bool((times[1:] >= times[:-1]).all())
 
     def _declare_from_chunks(self) -> None:
         """Find connections that only the chunks declare, as in a bag without its index section."""
@@ -230,7 +232,7 @@ class Rosbag1Container(FileContainer):
         if not complete or not chunk.counts or chunk.counts.total() * _LEAST_MESSAGE_BYTES > chunk.size:
             self._open_chunk(chunk)
         else:
-            self._add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts)))
+            self._add_span(chunk, Span(0, chunk.first_ns, chunk.last_ns + 1, dict(chunk.counts), chunk.ordered))
 
     def _add_span(self, chunk: _Chunk, span: Span) -> None:
         self._chunks.append(chunk)

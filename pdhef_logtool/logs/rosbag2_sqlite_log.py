@@ -6,15 +6,18 @@ import shutil
 import sqlite3
 import tempfile
 from collections import Counter
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
 from urllib.parse import quote
+
+import numpy as np
 
 from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError, block_from_lists, told
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.files import scratch_folder
+from pdhef_logtool.records.signals import IntArray
 
 _PAGE_ROWS = 8192
 _PAGE_BYTES = 4 << 20
@@ -122,7 +125,8 @@ class SqliteContainer(Container):
 
         def close_page() -> None:
             if times:
-                self.spans.append(Span(len(self.spans), min(times), max(times) + 1, dict(counts)))
+                ordered = all(a <= b for a, b in pairwise(times))
+                self.spans.append(Span(len(self.spans), min(times), max(times) + 1, dict(counts), ordered))
                 self._pages.append((first, last))
                 self._ends.append(total)
             times.clear()
@@ -205,6 +209,15 @@ class SqliteContainer(Container):
         lengths = [len(p) for p in payloads]
         offsets = [0, *accumulate(lengths)][:-1]
         return block_from_lists(b"".join(payloads), channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
+
+    def times(self, span: Span) -> tuple[IntArray, IntArray]:
+        """Return channels and log times of one page."""
+        query = "SELECT topic_id, timestamp FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
+        try:
+            rows = [(t, ns) for t, ns in self._db.execute(query, self._pages[span.index]) if isinstance(ns, int)]
+        except sqlite3.Error as error:
+            raise SpanDamageError(str(error)) from error
+        return np.array([t for t, _ in rows], dtype=np.int64), np.array([ns for _, ns in rows], dtype=np.int64)
 
     def close(self) -> None:
         """Release the file and the temporary copy."""

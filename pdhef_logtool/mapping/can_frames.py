@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import ByteLedger, Columns, DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.mapping.records import CAN_PREFIX, CanSettings, SignalSource
 from pdhef_logtool.mapping.records import Mapping as SignalMapping
 from pdhef_logtool.records.errors import MappingError, MappingFileError
@@ -182,6 +183,11 @@ class CanSignalLog:
             TopicInfo(name, v.message.name, "can", own[v.source.topic].messages) for name, v in self._views.items()
         )
         return (*own.values(), *views)
+
+    @property
+    def occupied(self) -> OccupiedTime:
+        """That of the log."""
+        return self._log.occupied
 
     @property
     def lost(self) -> tuple[Loss, ...]:

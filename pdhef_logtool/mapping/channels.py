@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping as Mapped
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog
 from pdhef_logtool.mapping.can_frames import CanSignalLog, with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping
-from pdhef_logtool.mapping.clocks import ClockModel, apply_clock, clock_key, raw_stamps, stamp_request
+from pdhef_logtool.mapping.clocks import ClockModel, clock_key, stamp_request, stamps_on_log_clock
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
+from pdhef_logtool.records.ledger import Role
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, BoolArray, Channel, FloatArray, IntArray, Loss
 
 #: A gate sample holds for this many of its periods, then the truth's quality is unknown.
@@ -21,7 +24,7 @@ GATE_MARGIN_NS = 2_000_000_000
 
 #: What one loss of each kind says; how many there are, and when, stands beside it.
 LOSS_TEXTS = {
-    "bad-stamp": "message without a usable stamp (zero, negative or not a number) dropped",
+    "bad-stamp": "message without a usable stamp (zero, not a number, or a minute off the others) dropped",
     "nan": "sample that is not a number dropped",
     "out-of-range": "sample outside valid_min and valid_max dropped",
     "duplicate-stamp": "message that repeats the stamp of another dropped, the first to arrive kept",
@@ -34,22 +37,31 @@ LOST_KINDS = frozenset({"nan", "bad-stamp"})
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedChannels:
-    """Channels of one window of log time; every mapped name is there, if need be with no samples."""
+    """Channels of one window of log time; every mapped name is there, if need be with no samples.
+
+    ``counts`` has by role and name the messages ``read``, and those of them that were dropped, by reason.
+    """
 
     signals: dict[str, Channel]
     truth: dict[str, Channel]
     losses: tuple[Loss, ...]
+    counts: dict[tuple[Role, str], Counter[str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanSamples:
-    """Samples in ascending, unique stamps; ``*_at`` are the indices of the samples that were dropped."""
+    """Samples in ascending, unique stamps; ``*_at`` are the indices of the samples that were dropped.
+
+    ``same`` and ``other`` count the samples dropped for a stamp that another one has, by whether its value is the same.
+    """
 
     stamps_ns: IntArray
     arrival_ns: IntArray
     values: FloatArray
     nan_at: IntArray
     out_of_range_at: IntArray
+    same: int = 0
+    other: int = 0
 
 
 def clean_samples(
@@ -83,13 +95,18 @@ def clean_samples(
     out_of_range_at = np.flatnonzero(finite & ~in_range)
     if not keep.all():
         stamps_ns, arrival_ns, values, columns = stamps_ns[keep], arrival_ns[keep], values[keep], columns[keep]
+    same = other = 0
     if stamps_ns.shape[0] > 1 and not np.all(stamps_ns[1:] > stamps_ns[:-1]):
         # The values come last among the keys, so that even equal stamps and arrivals leave nothing to the order.
         order = np.lexsort((*columns.T[::-1], arrival_ns, stamps_ns))
         ordered = stamps_ns[order]
-        order = order[np.concatenate([[True], ordered[1:] > ordered[:-1]])]
+        first = np.concatenate([[True], ordered[1:] > ordered[:-1]])
+        equal = (columns[order][1:] == columns[order][:-1]).all(axis=1)
+        same = int(np.count_nonzero(equal & ~first[1:]))
+        other = int(np.count_nonzero(~first)) - same
+        order = order[first]
         stamps_ns, arrival_ns, values = stamps_ns[order], arrival_ns[order], values[order]
-    return CleanSamples(stamps_ns, arrival_ns, values, nan_at, out_of_range_at)
+    return CleanSamples(stamps_ns, arrival_ns, values, nan_at, out_of_range_at, same, other)
 
 
 def gate_mask(
@@ -139,11 +156,23 @@ def read_signals(
     losses = _topic_losses(log, resolved, clocks, columns)
     if isinstance(log, CanSignalLog):
         losses += log.short_frames
-    signals = {n: _channel(log, s, SIGNAL_UNITS[n], clocks, columns, losses) for n, s in resolved.signals.items()}
-    truth = {n: _channel(log, s, TRUTH_UNITS[n], clocks, columns, losses) for n, s in resolved.truth.items()}
+    counts: dict[tuple[Role, str], Counter[str]] = {}
+
+    def channels(role: Role, sources: Mapped[str, SignalSource], units: Mapped[str, str]) -> dict[str, Channel]:
+        found = {}
+        for name, source in sources.items():
+            count = counts[role, name] = Counter()
+            found[name] = _channel(log, source, units[name], clocks, columns, losses, count)
+        return found
+
+    signals = channels("signal", resolved.signals, SIGNAL_UNITS)
+    truth = channels("truth", resolved.truth, TRUTH_UNITS)
     if gate is not None and truth:
+        before = truth
         truth = _apply_gate(log, gate, truth, clocks, start_ns, end_ns, losses)
-    return MappedChannels(signals=signals, truth=truth, losses=merge_losses([losses]))
+        for name, channel in truth.items():
+            counts["truth", name]["truth-quality"] += len(before[name]) - len(channel)
+    return MappedChannels(signals=signals, truth=truth, losses=merge_losses([losses]), counts=counts)
 
 
 def join_channels(parts: Sequence[Channel]) -> Channel:
@@ -209,7 +238,8 @@ def _topic_losses(
             continue
         seen.add(key)
         topic = columns[source.read_topic]
-        stamps, usable = raw_stamps(log, topic, source)
+        clock = clocks.get(key, ClockModel())
+        stamps, usable = stamps_on_log_clock(log, topic, source, clock)
         times = topic.log_time_ns
         if not usable.all():
             losses.append(dropped("bad-stamp", source.read_topic, times[~usable]))
@@ -222,8 +252,10 @@ def _topic_losses(
             repeated = np.concatenate([[False], stamps[order][1:] == stamps[order][:-1]])
             if repeated.any():
                 losses.append(dropped("duplicate-stamp", source.read_topic, times[order[repeated]]))
-        clock = clocks.get(key)
-        if clock is not None and not clock.delay_known:
+        if clock.unusable:
+            what = f"log time serves instead of {source.stamp}: {clock.unusable}"
+            losses.append(Loss("log-time-serves", what, source.read_topic, severity="note"))
+        if not clock.delay_known:
             losses.append(Loss("delay-unknown", LOSS_TEXTS["delay-unknown"], source.read_topic, severity="note"))
     return losses
 
@@ -235,23 +267,27 @@ def _channel(
     clocks: dict[str, ClockModel],
     columns: dict[str, Columns],
     losses: list[Loss],
+    count: Counter[str],
 ) -> Channel:
+    """Return the clean channel of a source; adds to ``losses``, and to ``count`` what became of its samples."""
     topic = columns.get(source.read_topic)
     if topic is None or len(topic) == 0:
         empty = np.empty(0, np.int64)
         shape = (0,) if source.columns == 1 else (0, source.columns)
         return Channel(source.name, unit, source.label, empty, empty, np.empty(shape))
-    stamps, usable = raw_stamps(log, topic, source)
+    clock = clocks.get(clock_key(source), ClockModel())
+    on_log_clock, usable = stamps_on_log_clock(log, topic, source, clock)
     values = si_values(topic, source)
     log_time = topic.log_time_ns
+    count.update({"read": len(topic), "bad-stamp": int(np.count_nonzero(~usable))})
     if not usable.all():
-        stamps, values, log_time = stamps[usable], values[usable], log_time[usable]
-    clock = clocks.get(clock_key(source), ClockModel())
-    on_log_clock = apply_clock(stamps, clock)
+        on_log_clock, values, log_time = on_log_clock[usable], values[usable], log_time[usable]
     measured = on_log_clock - np.int64(round(source.latency_s * 1e9))
     arrival = np.maximum(log_time if clock.delay_known else on_log_clock, measured)
     clean = clean_samples(measured, arrival, values, valid_min=source.valid_min, valid_max=source.valid_max)
     where = f"{source.name} ({source.label})"
+    count.update({"nan": clean.nan_at.shape[0], "out-of-range": clean.out_of_range_at.shape[0]})
+    count.update({"repeated": clean.same, "duplicate-stamp": clean.other})
     if clean.nan_at.shape[0]:
         losses.append(dropped("nan", where, log_time[clean.nan_at]))
     if clean.out_of_range_at.shape[0]:
@@ -294,8 +330,8 @@ def _apply_gate(
     stamps = np.empty(0, np.int64)
     values = np.empty(0)
     if topic is not None and len(topic):
-        raw, usable = raw_stamps(log, topic, source)
-        at = apply_clock(raw[usable], clock) - np.int64(round(source.latency_s * 1e9))
+        on_log_clock, usable = stamps_on_log_clock(log, topic, source, clock)
+        at = on_log_clock[usable] - np.int64(round(source.latency_s * 1e9))
         raw_values = si_values(topic, source)[usable]
         order = np.lexsort((raw_values, topic.log_time_ns[usable], at))
         stamps, values = at[order], raw_values[order]

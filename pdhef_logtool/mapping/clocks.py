@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
+from pdhef_logtool.logs.occupied_time import STEP_BACK_NS, steps_back
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.checking import resolve_mapping, split_stamp
 from pdhef_logtool.mapping.records import RECORDER_STAMPS, Mapping, SignalSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import FloatArray, IntArray
+
+#: Usable stamps, their log times, and the steps between stamps in s.
+_Stamps: TypeAlias = tuple[IntArray, IntArray, FloatArray]
 
 NANOSECONDS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 
@@ -29,6 +36,14 @@ ENVELOPE_BINS = 64
 ENVELOPE_QUANTILE = 0.02
 MIN_BIN_SAMPLES = 20
 
+#: No transport takes longer, so that a stamp further off from log time than the others is no time at all.
+STRAY_STAMP_NS = 60_000_000_000
+#: From this share on of stamps that are wrong in one way, all of them are given up and log time serves.
+UNUSABLE_SHARE = 0.1
+#: Messages of one stamp were measured apart, by a clock too coarse for them, when they were recorded apart by at
+#: least this share of what messages are apart; else they came in one packet, or are one message recorded twice.
+COARSE_SPACING = 1.0 / 3.0
+
 
 @dataclass(frozen=True, slots=True)
 class ClockModel:
@@ -44,6 +59,7 @@ class ClockModel:
     residual_s : largest deviation of the envelope from the fitted line; a clock that stepped shows here.
     median_period_s : median step between stamps; NaN with fewer than two.
     samples : messages that the survey saw.
+    unusable : why the stamps are no measure of time, so that log time serves instead; empty where they are.
     """
 
     reference_stamp_ns: int = 0
@@ -56,6 +72,7 @@ class ClockModel:
     residual_s: float = 0.0
     median_period_s: float = float("nan")
     samples: int = 0
+    unusable: str = ""
 
 
 def clock_key(source: SignalSource) -> str:
@@ -141,20 +158,112 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     for source in wanted.values():
         paths = requests.setdefault(source.read_topic, [])
         paths += [p for p in stamp_request(log, source) if p not in paths]
+    parts = _survey(log, wanted, requests, _survey_windows(start_ns, end_ns))
+    # Between the parts of a survey a clock may have stepped: then all of its stamps are looked at.
+    doubtful = {key: source for key, source in wanted.items() if _offset_changes(parts[key])}
+    whole: dict[str, list[_Stamps]] = {}
+    if doubtful and end_ns - start_ns > SURVEY_WHOLE_NS:
+        topics = {source.read_topic for source in doubtful.values()}
+        some = {topic: paths for topic, paths in requests.items() if topic in topics}
+        whole = _survey(log, doubtful, some, windows(start_ns, end_ns, SURVEY_WHOLE_NS, log.occupied))
+    clocks = {}
+    for key, source in wanted.items():
+        raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
+        seen, at, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
+        unusable = "" if source.stamp == "log_time" else why_unusable(seen, at)
+        if unusable:
+            period_s = np.concatenate([np.diff(part[1]) for part in parts[key]]) * 1e-9
+            clock = _clock_of(replace(source, clock="utc"), log_time, log_time, period_s)
+            clocks[key] = replace(clock, unusable=unusable)
+        else:
+            clocks[key] = _clock_of(source, raw, log_time, steps)
+    for key, why in _of_other_clocks(clocks).items():
+        source = wanted[key]
+        _, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
+        clocks[key] = replace(_clock_of(replace(source, clock="utc"), log_time, log_time, steps), unusable=why)
+    return clocks
+
+
+def _of_other_clocks(clocks: Mapped[str, ClockModel]) -> dict[str, str]:
+    """Return why the stamps of some topics cannot be set against those of the others, by key; all may be off as one."""
+    delays_s = {key: clock.median_delay_s for key, clock in clocks.items() if clock.samples}
+    if not delays_s or max(delays_s.values()) - min(delays_s.values()) <= MAX_CREDIBLE_DELAY_NS * 1e-9:
+        return {}
+    return {
+        key: f"it is {abs(delay_s):.1f} s {'behind' if delay_s > 0.0 else 'ahead of'} log time, other topics are not"
+        for key, delay_s in delays_s.items()
+        if delay_s * 1e9 < -MAX_CREDIBLE_DELAY_NS or delay_s * 1e9 > STRAY_STAMP_NS
+    }
+
+
+def _survey(
+    log: DriveLog,
+    wanted: Mapped[str, SignalSource],
+    requests: Mapped[str, Sequence[str]],
+    spans: Iterable[tuple[int, int]],
+) -> dict[str, list[_Stamps]]:
+    """Read the stamps of each clock, window by window."""
     none = (np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0))
-    parts: dict[str, list[tuple[IntArray, IntArray, FloatArray]]] = {key: [none] for key in wanted}
-    for window_start, window_end in _survey_windows(start_ns, end_ns):
-        columns = log.read(requests, window_start, window_end)
+    parts: dict[str, list[_Stamps]] = {key: [none] for key in wanted}
+    for start_ns, end_ns in spans:
+        columns = log.read(requests, start_ns, end_ns)
         for key, source in wanted.items():
             if source.read_topic not in columns:
                 continue
             raw, usable = raw_stamps(log, columns[source.read_topic], source)
             steps = np.diff(np.unique(raw[usable])).astype(np.float64) * 1e-9
             parts[key].append((raw[usable], columns[source.read_topic].log_time_ns[usable], steps))
-    return {
-        key: _clock_of(source, *(np.concatenate(column) for column in zip(*parts[key], strict=True)))
-        for key, source in wanted.items()
-    }
+    return parts
+
+
+def _offset_changes(parts: Sequence[_Stamps]) -> bool:
+    """Tell whether the least delay of one part differs from the next one's by more than clocks drift."""
+    least = np.array([float((log_time - raw).min()) for raw, log_time, _ in parts if raw.shape[0]])
+    return bool((np.abs(np.diff(least)) > STEP_BACK_NS).any())
+
+
+def why_unusable(stamps_ns: IntArray, log_time_ns: IntArray) -> str:
+    """Return in words why stamps are no measure of time; empty where they are.
+
+    Parameters
+    ----------
+    stamps_ns, log_time_ns : int64 [N], in order of log time.
+    """
+    n = stamps_ns.shape[0]
+    if n < MIN_BIN_SAMPLES:
+        return ""
+    back = steps_back(stamps_ns)
+    if back.size:
+        by_s = float(stamps_ns[back[0] - 1] - stamps_ns[back[0]]) * 1e-9
+        return f"its stamps step back by {by_s:.1f} s while log time goes on"
+    order = np.argsort(stamps_ns, kind="stable")
+    repeats = np.flatnonzero(np.diff(stamps_ns[order]) == 0)
+    if repeats.size > UNUSABLE_SHARE * n:
+        apart = log_time_ns[order[repeats + 1]] - log_time_ns[order[repeats]]
+        usual = float(np.quantile(np.diff(log_time_ns), 0.95))
+        if usual > 0.0 and float(np.median(apart)) >= COARSE_SPACING * usual:
+            return f"{repeats.size / n:.0%} of its stamps repeat another although the messages were recorded apart"
+    delay_ns = (log_time_ns - stamps_ns).astype(np.float64)
+    median_ns = float(np.median(delay_ns))
+    far = np.abs(delay_ns - median_ns) > STRAY_STAMP_NS
+    if 0.0 <= median_ns <= MAX_CREDIBLE_DELAY_NS:
+        far |= delay_ns < -MAX_CREDIBLE_DELAY_NS  # no message arrives before it is measured
+    share = float(far.mean())
+    return f"{share:.0%} of its stamps are far off from log time, the others are not" if share > UNUSABLE_SHARE else ""
+
+
+def stamps_on_log_clock(
+    log: DriveLog, columns: Columns, source: SignalSource, clock: ClockModel
+) -> tuple[IntArray, NDArray[np.bool_]]:
+    """Return a topic's stamps on the log's clock [N], and where they are usable [N]."""
+    if clock.unusable:
+        return columns.log_time_ns, columns.log_time_ns > 0
+    raw, usable = raw_stamps(log, columns, source)
+    stamps = apply_clock(raw, clock)
+    if source.stamp != "log_time" and clock.samples:
+        delay_ns = (columns.log_time_ns - stamps).astype(np.float64)
+        usable = usable & (np.abs(delay_ns - clock.median_delay_s * 1e9) <= STRAY_STAMP_NS)
+    return stamps, usable
 
 
 def stamp_request(log: DriveLog, source: SignalSource) -> tuple[str, ...]:
@@ -202,7 +311,7 @@ def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) ->
 
 def _survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
     if end_ns - start_ns <= SURVEY_WHOLE_NS:
-        return list(windows(start_ns, end_ns, max(1, end_ns - start_ns)))
+        return [(start_ns, end_ns)] if start_ns < end_ns else []
     starts = np.linspace(start_ns, end_ns - SURVEY_WINDOW_NS, SURVEY_WINDOWS).astype(np.int64)
     return [(int(s), int(s) + SURVEY_WINDOW_NS) for s in starts]
 

@@ -11,7 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, Literal, Self
 
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.processes import NAME, is_alive, own_name
@@ -98,9 +98,9 @@ def _digest(name: str) -> str:
     return hashlib.sha256(os.fsencode(name)).hexdigest()
 
 
-def open_new(path: Path) -> IO[bytes]:
-    """Open a file to write; all content of our outputs goes through files that this opens."""
-    return path.open("wb")
+def open_new(path: Path, mode: Literal["wb", "ab"] = "wb") -> IO[bytes]:
+    """Open a file to write or to go on with; all content of our outputs goes through files that this opens."""
+    return path.open(mode)
 
 
 def write_bytes(target: Path, data: bytes) -> None:

@@ -104,12 +104,33 @@ class StateTrack:
             if c not in OPTIONAL_COLUMNS or len(getattr(self, c)) == len(self)
         }
 
+    def rows(self, start: int, end: int) -> StateTrack:
+        """Return the rows [start, end)."""
+        n = len(self)
+        columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
+        return StateTrack(name=self.name, **{c: v[start:end] if len(v) == n else v for c, v in columns.items()})
+
     def between(self, start_ns: int | None, end_ns: int) -> StateTrack:
         """Return the stamps in [start_ns, end_ns), from the first one when ``start_ns`` is None."""
         first = 0 if start_ns is None else int(np.searchsorted(self.stamps_ns, start_ns))
         part = slice(first, int(np.searchsorted(self.stamps_ns, end_ns)))
         columns = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "name"}
         return StateTrack(name=self.name, **{c: v[part] if len(v) == len(self) else v for c, v in columns.items()})
+
+    def without_sideslip_below(self, speed_m_s: float) -> StateTrack:
+        """Return the track with its sideslip unknown (NaN) where its own speed is lower: it has no direction there."""
+        vy = np.where(np.isfinite(self.vy_m_s), self.vy_m_s, 0.0)
+        slow = np.hypot(self.vx_m_s, vy) < speed_m_s
+        if not slow.any():
+            return self
+        beta, std = (np.where(slow, np.nan, c) for c in (self.sideslip_rad, self.sideslip_std_rad))
+        return replace(self, sideslip_rad=beta, sideslip_std_rad=std)
+
+    @property
+    def something_known(self) -> BoolArray:
+        """Where one of its quantities is known, [N]."""
+        known = np.isfinite(self.vx_m_s) | np.isfinite(self.vy_m_s) | np.isfinite(self.yaw_rate_rad_s)
+        return np.asarray(known | np.isfinite(self.sideslip_rad) | np.isfinite(self.ay_m_s2), dtype=np.bool_)
 
     def with_pose(self, x_m: FloatArray, y_m: FloatArray, yaw_rad: FloatArray) -> StateTrack:
         """Return a copy with another pose."""

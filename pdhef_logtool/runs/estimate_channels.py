@@ -10,10 +10,10 @@ import numpy as np
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.estimators.filter_shell import sideslip_std
 from pdhef_logtool.logs.drive_log import Columns, DriveLog, windows
-from pdhef_logtool.mapping import SignalSource, apply_clock, clock_key, fit_clocks, resolve_mapping
+from pdhef_logtool.mapping import SignalSource, clock_key, fit_clocks, resolve_mapping
 from pdhef_logtool.mapping.can_frames import with_can_signals
 from pdhef_logtool.mapping.channels import LOSS_TEXTS, dropped, request_source, si_values
-from pdhef_logtool.mapping.clocks import raw_stamps
+from pdhef_logtool.mapping.clocks import stamps_on_log_clock
 from pdhef_logtool.mapping.estimates import BASE_ORDER, STDS, CovarianceSource, EstimateSource
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.geometry import wrap_angle
@@ -62,14 +62,14 @@ def read_estimate(
     matrices: list[FloatArray] = []
     losses: list[Loss] = []
     base = next(name for name in BASE_ORDER if name in mapping.signals)
-    for a, b in windows(start_ns, end_ns, round(window_s * 1e9)):
+    for a, b in windows(start_ns, end_ns, round(window_s * 1e9), log.occupied):
         columns = log.read(requests, a, b)
         for name, s in mapping.signals.items():
             topic = columns.get(s.read_topic)
             if topic is None or len(topic) == 0:
                 continue
-            raw, usable = raw_stamps(log, topic, s)
-            stamps = apply_clock(raw, clocks[clock_key(s)]) - np.int64(round(s.latency_s * 1e9))
+            stamps, usable = stamps_on_log_clock(log, topic, s, clocks[clock_key(s)])
+            stamps = stamps - np.int64(round(s.latency_s * 1e9))
             values = _in_range(si_values(topic, s), s)
             parts[name].append((stamps[usable], topic.log_time_ns[usable], values[usable]))
             if name == base:

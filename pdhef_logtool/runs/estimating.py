@@ -10,6 +10,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import Drive, WholeDrive, no_samples
+from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.drive.windows import with_look_ahead
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, run_window
@@ -23,7 +24,8 @@ from pdhef_logtool.watches.intervals import TrackCalibrator
 class Estimated:
     """One window with the tracks of all estimators, in their order.
 
-    ``truth`` is what they are scored against, ``drawn_truth`` the same with a pose; None if the log has none.
+    ``truth`` is what they are scored against, ``drawn_truth`` is what is written: the same with a pose, and valid where
+    all of it is known; None if the log has none.
     """
 
     signals: Signals
@@ -68,11 +70,14 @@ def estimate_windows(
         drawn_truth = truth
         if drawn and truth is not None and not drive.plan.has_truth_pose:
             drawn_truth = truth_pose.add(truth, start)
+        if drawn_truth is not None:
+            drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, drive.plan.vehicle.standstill_m_s)
         tracks = []
         for estimator in estimators:
             track, carries[estimator.name] = run_window(estimator, signals, carries.get(estimator.name), ahead)
             track = track if watch is None else watch.add(track, signals)
             track = track if intervals is None else intervals.add(track, signals)
+            track = track.without_sideslip_below(drive.plan.vehicle.standstill_m_s)
             tracks.append(poses[estimator.name].add(track, start) if drawn else track)
         yield Estimated(signals, truth, drawn_truth, tuple(tracks), window.share_done)
     if start is None:

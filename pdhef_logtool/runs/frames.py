@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.parts import Algorithm
@@ -94,7 +94,12 @@ def score(estimates: Estimates) -> pl.DataFrame:
 
     from pdhef_logtool.runs.scoring import evaluate
 
+    def read(name: str) -> StateTrack | None:
+        """Return a track; the truth counts wherever one of its quantities is known."""
+        track = estimates.tracks.get(name)
+        return replace(track, valid=track.something_known) if track is not None and name == TRUTH else track
+
     names = [name for name in estimates.tracks if name != TRUTH]
-    rows, _, _ = evaluate(estimates.drive, names, estimates.tracks.get, estimates.signals)
+    rows = evaluate(estimates.drive, names, read, estimates.signals).rows
     columns = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
     return pl.DataFrame([[getattr(r, c) for c in columns] for r in rows], schema=columns, orient="row")

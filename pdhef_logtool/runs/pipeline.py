@@ -26,8 +26,9 @@ from pdhef_logtool.records.errors import (
     PdhefError,
     UsageError,
 )
+from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals, join_signals
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.scoring import evaluate, in_time
@@ -61,6 +62,9 @@ LOGS = "logs"
 LOG_FILES = ("annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.json")
 METRICS_FILE = "metrics.parquet"
 
+_SILENT = "{} has no valid row although the car moves"
+_ALL_SILENT = "no estimator has a valid row although the car moves"
+_NEVER_MOVES = "the car is never faster than {:g} m/s: there is nothing to score"
 #: Units of truth quantities that have no channel of their own name.
 _DERIVED_UNITS = {"position_m": "m"}
 
@@ -89,7 +93,7 @@ class RunResult:
     @property
     def exit_code(self) -> int:
         """0 if all is well, 4 if a threshold failed, 3 if input was lost or some logs failed, 1 if all failed."""
-        if all(r.report is None for r in self.results):
+        if all(r.outcome.failed is not None for r in self.results):
             return EXIT_FAILURE
         if any(v.failed for v in self.verdicts):
             return EXIT_GATE
@@ -237,17 +241,22 @@ def run_log(
         with outputs.begin(log_place(drive.name)) as change, _open_sinks(change, drive, config, car) as sinks:
             with TrackStore(change.scratch / "tracks") as store:
                 signals = _estimate(drive, ready, intervals, sinks, store, progress)
-                rows, events, reasons = evaluate(drive, [e.name for e in ready], store.read, signals)
-            rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in rows]
-            if drive.friction.bank is not None:
-                events = sorted([*events, *friction_events(drive.friction, signals.stamps_ns)], key=in_time)
-            losses = merge_losses([drive.losses, *(sink.lost for sink in sinks)])
+                found = evaluate(drive, [e.name for e in ready], store.read, signals)
+                if drive.friction.bank is not None:
+                    observable = friction_events(drive.friction, signals.stamps_ns)
+                    found = replace(found, events=sorted([*found.events, *observable], key=in_time))
+            rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
+            events = found.events
+            if not found.moves:
+                drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
+            silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
+            losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent])
             ran = [
                 EstimatorFacts(
                     e.name,
                     causal=e.causal,
                     notes=(*notes_of(e), *intervals.notes(e.name)),
-                    reasons=reasons[e.name],
+                    reasons=found.reasons[e.name],
                     algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
                 )
                 for e, a in zip(ready, algorithms.values(), strict=True)
@@ -262,6 +271,8 @@ def run_log(
             write_metrics(change.file("metrics.parquet"), rows)
             write_json(change.file("report.json"), report)
         outcome = outcome_of(drive, losses)
+        if len(found.silent) == len(ready):
+            outcome = replace(outcome, failed=_ALL_SILENT)
     progress(drive.name, 1.0)
     return LogResult(outcome, change.target, report, tuple(rows))
 
@@ -329,9 +340,8 @@ def _estimate(
     progress: Progress,
 ) -> Signals:
     """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
-    seen: list[Signals] = []
     for window in estimate_windows(drive, estimators, intervals=intervals):
-        seen.append(window.signals)
+        store.append_signals(window.signals)
         for sink in sinks:
             sink.append_signals(window.signals)
         if window.truth is not None:
@@ -345,7 +355,7 @@ def _estimate(
                 sink.append(track)
         progress(drive.name, 0.8 * window.share_done)
     progress(drive.name, 0.8)
-    return join_signals(seen)
+    return store.signals()
 
 
 def friction_events(friction: FrictionSource, stamps_ns: IntArray) -> list[Event]:
@@ -364,8 +374,9 @@ def report_facts(
     events: Sequence[Event],
     losses: Sequence[Loss],
     samples: dict[str, int] | None = None,
+    ledger: Sequence[SampleCount] | None = None,
 ) -> ReportFacts:
-    """Gather what report.json says of one log; ``samples`` by source, None: those that the drive has read."""
+    """Gather what report.json says of one log; ``samples`` by source, ``ledger``: None is what the drive has read."""
     plan, log = drive.plan, drive.log
     samples = drive.samples if samples is None else samples
     mapping = plan.mapping
@@ -409,6 +420,7 @@ def report_facts(
         metrics=rows,
         segments=events,
         losses=losses,
+        samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
         versions=tool_versions(),
     )

@@ -6,6 +6,7 @@ the log has an IMU; the sensors, which only cut the drive into segments, are int
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -17,14 +18,23 @@ import numpy as np
 from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
-from pdhef_logtool.drive.truth import SAME_SHARE, TruthTrack, dependent_signals, derive_truth, share_equal, truth_at
-from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.drive.truth import (
+    SAME_SHARE,
+    TruthTrack,
+    dependent_signals,
+    derive_truth,
+    share_equal,
+    truth_at,
+    valid_as_a_whole,
+)
+from pdhef_logtool.drive.windows import DrivePlan, sample_ledger
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping import check_mapping, join_channels, load_mapping, merge_losses, read_signals
 from pdhef_logtool.mapping.estimates import EstimateSource, choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.ledger import Role, damage
 from pdhef_logtool.records.outputs import OutputFolder, Transaction
 from pdhef_logtool.records.signals import (
     ALIGNED_SIGNALS,
@@ -173,16 +183,17 @@ class _Scoring:
         progress(drive.name, 0.1)
         recorded, losses = self._read_estimates(drive)
         progress(drive.name, 0.3)
-        truth, truth_losses, samples = read_truth(drive.log, plan, drive.options.window_s)
+        truth, truth_losses, samples, counts = read_truth(drive.log, plan, drive.options.window_s)
+        ledger = sample_ledger(drive.log, plan, counts)
         progress(drive.name, 0.6)
         signals = _read_sensors(drive)
-        all_losses = merge_losses([drive.losses, losses, truth_losses])
+        all_losses = merge_losses([drive.losses, losses, truth_losses, damage(ledger)])
         progress(drive.name, 0.8)
         scored_ns = np.unique(np.concatenate([r.track.stamps_ns for r in recorded]))
         plan = self._with_dependence(plan, recorded)
         rows, dependent = self._figures(drive, plan, recorded, truth, signals)
         drive.plan = plan = replace(plan, dependent={**dependent, **plan.dependent})
-        truth_track = truth_at(truth, scored_ns, plan.truth_latency_s)
+        truth_track = truth_at(truth, scored_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s)
         events = self._events(truth_track, signals_at(signals, scored_ns), recorded)
         samples |= drive.samples
         for r in recorded:
@@ -190,7 +201,7 @@ class _Scoring:
         facts = report_facts(
             drive, self.car,
             [EstimatorFacts(r.track.name, causal=True, notes=[_RECORDED, *r.notes]) for r in recorded],
-            rows, events, all_losses, samples,
+            rows, events, all_losses, samples, (*drive.sample_ledger, *ledger),
         )  # fmt: skip
         read = {s.topic for e in self.estimates for s in e.signals.values()}
         topics = [replace(t, mapped=t.mapped or t.name in read) for t in facts.log.topics]
@@ -203,8 +214,9 @@ class _Scoring:
         report = build_report(facts)
         folder = None
         if outputs is not None:
+            written = valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s)
             with outputs.begin(log_place(drive.name)) as change:
-                _write(change, report, rows, [truth_track, *(r.track for r in recorded)], plan)
+                _write(change, report, rows, [written, *(r.track for r in recorded)], plan)
             folder = change.target
         progress(drive.name, 1.0)
         return LogResult(outcome_of(drive, all_losses), folder, report, tuple(rows))
@@ -245,7 +257,9 @@ class _Scoring:
         rows: list[MetricRow] = []
         dependent: dict[str, str] = {}
         for r in recorded:
-            at_stamps = truth_at(truth, r.track.stamps_ns, plan.truth_latency_s)
+            at_stamps = truth_at(
+                truth, r.track.stamps_ns, plan.truth_latency_s, standstill_m_s=self.car.vehicle.standstill_m_s
+            )
             masks = segment_masks(signals_at(signals, r.track.stamps_ns), at_stamps, self.car.vehicle)
             same = {
                 name: f"the truth's {name} equals that of the estimate {r.track.name}"
@@ -318,8 +332,14 @@ def _write(
     write_json(change.file("report.json"), report)
 
 
-def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int]]:
-    """Read and derive the whole truth on its own clock, window by window, with losses and samples by source.
+def read_truth(
+    log: DriveLog, plan: DrivePlan, window_s: float
+) -> tuple[TruthTrack, tuple[Loss, ...], dict[str, int], dict[tuple[Role, str], Counter[str]]]:
+    """Read and derive the whole truth on its own clock, window by window.
+
+    Returns
+    -------
+    truth, losses, samples by source, and the counts for :func:`~pdhef_logtool.drive.windows.sample_ledger`.
 
     Raises
     ------
@@ -330,12 +350,16 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
     tracks: list[StateTrack] = []
     losses: tuple[Loss, ...] = ()
     samples: dict[str, int] = {}
+    counts: dict[tuple[Role, str], Counter[str]] = {}
     done_ns: int | None = None
-    for a, b in windows(plan.start_ns, plan.end_ns, round(window_s * 1e9)):
+    ends = list(windows(plan.start_ns, plan.end_ns, round(window_s * 1e9), log.occupied))
+    for a, b in ends:
         if plan.truth is None:
             break
         part = read_signals(log, alone, plan.clocks, a, b)
         losses = merge_losses([losses, part.losses])
+        for key, count in part.counts.items():
+            counts.setdefault(key, Counter()).update(count)
         for name, channel in part.truth.items():
             samples[channel.source] = samples.get(channel.source, 0) + len(channel)
             channels[name] = join_channels([channels[name], channel]) if name in channels else channel
@@ -343,7 +367,7 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
         if not stamps:
             continue
         newest = max(int(s[-1]) for s in stamps) + 1
-        until = newest if b >= plan.end_ns else min(newest, b) - plan.truth.margin_ns
+        until = newest if (a, b) == ends[-1] else min(newest, b) - plan.truth.margin_ns
         if done_ns is not None and until <= done_ns:
             continue
         tracks.append(derive_truth(channels, plan=plan.truth).track.between(done_ns, until))
@@ -357,7 +381,7 @@ def read_truth(log: DriveLog, plan: DrivePlan, window_s: float) -> tuple[TruthTr
             remedy="pdhef inspect LOG shows what the log holds and what was dropped",
         )
     gap_s = plan.truth.max_gap_s[plan.truth.base]
-    return TruthTrack(concatenate(tracks), gap_s, plan.derivation), losses, samples
+    return TruthTrack(concatenate(tracks), gap_s, plan.derivation), losses, samples, counts
 
 
 def signals_at(signals: Signals | None, stamps_ns: IntArray) -> Signals:

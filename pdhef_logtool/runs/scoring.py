@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -16,27 +17,43 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.reasons import ReasonFacts
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """The figures of one drive.
+
+    Attributes
+    ----------
+    rows, events : figures, and events in order of time.
+    reasons : by estimator, why it did not use its sensors as usual.
+    silent : estimators without a valid row although the car moves. moves : whether it does.
+    """
+
+    rows: list[MetricRow]
+    events: list[Event]
+    reasons: dict[str, tuple[ReasonFacts, ...] | None]
+    silent: tuple[str, ...]
+    moves: bool
+
+
 def evaluate(
     drive: Drive, names: Sequence[str], read: Callable[[str], StateTrack | None], signals: Signals
-) -> tuple[list[MetricRow], list[Event], dict[str, tuple[ReasonFacts, ...] | None]]:
+) -> Evaluation:
     """Score the tracks of a drive, one whole track in memory at a time besides the truth.
 
     Parameters
     ----------
     names : of the estimators. read : returns the whole track of a name, ``truth`` too; None if there is none.
     signals : what the estimators saw.
-
-    Returns
-    -------
-    The figures, the events in order of time, and by estimator why it did not use its sensors as usual.
     """
     from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
     from pdhef_logtool.evaluation.metrics import score_track, state_rows
     from pdhef_logtool.evaluation.reasons import summarise_reasons
-    from pdhef_logtool.evaluation.segments import segment_masks
+    from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
     stem, truth, vehicle = drive.name, read(TRUTH), drive.car.vehicle
     masks = segment_masks(signals, truth, vehicle)
+    moving = moving_mask(signals, truth, vehicle)
+    silent = []
     slow = vehicle.low_speed_blend_m_s
     rows: list[MetricRow] = []
     reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
@@ -44,6 +61,8 @@ def evaluate(
     for name in names:
         track = read(name)
         assert track is not None
+        if moving.any() and not (moving & track.valid & track.something_known).any():
+            silent.append(name)
         if truth is not None:
             rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
         else:
@@ -56,7 +75,7 @@ def evaluate(
             pair = [t for t in (read(a), read(b)) if t is not None]
             rows += disagreement_rows(pair, masks, log=stem, low_speed_m_s=slow)
     rows += sensor_rows(signals, masks, log=stem, low_speed_m_s=slow)
-    return rows, sorted(events, key=in_time), reasons
+    return Evaluation(rows, sorted(events, key=in_time), reasons, tuple(silent), bool(moving.any()))
 
 
 def in_time(event: Event) -> tuple[int, int, str]:

@@ -15,6 +15,7 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import ReasonFacts
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.sinks.base import Event
 
@@ -107,7 +108,10 @@ class FrictionFacts:
 
 @dataclass(frozen=True, slots=True)
 class ReportFacts:
-    """Everything that report.json says about one log."""
+    """Everything that report.json says about one log.
+
+    ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
+    """
 
     log: LogFacts
     signals: Sequence[SourceFacts]
@@ -120,6 +124,8 @@ class ReportFacts:
     metrics: Sequence[MetricRow] = ()
     segments: Sequence[Event] = ()
     losses: Sequence[Loss] = ()
+    file_bytes: Sequence[Mapping[str, Any]] = ()
+    samples: Sequence[SampleCount] = ()
     warnings: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -192,6 +198,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
         "segments": list(facts.segments),
         "losses": list(facts.losses),
+        "ledger": {"bytes": list(facts.file_bytes), "samples": list(facts.samples)},
         "warnings": list(facts.warnings),
         "versions": dict(facts.versions),
     }

@@ -20,6 +20,7 @@ from pdhef_logtool.drive.truth import (
     estimate_truth_latency,
     plan_truth,
     truth_at,
+    valid_as_a_whole,
     yaw_rate_channel,
 )
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel
@@ -479,3 +480,45 @@ def test_a_copy_with_another_latency_is_still_a_copy():
     truth = {"vx_m_s": channel("vx_m_s", stamps, d.vx)}
     signals = {"speed_m_s": channel("speed_m_s", stamps + 7_000_000, d.vx, SIGNAL_UNITS)}
     assert list(dependent_signals(signals, truth)) == ["vx_m_s"]
+
+
+def test_valid_means_that_everything_claimed_is_known():
+    stamps, d = drive(10.0, rate=50)
+    vy = d.vy.copy()
+    keep = (d.t < 4.0) | (d.t > 5.0)
+    channels = {
+        "vx_m_s": channel("vx_m_s", stamps, d.vx),
+        "vy_m_s": channel("vy_m_s", stamps[keep], vy[keep]),
+        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, d.r),
+    }
+    truth = derive_truth(channels)
+    at_stamps = truth_at(truth, stamps[5:-5])
+    out = valid_as_a_whole(at_stamps, truth.derivation, 0.3)
+    hole = (d.t[5:-5] > 4.1) & (d.t[5:-5] < 4.9)
+    assert np.isfinite(out.yaw_rate_rad_s[hole]).all()  # known where the whole is not, and scored there
+    assert at_stamps.valid[hole].all()
+    assert not out.valid[hole].any()
+    for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad"):
+        assert np.isfinite(getattr(out, column)[out.valid]).all(), column
+    assert out.valid.sum() > 350
+    truth = derive_truth({"yaw_rate_rad_s": channels["yaw_rate_rad_s"]})
+    assert valid_as_a_whole(truth_at(truth, stamps[5:-5]), truth.derivation, 0.3).valid.all()
+
+
+def test_there_is_no_sideslip_at_standstill():
+    stamps, d = drive(10.0, rate=50)
+    noise = np.random.default_rng(0).normal(0.0, 0.01, (2, len(stamps)))
+    standing = d.t > 5.0
+    channels = {
+        "vx_m_s": channel("vx_m_s", stamps, np.where(standing, noise[0], d.vx)),
+        "vy_m_s": channel("vy_m_s", stamps, np.where(standing, noise[1], d.vy)),
+        "yaw_rate_rad_s": channel("yaw_rate_rad_s", stamps, d.r),
+    }
+    truth, at = derive_truth(channels), stamps[20:-20]
+    out, before = truth_at(truth, at, standstill_m_s=0.3), truth_at(truth, at)
+    still = standing[20:-20]
+    assert np.ptp(before.sideslip_rad[still]) > 6.0
+    assert np.isnan(out.sideslip_rad[still]).all()
+    assert valid_as_a_whole(out, truth.derivation, 0.3).valid[still].mean() > 0.9
+    assert np.isfinite(out.vx_m_s).all()
+    np.testing.assert_array_equal(out.sideslip_rad[~still], before.sideslip_rad[~still])

@@ -253,7 +253,9 @@ def test_windows_joined_are_the_whole(seed: int, length: int, device: bool) -> N
     mapping = replace(base, truth={"vx_m_s": vx}, quality=QualityGate("/gate", "mode", values=(4.0,)))
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
     whole = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
-    parts = [read_signals(log, mapping, clocks, s, e) for s, e in windows(log.start_ns, log.end_ns, length)]
+    parts = [
+        read_signals(log, mapping, clocks, s, e) for s, e in windows(log.start_ns, log.end_ns, length, log.occupied)
+    ]
     for name, channel in whole.signals.items():
         assert_same(join_channels([p.signals[name] for p in parts]), channel)
     assert 0 < len(whole.truth["vx_m_s"]) < len(whole.signals["ay_m_s2"])

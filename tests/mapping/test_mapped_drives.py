@@ -50,7 +50,10 @@ def test_race_car_in_windows(shared_dir: Path) -> None:
     assert np.rad2deg([np.arctan2(vy, vx).min(), np.arctan2(vy, vx).max()]) == pytest.approx([-5.3, 3.5], abs=0.05)
     log = open_log(path)
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    parts = [read_signals(log, mapping, clocks, s, e) for s, e in windows(log.start_ns, log.end_ns, 77_777_777_777)]
+    parts = [
+        read_signals(log, mapping, clocks, s, e)
+        for s, e in windows(log.start_ns, log.end_ns, 77_777_777_777, log.occupied)
+    ]
     for name, channel in whole.signals.items():
         joined = join_channels([p.signals[name] for p in parts])
         np.testing.assert_array_equal(joined.stamps_ns, channel.stamps_ns)

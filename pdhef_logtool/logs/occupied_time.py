@@ -1,0 +1,339 @@
+"""When a log was recorded: found before anything is read in windows, from spans, and from stamps where a span is torn.
+
+Log times are a recorder's claim. One message at time 0 makes a log 56 years long; a clock that is set after boot tears
+a recording in two; a clock that is set back records the same times twice. So three questions come first:
+
+* *Strays*: a few messages that lie far from all others are left out.
+* *Epochs*: stretches too far apart for a pause. The one with most messages is kept, the others are left out.
+* *Steps back*: where a topic's time falls back in file order, the order in the file is the truth of order. What was
+  recorded after the step is left out for as long as its times were recorded before, and ``BREAK_NS`` around, so that
+  two passes are never interleaved and the break shows as a gap.
+
+On a sound log nothing is left out, and its first and last log time are what they were.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from typing import Literal
+
+import numpy as np
+
+from pdhef_logtool.logs.container import Container, Span
+from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
+
+#: A longer silence ends a stretch. Shorter ones cost no window of their own.
+SILENCE_NS = 600_000_000_000
+#: A stretch of no more messages than this is stray: no drive, and nothing that an estimate could be made of.
+STRAY_MESSAGES = 3
+#: Nobody drives on in the same log after a longer pause; clocks that are set jump by months and years.
+EPOCH_NS = 86_400_000_000_000
+#: Recorders with several threads write up to a second out of order; a clock that is set back falls further...
+STEP_BACK_NS = 1_000_000_000
+#: ... for at least this many messages, behind the middle one of as many before, where wrong times stand alone.
+STEP_BACK_MESSAGES = 5
+#: Left out beside times that were recorded twice: nothing says how much time really passed at the step.
+BREAK_NS = 1_000_000_000
+#: Below this share of a log's messages what is left out is a note, above it is a loss.
+NOTED_SHARE = 0.01
+
+OUTLIER, OTHER_EPOCH, TIME_JUMP = "outlier", "other-epoch", "time-jump"
+_WHAT = {
+    OUTLIER: "messages far from all others are left out, recorded at {when}",
+    OTHER_EPOCH: "messages of another time are left out, recorded at {when}: the recorder's clock was set",
+    TIME_JUMP: "messages are left out: the recorder's clock stepped back, and their times were recorded before",
+}
+
+#: Channels and log times of a span's messages, [N] each, a channel's in file order; None if the span is damaged.
+SpanTimes = Callable[[int, Span], tuple[IntArray, IntArray] | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """Messages of a topic in [low_ns, high_ns] that were recorded at or after a place: file, span, row of its own."""
+
+    topic: str
+    place: tuple[int, int, int]
+    low_ns: int
+    high_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class OccupiedTime:
+    """The log times that count.
+
+    Attributes
+    ----------
+    intervals : [start, end) in ns, ascending, apart by more than ``SILENCE_NS``; none for a log without messages.
+    cuts : what is left out within them. left_out : messages left out, by topic and reason. losses : the same in words.
+    """
+
+    intervals: tuple[tuple[int, int], ...]
+    cuts: tuple[Cut, ...] = ()
+    left_out: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    losses: tuple[Loss, ...] = ()
+
+    @property
+    def start_ns(self) -> int:
+        """First log time; 0 without messages."""
+        return self.intervals[0][0] if self.intervals else 0
+
+    @property
+    def end_ns(self) -> int:
+        """Last log time + 1; 0 without messages."""
+        return self.intervals[-1][1] if self.intervals else 0
+
+    def unused(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray | None:
+        """Tell which of a topic's messages in a span (all of them, in file order) are left out; None: none of them."""
+        if not self.left_out:
+            return None
+        unused = ~_inside(log_time_ns, self.intervals)
+        for cut in self.cuts:
+            if cut.topic == topic and (c, span.index) >= cut.place[:2]:
+                first = cut.place[2] if (c, span.index) == cut.place[:2] else 0
+                later = log_time_ns[first:]
+                unused[first:] |= (later >= cut.low_ns) & (later <= cut.high_ns)
+        return unused if unused.any() else None
+
+
+def find_epochs(
+    start_ns: IntArray, end_ns: IntArray, count: IntArray
+) -> tuple[list[tuple[int, int]], BoolArray, BoolArray]:
+    """Find the stretches that belong together from pieces of recording [start, end) with their messages, [K] each.
+
+    Returns
+    -------
+    intervals : [start, end) that are kept, ascending. kept, stray : bool [K], by piece; what is neither is of another
+        epoch.
+    """
+    n = start_ns.shape[0]
+    if n == 0:
+        return [], np.zeros(0, np.bool_), np.zeros(0, np.bool_)
+    order = np.argsort(start_ns, kind="stable")
+    stretch = _groups(start_ns[order], end_ns[order], SILENCE_NS)
+    size = np.bincount(stretch, weights=count[order])
+    first = np.flatnonzero(np.diff(stretch, prepend=-1))
+    begin, end = start_ns[order][first], np.maximum.reduceat(end_ns[order], first)
+    solid = np.flatnonzero(size > STRAY_MESSAGES)
+    if solid.size == 0:  # a handful of messages: the largest stretch is the log
+        solid = np.array([int(np.argmax(size))])
+    epoch = _groups(begin[solid], end[solid], EPOCH_NS)
+    weight = np.bincount(epoch, weights=size[solid])
+    best = int(np.flatnonzero(weight == weight.max())[-1])  # of equals the last: its clock was set
+    chosen = solid[epoch == best]
+    kept, stray = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    kept[order] = np.isin(stretch, chosen)
+    stray[order] = ~np.isin(stretch, solid)
+    return [(int(begin[s]), int(end[s])) for s in chosen], kept, stray
+
+
+def steps_back(times_ns: IntArray) -> IntArray:
+    """Return the places i ≥ 1 [K] at which times [N] fall back by more than ``STEP_BACK_NS`` and stay behind."""
+    falls: IntArray = np.flatnonzero(np.diff(times_ns) < -STEP_BACK_NS) + 1
+    n = STEP_BACK_MESSAGES
+    falls = falls[(falls >= n) & (falls + n <= times_ns.shape[0])]
+    around = np.arange(n)
+    before = np.sort(times_ns[falls[:, None] - 1 - around], axis=1)[:, n // 2]
+    following = times_ns[falls[:, None] + around]
+    behind: BoolArray = (following < before[:, None] - STEP_BACK_NS).all(axis=1)
+    return np.asarray(falls[behind], dtype=np.int64)
+
+
+def recorded_twice(times_ns: IntArray) -> list[tuple[int, int, int]]:
+    """Return (place, low, high): times [N] in [low, high] at or after a place repeat those of an earlier pass.
+
+    A pass ends where the times fall back by more than ``STEP_BACK_NS``.
+    """
+    begins = np.concatenate([[0], np.flatnonzero(np.diff(times_ns) < -STEP_BACK_NS) + 1])
+    low, high = np.minimum.reduceat(times_ns, begins), np.maximum.reduceat(times_ns, begins)
+    found: list[tuple[int, int, int]] = []
+    earlier: list[tuple[int, int]] = []
+    for place, a, b in zip(begins.tolist(), low.tolist(), high.tolist(), strict=True):
+        twice = [(x, y) for x, y in earlier if min(y, b) - max(x, a) > 0]
+        found += [(place, x - BREAK_NS, y + BREAK_NS) for x, y in twice]
+        apart = [(x, y) for x, y in earlier if (x, y) not in twice]
+        earlier = [*apart, (min([a, *(x for x, _ in twice)]), max([b, *(y for _, y in twice)]))]
+    return found
+
+
+def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> OccupiedTime:
+    """Find the times of a log; only the stamps of spans that are torn or out of order are looked at.
+
+    Parameters
+    ----------
+    times : reads the times of a span. where : what losses call the log.
+    """
+    look = _look(containers, times)
+    pieces = [piece for of in look for piece in of.pieces()]
+    start, end, count = (np.array([p[i] for p in pieces], dtype=np.int64) for i in (0, 1, 2))
+    intervals, kept, stray = find_epochs(start, end, count)
+    left_out: dict[str, Counter[str]] = {}
+    losses = []
+    total = int(count.sum())
+    for reason, which in ((OUTLIER, stray), (OTHER_EPOCH, ~kept & ~stray)):
+        for i in np.flatnonzero(which).tolist():
+            for topic, n in pieces[i][3].items():
+                left_out.setdefault(topic, Counter())[reason] += n
+        if count[which].any():
+            rows = np.flatnonzero(which)
+            losses.append(_loss(reason, where, start[rows], end[rows], int(count[rows].sum()), total))
+    cuts = _cuts(look, intervals)
+    span_of: dict[tuple[int, int], Span] = {(c, s.index): s for c, of in enumerate(containers) for s in of.spans}
+    twice: list[IntArray] = []
+    within = OccupiedTime(tuple(intervals), tuple(cuts), {"": {}})
+    for (c, index), span in span_of.items() if cuts else ():
+        if not any((c, index) >= cut.place[:2] and _touches(span, cut) for cut in cuts):
+            continue
+        found = times(c, span)
+        for id_, own in _by_channel(found) if found is not None else ():
+            topic = containers[c].channels[id_].topic
+            unused = within.unused(topic, c, span, own)
+            again = own[_inside(own, intervals) & unused] if unused is not None else own[:0]
+            if again.size:
+                left_out.setdefault(topic, Counter())[TIME_JUMP] += again.size
+                twice.append(again)
+    if twice:
+        all_of_it = np.concatenate(twice)
+        losses.append(_loss(TIME_JUMP, where, all_of_it, all_of_it + 1, all_of_it.size, total))
+    return OccupiedTime(tuple(intervals), tuple(cuts), left_out, tuple(losses))
+
+
+# ---- the look at the spans ----
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Looked:
+    """A span, and its channels and times where these had to be looked at and say more than the span does."""
+
+    c: int
+    span: Span
+    topics: Mapping[int, str]
+    found: tuple[IntArray, IntArray] | None = None
+
+    def pieces(self) -> Iterator[tuple[int, int, int, Mapping[str, int]]]:
+        """Yield start, end, messages, and messages by topic; one piece a stretch."""
+        if self.found is None:
+            counts: Counter[str] = Counter()
+            for id_, messages in self.span.counts.items():
+                counts[self.topics[id_]] += messages
+            yield self.span.start_ns, self.span.end_ns, sum(counts.values()), counts
+            return
+        channel, times = self.found
+        order = np.argsort(times, kind="stable")
+        stretch = _groups(times[order], times[order], SILENCE_NS)
+        for rows in np.split(order, np.flatnonzero(np.diff(stretch)) + 1):
+            ids, n = np.unique(channel[rows], return_counts=True)
+            by_topic: Counter[str] = Counter()
+            for id_, m in zip(ids.tolist(), n.tolist(), strict=True):
+                by_topic[self.topics[id_]] += m
+            yield int(times[rows[0]]), int(times[rows[-1]]) + 1, rows.shape[0], by_topic
+
+    def of_channel(self, id_: int) -> IntArray:
+        """Return the times of a channel in file order; of a span in order its bounds stand for them."""
+        if self.found is None:
+            return np.array([self.span.start_ns, self.span.end_ns - 1])
+        channel, times = self.found
+        return np.asarray(times[channel == id_], dtype=np.int64)
+
+
+def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
+    """Return all spans in file order, with their times where the span does not tell when its messages are."""
+    looked: list[_Looked] = []
+    newest: dict[str, int] = {}
+    for c, container in enumerate(containers):
+        topics = {id_: channel.topic for id_, channel in container.channels.items()}
+        for span in container.spans:
+            lasts = span.end_ns - span.start_ns
+            behind = any(span.start_ns < newest.get(topics[id_], 0) - STEP_BACK_NS for id_ in span.counts)
+            of = _Looked(c, span, topics)
+            if lasts <= 0 or lasts > SILENCE_NS or behind or (lasts > STEP_BACK_NS and not span.ordered):
+                found = times(c, span)
+                if found is None:
+                    continue  # damaged: nothing of it can be read
+                known = np.isin(found[0], list(topics))
+                found = found[0][known], found[1][known]
+                disorder = any((np.diff(own) < -STEP_BACK_NS).any() for _, own in _by_channel(found))
+                if found[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
+                    of = _Looked(c, span, topics, found)
+            for id_ in span.counts:
+                own = of.of_channel(id_)
+                newest[topics[id_]] = max(newest.get(topics[id_], 0), int(own.max()) if own.size else 0)
+            looked.append(of)
+    return looked
+
+
+def _cuts(looked: Sequence[_Looked], intervals: Sequence[tuple[int, int]]) -> list[Cut]:
+    """Return what was recorded twice, of all topics, if the time of one of them clearly stepped back."""
+    if all(of.found is None for of in looked):
+        return []
+    sequences: dict[str, tuple[IntArray, list[tuple[int, int, int, int]]]] = {}
+    parts: dict[str, list[tuple[IntArray, int, int]]] = {}
+    for of in looked:
+        for id_ in of.span.counts:
+            own = of.of_channel(id_)
+            inside = _inside(own, intervals)
+            if inside.any():  # what is left out anyway stands for its neighbour, so that rows keep their places
+                last = np.maximum.accumulate(np.where(inside, np.arange(own.shape[0]), -1))
+                own = own[np.where(last >= 0, last, int(np.argmax(inside)))]
+                parts.setdefault(of.topics[id_], []).append((own, of.c, of.span.index))
+    for topic, those in parts.items():
+        at = np.cumsum([0, *(own.shape[0] for own, _, _ in those)]).tolist()
+        places = [(a, b, c, index) for a, b, (_, c, index) in zip(at[:-1], at[1:], those, strict=True)]
+        sequences[topic] = np.concatenate([own for own, _, _ in those]), places
+    if not any(steps_back(own).size for own, _ in sequences.values()):
+        return []
+    cuts = []
+    for topic, (own, places) in sequences.items():
+        for place, low, high in recorded_twice(own):
+            c, index, row = next((c, index, place - a) for a, b, c, index in places if a <= place < b)
+            cuts.append(Cut(topic, (c, index, row), low, high))
+    return cuts
+
+
+# ---- small things ----
+
+
+def _groups(start_ns: IntArray, end_ns: IntArray, silence_ns: int) -> IntArray:
+    """Number the groups of intervals [K], ascending by start, that a longer silence keeps apart."""
+    if start_ns.shape[0] == 0:
+        return np.empty(0, np.int64)
+    reach = np.maximum.accumulate(end_ns)[:-1]
+    # As floats: the difference of two times need not fit into int64.
+    apart = start_ns[1:].astype(np.float64) - reach.astype(np.float64) > silence_ns
+    return np.concatenate([[0], np.cumsum(apart)]).astype(np.int64)
+
+
+def _inside(times_ns: IntArray, intervals: Sequence[tuple[int, int]]) -> BoolArray:
+    inside = np.zeros(times_ns.shape[0], np.bool_)
+    for start, end in intervals:
+        inside |= (times_ns >= start) & (times_ns < end)
+    return inside
+
+
+def _by_channel(found: tuple[IntArray, IntArray]) -> Iterable[tuple[int, IntArray]]:
+    channel, times = found
+    return ((int(id_), times[channel == id_]) for id_ in np.unique(channel))
+
+
+def _touches(span: Span, cut: Cut) -> bool:
+    return span.end_ns < span.start_ns or (span.start_ns <= cut.high_ns and span.end_ns > cut.low_ns)
+
+
+def _loss(reason: str, where: str, start_ns: IntArray, end_ns: IntArray, count: int, total: int) -> Loss:
+    first, last = int(start_ns.min()), int(end_ns.max())
+    when = shown_time(first) if last - first < SILENCE_NS else f"{shown_time(first)} to {shown_time(last)}"
+    inside = (first, last) if reason == TIME_JUMP else (None, None)  # the others are not of the log's time
+    what = f"{count} {_WHAT[reason].format(when=when)}"
+    severity: Literal["lost", "note"] = "lost" if count > NOTED_SHARE * total else "note"
+    return Loss(reason, what, where, inside[0], inside[1], count, severity)
+
+
+def shown_time(ns: int) -> str:
+    """Return a time of the log's clock in UTC to the second, whatever it is."""
+    try:
+        return (datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=ns // 10**9)).strftime("%Y-%m-%d %H:%M:%S UTC")
+    except (OverflowError, ValueError):
+        return f"{ns} ns"

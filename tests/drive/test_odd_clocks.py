@@ -1,0 +1,148 @@
+"""Logs of odd clocks end, say what they left out, and what is left is what the sound log gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from odd_clocks import S, Shift, rewrite
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Drive, WholeDrive, read_drive
+from pdhef_logtool.inspection import inspect_log
+from pdhef_logtool.records.ledger import DAMAGE, DAMAGED_SHARE, SampleCount, damage
+
+YEARS = 10 * 365 * 86_400 * S
+START = 1_767_225_600 * S
+
+
+@pytest.fixture(scope="module")
+def car() -> Car:
+    return Car.load(Path(__file__).resolve().parents[2] / "sample_logs/vehicle.toml", network=Path("none"))
+
+
+def read(path: Path, car: Car, **options: object) -> tuple[Drive, WholeDrive]:
+    with read_drive(path, car, options=ReadOptions(friction=1.0, **options)) as drive:  # type: ignore[arg-type]
+        whole = drive.whole()
+        for s in drive.sample_ledger:
+            assert s.used + sum(s.dropped.values()) == s.total, s
+            assert "not-read" not in s.dropped
+        return drive, whole
+
+
+def kinds(drive: Drive) -> dict[str, str]:
+    return {x.kind: x.severity for x in drive.losses if x.kind != "gap"}
+
+
+def dropped(drive: Drive) -> dict[str, int]:
+    return dict(next(s.dropped for s in drive.sample_ledger if s.name == "yaw_rate_rad_s" and s.role == "signal"))
+
+
+def same_at_common_stamps(whole: WholeDrive, sound: WholeDrive, least: int) -> None:
+    _, i, j = np.intersect1d(whole.signals.stamps_ns, sound.signals.stamps_ns, return_indices=True)
+    assert len(i) >= least
+    np.testing.assert_array_equal(whole.signals.yaw_rate_rad_s[i], sound.signals.yaw_rate_rad_s[j])
+    assert whole.truth is not None
+    assert sound.truth is not None
+    known = whole.truth.valid[i] & sound.truth.valid[j]
+    assert known.sum() >= least - 250
+    np.testing.assert_allclose(whole.truth.vy_m_s[i][known], sound.truth.vy_m_s[j][known], atol=1e-6)
+
+
+def test_a_sound_log_uses_every_sample(sample_logs_dir: Path, car: Car) -> None:
+    drive, _ = read(sample_logs_dir / "dlc.mcap", car)
+    assert drive.losses == ()
+    assert all(s.used == s.total and not s.dropped for s in drive.sample_ledger)
+    drive, _ = read(sample_logs_dir / "dlc.mcap", car, start="2", end="5")
+    assert drive.losses == ()
+    assert {reason for s in drive.sample_ledger for reason in s.dropped} == {"outside-slice"}
+
+
+@pytest.mark.parametrize("at_ns", [0, 2**64 - 1])
+def test_one_message_at_the_end_of_time(at_ns: int, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+    def shift(number: int, at_s: float, topic: str) -> int:
+        return (2 * at_ns - 2**64) if (topic, number) == ("/truth/perfect/state", 250) else 0
+
+    log = tmp_path / "stray.mcap"
+    rewrite(sample_logs_dir / "dlc.mcap", log, shift, lambda *_: 0)
+    drive, whole = read(log, car)
+    sound = read(sample_logs_dir / "dlc.mcap", car)[1]
+    assert kinds(drive) == {"outlier": "note"}
+    same_at_common_stamps(whole, sound, len(sound.signals))
+    assert inspect_log(log).duration_s == pytest.approx(9.51, abs=0.1)
+
+
+@pytest.mark.parametrize(("until_s", "kept"), [(2.0, 0.75), (7.5, 0.75)])
+def test_a_clock_that_is_set(until_s: float, kept: float, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+    log = tmp_path / "boot.mcap"
+    rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: -YEARS if at_s < until_s else 0)
+    drive, whole = read(log, car)
+    assert kinds(drive) == {"other-epoch": "lost", "dropped-samples": "lost"}
+    assert set(dropped(drive)) == {"other-epoch"}
+    assert len(whole.signals) / 951 == pytest.approx(kept, abs=0.06)
+    assert drive.plan.start_ns == drive.log.start_ns  # a slice counts from the epoch that is kept
+    assert (whole.signals.stamps_ns[0] < START) == (until_s > 5.0)
+
+
+@pytest.mark.parametrize("chunk", [30_000, 1 << 26])
+def test_a_clock_that_steps_back(chunk: int, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+    """Log time and header stamps fall back by 3 s: the times that come twice are left out, and a gap shows the step."""
+    log = tmp_path / "back.mcap"
+    rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: -3 * S if at_s > 4.0 else 0, chunk=chunk)
+    drive, whole = read(log, car)
+    assert kinds(drive) == {"time-jump": "lost", "dropped-samples": "lost"}
+    assert dropped(drive)["time-jump"] == pytest.approx(400, abs=5)
+    stamps = whole.signals.stamps_ns
+    assert np.diff(stamps).max() == pytest.approx(S, abs=0.1 * S)
+    sound = read(sample_logs_dir / "dlc.mcap", car)[1].signals
+    after = stamps > START + round(4.5 * S)
+    for part, by in ((~after, 0), (after, 3 * S)):
+        _, i, j = np.intersect1d(stamps[part] + by, sound.stamps_ns, return_indices=True)
+        assert len(i) == part.sum() > 100
+        np.testing.assert_array_equal(whole.signals.yaw_rate_rad_s[part][i], sound.yaw_rate_rad_s[j])
+
+
+def shifts() -> dict[str, Shift]:
+    return {
+        "an hour back, half-way": lambda _n, at_s, _t: -3600 * S if at_s > 4.0 else 0,
+        "an hour back, one topic": lambda _n, _s, topic: -3600 * S if topic == "/imu/data" else 0,
+        "three seconds back, one topic": lambda _n, at_s, t: -3 * S if at_s > 4.0 and t == "/imu/data" else 0,
+        "in fives": lambda number, _s, _t: -(number % 5) * S // 100,
+    }
+
+
+@pytest.mark.parametrize("name", shifts())
+def test_header_stamps_that_are_no_time(name: str, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+    log = tmp_path / "headers.mcap"
+    rewrite(sample_logs_dir / "dlc.mcap", log, lambda *_: 0, shifts()[name])
+    drive, whole = read(log, car)
+    assert kinds(drive) == {"log-time-serves": "note"}
+    assert all(s.used == s.total for s in drive.sample_ledger)
+    assert {s.stamp for s in drive.sample_ledger if s.source.startswith("/imu/data")} == {"log_time"}
+    assert len(whole.signals) == 951
+    assert whole.truth is not None
+    assert whole.truth.valid.sum() > 850
+
+
+def test_a_pause_of_twenty_minutes_is_no_epoch(sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
+    log = tmp_path / "pause.mcap"
+    rewrite(sample_logs_dir / "dlc.mcap", log, lambda _n, at_s, _t: 1200 * S if at_s > 4.0 else 0)
+    drive, whole = read(log, car, window_s=7.0)
+    assert kinds(drive) == {}
+    assert all(s.used == s.total for s in drive.sample_ledger)
+    assert len(whole.signals) == 951
+
+
+def test_the_share_that_is_damage() -> None:
+    def count(**reasons: int) -> SampleCount:
+        named = {reason.replace("_", "-"): n for reason, n in reasons.items()}
+        return SampleCount("signal", "ay_m_s2", "/imu.a", "header.stamp", 10_000, 10_000 - sum(named.values()), named)
+
+    least = round(DAMAGED_SHARE * 10_000)
+    assert damage([count(nan=least), count(out_of_range=5000), count(truth_quality=9000), count(repeated=5000)]) == []
+    (loss,) = damage([count(nan=1, duplicate_stamp=least), count(nan=1, duplicate_stamp=least)])
+    assert (loss.severity, loss.count) == ("lost", 2 * (least + 1))
+    assert "101 of 10000 samples are not used (100 duplicate-stamp, 1 nan)" in loss.what
+    assert {"nan", "bad-stamp", "duplicate-stamp", "time-jump", "outlier", "other-epoch"} <= DAMAGE

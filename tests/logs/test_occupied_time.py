@@ -1,0 +1,123 @@
+"""Strays, epochs and steps back of the recorder's clock: found before windows, and nothing else moves."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.logs.drive_log import windows
+from pdhef_logtool.logs.occupied_time import (
+    EPOCH_NS,
+    SILENCE_NS,
+    OccupiedTime,
+    find_epochs,
+    recorded_twice,
+    shown_time,
+    steps_back,
+)
+from pdhef_logtool.records.signals import IntArray
+
+S = 1_000_000_000
+T0 = 1_767_225_600 * S
+LATEST = 2**63 - 2
+
+
+def epochs(times_ns: IntArray) -> tuple[list[tuple[int, int]], np.ndarray, np.ndarray]:
+    return find_epochs(times_ns, times_ns + 1, np.ones(len(times_ns), dtype=np.int64))
+
+
+@pytest.mark.parametrize("stray", [0, 1, LATEST, T0 - 900 * S, T0 + 5000 * S])
+def test_one_message_far_from_all_others_is_stray(stray: int) -> None:
+    times = np.append(T0 + np.arange(1000) * S // 100, stray)
+    intervals, kept, strays = epochs(times)
+    assert intervals == [(T0, T0 + 999 * S // 100 + 1)]
+    assert np.flatnonzero(strays).tolist() == [1000]
+    assert kept.sum() == 1000
+
+
+def test_the_epoch_with_most_messages_is_kept_and_a_pause_is_no_epoch() -> None:
+    boot = np.arange(400) * S // 10
+    drive = T0 + np.concatenate([np.arange(300), 12_000 + np.arange(300)]) * S // 10  # with a pause of 20 minutes
+    intervals, kept, strays = epochs(np.concatenate([boot, drive]))
+    assert [start for start, _ in intervals] == [T0, T0 + 1200 * S]
+    assert kept.tolist() == [False] * 400 + [True] * 600
+    assert not strays.any()
+    assert epochs(np.concatenate([boot, drive[:300]]))[0] == [(0, int(boot[-1]) + 1)]
+
+
+def test_a_handful_of_messages_is_a_log() -> None:
+    assert epochs(np.array([T0]))[0] == [(T0, T0 + 1)]
+    assert epochs(np.empty(0, dtype=np.int64))[0] == []
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    pieces=st.lists(
+        st.tuples(st.integers(0, LATEST), st.integers(1, 10_000 * S), st.integers(1, 50)), min_size=1, max_size=12
+    )
+)
+def test_every_piece_is_kept_stray_or_of_another_epoch(pieces: list[tuple[int, int, int]]) -> None:
+    start = np.array([p[0] for p in pieces], dtype=np.int64)
+    end = np.array([min(p[0] + p[1], LATEST + 1) for p in pieces], dtype=np.int64)
+    intervals, kept, stray = find_epochs(start, end, np.array([p[2] for p in pieces], dtype=np.int64))
+    assert kept.any()
+    assert not (kept & stray).any()
+    for i in np.flatnonzero(kept):
+        assert any(a <= start[i] and end[i] <= b for a, b in intervals)
+    for i in np.flatnonzero(~kept):
+        assert all(end[i] <= a or start[i] >= b for a, b in intervals)
+    for (_, b), (a, _) in pairwise(intervals):
+        assert SILENCE_NS - 1000 < a - b < EPOCH_NS + 1000
+
+
+def test_only_a_step_that_lasts_is_one() -> None:
+    times = T0 + np.arange(1000) * S // 100
+    back = times.copy()
+    back[500:] -= 3 * S
+    assert steps_back(back).tolist() == [500]
+    late, early = times.copy(), times.copy()
+    late[500] -= 3 * S
+    early[500] = LATEST
+    burst = np.concatenate([times[:400], times[440:480], times[400:440], times[480:]])  # 0.4 s swapped with 0.4 s
+    for harmless in (times, late, early, burst):
+        assert steps_back(harmless).size == 0
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(
+    steps=st.lists(st.tuples(st.integers(1, 199), st.integers(-8 * S, 8 * S)), max_size=4), seed=st.integers(0, 1000)
+)
+def test_what_is_left_never_interleaves_two_passes(steps: list[tuple[int, int]], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    times = T0 + np.cumsum(rng.integers(S // 20, S // 5, 200))
+    for at, by in steps:
+        times[at:] += by
+    left = np.ones(200, dtype=np.bool_)
+    for place, low, high in recorded_twice(times):
+        left[place:] &= ~((times[place:] >= low) & (times[place:] <= high))
+    passes = np.concatenate([[0], np.cumsum(np.diff(times) < -S)])
+    for p in range(passes[-1]):
+        of_this, later = times[passes == p], times[left & (passes > p)]
+        assert not ((later > of_this.min()) & (later < of_this.max())).any()
+    if not (np.diff(times) < -S).any():
+        assert left.all()
+
+
+def test_windows_keep_their_borders_and_leave_silences_out() -> None:
+    occupied = OccupiedTime(((100, 130), (1000, 1011), (1015, 1030)))
+    whole = list(windows(100, 1030, 20))
+    some = list(windows(100, 1030, 20, occupied))
+    assert some == [w for w in whole if any(w[0] < b and a < w[1] for a, b in occupied.intervals)]
+    assert list(windows(100, 1030, 20, OccupiedTime(((100, 1030),)))) == whole
+    assert list(windows(200, 900, 20, occupied)) == []
+    assert list(windows(110, 120, 20, occupied)) == [(110, 120)]
+
+
+def test_any_time_can_be_shown() -> None:
+    assert shown_time(0) == "1970-01-01 00:00:00 UTC"
+    assert shown_time(-1) == "1969-12-31 23:59:59 UTC"
+    assert shown_time(LATEST).startswith("2262-04-11")

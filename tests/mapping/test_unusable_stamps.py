@@ -1,0 +1,107 @@
+"""Header stamps that are no measure of time: log time serves, the log says so, and nothing is dropped in silence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+
+from pdhef_logtool.mapping import Mapping, SignalSource, fit_clocks, read_signals
+from pdhef_logtool.mapping.clocks import why_unusable
+from pdhef_logtool.records.signals import IntArray
+
+MS, S = 1_000_000, 1_000_000_000
+T0 = 1_700_000_000 * S
+N = 1000
+TRUE = T0 + np.arange(N, dtype=np.int64) * 10 * MS
+LOG = TRUE + 3 * MS + np.random.default_rng(0).integers(0, MS, N)
+
+
+def stepped(by_ns: int) -> IntArray:
+    return TRUE + np.where(np.arange(N) < N // 2, 0, by_ns)
+
+
+UNUSABLE = {
+    "back by 3 s": (stepped(-3 * S), "step back"),
+    "back by an hour": (stepped(-3600 * S), "step back"),
+    "ahead by an hour": (stepped(3600 * S), "far off"),
+    "in fives": (TRUE // (50 * MS) * (50 * MS), "repeat"),
+}
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_log_time_serves(name: str) -> None:
+    stamps, why = UNUSABLE[name]
+    assert why in why_unusable(stamps, LOG)
+    log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": stamps, "v": np.arange(float(N))})})
+    source = SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp", latency_s=0.001)
+    mapping = Mapping(signals={"ay_m_s2": source})
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    found = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    np.testing.assert_array_equal(found.signals["ay_m_s2"].stamps_ns, LOG - MS)
+    np.testing.assert_array_equal(found.signals["ay_m_s2"].arrival_ns, LOG)
+    assert [(x.kind, x.severity) for x in found.losses] == [("log-time-serves", "note")]
+    assert why in found.losses[0].what
+    assert +found.counts["signal", "ay_m_s2"] == {"read": N}
+
+
+def test_sound_stamps_stay() -> None:
+    late = LOG.copy()
+    late[300:500] += np.linspace(5 * S, 0, 200).astype(np.int64)  # held up for five seconds, then sent in order
+    twice = np.repeat(TRUE, 2)
+    copied = np.sort(np.concatenate([LOG, LOG + MS]))  # every message again a millisecond later
+    in_one_packet = np.repeat(TRUE[::5], 5)
+    together = np.repeat(LOG[4::5], 5) + np.tile(np.arange(5) * 10_000, N // 5)
+    wild = TRUE.copy()
+    wild[[5, 100, 101, 700]] = [1, T0 + 10**18, T0 - 10**17, T0 + 500 * S]
+    swapped = np.concatenate([TRUE[:400], TRUE[440:480], TRUE[400:440], TRUE[480:]])
+    for stamps, log_time in (
+        (TRUE, LOG),
+        (TRUE, np.maximum.accumulate(late)),
+        (twice, copied),
+        (in_one_packet, together),
+        (wild, LOG),
+        (swapped, LOG),
+        (TRUE - 3600 * S, LOG),
+    ):
+        assert why_unusable(stamps, log_time) == ""
+
+
+def test_single_wild_stamps_are_bad_stamps() -> None:
+    stamps = TRUE.copy()
+    stamps[[100, 101]] = [T0 + 10**18, T0 - 500 * S]
+    log = FakeLog({"/imu": FakeTopic("a/b", LOG, {"header.stamp": stamps, "v": np.arange(float(N))})})
+    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    found = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    assert +found.counts["signal", "ay_m_s2"] == {"read": N, "bad-stamp": 2}
+    assert [(x.kind, x.count, x.severity) for x in found.losses] == [("bad-stamp", 2, "lost")]
+
+
+@pytest.mark.parametrize(("behind_ns", "serves"), [(3600 * S, True), (-3 * S, True), (20 * MS, False)])
+def test_one_topic_of_another_clock(behind_ns: int, serves: bool) -> None:
+    """Stamps that are off as one stay, but one topic's cannot be set against those of the others."""
+    topics = {
+        "/imu": FakeTopic("a/b", LOG, {"header.stamp": TRUE - behind_ns, "v": np.arange(float(N))}),
+        "/steer": FakeTopic("a/b", LOG, {"header.stamp": TRUE, "v": np.arange(float(N))}),
+    }
+    both = {
+        "ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp"),
+        "steer_rad": SignalSource("steer_rad", "/steer", "v", stamp="header.stamp"),
+    }
+    log = FakeLog(topics)
+    clocks = fit_clocks(log, Mapping(signals=both), log.start_ns, log.end_ns)
+    assert bool(clocks["/imu.header.stamp"].unusable) == serves
+    assert not clocks["/steer.header.stamp"].unusable
+    alone = fit_clocks(log, Mapping(signals={"ay_m_s2": both["ay_m_s2"]}), log.start_ns, log.end_ns)
+    assert not alone["/imu.header.stamp"].unusable
+
+
+def test_a_step_between_the_parts_of_a_survey_is_found() -> None:
+    n = 3600 * 10
+    true = T0 + np.arange(n, dtype=np.int64) * 100 * MS
+    stamps = true - np.where(np.arange(n) < 17_437, 0, 3 * S)
+    log = FakeLog({"/imu": FakeTopic("a/b", true + 5 * MS, {"header.stamp": stamps, "v": np.zeros(n)})})
+    mapping = Mapping(signals={"ay_m_s2": SignalSource("ay_m_s2", "/imu", "v", stamp="header.stamp")})
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    assert "step back by 2.9 s" in clocks["/imu.header.stamp"].unusable
