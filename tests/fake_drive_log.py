@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.drive_log import ByteLedger, Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.records.signals import IntArray, Loss
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.logs.budget import BudgetError
+from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, told
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
@@ -19,7 +20,7 @@ from pdhef_logtool.logs.decoding import (
     empty_column,
     missing_column,
 )
-from pdhef_logtool.logs.drive_log import ByteLedger, Columns, FieldInfo, TopicInfo
+from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
 from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, Selection, leaves, resolve
 from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
 from pdhef_logtool.records.errors import MappingError

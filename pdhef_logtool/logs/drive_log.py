@@ -9,6 +9,7 @@ from typing import Protocol
 
 from numpy.typing import NDArray
 
+from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -34,30 +35,6 @@ class FieldInfo:
 
     path: str
     kind: str
-
-
-@dataclass(frozen=True, slots=True)
-class ByteLedger:
-    """Where the bytes of one file of a log went; the three sums are its size.
-
-    Attributes
-    ----------
-    file : its path. size : bytes when it was opened; of a file that is compressed as a whole, those inside of it.
-    decoded : bytes that were read: framing, and chunks (or runs of messages or rows) of which any message was read.
-    unwanted : sound as far as is known, and never asked for: attachments, metadata, index, other topics' chunks.
-    lost : damaged, cut, above the budget. Where the place of damage is not known, the record that tells of it.
-    cut : the file ends before its time. What should follow is in no sum.
-
-    In a database the rows' data count, one row behind the other; all else of the file is unwanted while rows can be
-    read to the end, and lost where they cannot.
-    """
-
-    file: str
-    size: int
-    decoded: int
-    unwanted: int
-    lost: int
-    cut: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
