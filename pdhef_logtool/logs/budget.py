@@ -15,6 +15,7 @@ from pdhef_logtool.records.errors import LogError
 
 _OPTION = "--budget"
 _MIB = 1 << 20
+_FEW_MESSAGES = 1 << 16
 
 
 class BudgetError(LogError):
@@ -30,6 +31,7 @@ class Budget:
     chunk_bytes : decompressed bytes of what is read as a whole: a chunk, or a run of messages without chunks.
     chunk_ratio : decompressed by stored bytes of a chunk, or file, of more than a MiB.
     chunk_messages : messages of what is read as a whole.
+    messages_per_byte : messages by stored bytes of a chunk of more than 65,536 messages.
     channels : of one file. metadata_bytes : of one declaration, metadata record or header.
     schema_bytes : text or descriptors of one schema. schema_leaves : scalar places of an unfolded schema.
     schema_depth : structs inside one another, also of a JSON message.
@@ -40,6 +42,7 @@ class Budget:
     chunk_bytes: int = 256 << 20
     chunk_ratio: int = 2000
     chunk_messages: int = 1_000_000
+    messages_per_byte: float = 4.0
     channels: int = 8192
     metadata_bytes: int = 64 << 20
     schema_bytes: int = 4 << 20
@@ -70,6 +73,12 @@ class Budget:
         self.check("chunk_bytes", size, what)
         if size > _MIB:
             self.check("chunk_ratio", size / max(stored, 1), what)
+
+    def check_messages(self, count: int, stored: int) -> None:
+        """Raise :class:`BudgetError` if ``stored`` bytes may not hold so many messages."""
+        self.check("chunk_messages", count, "a chunk")
+        if count > _FEW_MESSAGES:
+            self.check("messages_per_byte", count / max(stored, 1), "a chunk")
 
 
 DEFAULT_BUDGET = Budget()

@@ -240,14 +240,13 @@ class McapContainer(FileContainer):
         record = self.source.read(extent.at, extent.index_end - extent.at)
         content = self.chunk_content(record, extent.end - extent.at)
         block = _indexed_messages(content, record, extent.end - extent.at)
-        if block is None:
-            return self._scan(content)
-        budget.check("chunk_messages", len(block), "a chunk")
+        block = self._scan(content) if block is None else block
+        budget.check_messages(len(block), extent.end - extent.at)
         return block
 
     def chunk_content(self, record: bytes, end: int) -> bytes:
         """Decompress the chunk record that is the first ``end`` bytes, and check its CRC."""
-        size, crc, compression, at, stored = _chunk_head(record[:end])
+        size, crc, compression, at, stored = _chunk_head(record, end)
         content = decompress(compression, memoryview(record)[at : at + stored], size, self.meter.budget)
         if crc and zlib.crc32(content) != crc:
             raise SpanDamageError("its CRC does not match")
@@ -310,7 +309,7 @@ class McapContainer(FileContainer):
         if others is None or not all(self._is_known(op, content[at:end], kept) for op, at, end in others):
             return None
         record = self.source.read(extent.at, extent.end - extent.at)
-        size, crc, compression, at, length = _chunk_head(record)
+        size, crc, compression, at, length = _chunk_head(record, len(record))
         return RawChunk(
             compression=compression,
             stored=record[at : at + length],
@@ -422,6 +421,7 @@ class McapContainer(FileContainer):
         try:
             record = self.source.read(extent.at, extent.end - extent.at)
             block = self._scan(self.chunk_content(record, len(record)), declare=True)
+            self.meter.budget.check_messages(len(block), len(record))
         except Exception as error:  # noqa: BLE001 (the boundary)
             kind, text = told(error)
             count = sum(claimed.counts.values()) or None
@@ -705,8 +705,8 @@ class _Walk:
         of.drop_undeclared("channels {}")
 
 
-def _chunk_head(record: bytes) -> tuple[int, int, str, int, int]:
-    """Return size, CRC, compression, and place and length of the stored bytes of a chunk record."""
+def _chunk_head(record: bytes, end: int) -> tuple[int, int, str, int, int]:
+    """Return size, CRC, compression, and place and length of the stored bytes of the chunk record up to ``end``."""
     try:
         _, _, size, crc = _CHUNK.unpack_from(record, 9)
         (n,) = _U32.unpack_from(record, 37)
@@ -714,7 +714,7 @@ def _chunk_head(record: bytes) -> tuple[int, int, str, int, int]:
         (stored,) = _U64.unpack_from(record, 41 + n)
     except (struct.error, UnicodeDecodeError) as error:
         raise SpanDamageError(f"malformed chunk header: {error}") from error
-    if 49 + n + stored > len(record):
+    if 49 + n + stored > end:
         raise SpanDamageError("the chunk's records run past its end")
     return size, crc, compression, 49 + n, stored
 

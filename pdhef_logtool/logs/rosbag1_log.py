@@ -291,6 +291,7 @@ class Rosbag1Container(FileContainer):
                     self._add_connection(fields, content[begin:at])
             except (KeyError, struct.error, ValueError) as error:
                 raise SpanDamageError(f"a record is malformed: {error}") from error
+        self.meter.budget.check_messages(len(stamps), len(stored))
         return block_from_lists(content, channels, stamps, stamps, [0] * len(stamps), offsets, lengths)
 
 

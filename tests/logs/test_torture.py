@@ -374,3 +374,13 @@ def test_every_case_that_did_harm_once_ends_as_it_must(shared_dir: Path, name: s
     assert any(_ENDS[name] in loss.what for loss in inspection.lost)
     read, _, claimed = _outcome(path)
     assert read == claimed
+
+
+def test_more_messages_than_their_bytes_can_hold_are_refused(tmp_path: Path) -> None:
+    record = struct.pack("<BQHIQQ", 5, 22, 1, 0, T0, T0)
+    for count, kinds in ((60_000, {"unknown-channel"}), (70_000, {"over-budget"})):
+        content = record * count
+        stored = zstandard.ZstdCompressor().compress(content)
+        path = _mcap_of_chunk(tmp_path / "a.mcap", len(content), b"zstd", stored)
+        assert {loss.kind for loss in _outcome(path, Budget(chunk_ratio=100_000))[1]} == kinds
+    assert _outcome(path, Budget(chunk_ratio=100_000).times(100))[1][0].kind == "unknown-channel"
