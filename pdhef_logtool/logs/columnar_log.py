@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET
 from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
@@ -25,6 +27,8 @@ from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
 #: Neighbouring windows share the span at their border; this many decoded spans are kept for the next window.
 _KEPT_SPANS = 2
+#: No sound schema takes longer; what such ones take, and those that are refused, is bounded for the log.
+_SLOW_SCHEMA_S = 0.25
 
 
 class ColumnarLog:
@@ -51,6 +55,7 @@ class ColumnarLog:
         # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
         self._undecodable: dict[tuple[int, int, int], IntArray] = {}
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
+        self._slow_schemas_s = 0.0
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
 
@@ -165,10 +170,16 @@ class ColumnarLog:
     def _schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
         key = (c, channel.id)
         if key not in self._schemas:
+            started = time.monotonic()
             try:
+                if self._slow_schemas_s > DEFAULT_BUDGET.seconds:
+                    raise SchemaError(f"the schemas before it took {self._slow_schemas_s:.0f} s")
                 self._schemas[key] = channel_schema(channel, self.distro, self._example(c, channel))
             except SchemaError as error:
                 self._schemas[key] = error
+            took = time.monotonic() - started
+            if took > _SLOW_SCHEMA_S or isinstance(self._schemas[key], SchemaError):
+                self._slow_schemas_s += took
         return self._schemas[key]
 
     def _example(self, c: int, channel: ChannelRecord) -> bytes | None:
