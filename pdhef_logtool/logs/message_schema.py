@@ -169,7 +169,7 @@ _SEPARATOR = re.compile(r"^={3,}[ \t]*$", re.MULTILINE)
 
 
 #: Bytes of descriptors that cost what one byte of a text costs, which a grammar parses step by step.
-_BYTES_OF_MSG, _BYTES_OF_IDL = 16, 32
+_BYTES_OF_TEXT = 32
 #: An element of a fixed array of structs or texts is a line in each of the functions that rosbags writes for its type.
 _PLACES_AN_ELEMENT = 8
 
@@ -199,7 +199,7 @@ def ros_schema(
 
     what = f"the definition of {type_name}"
     with parsing(what):
-        budget.check("schema_bytes", len(text) * (_BYTES_OF_IDL if encoding == "ros2idl" else _BYTES_OF_MSG), what)
+        budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
         if text.strip():
             text = _SEPARATOR.sub("=" * 80, text)

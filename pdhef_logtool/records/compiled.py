@@ -23,6 +23,8 @@ import numba
 from numba.core import caching, config
 from numba.misc.appdirs import AppDirs
 
+from pdhef_logtool.records.shown import shown
+
 #: What the first run with all estimators compiles on one core, in seconds; told to the user as a rough figure.
 COMPILING_S = 45
 
@@ -155,15 +157,15 @@ _announced: list[str | None] = []
 
 
 def _announce(folder: str | None) -> None:
-    """Say on stderr, once, that compiling begins; the workers of a run leave that to it."""
-    from multiprocessing import parent_process
+    """Say on stderr, once, that compiling begins; of the workers of a command the first one does."""
+    from multiprocessing import current_process, parent_process
 
-    if _announced or parent_process() is not None:
+    if _announced or (parent_process() is not None and not current_process().name.endswith("-1")):
         return
     _announced.append(folder)
     if folder is None:
-        told = f"compiling the filters, about {COMPILING_S} s in every run: no folder can be written to keep them in"
+        told = f"compiling, about {COMPILING_S} s in every run: there is no folder to keep the code in"
     else:
-        told = f"compiling the filters, once, about {COMPILING_S} s; they are kept in {folder}"
+        told = f"compiling, once, about {COMPILING_S} s; the code is kept in {shown(folder)}"
     sys.stderr.write(f"{told}\n")
     sys.stderr.flush()

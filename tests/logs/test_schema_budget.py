@@ -198,6 +198,24 @@ def test_a_schema_that_does_not_parse_is_a_loss_of_its_channel_and_no_other(tmp_
     log.close()
 
 
+@pytest.mark.slow
+def test_many_schemas_that_cost_too_much_are_no_more_than_a_few(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="test")
+        for number in range(600):
+            schema = writer.register_schema(str(number), "jsonschema", _nested(13, 10).encode() + b" " * number)
+            writer.add_message(writer.register_channel(f"/{number}", "json", schema), 5, b"{}", 5)
+        writer.finish()
+    log = open_log(path)
+    started = time.process_time()
+    assert not any(log.fields(f"/{number}") for number in range(600))
+    assert time.process_time() - started < 15.0
+    assert len(log.lost) == 600
+    log.close()
+
+
 @pytest.mark.parametrize(
     "name", ["../../x", "p/msg/../../../x", "/etc/x", "p/msg/T\n", "p/T", "", "p/msg/", "sensor_msgs/msg/Imu/../Imu"]
 )
@@ -250,3 +268,14 @@ def test_a_mutated_schema_is_read_or_refused(encoding: str, cuts: list[tuple[int
             _columns(schema, leaf.path, message, b"\0\1\0\0" + message)
         except MappingError:
             continue
+
+
+@pytest.mark.parametrize(("name", "topic"), [("ros_listed_bomb.mcap", "/b"), ("json_ref_bomb.mcap", "/j")])
+def test_the_bombs_that_did_harm_are_losses_that_name_their_channel(shared_dir: Path, name: str, topic: str) -> None:
+    path = shared_dir / "torture" / name
+    if not path.is_file():
+        pytest.skip("needs ../shared/torture")
+    log = open_log(path)
+    assert log.fields(topic) == ()
+    assert [(loss.kind, loss.where) for loss in log.lost] == [("bad-schema", topic)]
+    log.close()

@@ -115,3 +115,15 @@ def test_a_dbc_that_is_none_is_a_wrong_mapping(tmp_path: Path) -> None:
         with pytest.raises(PdhefError) as caught:
             _load_dbc(tmp_path / name)
         assert caught.value.exit_code == EXIT_USAGE
+
+
+def test_the_configurations_that_did_harm_are_wrong_ones(shared_dir: Path, tmp_path: Path) -> None:
+    cases = {"mapping.toml": "cfg_mapping.toml_RecursionError_1", "model.json": "cfg_model.json_AttributeError_0"}
+    for name, case in cases.items():
+        file = shared_dir / "torture" / case
+        if not file.is_file():
+            pytest.skip("needs ../shared/torture")
+        (tmp_path / name).write_bytes(file.read_bytes())
+        with pytest.raises(PdhefError) as caught:
+            _LOADERS[name](tmp_path / name)
+        assert caught.value.exit_code == EXIT_USAGE
