@@ -12,7 +12,8 @@ valid and finite; ``n`` is their number. Sideslip counts only where the truth's 
 ``coverage95``            share of stamps with abs e ≤ 1.96 σ; σ² is the estimate's variance plus the truth's if known
 ``availability``          share of the stamps with scorable truth at which the estimate is valid and finite; n = all
 ``lag_s``                 shift, within ± 0.3 s, at which the estimate correlates best with the truth; positive =
-                          estimate late. Segment ``all`` only; NaN when the correlation stays below 0.5 or has no peak
+                          estimate late. Segment ``all`` only, its first hour; NaN when the correlation stays below 0.5
+                          or has no peak
 ``nees``                  mean eᵀ (P + P_truth)⁻¹ e over [v_x, v_y, r]; 3 when P is right. Signal ``state``
 ``nis``, ``nis_dof``      mean normalised innovation squared and the mean of its degrees of freedom, which it should
                           equal. Signal ``state``
@@ -50,6 +51,7 @@ SCORED_SIGNALS: dict[str, str] = {
 ALL = "all"
 MAX_LAG_S = 0.3
 MIN_LAG_CORRELATION = 0.5
+LAG_SPAN_NS = 3_600_000_000_000
 NORMAL_95 = 1.959963984540054
 ANCHOR_S = 1.0
 #: Rows of which covariances are in memory at once.
@@ -276,8 +278,10 @@ def _score_signal(
             covered = np.abs(error[banded]) <= NORMAL_95 * sigma[banded]
             add(segment, "coverage95", float(np.mean(covered)), "1", int(covered.size))
         if segment == ALL:
-            values = np.where(use, getattr(estimate, signal), np.nan)
-            add(segment, "lag_s", lag_s(estimate.stamps_ns, values, reference), "s", n)
+            stamps = truth.stamps_ns
+            hour = slice(0, int(np.searchsorted(stamps, stamps[0] + LAG_SPAN_NS)))
+            values = np.where(use[hour], getattr(estimate, signal)[hour], np.nan)
+            add(segment, "lag_s", lag_s(stamps[hour], values, reference[hour]), "s", n)
     return rows
 
 

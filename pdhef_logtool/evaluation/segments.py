@@ -70,33 +70,48 @@ def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehiclePa
     ----------
     signals : what the sensors say at the scored stamps. truth : at the same stamps, or None.
     """
+    # One quantity after the other: of hours of driving a column takes tens of megabytes.
     stamps = signals.stamps_ns
-    n = len(signals)
-    ay = _preferred(truth.ay_m_s2 if truth else None, signals.ay_m_s2)
-    rate = _preferred(truth.yaw_rate_rad_s if truth else None, signals.yaw_rate_rad_s)
-    speed = _speed(signals, truth)
-    friction = np.where(np.isfinite(signals.friction), signals.friction, vehicle.assumed_friction)
-
-    grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ)) / (friction * GRAVITY_M_S2)
-    ay, rate = smooth(stamps, ay, MANOEUVRE_SMOOTHING_HZ), smooth(stamps, rate, MANOEUVRE_SMOOTHING_HZ)
-    ax = smooth(stamps, signals.ax_m_s2, MANOEUVRE_SMOOTHING_HZ)
     slow = vehicle.low_speed_blend_m_s
+    lateral = truth.ay_m_s2 if truth else None
+    linear, nonlinear = _grip_masks(signals, stamps, _preferred(lateral, signals.ay_m_s2), vehicle)
+    ay = smooth(stamps, _preferred(lateral, signals.ay_m_s2), MANOEUVRE_SMOOTHING_HZ)
+    del lateral
     slalom = _slalom(stamps, ay)
-    standing = (speed < vehicle.standstill_m_s) & (np.abs(rate) < STANDSTILL_YAW_RATE_RAD_S)
-    standing = _lasting(stamps, standing, STANDSTILL_S)
+    left = _lasting(stamps, (ay > CORNERING_M_S2) & ~slalom, CORNERING_S)
+    right = _lasting(stamps, (ay < -CORNERING_M_S2) & ~slalom, CORNERING_S)
+    speed = _speed(signals, truth)
+    straight = _lasting(stamps, (speed > slow) & (np.abs(ay) < STRAIGHT_M_S2), STRAIGHT_S)
+    standing = speed < vehicle.standstill_m_s
+    del ay, speed
+    rate = _preferred(truth.yaw_rate_rad_s if truth else None, signals.yaw_rate_rad_s)
+    rate = smooth(stamps, rate, MANOEUVRE_SMOOTHING_HZ)
+    standing = _lasting(stamps, standing & (np.abs(rate) < STANDSTILL_YAW_RATE_RAD_S), STANDSTILL_S)
     moving = ~standing
+    del rate
+    ax = smooth(stamps, signals.ax_m_s2, MANOEUVRE_SMOOTHING_HZ)
     return {
-        "all": np.ones(n, dtype=np.bool_),
-        "linear": grip < LINEAR_SHARE,
-        "nonlinear": grip > NONLINEAR_SHARE,
+        "all": np.ones(len(signals), dtype=np.bool_),
+        "linear": linear,
+        "nonlinear": nonlinear,
         "standstill": standing,
-        "straight": _lasting(stamps, (speed > slow) & (np.abs(ay) < STRAIGHT_M_S2), STRAIGHT_S),
-        "cornering-left": _lasting(stamps, (ay > CORNERING_M_S2) & ~slalom, CORNERING_S),
-        "cornering-right": _lasting(stamps, (ay < -CORNERING_M_S2) & ~slalom, CORNERING_S),
+        "straight": straight,
+        "cornering-left": left,
+        "cornering-right": right,
         "slalom": slalom,
         "braking": _lasting(stamps, (ax < BRAKING_M_S2) & moving, PEDAL_S),
         "accelerating": _lasting(stamps, (ax > ACCELERATING_M_S2) & moving, PEDAL_S),
     }
+
+
+def _grip_masks(
+    signals: Signals, stamps: IntArray, ay: FloatArray, vehicle: VehicleParameters
+) -> tuple[BoolArray, BoolArray]:
+    """Return where the grip is used little and much, [N]."""
+    grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ))
+    friction = signals.friction
+    grip /= np.where(np.isfinite(friction), friction, vehicle.assumed_friction) * GRAVITY_M_S2
+    return grip < LINEAR_SHARE, grip > NONLINEAR_SHARE
 
 
 def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehicleParameters) -> BoolArray:
