@@ -153,6 +153,7 @@ def test_two_truths_are_said_and_the_one_with_a_pose_is_taken() -> None:
         ("/odometry/filtered", "neither"),
         ("/localization/kinematic_state", "neither"),
         ("/something", "neither"),
+        ("/ground/odometry", "neither"),
     ],
 )
 def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
@@ -235,6 +236,14 @@ def test_a_fix_beside_a_velocity_gives_the_position() -> None:
 def test_a_zero_twist_beside_a_moving_pose_is_a_filler() -> None:
     auto = found({"/gps/odom": odometry(forward=0 * S, left=0 * S)})
     assert set(auto.mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
+
+
+def test_an_orientation_that_is_none_and_a_pose_that_stays_at_the_origin_are_fillers() -> None:
+    out = odometry()
+    out.fields["pose.pose.orientation.w"] = np.zeros(N)
+    assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m"}
+    out.fields |= {f"pose.pose.position.{a}": np.zeros(N) for a in "xy"}
+    assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
 
 
 def test_an_empty_log_maps_to_nothing() -> None:
