@@ -153,7 +153,7 @@ def test_two_truths_are_said_and_the_one_with_a_pose_is_taken() -> None:
         ("/odometry/filtered", "neither"),
         ("/localization/kinematic_state", "neither"),
         ("/something", "neither"),
-        ("/ground/odometry", "neither"),
+        ("/ground/odometry", "speed"),
     ],
 )
 def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
