@@ -382,6 +382,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
         (tmp_path / f"{name}.mcap").write_bytes(b"")
 
     def one(job: Any, _progress: Any) -> Any:
+        assert not (job.output / "manifest.json").exists()  # while drives are written, the old one is not true
         rows, split = residual_rows(60), "train" if job.log_input.stem == "a" else "test"
         writer = DriveWriter(drive_file(job.output, job.log_input.stem), split)
         writer.append(rows)
@@ -403,6 +404,12 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
     chosen = replace(settings, split="train", config=RunConfig(car=Path("saloon")))
     extract_command.extract([str(tmp_path)], tmp_path / "out", chosen, warn=warned.append)
     assert warned == []
+    with pytest.raises(UsageError, match="--jobs"):
+        extract_command.extract([str(tmp_path)], tmp_path / "new", settings, jobs=0)
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new/manifest.json").write_text("no json")
+    with pytest.raises(UsageError, match="another manifest"):
+        extract_command.extract([str(tmp_path)], tmp_path / "new", settings)
 
 
 # ---- training ----

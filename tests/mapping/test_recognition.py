@@ -197,6 +197,10 @@ def test_what_a_message_disowns_is_not_mapped() -> None:
     auto = found({"/imu": imu(angular_velocity_covariance=minus)})
     assert set(auto.mapping.signals) == {"ax_m_s2", "ay_m_s2"}
     assert "yaw_rate_rad_s" in auto.missing
+    assert auto.mapping.notes == ("/imu says that it gives no angular rate (covariance -1)",)
+    auto = found({"/imu": imu(linear_acceleration_covariance=minus)})
+    assert set(auto.mapping.signals) == {"yaw_rate_rad_s"}
+    assert auto.mapping.notes == ("/imu says that it gives no acceleration (covariance -1)",)
     hidden_pose = odometry(pose=True)
     hidden_pose.fields["pose.covariance"] = np.full((N, 36), -1.0)
     auto = found({"/ins/odometry": hidden_pose})
