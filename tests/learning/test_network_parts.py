@@ -332,9 +332,13 @@ class DyingPool:
     """A pool in which drive ``b`` kills its process, and ``c`` with it the first time."""
 
     sizes: list[int]
+    ended: dict[str, bool]
 
     def __init__(self, count: int, **_: Any) -> None:
         self.sizes.append(count)
+
+    def shutdown(self, **how: bool) -> None:
+        type(self).ended = how
 
     def submit(self, _function: Any, job: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -361,6 +365,11 @@ def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.Monkey
         ("a", "fine"), ("b", "the process that read it died (out of memory?)"), ("c", "fine"),
     ]  # fmt: skip
     assert DyingPool.sizes == [2, 1, 1]
+    begun = extract_command._run_jobs(work, 2, lambda *_: None)
+    next(begun)
+    with pytest.raises(KeyboardInterrupt):
+        begun.throw(KeyboardInterrupt())  # type: ignore[attr-defined]
+    assert DyingPool.ended == {"wait": False, "cancel_futures": True}
 
 
 def test_an_error_of_one_log_is_a_reason_and_of_the_only_log_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
