@@ -292,13 +292,13 @@ def test_counts_are_sums_over_the_usable_rows() -> None:
                 stamps_ns=START_NS + (first + np.arange(4)) * 10_000_000,
                 targets=np.tile([value, 0.01], (4, 1)),
                 step_s=np.full(4, 0.01),
-                weight=np.array([1.0, 1.0, 0.0, 0.0]),
-                segment=np.array([first, first, 7, 8]),
+                weight=np.array([1.0, 1.0, 1.0, 0.0]),
+                segment=np.array([first, first, first, 8]),
             )
         )
     found = counts.to_dict()
     rms = found.pop("residual_rms")
-    assert found == {"duration_s": pytest.approx(0.07), "rows": 8, "usable_rows": 4, "segments": 2}
+    assert found == {"duration_s": pytest.approx(0.07), "rows": 8, "usable_rows": 6, "segments": 2}
     assert rms == {"vy_dot_m_s2": pytest.approx(math.sqrt(12.5)), "yaw_acceleration_rad_s2": pytest.approx(1.0)}
 
 
