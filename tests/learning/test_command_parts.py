@@ -40,7 +40,6 @@ from pdhef_logtool.learning.noise import tune_command, tune_drives
 from pdhef_logtool.learning.noise.search import DriveError, Score, Trial
 from pdhef_logtool.learning.noise.tune_command import REFUSED, Tuned, TuneSettings
 from pdhef_logtool.learning.noise.tune_drives import Benches, DriveBench, TuneSetup, choose_names
-from pdhef_logtool.learning.variation import vary
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
@@ -202,45 +201,7 @@ def test_settings_are_told_by_name_and_estimators_where_they_matter() -> None:
     assert named["estimators"] == ["zero"]
 
 
-# ---- variation ----
-
-
-def test_a_varied_car_differs_from_its_file_by_the_factors_it_was_drawn_with() -> None:
-    told = next(t for t in (vary(VEHICLE, 0.1, str(k)) for k in range(99)) if t.vehicle is not VEHICLE)
-    old, new = VEHICLE, told.vehicle
-    shift = new.cg_to_front_axle_m - old.cg_to_front_axle_m
-    assert 0.0 < abs(shift) <= 2.5 * 0.2 * 0.1 * old.wheelbase_m
-    assert new.cg_to_rear_axle_m == pytest.approx(old.cg_to_rear_axle_m - shift)
-    limits = {"mass": 0.7, "inertia": 1.4, "roll": 1.5, "front D": 0.5, "front BCD": 1.5, "rear BCD": 1.5}
-    logs_of = {
-        "mass": new.mass_kg / old.mass_kg,
-        "inertia": new.yaw_inertia_kg_m2 / old.yaw_inertia_kg_m2,
-        "roll": new.roll_gradient_rad_per_m_s2 / old.roll_gradient_rad_per_m_s2,
-        "front D": new.magic_formula(True, 1.0)[2] / old.magic_formula(True, 1.0)[2],
-        "front BCD": new.cornering_stiffness_n_per_rad(True, 1.0) / old.cornering_stiffness_n_per_rad(True, 1.0),
-        "rear BCD": new.cornering_stiffness_n_per_rad(False, 1.0) / old.cornering_stiffness_n_per_rad(False, 1.0),
-    }
-    for name, ratio in logs_of.items():
-        assert 0.0 < abs(math.log(ratio)) <= 2.5 * 0.1 * limits[name], name
-    # Both axles have the peak's factor and the shapes of the file.
-    for front in (True, False):
-        assert new.magic_formula(front, 1.0)[1] == old.magic_formula(front, 1.0)[1]
-        assert new.magic_formula(front, 1.0)[2] / old.magic_formula(front, 1.0)[2] == pytest.approx(logs_of["front D"])
-    assert logs_of["front BCD"] != pytest.approx(logs_of["rear BCD"], rel=1e-6)
-    linear = VEHICLE.model_copy(
-        update={
-            "friction": None,
-            "tyres": VEHICLE.tyres.model_copy(
-                update={k: type(VEHICLE.tyres.front)(cornering_stiffness_n_per_rad=9e4) for k in ("front", "rear")}
-            ),
-        }
-    )
-    key = next(str(k) for k in range(99) if vary(linear, 0.1, str(k)).vehicle is not linear)
-    varied, magic = vary(linear, 0.1, key), vary(VEHICLE, 0.1, key)
-    assert varied.vehicle.friction is None and varied.friction_factor == magic.friction_factor != 1.0
-    assert varied.vehicle.tyres.front.cornering_stiffness_n_per_rad / 9e4 == pytest.approx(  # type: ignore[operator]
-        magic.vehicle.cornering_stiffness_n_per_rad(True, 1.0) / old.cornering_stiffness_n_per_rad(True, 1.0)
-    )
+# ---- calibrate ----
 
 
 def test_every_wrong_run_is_wrong() -> None:
@@ -249,9 +210,6 @@ def test_every_wrong_run_is_wrong() -> None:
         first = [next(draws) for _ in range(8)]
         assert all(one.vehicle != VEHICLE and one.friction_factor != 1.0 for one in first)
         assert len({one.friction_factor for one in first}) == 8
-
-
-# ---- calibrate ----
 
 
 def test_samples_stand_every_twentieth_of_a_second_where_all_is_known() -> None:

@@ -175,6 +175,16 @@ def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, mo
     assert wide.manifest["drives"][0]["truth"]["smoothing_half_s"] == 0.2
 
 
+def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = _extract(tmp_path, monkeypatch, _log(drive(4.0, speed=2.0)))
+    (one,) = result.results
+    assert one.entry is not None and one.entry["rows"] == 400 and one.entry["usable_rows"] == 0
+    assert "not one usable target: no truth above the low-speed limit" in one.record.notes
+    assert one.record.seconds == pytest.approx(3.99) and result.exit_code == 0
+
+
 def test_windows_of_reading_change_no_byte(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hashes = set()
     for window_s in (3.0, 7.3, 600.0):

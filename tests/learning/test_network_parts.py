@@ -29,7 +29,7 @@ from pdhef_logtool.learning.network.dataset import (
     read_entry,
     write_manifest,
 )
-from pdhef_logtool.learning.network.extract_command import ExtractSettings, choose_split
+from pdhef_logtool.learning.network.extract_command import ExtractSettings
 from pdhef_logtool.learning.network.fit import CHECKPOINT, Epoch, FeatureSequence, Recipe, normalisation_of, train
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
@@ -163,6 +163,10 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.targets[used], rows.targets[kept][used].astype(np.float32))
     assert not found.targets[~used].any()
     np.testing.assert_allclose(found.step_s, [*[0.01] * 118, 0.02])  # the period at the last row
+    for wrong in ({"features": document["features"][::-1]}, {"version": 1}, {"drives": [{}]}):
+        (tmp_path / "manifest.json").write_text(json.dumps({**document, **wrong}))
+        with pytest.raises(OutputError, match="extract"):
+            read_dataset(tmp_path)
     frame = pl.read_parquet(tmp_path / "drives/z.parquet")
     assert frame["target_dvy_m_s"].null_count() == 1 and frame[FEATURES[0]].null_count() == 1
     groups = pl.read_parquet_metadata(tmp_path / "drives/z.parquet")
@@ -211,24 +215,6 @@ def test_settings_say_what_decides_a_dataset() -> None:
     for wrong in ("0", "1.01", "-0.1", "nan", "x"):
         with pytest.raises(UsageError, match="--truth-smoothing"):
             ExtractSettings(RunConfig(), truth_smoothing=wrong).smoothing_half_s()
-
-
-@pytest.mark.parametrize(
-    ("changes", "option"),
-    [({"jobs": 0}, "--jobs"), ({"seed": -1}, "--seed"), ({"vary": 0.31}, "--vary"), ({"vary": -0.1}, "--vary"),
-     ({"split": "extrapolation"}, "--split")],
-)  # fmt: skip
-def test_wrong_counts_are_usage_errors(changes: dict[str, Any], option: str) -> None:
-    jobs = changes.pop("jobs", 1)
-    extract_command._check_counts(1, ExtractSettings(RunConfig(), seed=0, vary=0.3, split="test"))
-    with pytest.raises(UsageError, match=option):
-        extract_command._check_counts(jobs, ExtractSettings(RunConfig(), **changes))
-
-
-def test_the_split_is_the_options_the_manifests_or_the_hashs() -> None:
-    assert choose_split("x", 0, chosen="test", listed="train") == ("test", "option")
-    assert choose_split("x", 0, listed="extrapolation") == ("extrapolation", "manifest")
-    assert choose_split("x", 0)[1] == "hash"
 
 
 def test_a_manifest_gives_split_and_vehicle_file(tmp_path: Path) -> None:
@@ -306,13 +292,13 @@ def test_counts_are_sums_over_the_usable_rows() -> None:
                 stamps_ns=START_NS + (first + np.arange(4)) * 10_000_000,
                 targets=np.tile([value, 0.01], (4, 1)),
                 step_s=np.full(4, 0.01),
-                weight=np.array([1.0, 1.0, 0.0, 0.0]),
-                segment=np.array([first, first, 7, 8]),
+                weight=np.array([1.0, 1.0, 1.0, 0.0]),
+                segment=np.array([first, first, first, 8]),
             )
         )
     found = counts.to_dict()
     rms = found.pop("residual_rms")
-    assert found == {"duration_s": pytest.approx(0.07), "rows": 8, "usable_rows": 4, "segments": 2}
+    assert found == {"duration_s": pytest.approx(0.07), "rows": 8, "usable_rows": 6, "segments": 2}
     assert rms == {"vy_dot_m_s2": pytest.approx(math.sqrt(12.5)), "yaw_acceleration_rad_s2": pytest.approx(1.0)}
 
 
@@ -346,9 +332,13 @@ class DyingPool:
     """A pool in which drive ``b`` kills its process, and ``c`` with it the first time."""
 
     sizes: list[int]
+    ended: dict[str, bool]
 
     def __init__(self, count: int, **_: Any) -> None:
         self.sizes.append(count)
+
+    def shutdown(self, **how: bool) -> None:
+        type(self).ended = how
 
     def submit(self, _function: Any, job: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -375,6 +365,11 @@ def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.Monkey
         ("a", "fine"), ("b", "the process that read it died (out of memory?)"), ("c", "fine"),
     ]  # fmt: skip
     assert DyingPool.sizes == [2, 1, 1]
+    begun = extract_command._run_jobs(work, 2, lambda *_: None)
+    next(begun)
+    with pytest.raises(KeyboardInterrupt):
+        begun.throw(KeyboardInterrupt())  # type: ignore[attr-defined]
+    assert DyingPool.ended == {"wait": False, "cancel_futures": True}
 
 
 def test_an_error_of_one_log_is_a_reason_and_of_the_only_log_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -396,6 +391,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
         (tmp_path / f"{name}.mcap").write_bytes(b"")
 
     def one(job: Any, _progress: Any) -> Any:
+        assert not (job.output / "manifest.json").exists()  # while drives are written, the old one is not true
         rows, split = residual_rows(60), "train" if job.log_input.stem == "a" else "test"
         writer = DriveWriter(drive_file(job.output, job.log_input.stem), split)
         writer.append(rows)
@@ -417,6 +413,12 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
     chosen = replace(settings, split="train", config=RunConfig(car=Path("saloon")))
     extract_command.extract([str(tmp_path)], tmp_path / "out", chosen, warn=warned.append)
     assert warned == []
+    with pytest.raises(UsageError, match="--jobs"):
+        extract_command.extract([str(tmp_path)], tmp_path / "new", settings, jobs=0)
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new/manifest.json").write_text("no json")
+    with pytest.raises(UsageError, match="another manifest"):
+        extract_command.extract([str(tmp_path)], tmp_path / "new", settings)
 
 
 # ---- training ----
@@ -474,6 +476,7 @@ def _piece(target: list[float], weight: list[float]) -> Any:
     return fit._Piece(torch.zeros(len(target), 1), column, torch.tensor(weight))
 
 
+@pytest.mark.slow  # loads what optimisers need
 def test_a_batch_runs_in_chunks_with_the_state_carried_but_not_its_gradient() -> None:
     network: Any = Constant(0.0)
     still = torch.optim.SGD(network.parameters(), lr=0.0)
@@ -531,6 +534,7 @@ def _numbered(count: int) -> list[FeatureSequence]:
     return [replace(sequence(60, i + 1.0, f"d{i}"), weight=np.full(60, i + 1.0)) for i in range(count)]
 
 
+@pytest.mark.slow  # loads what optimisers need
 def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -561,6 +565,7 @@ def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(
     assert (again.sha256, same) == (bundle.sha256, history)
 
 
+@pytest.mark.slow  # loads what optimisers need
 def test_an_interrupted_training_goes_on_with_its_weights_and_best(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -587,6 +592,7 @@ def test_an_interrupted_training_goes_on_with_its_weights_and_best(
             train(training, training, other, tmp_path)
 
 
+@pytest.mark.slow  # loads what optimisers need
 def test_fine_tuning_takes_shape_weights_and_normalisation_of_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -769,6 +775,17 @@ def test_a_regression_is_of_the_training_drives_and_judged_on_all() -> None:
     errors = p["sideslip_rmse_deg"]
     assert errors["test"] is None and errors["train"] < 0.1
     assert errors["validation"] == pytest.approx(math.degrees(0.01), rel=0.15)
+
+
+def test_what_hardly_varies_beside_its_size_is_a_constant() -> None:
+    rng = np.random.default_rng(0)
+    features = np.zeros((400, len(FEATURES)))
+    features[:, 0] = 20.0 + 1e-4 * rng.standard_normal(400)
+    features[:, 1] = 1e-9 * rng.standard_normal(400)
+    features[:, 2] = 0.02 * rng.standard_normal(400)
+    dt = np.array([np.nan, *[0.01] * 399])
+    model = baselines.fit_linear([SideslipSequence(features, dt, rng.standard_normal(400))], FEATURES[:3])
+    assert model.coefficients[:2] == (0.0, 0.0) and model.coefficients[2] != 0.0
 
 
 def test_the_error_of_a_regression_is_over_all_known_rows() -> None:

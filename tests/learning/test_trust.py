@@ -127,6 +127,40 @@ def test_too_little_driving_decides_nothing() -> None:
     assert nothing.cap == 0.0
 
 
+def test_the_limits_of_the_rule_belong_to_what_they_allow() -> None:
+    helps = _errors([0.5, 0.4, 0.3, 0.2, 0.1], spread=0.0, blocks=MIN_BLOCKS)
+    assert decide_cap(replace(helps, excited_s=MIN_EXCITED_S)).cap == 1.0
+    # 5 % above the best lower trust is no worse, 6 % may be.
+    assert decide_cap(_errors([0.5, 0.4, 0.3, 0.2, 0.2099], spread=0.0)).cap == 1.0
+    worse = decide_cap(_errors([0.5, 0.4, 0.3, 0.2, 0.2101], spread=0.0))
+    assert (worse.cap, worse.best_lower) == (0.5, 0.75) and "more than 5% worse than trust 0.75" in worse.reason
+    assert worse.against_best.value_deg2 == pytest.approx(0.2101**2 - 0.2**2)
+    assert [b.value_deg2 for b in worse.against_zero[:2]] == pytest.approx([0.0, 0.4**2 - 0.5**2])
+    assert (worse.blocks, worse.scored_s, worse.excited_s) == (30, 300.0, 120.0)
+    same = decide_cap(_errors([0.3] * 5, spread=0.0))
+    assert (same.cap, same.reason) == (0.0, "no gain over physics alone")
+    # Blocks count by their stamps.
+    uneven = replace(helps, squares=np.tile([[4.0, 1.0]] + [[1.0, 0.25]] * 4, (1, 4)), counts=np.tile([4.0, 1.0], 4))
+    assert decide_cap(uneven).rmse_deg[:2] == pytest.approx([math.degrees(1.0), math.degrees(0.5)])
+
+
+def test_blocks_are_of_equal_time_and_a_lost_stamp_counts_once() -> None:
+    count = 2500
+    stamps = 10**18 + np.arange(count, dtype=np.int64) * PERIOD_NS
+    errors = np.full((len(TRUSTS), count), 0.01)
+    errors[2:4, 7] = np.nan
+    blocks = block_errors(errors, np.zeros(count), stamps, np.arange(count) < 100)
+    assert blocks.counts.tolist() == [1250.0, 1250.0]  # 24.99 s: two, not three
+    assert (blocks.lost, blocks.scored_s, blocks.excited_s) == (1, pytest.approx(25.0), pytest.approx(1.0))
+    assert block_errors(errors, np.zeros(count), stamps, np.arange(count) < 100, block_s=5.0).counts.shape == (4,)
+    one = block_errors(errors[:, :1], np.zeros(1), stamps[:1], np.ones(1, dtype=np.bool_))
+    assert one.counts.tolist() == [1.0] and one.scored_s == 0.0
+    nothing = block_errors(np.full((5, 9), np.nan), np.zeros(9), stamps[:9], np.ones(9, dtype=np.bool_))
+    assert nothing.squares.shape == (5, 0) and nothing.counts.shape == (0,)
+    both = join_blocks([blocks, replace(blocks, lost=4)])
+    assert (both.lost, both.excited_s) == (5, pytest.approx(2.0))
+
+
 @settings(deadline=None, max_examples=150)
 @given(
     st.lists(st.floats(0.01, 5.0), min_size=5, max_size=5),

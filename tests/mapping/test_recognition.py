@@ -10,6 +10,7 @@ from fake_drive_log import FakeLog, FakeTopic
 
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import AutoMapping, auto_map, load_mapping
+from pdhef_logtool.mapping.recognition import _looks_like_body_frame
 
 N = 400
 T = 1_700_000_000_000_000_000 + np.arange(N, dtype=np.int64) * 20_000_000
@@ -153,6 +154,7 @@ def test_two_truths_are_said_and_the_one_with_a_pose_is_taken() -> None:
         ("/odometry/filtered", "neither"),
         ("/localization/kinematic_state", "neither"),
         ("/something", "neither"),
+        ("/ground/odometry", "speed"),
     ],
 )
 def test_names_tell_sensors_from_truth(name: str, role: str) -> None:
@@ -196,6 +198,10 @@ def test_what_a_message_disowns_is_not_mapped() -> None:
     auto = found({"/imu": imu(angular_velocity_covariance=minus)})
     assert set(auto.mapping.signals) == {"ax_m_s2", "ay_m_s2"}
     assert "yaw_rate_rad_s" in auto.missing
+    assert auto.mapping.notes == ("/imu says that it gives no angular rate (covariance -1)",)
+    auto = found({"/imu": imu(linear_acceleration_covariance=minus)})
+    assert set(auto.mapping.signals) == {"yaw_rate_rad_s"}
+    assert auto.mapping.notes == ("/imu says that it gives no acceleration (covariance -1)",)
     hidden_pose = odometry(pose=True)
     hidden_pose.fields["pose.covariance"] = np.full((N, 36), -1.0)
     auto = found({"/ins/odometry": hidden_pose})
@@ -235,6 +241,77 @@ def test_a_fix_beside_a_velocity_gives_the_position() -> None:
 def test_a_zero_twist_beside_a_moving_pose_is_a_filler() -> None:
     auto = found({"/gps/odom": odometry(forward=0 * S, left=0 * S)})
     assert set(auto.mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
+
+
+def test_a_yaw_rate_of_nothing_but_zeros_is_a_filler() -> None:
+    out = odometry()
+    out.fields["twist.twist.angular.z"] = np.zeros(N)
+    assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "x_m", "y_m", "quat_wxyz"}
+    out.fields["twist.twist.angular.z"] = np.where(np.arange(N) % 2, 0.0, 1.0)
+    assert "yaw_rate_rad_s" in found({"/ins/odom": out}).mapping.truth
+    out.fields["twist.covariance"] = np.full((N, 36), -1.0)
+    assert set(found({"/ins/odom": out}).mapping.truth) == {"x_m", "y_m", "quat_wxyz"}
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "filler"), [(0.9, 0.9, False), (1.1, 0.0, True), (0.0, 1.1, True), (1.9, 0.5, True)]
+)
+def test_a_car_that_stands_still_has_a_twist_of_zero(x_m: float, y_m: float, filler: bool) -> None:
+    out = odometry(forward=0 * S, left=0 * S)
+    out.fields |= {f"pose.pose.position.{a}": m * np.sin(S) for a, m in (("x", x_m / 2), ("y", y_m / 2))}
+    out.fields["pose.pose.position.x"][5] = np.nan
+    assert ("vx_m_s" not in found({"/ins/odom": out}).mapping.truth) == filler
+    out.fields["twist.twist.linear.y"] = np.where(np.arange(N) == N - 1, 0.01, 0.0)
+    assert "vx_m_s" in found({"/ins/odom": out}).mapping.truth
+
+
+def test_ten_moving_samples_of_which_most_go_forward_tell_the_body_frame() -> None:
+    def looks(along: int, moving: int, slow: int = 0) -> bool | None:
+        forward = np.array([2.0] * along + [-2.0] * (moving - along) + [0.9] * slow + [np.nan])
+        return _looks_like_body_frame(forward, np.zeros(len(forward)))
+
+    assert [looks(9, 9), looks(9, 9, slow=50)] == [None, None]
+    assert [looks(7, 10), looks(6, 10), looks(0, 10)] == [True, False, False]
+    sideways = np.full(20, 1.5)
+    assert _looks_like_body_frame(sideways, sideways) is False
+    assert _looks_like_body_frame(sideways, 0.99 * sideways) is True
+    assert _looks_like_body_frame(np.full(20, 0.8), np.full(20, 0.7)) is True  # 1.06 m/s together
+
+
+def test_what_was_ambiguous_names_its_readings_and_the_one_that_was_taken() -> None:
+    heading = 0.5 * S
+    vel = twist("geometry_msgs/msg/TwistStamped", "twist", 10 * np.cos(heading), 10 * np.sin(heading))
+    (doubt,) = found({"/gps/vel": vel}).ambiguities
+    readings = ("/gps/vel as body velocity", "/gps/vel as east, north, up")
+    assert (doubt.candidates, doubt.chosen) == (readings, readings[1])
+    assert doubt.reason == "x is not the direction of travel"
+    # More messages go first, then the shorter name.
+    few = FakeTopic("sensor_msgs/msg/Imu", T[:9], {k: v[:9] for k, v in imu().fields.items()})
+    (doubt,) = found({"/a/imu": few, "/imu/long": imu(), "/imu/b": imu()}).ambiguities
+    assert (doubt.candidates, doubt.chosen) == (("/imu/b", "/imu/long", "/a/imu"), "/imu/b")
+    # A truth's name promises the body frame: what does not look like it is said, and taken all the same.
+    auto = found({"/truth/vel": vel})
+    assert set(auto.mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
+    assert [(a.candidates, a.chosen) for a in auto.ambiguities] == [(("/truth/vel as body velocity",), "/truth/vel")]
+
+
+@pytest.mark.parametrize(
+    ("name", "status", "lowest"),
+    [("/rtk/fix", 2.0, 2.0), ("/rtk/fix", 1.0, 0.0), ("/gps/fix", 2.0, 0.0)],
+)
+def test_a_fix_is_gated_by_the_best_that_its_receiver_can_say(name: str, status: float, lowest: float) -> None:
+    auto = found({name: fix(status)})
+    gate = auto.mapping.quality
+    assert gate is not None and (gate.topic, gate.minimum, gate.stamp) == (name, lowest, "header.stamp")
+    assert auto.mapping.notes == (f"truth is kept where {name}.status.status is at least {lowest:g}",)
+
+
+def test_an_orientation_that_is_none_and_a_pose_that_stays_at_the_origin_are_fillers() -> None:
+    out = odometry()
+    out.fields["pose.pose.orientation.w"] = np.zeros(N)
+    assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m"}
+    out.fields |= {f"pose.pose.position.{a}": np.zeros(N) for a in "xy"}
+    assert set(found({"/ins/odom": out}).mapping.truth) == {"vx_m_s", "vy_m_s", "yaw_rate_rad_s"}
 
 
 def test_an_empty_log_maps_to_nothing() -> None:

@@ -15,7 +15,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.tracks import concatenate, make_track
-from pdhef_logtool.sinks.mcap import AnnotatedMcapSink, topic_of
+from pdhef_logtool.sinks.mcap import AnnotatedMcapSink, _twist_covariance, metrics_record, topic_of
 
 STATE = "pdhef_msgs/msg/VehicleStateEstimate"
 ODOMETRY = "nav_msgs/msg/Odometry"
@@ -409,6 +409,21 @@ def test_odometry_holds_no_pose_that_is_not_known(tmp_path, circle):
     stamps = [t for t, _ in decoded(path, "/pdhef/zero/odometry")]
     assert stamps == np.delete(track.stamps_ns, [3, 4]).tolist()
     assert len(decoded(path, "/pdhef/zero/state")) == 10
+
+
+def test_a_log_without_truth_says_so_in_its_record():
+    report = {**REPORT, "truth": {"available": False}, "metrics": [], "estimators": []}
+    assert metrics_record(report) == {"log": "drive", "truth": "no truth"}
+
+
+def test_a_covariance_that_is_not_known_is_zero_as_ros_wants_it():
+    covariance = np.arange(18.0).reshape(2, 3, 3)
+    covariance[1, 0, 2] = np.nan
+    full = _twist_covariance(covariance, 2).reshape(2, 6, 6)
+    places = np.ix_([0, 1, 5], [0, 1, 5])
+    np.testing.assert_array_equal(full[0][places], covariance[0])
+    assert np.count_nonzero(full) == 8  # the first entry is 0 itself
+    assert not _twist_covariance(np.empty((0, 3, 3)), 2).any()
 
 
 def test_topic_names_are_legal():
