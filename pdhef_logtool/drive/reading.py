@@ -13,6 +13,7 @@ from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET
+from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
@@ -114,8 +115,15 @@ class Drive:
         found = merge_losses(
             [self.log.lost, () if self._reader is None else self._reader.losses, damage(self.sample_ledger)]
         )
-        folder = f"{self.path.parent}/"
-        return tuple(replace(x, where=x.where.removeprefix(folder)) for x in found)
+        return tuple(replace(x, where=self._without_folder(x.where)) for x in found)
+
+    @property
+    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
+        """Where the bytes of each file of the log went so far. Files are named without their folder."""
+        return tuple(replace(x, file=self._without_folder(x.file)) for x in self.log.byte_ledgers)
+
+    def _without_folder(self, where: str) -> str:
+        return where.removeprefix(f"{self.path.parent}/")
 
     @property
     def samples(self) -> dict[str, int]:

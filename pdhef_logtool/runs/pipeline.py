@@ -420,6 +420,7 @@ def report_facts(
         metrics=rows,
         segments=events,
         losses=losses,
+        file_bytes=drive.byte_ledgers,
         samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
         versions=tool_versions(),

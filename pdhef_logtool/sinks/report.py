@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import ReasonFacts
+from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.ledger import SampleCount
@@ -124,7 +125,7 @@ class ReportFacts:
     metrics: Sequence[MetricRow] = ()
     segments: Sequence[Event] = ()
     losses: Sequence[Loss] = ()
-    file_bytes: Sequence[Mapping[str, Any]] = ()
+    file_bytes: Sequence[ByteLedger] = ()
     samples: Sequence[SampleCount] = ()
     warnings: Sequence[str] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
