@@ -140,11 +140,13 @@ class ValueStatistics:
         n = int(values.shape[0])
         if n == 0:
             return
-        mean = float(values.mean())
-        squares = float(np.square(values - mean).sum())
+        with np.errstate(over="ignore", invalid="ignore"):  # of values that are no measurements
+            mean = float(values.mean())
+            squares = float(np.square(values - mean).sum())
         total = self.count + n
-        self.squares += squares + (mean - self.mean) ** 2 * self.count * n / total
-        self.mean += (mean - self.mean) * n / total
+        by = mean - self.mean
+        self.squares += squares + by * by * self.count * n / total
+        self.mean += by * n / total
         self.count = total
         self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
 

@@ -43,7 +43,7 @@ class Budget:
     chunk_ratio: int = 2000
     chunk_messages: int = 1_000_000
     messages_per_byte: float = 4.0
-    channels: int = 8192
+    channels: int = 4096
     metadata_bytes: int = 64 << 20
     schema_bytes: int = 4 << 20
     schema_leaves: int = 20_000

@@ -1,0 +1,96 @@
+"""Drives that give no estimate: exit codes, notes and losses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.estimators import table
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack, make_track
+from pdhef_logtool.runs import pipeline
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import RunResult, run_logs
+from studies.torture.numerics import NUMERICS, Drive, read_samples, write_samples
+
+
+@dataclass(frozen=True)
+class _Silent:
+    """An estimator that is never sure of anything."""
+
+    name: str = "silent"
+    causal: bool = True
+
+    def run(self, signals: Signals, carry: object) -> tuple[StateTrack, None]:
+        known = np.zeros(len(signals), np.bool_)
+        zeros = np.zeros(len(signals))
+        return make_track(self.name, signals.stamps_ns, vx_m_s=zeros, vy_m_s=zeros, valid=known), None
+
+
+@pytest.fixture
+def silenced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put the silent estimator in the place of ``phy-ukf``."""
+
+    def runnable(*arguments: Any) -> Any:
+        ready, skipped = table.runnable(*arguments)
+        return [_Silent() if e.name == "phy-ukf" else e for e in ready], skipped
+
+    monkeypatch.setattr(pipeline, "runnable", runnable)
+
+
+def _run(change: Callable[[Drive], Drive], folder: Path, sample_logs_dir: Path, *estimators: str) -> RunResult:
+    log = folder / "odd.mcap"
+    write_samples(log, [change(read_samples(sample_logs_dir / "step.mcap"))])
+    config = RunConfig(estimators=estimators, car=Path("saloon"), annotate="none", network=Path("none"))
+    return run_logs([str(log)], folder / "out", config)
+
+
+def test_standstill_alone_is_no_failure_and_is_said(tmp_path: Path, sample_logs_dir: Path) -> None:
+    result = _run(NUMERICS["standstill"][0], tmp_path, sample_logs_dir, "zero", "phy-ukf")  # type: ignore[arg-type]
+    assert result.exit_code == 0
+    (log,) = result.results
+    assert log.report is not None
+    assert any("the car is never faster than" in text for text in log.report["warnings"])
+
+
+@pytest.mark.usefixtures("silenced")
+def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sample_logs_dir: Path) -> None:
+    result = _run(dict, tmp_path, sample_logs_dir, "zero", "phy-ukf")
+    (log,) = result.results
+    assert result.exit_code == 3
+    assert log.report is not None
+    silent = [x["what"] for x in log.report["losses"] if x["kind"] == "no-valid-row"]
+    assert silent == ["silent has no valid row although the car moves"]
+
+
+@pytest.mark.usefixtures("silenced")
+def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(tmp_path: Path, sample_logs_dir: Path) -> None:
+    result = _run(dict, tmp_path, sample_logs_dir, "phy-ukf")
+    assert result.exit_code == 1
+    report = json.loads((tmp_path / "out" / "logs" / "odd" / "report.json").read_text())
+    assert [x["kind"] for x in report["losses"]] == ["no-valid-row"]
+
+
+@pytest.mark.parametrize(("share", "code"), [(0.005, 0), (0.03, 3)])
+def test_the_share_of_dropped_samples_decides(share: float, code: int, tmp_path: Path, sample_logs_dir: Path) -> None:
+    def jumbled(drive: Drive) -> Drive:
+        """Repeat the stamps of some samples."""
+        imu = drive["/imu/data"]
+        stamps = imu.stamp_ns.copy()
+        again = np.linspace(10, stamps.size - 10, round(share * stamps.size)).astype(int)
+        stamps[again] = stamps[again - 1]
+        return drive | {"/imu/data": replace(imu, stamp_ns=stamps)}
+
+    result = _run(jumbled, tmp_path, sample_logs_dir, "zero")
+    assert result.exit_code == code
+    (log,) = result.results
+    assert log.report is not None
+    (count,) = [c for c in log.report["ledger"]["samples"] if c["name"] == "ay_m_s2"]
+    assert count["used"] + sum(count["dropped"].values()) == count["total"]
+    assert count["dropped"] == {"duplicate-stamp": round(share * count["total"])}
