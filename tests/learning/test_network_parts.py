@@ -236,7 +236,7 @@ def test_a_plan_needs_three_true_states_and_the_filters_signals() -> None:
     extract_command._check_plan(plan, job)
     for changes in ({"truth": None}, {"derivation": {"vx_m_s": "x", "ay_m_s2": "x"}}):
         with pytest.raises(EstimatorError, match="truth from which"):
-            extract_command._check_plan(SimpleNamespace(**{**plan.__dict__, **changes}), job)  # type: ignore[arg-type]
+            extract_command._check_plan(SimpleNamespace(**{**plan.__dict__, **changes}), job)
     plan.alignment.available = available - {"ay_m_s2"}
     with pytest.raises(EstimatorError, match="no ay_m_s2"):
         extract_command._check_plan(plan, job)
@@ -368,7 +368,7 @@ def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.Monkey
     begun = extract_command._run_jobs(work, 2, lambda *_: None)
     next(begun)
     with pytest.raises(KeyboardInterrupt):
-        begun.throw(KeyboardInterrupt())  # type: ignore[attr-defined]
+        begun.throw(KeyboardInterrupt())
     assert DyingPool.ended == {"wait": False, "cancel_futures": True}
 
 
