@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
@@ -164,10 +165,8 @@ def set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
     """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
     documents: list[Any] = []
     for name, parse in (("manifest.json", json.loads), ("manifest.toml", tomllib.loads)):
-        try:
+        with suppress(OSError, ValueError, RecursionError):  # there is none, or it is somebody else's
             documents.append(parse((folder / name).read_text(encoding="utf-8")))
-        except (OSError, ValueError, RecursionError):
-            continue  # there is none, or it is somebody else's
     entries = [e for d in documents if isinstance(d, dict) for key in ("drives", "log") for e in _entries(d.get(key))]
     return {e["file"]: e for e in entries if isinstance(e.get("file"), str)}
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation.consistency import disagreement_rows, innovation_rows, sensor_rows, whiteness_rows
+from pdhef_logtool.evaluation.metrics import MetricRow, score_track
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 
@@ -101,3 +102,25 @@ def test_disagreement_is_pairwise_above_the_blend_and_wraps():
     values = {r.estimator: r.value for r in rows}
     assert values == pytest.approx({"a~b": 0.02, "a~c": 0.01, "b~c": 0.03})
     assert all(r.n == 3000 for r in rows)
+
+
+def test_rows_of_a_filter_are_filed_under_log_estimator_and_segment() -> None:
+    n = 40
+    stamps = 10**18 + np.arange(n, dtype=np.int64) * 10_000_000
+    nis = np.where(np.arange(n) % 2, 1.0, 3.0)
+    speed, zero, dof = np.full(n, 20.0), np.zeros(n), np.full(n, 2.0)
+    track = make_track("e", stamps, vx_m_s=speed, vy_m_s=zero, nis=nis, nis_dof=dof, diverged=np.arange(n) < 4)
+    other = make_track("f", stamps, vx_m_s=speed, vy_m_s=speed * np.tan(0.01))
+    masks = {"turn": np.arange(n) < 20}
+
+    def filed(rows: list[MetricRow]) -> list[tuple]:
+        return [(r.log, r.estimator, r.signal, r.segment, r.metric, round(r.value, 9), r.unit, r.n) for r in rows]
+
+    turn = ("drive", "e", "state", "turn")
+    assert filed(whiteness_rows(track, masks, log="drive")) == [(*turn, "nis_autocorrelation", -1.0, "1", 19)]
+    (pair,) = filed(disagreement_rows([track, other], masks, log="drive", low_speed_m_s=3.0))
+    assert pair == ("drive", "e~f", "sideslip_rad", "turn", "disagreement_rms", 0.01, "rad", 20)
+    state = [r for r in filed(score_track(track, other, masks, log="drive", low_speed_m_s=3.0)) if r[2] == "state"]
+    of_nis = {r[4]: r for r in state if r[3] == "turn" and r[4].startswith("nis")}
+    assert of_nis == {"nis": (*turn, "nis", 2.0, "1", 20), "nis_dof": (*turn, "nis_dof", 2.0, "1", 20)}
+    assert [r[5] for r in state if r[3:5] == ("turn", "diverged")]

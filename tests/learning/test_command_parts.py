@@ -156,7 +156,7 @@ def test_a_drive_is_loaded_with_what_is_known_of_it(monkeypatch: pytest.MonkeyPa
     assert (short.seconds, short.span_s, short.bytes_held, short.counts) == (0.0, None, 0, {})
     refused, whole = load_drive(log, car, None, SALOON.read_options, refuse=lambda d: f"not {d.name}")
     assert whole is None and refused.left_out == "not made"
-    unknown = replace(WHOLE.truth, sideslip_rad=np.full(601, np.nan))  # type: ignore[type-var]
+    unknown = replace(WHOLE.truth, sideslip_rad=np.full(601, np.nan))
     read._whole = replace(WHOLE, truth=unknown)
     assert load_drive(log, car, None, SALOON.read_options)[1] is None
 
@@ -256,7 +256,7 @@ def test_samples_stand_every_twentieth_of_a_second_where_all_is_known() -> None:
     without = drive_samples(track, signals, signals, replace(truth, ay_m_s2=holed), VEHICLE, 4, wrong=True)
     assert len(without) == len(found) - 2
     late = [replace(one, stamps_ns=one.stamps_ns + 13_000_000) for one in (track, signals, truth)]
-    shifted = drive_samples(late[0], late[1], late[1], late[2], VEHICLE, 4, wrong=True)  # type: ignore[arg-type]
+    shifted = drive_samples(late[0], late[1], late[1], late[2], VEHICLE, 4, wrong=True)
     np.testing.assert_array_equal(shifted.sideslip_error, found.sideslip_error)
     none = replace(track, sideslip_std_rad=np.full(n, np.nan))
     assert len(drive_samples(none, signals, signals, truth, VEHICLE, 4, wrong=True)) == 0
@@ -537,7 +537,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     values = [t.score.objective_deg for t in result.tuned[0].trials]
     np.testing.assert_allclose(lines[0].get_xydata(), np.stack([np.arange(1, 7), values], axis=1))
     np.testing.assert_allclose(lines[1].get_ydata(), np.minimum.accumulate(values))
-    assert lines[2].get_ydata()[0] == pytest.approx(result.tuned[0].before.objective_deg)  # type: ignore[union-attr]
+    assert lines[2].get_ydata()[0] == pytest.approx(result.tuned[0].before.objective_deg)
     assert lines[-1].get_xdata()[0] == 3.5  # between the third trial, the last that explores, and the fourth
     shown = result.to_dict()["estimators"]["pd-hef"]
     assert (shown["trials"], shown["best_trial"]) == (6, result.tuned[2].best.number)
@@ -595,7 +595,7 @@ def test_a_bench_keeps_drives_by_number_and_scores_filters_at_full_trust(monkeyp
     monkeypatch.setattr(tune_drives, "load_drive", load)
     bench, loaded = DriveBench(setup), WHOLE
     assert bench.load(3, LogInput(Path("a"), "a"), "test", 17).name == "a"
-    loaded = None  # type: ignore[assignment]
+    loaded = None
     bench.load(4, LogInput(Path("b"), "b"), None, 17)
     used, why, named = asked[0]
     lacks = "ay_m_s2, yaw_rate_rad_s"
@@ -649,7 +649,7 @@ class FakePool:
             pool.waiting -= 1
             return getattr(pool.bench, function.__name__.lstrip("_"))(*arguments)
 
-        future.result = result  # type: ignore[method-assign]
+        future.result = result
         return future
 
     def shutdown(self, **named: Any) -> None:
@@ -670,7 +670,7 @@ def test_drives_are_dealt_out_in_turn_within_the_memory(monkeypatch: pytest.Monk
             assert loaded == told and [r.name for r in told] == list("abcde")
             assert benches.score({"x": FilterNoise()}) == {"x": [0, 1, 2, 3, 4]}
             if jobs == 1:
-                seen = benches._local.loaded  # type: ignore[union-attr]
+                seen = benches._local.loaded
                 assert seen == [(i, n, "test" if n == "b" else None, 200 - 40 * i) for i, n in enumerate("abcde")]
     assert [[one[1] for one in pool.bench.loaded] for pool in FakePool.made] == [["a", "c", "e"], ["b", "d"]]
     # No more than one drive a process ahead of what is known to be held.

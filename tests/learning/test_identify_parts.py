@@ -246,7 +246,7 @@ def test_no_peak_lies_below_a_force_that_was_seen() -> None:
     least = 1.1 * float(np.percentile(np.abs(rear), 99.5))
     assert by_name["rear peak force"].low == pytest.approx(least)
     assert by_name["rear peak force"].mean >= least * (1 - 1e-6)
-    assert by_name["front peak force"].mean > by_name["front peak force"].low  # type: ignore[operator]
+    assert by_name["front peak force"].mean > by_name["front peak force"].low
     assert by_name["rear cornering stiffness"].mean > by_name["front cornering stiffness"].mean
     low = identify._low_theta([by_name["rear peak force"], by_name["rear shape"], by_name["yaw inertia"]])
     assert low[0] == pytest.approx(by_name["rear peak force"].theta(least))

@@ -236,7 +236,7 @@ def test_a_plan_needs_three_true_states_and_the_filters_signals() -> None:
     extract_command._check_plan(plan, job)
     for changes in ({"truth": None}, {"derivation": {"vx_m_s": "x", "ay_m_s2": "x"}}):
         with pytest.raises(EstimatorError, match="truth from which"):
-            extract_command._check_plan(SimpleNamespace(**{**plan.__dict__, **changes}), job)  # type: ignore[arg-type]
+            extract_command._check_plan(SimpleNamespace(**{**plan.__dict__, **changes}), job)
     plan.alignment.available = available - {"ay_m_s2"}
     with pytest.raises(EstimatorError, match="no ay_m_s2"):
         extract_command._check_plan(plan, job)
@@ -368,7 +368,7 @@ def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.Monkey
     begun = extract_command._run_jobs(work, 2, lambda *_: None)
     next(begun)
     with pytest.raises(KeyboardInterrupt):
-        begun.throw(KeyboardInterrupt())  # type: ignore[attr-defined]
+        begun.throw(KeyboardInterrupt())
     assert DyingPool.ended == {"wait": False, "cancel_futures": True}
 
 
@@ -503,8 +503,9 @@ def test_validation_is_the_weighted_mean_over_all_drives() -> None:
 
 def test_the_rate_goes_up_for_three_tenths_and_down_to_nothing_or_decays() -> None:
     recipe = replace(TINY, learning_rate=2.0)
-    rates = [fit._learning_rate(recipe, s) for s in (0.0, 0.15, 0.2999999, 0.3, 0.65, 1.0)]
-    assert rates == pytest.approx([0.08, 1.04, 2.0, 2.0, 1.0001, 2e-4], rel=1e-4)
+    rates = [fit._learning_rate(recipe, s) for s in (0.0, 0.15, 0.2999999, 0.3, 0.5, 0.65, 1.0)]
+    half = 2.0 * (1e-4 + 0.9999 * (0.5 + 0.5 * math.cos(math.pi * 2.0 / 7.0)))
+    assert rates == pytest.approx([0.08, 1.04, 2.0, 2.0, half, 1.0001, 2e-4], rel=1e-6)
     slow = replace(recipe, schedule="exponential")
     assert [fit._learning_rate(slow, s) for s in (0.0, 1.0)] == pytest.approx([2.0, 2.0 * math.exp(-3.0)])
 
@@ -676,13 +677,14 @@ def test_the_test_loss_is_the_weighted_mean_square_of_normalised_targets(monkeyp
 
         def run(self, features: Any, starts: Any, carry: Any) -> Any:
             assert not starts.any() and carry is None
-            return np.zeros((len(features), 2)), None
+            return np.ones((len(features), 2)), None
 
     monkeypatch.setattr(service, "NetworkService", Zero)
     one, other = sequence(3, 2.0), sequence(2, 4.0)
     other.weight[:] = [3.0, 0.0]
-    # (2, -4)/(2, 4) and (4, -8)/(2, 4): mean squares of 1 and 4.
-    assert mean_square(BUNDLE, [one, other]) == pytest.approx((3 * 1 + 3 * 4) / 6)
+    # (1 - 2, 1 + 4) over (2, 4), and (1 - 4, 1 + 8).
+    squares = [(0.5**2 + 1.25**2) / 2, (1.5**2 + 2.25**2) / 2]
+    assert mean_square(BUNDLE, [one, other]) == pytest.approx((3 * squares[0] + 3 * squares[1]) / 6)
     with pytest.raises(ModelError, match="usable samples"):
         mean_square(BUNDLE, [])
 
@@ -706,7 +708,7 @@ def test_a_training_tells_epochs_and_writes_history_plot_and_where_it_is_from(
     monkeypatch.setattr(train_command, "mean_square", lambda bundle, sequences: len(sequences) / 2)
     saved: list[Path] = []
     monkeypatch.setattr(ModelBundle, "save", lambda self, folder: saved.append(folder))
-    data = dataset(a=("train", arrays(360)), b=("validation", arrays()), c=("test", arrays()), d=("train", arrays(360)))
+    data = dataset(a=("train", arrays(430)), b=("validation", arrays()), c=("test", arrays()), d=("train", arrays(430)))
     told: list[tuple[str, float]] = []
     found = train_on(data, tmp_path, TINY, init=BUNDLE, device="cuda", progress=lambda *x: told.append(x))
     assert told == [

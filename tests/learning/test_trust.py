@@ -157,6 +157,7 @@ def test_blocks_are_of_equal_time_and_a_lost_stamp_counts_once() -> None:
     assert one.counts.tolist() == [1.0] and one.scored_s == 0.0
     nothing = block_errors(np.full((5, 9), np.nan), np.zeros(9), stamps[:9], np.ones(9, dtype=np.bool_))
     assert nothing.squares.shape == (5, 0) and nothing.counts.shape == (0,)
+    assert (nothing.scored_s, nothing.excited_s, nothing.lost) == (0.0, 0.0, 0)
     both = join_blocks([blocks, replace(blocks, lost=4)])
     assert (both.lost, both.excited_s) == (5, pytest.approx(2.0))
 
