@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -63,6 +64,7 @@ class ColumnarLog:
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
+        self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
         self._occupied: OccupiedTime | None = None
@@ -247,13 +249,18 @@ class ColumnarLog:
         return self._schemas[key]
 
     def _parse_schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
-        """Parse a schema once, within the log's time; one that does not parse is a loss of its topic."""
+        """Parse a schema once, within the log's time; one that does not parse is a loss of its topic.
+
+        All schemas together get the time that a log has whatever its size: they do not grow with it.
+        """
         example = self._example(c, channel)
         names = (channel.encoding, channel.schema_encoding, channel.schema_name, channel.type_name)
         definition = (*names, channel.schema_data, example)
         meter = self.containers[c].meter
+        started = time.process_time()
         try:
             meter.check()
+            meter.budget.check("seconds", self._schemas_s, "the time for all schemas")
             with meter.running():
                 if definition not in self._parsed:
                     self._parsed[definition] = channel_schema(channel, self.distro, example, meter.budget)
@@ -262,6 +269,8 @@ class ColumnarLog:
             return self._parsed.setdefault(definition, error)
         except BudgetError as error:  # of time
             return SchemaError(told(error)[1])
+        finally:
+            self._schemas_s += time.process_time() - started
 
     def _example(self, c: int, channel: ChannelRecord) -> bytes | None:
         """Return a channel's first message if its schema has to be taken from it."""

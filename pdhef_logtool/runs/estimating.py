@@ -68,9 +68,9 @@ def estimate_windows(
         if start is None:
             start = first_pose(truth)
         drawn_truth = truth
-        if drawn and truth is not None and not drive.plan.has_truth_pose:
-            drawn_truth = truth_pose.add(truth, start)
-        if drawn_truth is not None:
+        if drawn and drawn_truth is not None:
+            if not drive.plan.has_truth_pose:
+                drawn_truth = truth_pose.add(drawn_truth, start)
             drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, drive.plan.vehicle.standstill_m_s)
         tracks = []
         for estimator in estimators:

@@ -134,7 +134,7 @@ def test_a_file_may_be_called_as_a_set(tmp_path: Path) -> None:
         (("dlc", "--fault", "nonsense"), 2, ("--fault", "KIND:WHAT:START:END", "nonsense")),
         (("dlc", "--fault", "stuck:nothing:1:2"), 2, ("--fault", "yaw_rate")),
         (("loop-the-loop",), 2, ("loop-the-loop", "--list")),
-        (("dlc", "--vehicle", "tank"), 1, ("tank", "sedan")),
+        (("dlc", "--vehicle", "tank"), 2, ("tank", "sedan")),
         (("dlc", "--without", "gps"), 2, ("gps", "wheels")),
         (("dlc-3888-2", "--speed", "100"), 1, ("70 km/h",)),
         (("dlc-3888-2", "--speed", "70", "--mu", "0.2", "--vehicle", "sedan,cg=0.45"), 1, ("spun", "--keep-spins")),

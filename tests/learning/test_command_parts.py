@@ -57,6 +57,7 @@ def whole_drive(seconds: float = 6.0, name: str = "made") -> WholeDrive:
     truth = make_track("truth", stamps, vx_m_s=made.vx, vy_m_s=made.vy, yaw_rate_rad_s=made.r, ay_m_s2=made.ay)
     available = frozenset({"steer_rad", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
     plan: Any = SimpleNamespace(
+        vehicle=VEHICLE,
         mapping=SimpleNamespace(signals={}),
         alignment=SimpleNamespace(available=available),
         truth=object(),
@@ -491,7 +492,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     monkeypatch.setattr(FakeBenches, "made", [], raising=False)
     monkeypatch.setattr(tune_command, "Benches", FakeBenches)
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: (figures.append(self), Path(path).write_bytes(b"")))
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"png")))
     folder = tmp_path / "set"
     arguments = logs(folder, "abc")
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "train"}]}))

@@ -562,7 +562,7 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
 
     monkeypatch.setattr(identify_command, "load_fit_drive", load)
     monkeypatch.setattr(identify_command, "fit_car", fit)
-    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: Path(path).write_bytes(b"png"))
+    monkeypatch.setattr(Figure, "savefig", lambda _, file, **__: file.write(b"png"))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
     result = identify_command.identify(
@@ -608,7 +608,7 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
 
 def test_the_plot_shows_samples_curves_intervals_and_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: (figures.append(self), Path(path).write_bytes(b"")))
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"png")))
     identify_plot.plot_identification(FOUND, tmp_path / "fit.png")
     front, rear, parameters, scores = figures[0].axes
     assert [a.get_title() for a in figures[0].axes] == ["front axle", "rear axle", "parameters", "error of the filter"]

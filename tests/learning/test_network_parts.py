@@ -693,7 +693,7 @@ def test_a_training_tells_epochs_and_writes_history_plot_and_where_it_is_from(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     figures: list[Figure] = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: (figures.append(self), Path(path).write_bytes(b"")))
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"png")))
     history = [Epoch(1, 0.5, 0.25, 1e-3, 2.0), Epoch(2, 0.4, 0.125, 1e-4, 2.0)]
     asked: list[Any] = []
 

@@ -99,7 +99,7 @@ def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="extract"):
         run_training(tmp_path, tmp_path / "m")
     done = _pdhef("train", str(dataset / "train"), "-o", str(tmp_path / "m"), "--epochs", "1")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "validation" in done.stderr
 

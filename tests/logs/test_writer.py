@@ -350,8 +350,9 @@ def test_columns_that_do_not_fit_are_named(fields: dict[str, np.ndarray], proble
 
 
 def test_errors_of_use_are_one_line(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="writable"):
-        McapLogWriter(tmp_path / "missing" / "log.mcap")
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="a place to write to"):
+        McapLogWriter(tmp_path / "file" / "log.mcap")
     with McapLogWriter(tmp_path / "log.mcap") as writer:
         with pytest.raises(MappingError, match="no_such/msg/Type"):
             writer.add_topic("/x", "no_such/msg/Type")

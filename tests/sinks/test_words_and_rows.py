@@ -26,14 +26,10 @@ SECOND = 10**9
 START_NS = 1_700_000_000 * SECOND
 
 
-def _failed(error: OSError) -> OutputError:
-    return OutputError(expected="x", got=str(error), where="y")
-
-
 @pytest.mark.parametrize("joined", [False, True])
 def test_a_row_group_holds_so_many_rows_of_one_key(tmp_path: Path, joined: bool) -> None:
     path, schema = tmp_path / "rows.parquet", pa.schema([("key", pa.string()), ("n", pa.int64())])
-    file = RowGroups(path, schema, 50, ["key"], _failed, joined=joined)
+    file = RowGroups(path, schema, 50, ["key"], joined=joined)
     for a in range(0, 120, 30):
         for key in "ab":
             file.append(key, pa.table({"key": [key] * 30, "n": range(a, a + 30)}, schema=schema))

@@ -164,9 +164,10 @@ def test_a_long_drive_is_written_in_pieces_without_a_seam(tmp_path: Path) -> Non
     assert set(np.diff(log_times["/rtk/odometry"])) == {20_000_000}
 
 
-def test_a_folder_that_is_not_there_is_one_clear_line(drive: Drive, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_one_clear_line(drive: Drive, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
     with pytest.raises(OutputError):
-        write_drive(drive, tmp_path / "none" / "x.mcap")
+        write_drive(drive, tmp_path / "file" / "x.mcap")
 
 
 @pytest.fixture(scope="module")
