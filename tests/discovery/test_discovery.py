@@ -96,7 +96,8 @@ def test_any_name_gives_a_folder_name_that_any_system_takes(tmp_path: Path, name
     assert stem[-9] == "-"
 
 
-_SIGNS = st.characters(exclude_characters="/\0*?[") | st.sampled_from("\udcff\udc80 ._aA")
+#: Of the surrogates only those that stand for bytes of a name that is no UTF-8.
+_SIGNS = st.characters(exclude_categories=["Cs"], exclude_characters="/\0*?[") | st.sampled_from("\udcff\udc80 ._aA")
 
 
 @given(st.lists(st.text(_SIGNS, min_size=1, max_size=40)))
