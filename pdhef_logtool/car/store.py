@@ -113,6 +113,7 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
             for name, content in change.files.items():
                 _write(fresh / name, content)
             _log(fresh, change)
+            lock.hold_next(fresh)
     except BaseException:
         if new:
             with suppress(OSError):

@@ -30,6 +30,8 @@ LOCK_FILE = ".pdhef.lock"
 _FORMER = re.compile(r"\.tracks-\w{8}|\.[\w.]+\.partial|\.annotated\.mcap\.\d+\.part")
 _NO_LOCK = (errno.EBADF, errno.EINVAL, errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EISDIR)
 _POLL_S = 0.05
+#: To make a folder that a command beside this one may remove while it is empty.
+_TRIES = 100
 
 
 class Transaction(ABC):
@@ -100,11 +102,20 @@ class FolderTransaction(Transaction):
                 if self._place.exists() and not self._place.is_dir():
                     raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
                 _repair(self._work, self._place)
-                self._new.mkdir(parents=True)
-                self.scratch.mkdir()
+                self._make()
         except BaseException:
             self.discard()
             raise
+
+    def _make(self) -> None:
+        for left in reversed(range(_TRIES)):
+            try:
+                self._new.mkdir(parents=True)
+                break
+            except FileNotFoundError:  # a command beside this one has removed the folder of both while it was empty
+                if not left:
+                    raise
+        self.scratch.mkdir()
 
     def file(self, name: str) -> Path:
         """Return where to write the file of a name."""
@@ -197,7 +208,7 @@ class FolderLock:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._descriptor: int | None = None
+        self._descriptors: list[int] = []
         self._file: Path | None = None
 
     def acquire(self, wait_s: float = 0.0) -> None:
@@ -217,14 +228,27 @@ class FolderLock:
                 )
             time.sleep(_POLL_S)
 
+    def hold_next(self, folder: Path) -> None:
+        """Hold a folder of ours as well that is about to take the place of the one that is held.
+
+        Else whoever waits would take hold of it before this command has swept what it leaves.
+        """
+        with writing(folder):
+            if self._file is not None:
+                shutil.copyfile(self._file, folder / LOCK_FILE)
+                return
+            descriptor = os.open(folder, os.O_RDONLY)
+            self._descriptors.append(descriptor)
+            _locked(descriptor)
+
     def release(self) -> None:
         """Let go; harmless when it is not held."""
         if self._file is not None:
             with contextlib.suppress(OSError):
                 self._file.unlink(missing_ok=True)
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-        self._file = self._descriptor = None
+        for descriptor in self._descriptors:
+            os.close(descriptor)
+        self._file, self._descriptors = None, []
 
     def _try(self) -> bool:
         descriptor = os.open(self._folder, os.O_RDONLY)
@@ -240,7 +264,7 @@ class FolderLock:
             if error.errno not in _NO_LOCK:
                 raise
             return self._try_file()
-        self._descriptor = descriptor
+        self._descriptors.append(descriptor)
         return True
 
     def _try_file(self) -> bool:

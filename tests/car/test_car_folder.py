@@ -644,3 +644,14 @@ def test_a_car_that_stays_held_is_one_line(folder: Path, monkeypatch: pytest.Mon
     with outputs.OutputFolder(folder), pytest.raises(OutputError, match="another command is writing to"):
         update_car(load(folder), folder, noise_change(NEW))
     assert files_of(folder) == before
+
+
+def test_cars_beside_one_another_are_changed_at_once(folder: Path) -> None:
+    car = load(folder)
+    change = Change("tune", "part.toml", {"part.toml": b"x = 1\n"})
+    for again in range(3):
+        names = [folder.with_name(f"beside-{again}-{i}") for i in range(8)]
+        with ThreadPoolExecutor(8) as pool:
+            list(pool.map(lambda output: update_car(car, output, change), names))
+        assert all((name / "part.toml").is_file() for name in names)
+    assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]

@@ -16,6 +16,7 @@ PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 FULL = Path("/dev/full")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", [["inspect", "LOG"], ["inspect", "LOG", "--json"], ["simulate", "--list"]])
 def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path, arguments: list[str]) -> None:
     read, write = os.pipe()
@@ -38,6 +39,7 @@ def test_an_output_that_takes_nothing_is_one_line(arguments: list[str]) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("closed", [(1,), (2,), (0, 1, 2)])
 def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path: Path, closed: tuple[int, ...]) -> None:
     log = tmp_path / "x.mcap"
@@ -66,6 +68,7 @@ main()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["raised", "swallowed", "changed"])
 @pytest.mark.parametrize(("name", "code", "said"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
 def test_a_request_to_end_is_one_line_whatever_becomes_of_it(name: str, code: int, said: str, way: str) -> None:
