@@ -258,9 +258,8 @@ def mutated(source: bytes, mutant: Mutant) -> bytes:
 def apply(mutant: Mutant, tree: Path) -> None:
     """Put the fault into a copy of the tree, and forget what was compiled from what it changes.
 
-    Numba takes a file that kept time and size for unchanged, and never looks at the files of the functions that a
-    compiled one calls. A fault in plain Python keeps both, so that nothing is compiled anew; for one in a compiled
-    function the caches of its module and of all that import it, directly or not, go.
+    The compiler's cache knows a file by its content, and never looks at the files of the functions that a compiled one
+    calls: for a fault in a compiled function the caches of its module and of all that import it, directly or not, go.
     """
     path = tree / mutant.file
     before = path.stat()

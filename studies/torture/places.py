@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -97,13 +98,25 @@ def second_run(work: Path) -> Verdict:
 def shrinking_file(work: Path) -> Verdict:
     """Cut a log while it is read."""
     log = work / "hour.mcap"
-    write_hours(log, 0.5)
+    write_hours(log, 1.0)
     with start("inspect", str(log), stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
-        time.sleep(1.5)
+        files, until = Path(f"/proc/{process.pid}/fd"), time.monotonic() + 60.0
+        while str(log) not in _opened(files) and time.monotonic() < until:
+            time.sleep(0.01)
+        time.sleep(0.3)
         with log.open("r+b") as file:
             file.truncate(log.stat().st_size // 3)
         out, err = process.communicate(timeout=120)
     return judge(Ended(process.returncode, out.decode(), err.decode()), (1, 3))
+
+
+def _opened(files: Path) -> set[str]:
+    """Return what the descriptors below a folder of ``/proc`` stand for."""
+    found = set()
+    for file in files.iterdir():
+        with contextlib.suppress(OSError):
+            found.add(str(file.readlink()))
+    return found
 
 
 def output_is_input(work: Path) -> Verdict:
