@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from fake_drive_log import FakeLog, FakeTopic
 
+from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import load_mapping, mapping_to_toml
 from pdhef_logtool.mapping.estimates import choose_estimates, sources_of
 from pdhef_logtool.records.errors import MappingError
@@ -82,3 +83,14 @@ def test_flags_win_over_tables(tmp_path: Path) -> None:
     assert flag.signals["sideslip_rad"].scale == 1.0
     tables = choose_estimates(log, [], mapping, None)  # type: ignore[arg-type]
     assert [e.name for e in tables] == ["esc", "my ekf 2.1"]
+
+
+def test_a_topic_named_as_a_whole_brings_its_covariance_and_a_field_does_not(sample_logs_dir: Path) -> None:
+    log = open_log(sample_logs_dir / "step.mcap")
+    sources, covariance = sources_of(log, ["/rtk/odometry"], ESTIMATE_UNITS, "--estimate")
+    assert {"vx_m_s", "vy_m_s"} <= sources.keys()
+    assert covariance is not None
+    assert covariance.topic == "/rtk/odometry"
+    _, none = sources_of(log, ["vx_m_s=/rtk/odometry.twist.twist.linear.x"], ESTIMATE_UNITS, "--estimate")
+    assert none is None
+    log.close()
