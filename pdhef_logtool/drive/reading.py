@@ -239,6 +239,8 @@ def read_drive(
         if adjust is not None:
             chosen = adjust(opened, chosen, told)
             check_mapping(chosen, opened)
+        if opened.end_ns <= opened.start_ns:
+            raise no_samples(log_input.path)
         slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         plan = plan_drive(opened, chosen, car.vehicle, *slice_ns, require_imu=require_sensors)
         _tell_doubts(plan, told)

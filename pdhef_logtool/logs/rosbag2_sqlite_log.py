@@ -14,7 +14,16 @@ import numpy as np
 
 from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_source import require_regular
-from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, SpanDamageError, block_from_lists, told
+from pdhef_logtool.logs.container import (
+    MAX_TIME_NS,
+    Block,
+    ChannelRecord,
+    Container,
+    Span,
+    SpanDamageError,
+    block_from_lists,
+    told,
+)
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import IntArray
@@ -141,7 +150,7 @@ class SqliteContainer(Container):
                 if not times:
                     first, size = id_, 0
                 last = id_
-                times.append(timestamp)
+                times.append(min(timestamp, MAX_TIME_NS))
                 counts[topic] += 1
                 size += length
                 total += length
@@ -202,7 +211,7 @@ class SqliteContainer(Container):
                 if not isinstance(timestamp, int) or not isinstance(data, bytes):
                     continue
                 channels.append(topic)
-                stamps.append(timestamp)
+                stamps.append(min(timestamp, MAX_TIME_NS))
                 payloads.append(data)
         except sqlite3.Error as error:
             raise self._late or SpanDamageError(str(error)) from error
@@ -214,7 +223,8 @@ class SqliteContainer(Container):
         """Return channels and log times of one page."""
         query = "SELECT topic_id, timestamp FROM messages WHERE id BETWEEN ? AND ? ORDER BY id"
         try:
-            rows = [(t, ns) for t, ns in self._db.execute(query, self._pages[span.index]) if isinstance(ns, int)]
+            found = self._db.execute(query, self._pages[span.index])
+            rows = [(t, min(ns, MAX_TIME_NS)) for t, ns in found if isinstance(ns, int)]
         except sqlite3.Error as error:
             raise SpanDamageError(str(error)) from error
         return np.array([t for t, _ in rows], dtype=np.int64), np.array([ns for _, ns in rows], dtype=np.int64)

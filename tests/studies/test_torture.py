@@ -32,6 +32,13 @@ def test_mutated_logs_do_no_harm(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_numbers_that_did_harm_once(tmp_path: Path) -> None:
+    judge_number = log_judge(tmp_path, 1)
+    # A database's time of 2^63 - 1; a run of a log without messages; 55 years of a channel that nothing declares.
+    assert [judge_number(number).problem for number in (6586, 11008, 12118)] == ["", "", ""]
+
+
+@pytest.mark.slow
 def test_mutated_configurations_do_no_harm(tmp_path: Path) -> None:
     tallies = run_cases(config_judge(tmp_path, 7), CONFIGS, tmp_path / "configs.jsonl", jobs=1, tell=_quiet)
     assert [p for t in tallies for p in t.problems] == []
