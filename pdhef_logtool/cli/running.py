@@ -115,6 +115,9 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
     from pdhef_logtool.cli.run_tables import render_run
 
     console.show(result, render_run, as_json)
+    for one in result.results:
+        if one.outcome.failed is not None and one.report is not None:  # of the others it was told as a warning
+            console.say(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
     failed = [v for v in result.verdicts if v.failed]
     for verdict in failed:
         where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"

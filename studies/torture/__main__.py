@@ -252,7 +252,9 @@ def main() -> int:
         if kept.is_file():
             results[name] = json.loads(kept.read_text())
     if given.out.is_file():
-        write(given.out, fill(given.out.read_text(), blocks(results), str(given.out)))
+        counts = f"--logs {given.logs} --configs {given.configs} --kills {given.kills} --hours {given.hours:g}"
+        asked = {"command": f"The figures below: `python -m studies.torture --seed {given.seed} {counts}`."}
+        write(given.out, fill(given.out.read_text(), blocks(results) | asked, str(given.out)))
     return int(any(_wrong(r) for r in results.values()))
 
 

@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
+from pdhef_logtool.cli.running import _finish
 from pdhef_logtool.estimators import table
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -70,11 +72,17 @@ def test_an_estimator_without_a_valid_row_while_the_car_moves(tmp_path: Path, sa
 
 
 @pytest.mark.usefixtures("silenced")
-def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(tmp_path: Path, sample_logs_dir: Path) -> None:
+def test_no_valid_row_of_any_estimator_fails_and_keeps_the_report(
+    tmp_path: Path, sample_logs_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     result = _run(dict, tmp_path, sample_logs_dir, "phy-ukf")
     assert result.exit_code == 1
     report = json.loads((tmp_path / "out" / "logs" / "odd" / "report.json").read_text())
     assert [x["kind"] for x in report["losses"]] == ["no-valid-row"]
+    with pytest.raises(typer.Exit) as left:
+        _finish(result, as_json=True)
+    assert left.value.exit_code == 1
+    assert capsys.readouterr().err == "pdhef: odd: no estimator has a valid row although the car moves\n"
 
 
 @pytest.mark.parametrize(("share", "code"), [(0.005, 0), (0.03, 3)])

@@ -420,7 +420,7 @@ except OutputError as error:
 def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
     done = subprocess.run(
         [sys.executable, "-c", HANGING, str(tmp_path / "recording.rrd"), str(writes)],
-        capture_output=True, text=True, check=True, timeout=30,
+        capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     assert "recording.rrd: expected a place to write to, got nothing could be written for 1 s" in done.stdout
 
