@@ -106,6 +106,23 @@ class Sensors(Record):
     steer_bias_std_rad: AngleStd = 0.0008
 
 
+class PhysicsParts(Record):
+    """Which parts of the model ``physics`` has beside the static single track (METHOD §16); each needs evidence."""
+
+    lag: bool = False
+    load_transfer: bool = False
+    braking: bool = False
+    roll: bool = False
+    biases: bool = False
+    bank: bool = False
+    force_scale: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parts that the car has."""
+        return tuple(name for name, has in self if has)
+
+
 class VehicleParameters(Record):
     """Everything that the nominal single-track model needs to know of a vehicle (DESIGN §8). SI units, ISO 8855.
 
@@ -133,6 +150,12 @@ class VehicleParameters(Record):
     #: Share of lateral force per load that a tyre loses for each relative excess of load: −p_Dy2/p_Dy1, 0.145/0.990 for
     #: the 205/60 R15 of Pacejka 2012, appendix 3.
     load_sensitivity: Annotated[float, Field(ge=0, lt=1)] = 0.15
+    #: Undamped natural frequency and damping ratio of body roll; 1.5-2 Hz and 0.3-0.4 for cars (METHOD §16).
+    roll_frequency_rad_s: Annotated[float, Field(ge=2, le=60)] = 11.0
+    roll_damping: Annotated[float, Field(ge=0.02, le=3)] = 0.35
+    #: 0.7 of the height of the CG for the default sedan (METHOD §16).
+    cg_over_roll_axis_m: Annotated[float, Field(ge=0, le=3)] = 0.4
+    physics: PhysicsParts = PhysicsParts()
     sensors: Sensors = Sensors()
     tyres: Tyres
 

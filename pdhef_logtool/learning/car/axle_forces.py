@@ -87,7 +87,11 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> Axle
         total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
         front = (lr * total + moment) / (lf + lr) / np.cos(steer)
         rear = (lf * total - moment) / (lf + lr)
-        columns.append((steer - np.arctan((vy + lf * r) / vx), front, -np.arctan((vy - lr * r) / vx), rear))
+        # A tyre that keeps its stiffness has one curve of force over friction by slip over friction (similarity).
+        known = np.isfinite(drive.signals.friction)
+        grip = np.where(known, drive.signals.friction / vehicle.assumed_friction, 1.0)
+        slips = (steer - np.arctan((vy + lf * r) / vx), -np.arctan((vy - lr * r) / vx))
+        columns.append((slips[0] / grip, front / grip, slips[1] / grip, rear / grip))
     joined = [np.concatenate(c) for c in zip(*columns, strict=True)]
     good = np.isfinite(np.sum(joined, axis=0))
     return AxleSamples(*(c[good] for c in joined))

@@ -1,0 +1,315 @@
+"""The single-track model of ``physics``: axle forces that lag, load transfer, braking, roll, bank (METHOD §3, §16).
+
+State of a point, ISO 8855, SI, at the centre of gravity: [v_x, v_y, r, b_ax, f_f, f_r] and, each where the car has that
+part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lateral force over the vehicle's mass in m/s².
+
+- **Lag**: (σ / v_x) ḟ + f = f_ss(α). Without it f is the tyres' force at once.
+- **Roll**: φ̈ = ω² (G a_y − φ) − 2 ζ ω φ̇ with the roll gradient G. The tyres see v_y + h_s φ̇, for the centre of gravity
+  swings h_s above the roll axis; the accelerometer reads g φ beside the forces. Without it the body follows at once:
+  (1 + g G) Σf.
+- **Load transfer** takes x = 2 h a_y / (g T) of a wheel's load to the other one of its axle; with roll a_y is φ / G, for
+  springs carry it. A tyre whose force per load falls by the share s_z for each relative excess of load leaves
+  1 − s_z x² of an axle's force (Eq 7). A magic formula that was fitted to an axle holds that loss already for steady
+  cornering, in which the axle's own force says what a_y was: what is left is the ratio of the two.
+- **Braking** (``ax`` below 0) moves the load a_x h / L to the front and takes from both axles' grip what it uses itself,
+  √(1 − (a_x / μ g)²), with brakes that are shared as the loads are. Which axle drives is not known: nothing is done
+  when the car accelerates.
+- **Bank**: −g · bank in v̇_y and nowhere else, an Ornstein-Uhlenbeck process.
+- **Force scale**: 1 + s on the tyres' forces, an Ornstein-Uhlenbeck process.
+
+A step moves all points at once in inner loops without branches, as :mod:`~pdhef_logtool.car.nominal_points` does. One
+evaluation of the tyres a step: the exponential kernel of the lag weighs what they were asked over the step, and stands
+for one instant of it, t*; the state there is that at the start, moved by its derivative. Velocities take the mean of the
+forces at both ends. Both are of second order in the step, and stable for any lag.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S, dynamic_share, substeps
+from pdhef_logtool.car.nominal_points import arctangent, sine
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.records.compiled import njit
+
+#: Entries of the state that every car has, and how many of the others its parts add.
+VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR = range(6)
+CORE = 6
+
+#: Time constants with which bank and force scale return to 0 (METHOD §16).
+BANK_TIME_S, FORCE_SCALE_TIME_S = 5.0, 2.0
+#: Largest product of step and the roll mode's frequency; longer steps are divided.
+_MAX_ROLL_STEP = 0.5
+_MAX_SUBSTEPS = 32
+#: Grip is never taken to be used up by braking alone: a car that still steers has this share.
+_LEAST_GRIP = 0.2
+#: A body that hardly rolls, rad/(m/s²), tells nothing of the load transfer, which then follows the acceleration.
+LEAST_ROLL_GRADIENT = 1e-3
+
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
+_inline = njit(forceinline=True, error_model="numpy", fastmath={"contract"})
+
+
+class Layout(NamedTuple):
+    """Where the entries of the parts stand in the state; −1: the car has no such part."""
+
+    size: int
+    roll: int  # φ, and φ̇ behind it
+    bank: int
+    force_scale: int
+    steer_bias: int
+    sensor_bias: int  # of a_y, and of the yaw rate behind it; the last entries, for only the sensors feel them
+
+
+class PhysicsParameters(NamedTuple):
+    """What the compiled model needs beside :class:`~pdhef_logtool.car.nominal_model.ModelParameters`."""
+
+    relaxation_length_m: float  # 0: no lag
+    load_sensitivity: float  # s_z; 0: no load transfer
+    transfer_per_ay: float  # x over a_y, s²/m
+    front_share: float  # m_f / m
+    rear_share: float
+    front_holds_transfer: bool  # the formula was fitted with the load transfer of steady cornering in it
+    rear_holds_transfer: bool
+    front_load_per_ax: float  # relative change of the axle's load over a_x when braking, s²/m; 0: braking is no part
+    rear_load_per_ax: float
+    roll_gradient: float  # G in rad/(m/s²); 0: neither roll nor its share of a_y
+    roll_frequency_rad_s: float
+    roll_damping: float
+    swing_m: float  # h_s
+
+
+def layout_of(vehicle: VehicleParameters) -> Layout:
+    """Return where the states of a car's parts stand."""
+    parts = vehicle.physics
+    at = CORE
+    places = []
+    for has, width in ((parts.roll, 2), (parts.bank, 1), (parts.force_scale, 1), (parts.biases, 1), (parts.biases, 2)):
+        places.append(at if has else -1)
+        at += width if has else 0
+    return Layout(at, *places)
+
+
+def physics_parameters(vehicle: VehicleParameters) -> PhysicsParameters:
+    """Flatten what the parts of a car need."""
+    parts, height = vehicle.physics, vehicle.cg_height_m
+    front, rear = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
+    moved = height / GRAVITY_M_S2 if parts.braking else 0.0
+    return PhysicsParameters(
+        relaxation_length_m=vehicle.relaxation_length_m if parts.lag else 0.0,
+        load_sensitivity=vehicle.load_sensitivity if parts.load_transfer else 0.0,
+        transfer_per_ay=2.0 * height / (GRAVITY_M_S2 * vehicle.track_m),
+        front_share=rear / vehicle.wheelbase_m,
+        rear_share=front / vehicle.wheelbase_m,
+        front_holds_transfer=vehicle.tyres.front.cornering_stiffness_n_per_rad is None,
+        rear_holds_transfer=vehicle.tyres.rear.cornering_stiffness_n_per_rad is None,
+        front_load_per_ax=-moved / rear,
+        rear_load_per_ax=moved / front,
+        roll_gradient=vehicle.roll_gradient_rad_per_m_s2,
+        roll_frequency_rad_s=vehicle.roll_frequency_rad_s,
+        roll_damping=vehicle.roll_damping,
+        swing_m=vehicle.cg_over_roll_axis_m,
+    )
+
+
+class _Step(NamedTuple):
+    """What stays the same for all points of a step."""
+
+    angle: float
+    cos: float
+    r_kin_per_vx: float
+    ax: float
+    b_front: float
+    b_rear: float
+    peak_front: float  # over the mass, friction and braking applied, m/s²
+    peak_rear: float
+    kept: float  # share of an axle's force at the start that is left at the end of the step
+    tyre_s: float  # t*: the time from the step's start at which the tyres are asked
+    inertia: float  # m / I_z
+
+
+@njit(cache=True)
+def step_count(vx, dt, friction, layout, p, f):  # type: ignore[no-untyped-def]
+    """Return into how many steps ``dt`` must be divided: as the nominal model, and for the roll mode."""
+    n = substeps(vx, dt, friction, p)
+    if layout.roll >= 0:
+        n = max(n, math.ceil(dt * f.roll_frequency_rad_s / _MAX_ROLL_STEP))
+    return min(n, _MAX_SUBSTEPS)
+
+
+@njit(cache=True)
+def grip_under_braking(ax, friction, load_per_ax):  # type: ignore[no-untyped-def]
+    """Return the factor on an axle's lateral force: its load, and what braking leaves of its grip."""
+    if ax >= 0.0 or load_per_ax == 0.0:
+        return 1.0
+    used = ax / (friction * GRAVITY_M_S2)
+    left = math.sqrt(max(1.0 - used * used, _LEAST_GRIP * _LEAST_GRIP))
+    return max(1.0 + load_per_ax * ax, _LEAST_GRIP) * left
+
+
+@njit(cache=True)
+def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
+    """Return what stays the same over a step of ``h`` s at a speed of about ``vx``."""
+    kept, tyre_s = 0.0, h
+    if f.relaxation_length_m > 0.0:
+        x = h * max(vx, p.blend_low_m_s) / f.relaxation_length_m
+        kept = math.exp(-x)
+        tyre_s = h * (1.0 - (1.0 - x * kept / (1.0 - kept)) / x) if x > 1e-3 else h * (0.5 + x / 12.0)
+    return _Step(
+        steer,
+        math.cos(steer),
+        math.tan(steer) / (p.front_m + p.rear_m),
+        ax,
+        p.front_B / friction if p.front_fixed_stiffness else p.front_B,
+        p.rear_B / friction if p.rear_fixed_stiffness else p.rear_B,
+        friction * p.front_D_n / p.mass_kg * grip_under_braking(ax, friction, f.front_load_per_ax),
+        friction * p.rear_D_n / p.mass_kg * grip_under_braking(ax, friction, f.rear_load_per_ax),
+        kept,
+        tyre_s,
+        p.mass_kg / p.yaw_inertia_kg_m2,
+    )
+
+
+@_inline
+def _transfer_factor(ay, f):  # type: ignore[no-untyped-def]
+    """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x ends at 1, where the inner wheel is off the road."""
+    x = min(1.0, abs(f.transfer_per_ay * ay))
+    return 1.0 - f.load_sensitivity * x * x
+
+
+# positional: numbers of one point in an inner loop that is to become vector instructions.
+@_inline
+def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untyped-def]
+    """Return F_yf/m and F_yr/m in m/s² to which the tyres settle; ``ay`` is what the load transfer goes by."""
+    front = c.b_front * (angle - arctangent(vy + p.front_m * r, v))
+    rear = -c.b_rear * arctangent(vy - p.rear_m * r, v)
+    front = arctangent(front - p.front_E * (front - arctangent(front, 1.0)), 1.0)
+    rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
+    ff = c.peak_front * sine(p.front_C * front)
+    fr = c.peak_rear * sine(p.rear_C * rear)
+    factor = _transfer_factor(ay, f)
+    ff *= force * factor / (_transfer_factor(ff / f.front_share, f) if f.front_holds_transfer else 1.0)
+    fr *= force * factor / (_transfer_factor(fr / f.rear_share, f) if f.rear_holds_transfer else 1.0)
+    return ff, fr
+
+
+@_compiled
+def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
+    """Advance points [state, WIDTH], of which ``count`` are used, by ``dt`` s in ``n`` steps with constant inputs.
+
+    ``over`` are steering angle, accelerometer's a_x and friction. The rows of sensors' biases are not looked at.
+    """
+    h = dt / n
+    c = _prepare(points[VX, 0], h, over.steer, over.ax, over.friction, p, f)
+    per_blend = 1.0 / (p.blend_high_m_s - p.blend_low_m_s)
+    per_kinematic = 1.0 / KINEMATIC_TIME_CONSTANT_S
+    rolls, banks, scales, steers = layout.roll >= 0, layout.bank >= 0, layout.force_scale >= 0, layout.steer_bias >= 0
+    # Rows that a car has not stand for another one, whose value is then not used.
+    roll, bank = max(layout.roll, 0), max(layout.bank, 0)
+    scale, steer_bias = max(layout.force_scale, 0), max(layout.steer_bias, 0)
+    stiffness, damping = f.roll_frequency_rad_s**2, 2.0 * f.roll_damping * f.roll_frequency_rad_s
+    leans = rolls and abs(f.roll_gradient) > LEAST_ROLL_GRADIENT
+    per_gradient = 1.0 / f.roll_gradient if leans else 0.0
+    bank_kept, scale_kept = math.exp(-h / BANK_TIME_S), math.exp(-h / FORCE_SCALE_TIME_S)
+    t = c.tyre_s
+    for _ in range(n):
+        for j in range(count):
+            vx, vy, r = points[VX, j], points[VY, j], points[YAW_RATE, j]
+            ff, fr = points[FRONT, j], points[REAR, j]
+            angle = c.angle - (points[steer_bias, j] if steers else 0.0)
+            slope = GRAVITY_M_S2 * points[bank, j] if banks else 0.0
+            force = max(0.1, 1.0 + points[scale, j]) if scales else 1.0
+            phi = points[roll, j] if rolls else 0.0
+            phi_dot = points[roll + 1, j] if rolls else 0.0
+            ax = c.ax - points[AX_BIAS, j]
+            w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * per_blend))
+            follow = (1.0 - w) * per_kinematic
+            # at the start
+            ffc = ff * c.cos
+            r_kin = vx * c.r_kin_per_vx
+            vx_dot = ax + r * r * p.imu_x_m + vy * r
+            vy_dot = w * (ffc + fr - slope - vx * r) + (follow * (p.rear_m * r_kin - vy) if w < 1.0 else 0.0)
+            r_dot = w * c.inertia * (p.front_m * ffc - p.rear_m * fr) + (follow * (r_kin - r) if w < 1.0 else 0.0)
+            vx_dot += r_dot * p.imu_y_m
+            ay = w * (ffc + fr) + (1.0 - w) * vx * r
+            roll_acc = stiffness * (f.roll_gradient * ay - phi) - damping * phi_dot if rolls else 0.0
+            # the tyres, at t*
+            sway = f.swing_m * (phi_dot + t * roll_acc) if rolls else 0.0
+            lean = (phi + t * phi_dot) * per_gradient if leans else ay
+            v = max(vx + t * vx_dot, p.blend_low_m_s)
+            sf, sr = _tyre_forces(v, vy + t * vy_dot + sway, r + t * r_dot, angle, lean, force, c, p, f)
+            ff1 = sf + (ff - sf) * c.kept
+            fr1 = sr + (fr - sr) * c.kept
+            # the mean over the step
+            half = 0.5 * h
+            mf = 0.5 * (ff + ff1)
+            mr = 0.5 * (fr + fr1)
+            mfc = mf * c.cos
+            mx, my, mrate = vx + half * vx_dot, vy + half * vy_dot, r + half * r_dot
+            r_kin = mx * c.r_kin_per_vx
+            r_dot = w * c.inertia * (p.front_m * mfc - p.rear_m * mr) + (follow * (r_kin - mrate) if w < 1.0 else 0.0)
+            mrate = r + half * r_dot
+            vy_dot = w * (mfc + mr - slope - mx * mrate) + (follow * (p.rear_m * r_kin - my) if w < 1.0 else 0.0)
+            my = vy + half * vy_dot
+            points[VX, j] = vx + h * (ax + r_dot * p.imu_y_m + mrate * mrate * p.imu_x_m + my * mrate)
+            points[VY, j] = vy + h * vy_dot
+            points[YAW_RATE, j] = r + h * r_dot
+            points[FRONT, j] = ff1
+            points[REAR, j] = fr1
+            if rolls:
+                ay = w * (mfc + mr) + (1.0 - w) * mx * mrate
+                middle, speed = phi + half * phi_dot, phi_dot + half * roll_acc
+                points[roll, j] = phi + h * speed
+                points[roll + 1, j] = phi_dot + h * (
+                    stiffness * (f.roll_gradient * ay - middle) - damping * speed
+                )
+            if banks:
+                points[bank, j] *= bank_kept
+            if scales:
+                points[scale, j] *= scale_kept
+
+
+@njit(cache=True)
+def settle_forces(x, steer, ax, friction, layout, p, f):  # type: ignore[no-untyped-def]
+    """Put the axles' forces of a state [n] to the tyres' steady ones at their own lateral acceleration; no roll."""
+    c = _prepare(x[VX], 0.01, steer, ax, friction, p, f)
+    v = max(x[VX], p.blend_low_m_s)
+    force = max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+    x[FRONT], x[REAR] = 0.0, 0.0
+    for _ in range(3):  # a strong contraction
+        ay = x[FRONT] * c.cos + x[REAR]
+        x[FRONT], x[REAR] = _tyre_forces(v, x[VY], x[YAW_RATE], steer, ay, force, c, p, f)
+    if layout.roll >= 0:
+        ay = planar_ay(x, steer, p)
+        x[layout.roll] = f.roll_gradient * ay
+
+
+@njit(cache=True)
+def planar_ay(x, steer, p):  # type: ignore[no-untyped-def]
+    """Return the lateral acceleration at the centre of gravity in state x [n], m/s², but for that of the bank."""
+    w = dynamic_share(x[VX], p)
+    return w * (x[FRONT] * math.cos(steer) + x[REAR]) + (1.0 - w) * x[VX] * x[YAW_RATE]
+
+
+@njit(cache=True)
+def sensed_ay(x, steer, layout, p, f, row):  # type: ignore[no-untyped-def]
+    """Return what the accelerometer reads in state x [n], and write its derivative by the state to row [n]."""
+    row[:] = 0.0
+    w = dynamic_share(x[VX], p)
+    c = math.cos(steer)
+    gain = 1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient
+    turn = w * p.imu_x_m * p.mass_kg / p.yaw_inertia_kg_m2
+    vx, r = x[VX], x[YAW_RATE]
+    row[FRONT] = (gain * w + turn * p.front_m) * c
+    row[REAR] = gain * w - turn * p.rear_m
+    ay = row[FRONT] * x[FRONT] + row[REAR] * x[REAR] + gain * (1.0 - w) * vx * r - r * r * p.imu_y_m
+    row[VX] = gain * (1.0 - w) * r
+    row[YAW_RATE] = gain * (1.0 - w) * vx - 2.0 * r * p.imu_y_m
+    if layout.roll >= 0:
+        row[layout.roll] = GRAVITY_M_S2
+        ay += GRAVITY_M_S2 * x[layout.roll]
+    if layout.sensor_bias >= 0:
+        row[layout.sensor_bias] = 1.0
+        ay += x[layout.sensor_bias]
+    return ay

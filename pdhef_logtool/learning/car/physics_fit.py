@@ -1,0 +1,389 @@
+"""Identification of a car for ``physics``: the model, its parts' parameters and its noise, through the filter itself.
+
+In normalised parameters θ (distance from the prior in its standard deviations) the cost is
+
+    Σ_i N_i log(s_i² + s_0²) + |θ|² + (log(NIS / dof) / w)²
+
+where s_i is the RMS of the filter's sideslip error on drive i, N_i its length over the time in which errors stay alike,
+and s_0 what is not believed to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
+and a poor start ends at the worse one (METHOD §16). The last term fixes the scale of Q and R, of which the gain knows
+the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i, with derivatives by differences.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, PhysicsParts, Tyres, VehicleParameters, correct_signals
+from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, physics_filter
+from pdhef_logtool.learning.car.axle_forces import (
+    PEAK_LOG_STD,
+    SHAPE,
+    SHAPE_STD,
+    STIFFNESS_LOG_STD,
+    AxleCurve,
+    AxleSamples,
+    axle_samples,
+    fit_axle,
+    usable_stamps,
+)
+from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.signals import FloatArray, Signals
+
+#: Errors stay alike for this long, s; samples of the error a second; what the filter needs before it counts, s.
+CORRELATION_S, FIT_RATE_HZ, SETTLE_S = 1.0, 20.0, 2.0
+#: An RMS below this is not believed to be better still.
+FLOOR_RAD = math.radians(0.05)
+#: Spread of log(NIS / dof) about 0.
+NIS_LOG_STD = 1.0
+#: Errors beyond this many s count linearly: a moment in which the filter is lost must not decide the tyres.
+ROBUST = 3.0
+DERIVATIVE_STEP = 0.05
+MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
+#: Width of the tyres' priors about the axle-force fit, as a share of METHOD §14's widths about a vehicle file.
+AXLE_FIT_SHARE = 0.5
+NOISE_LOG_STD = 1.2
+#: Where θ starts: the noise has two valleys, that of clean sensors and that of a filter that hardly hears a_y.
+STARTS: tuple[dict[str, float], ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Prior of one parameter, normal in its own or, if ``log``, in logarithmic scale; ``low`` bounds the value."""
+
+    name: str
+    unit: str
+    mean: float
+    std: float
+    log: bool = False
+    low: float | None = None
+    tuning: bool = False  # belongs to the filter, not to the car
+
+    def value(self, theta: float) -> float:
+        """Return the parameter at a normalised distance from the prior."""
+        value = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
+        return value if self.low is None else max(value, self.low)
+
+
+def make_priors(
+    start: VehicleParameters, parts: PhysicsParts, samples: AxleSamples, usable_s: float, *, steering_wheel: bool
+) -> tuple[Prior, ...]:
+    """Return the priors of METHOD §14 and §16 about a vehicle file."""
+    mu = start.assumed_friction
+    priors = []
+    for axle, front, slip, force in (
+        ("front", True, samples.front_slip_rad, samples.front_force_n),
+        ("rear", False, samples.rear_slip_rad, samples.rear_force_n),
+    ):
+        seen = float(np.percentile(np.abs(force), 99.5)) if force.size else 0.0
+        peak = max(start.magic_formula(front, mu)[2], seen)
+        file_curve = AxleCurve(start.cornering_stiffness_n_per_rad(front, mu), peak, SHAPE)
+        curve = fit_axle(slip, force, prior=file_curve, mass_kg=start.mass_kg, independent=usable_s / CORRELATION_S)
+        width = AXLE_FIT_SHARE
+        priors += [
+            Prior(f"{axle} cornering stiffness", "N/rad", curve.stiffness_n_per_rad, width * STIFFNESS_LOG_STD, log=True),
+            Prior(f"{axle} peak force", "N", curve.peak_n, width * PEAK_LOG_STD, log=True),
+            Prior(f"{axle} shape", "1", curve.shape, width * SHAPE_STD, low=1.0),
+        ]
+    gradient = start.roll_gradient_rad_per_m_s2
+    known = gradient > 0.001
+    priors += [
+        Prior("yaw inertia", "kg m^2", start.yaw_inertia_kg_m2, 0.20, log=True),
+        Prior("steering offset", "rad", start.steer_offset_rad, math.radians(0.2)),
+        Prior("roll gradient", "rad/(m/s^2)", gradient, 0.3, log=True)
+        if known
+        else Prior("roll gradient", "rad/(m/s^2)", 0.004, 0.004, low=0.0),
+        Prior("a_y bias", "m/s^2", start.sensors.ay_bias_m_s2, 0.10),
+        Prior("yaw rate bias", "rad/s", start.sensors.yaw_rate_bias_rad_s, 0.002),
+    ]
+    if steering_wheel:
+        priors.append(Prior("steering ratio", "1", start.steering_ratio, 0.05, log=True))
+    if parts.lag:
+        priors.append(Prior("relaxation length", "m", start.relaxation_length_m or 0.5, 0.4, log=True))
+    if parts.load_transfer:
+        priors.append(Prior("load sensitivity", "1", start.load_sensitivity, 0.1, low=0.0))
+    if parts.roll:
+        priors += [
+            Prior("roll frequency", "rad/s", start.roll_frequency_rad_s, 0.3, log=True),
+            Prior("roll damping", "1", start.roll_damping, 0.4, log=True),
+            Prior("CG over roll axis", "m", 0.7 * start.cg_height_m, 0.2, low=0.0),
+        ]
+    sensors = start.sensors
+    priors += [
+        Prior("q v_y", "m/s/sqrt(s)", PHYSICS_Q_STD[1], NOISE_LOG_STD, log=True, tuning=True),
+        Prior("q yaw rate", "rad/s/sqrt(s)", PHYSICS_Q_STD[2], NOISE_LOG_STD, log=True, tuning=True),
+        Prior("q a_x bias", "m/s^2/sqrt(s)", 0.03, NOISE_LOG_STD, log=True, tuning=True),
+        Prior("q axle force", "m/s^2/sqrt(s)", PHYSICS_Q_STD[4], NOISE_LOG_STD, log=True, tuning=True),
+        Prior("r a_y", "m/s^2", max(0.3, sensors.ay_std_m_s2), NOISE_LOG_STD, log=True, tuning=True),
+        Prior("r yaw rate", "rad/s", sensors.yaw_rate_std_rad_s, NOISE_LOG_STD, log=True, tuning=True),
+    ]
+    return tuple(priors)
+
+
+def build_car(
+    start: VehicleParameters, parts: PhysicsParts, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
+) -> tuple[VehicleParameters, FilterNoise]:
+    """Return the vehicle file with the parameters at ``theta``, and the noise of ``physics`` that belongs to them."""
+
+    def rounded(value: float) -> float:
+        return float(f"{value:.{digits}g}")
+
+    v = {p.name: rounded(p.value(float(t))) for p, t in zip(priors, theta, strict=True)}
+    mu = start.assumed_friction
+
+    def tyre(axle: str) -> AxleTyre:
+        peak, shape = v[f"{axle} peak force"], v[f"{axle} shape"]
+        b = rounded(v[f"{axle} cornering stiffness"] / (shape * peak))
+        return AxleTyre(B=b, C=shape, D_n=rounded(peak / mu), E=0.0, reference_friction=mu)
+
+    sensors = start.sensors.model_copy(
+        update={"ay_bias_m_s2": v["a_y bias"], "yaw_rate_bias_rad_s": v["yaw rate bias"]}
+    )
+    update = {
+        "yaw_inertia_kg_m2": v["yaw inertia"],
+        "steer_offset_rad": v["steering offset"],
+        "roll_gradient_rad_per_m_s2": v["roll gradient"],
+        "friction": mu,
+        "sensors": sensors,
+        "tyres": Tyres(front=tyre("front"), rear=tyre("rear")),
+        "physics": parts,
+    }
+    for name, entry in (
+        ("steering ratio", "steering_ratio"),
+        ("relaxation length", "relaxation_length_m"),
+        ("load sensitivity", "load_sensitivity"),
+        ("roll frequency", "roll_frequency_rad_s"),
+        ("roll damping", "roll_damping"),
+        ("CG over roll axis", "cg_over_roll_axis_m"),
+    ):
+        if name in v:
+            update[entry] = v[name]
+    noise = FilterNoise(
+        q_std=(PHYSICS_Q_STD[0], v["q v_y"], v["q yaw rate"], v["q a_x bias"], v["q axle force"], v["q axle force"]),
+        r_std={"ay_m_s2": v["r a_y"], "yaw_rate_rad_s": v["r yaw rate"], "speed_m_s": sensors.speed_std_m_s},
+    )
+    return start.model_copy(update=update), noise
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveError:
+    """Sideslip errors in rad on one drive at :data:`FIT_RATE_HZ`, 0 where it does not count, and the mean NIS / dof."""
+
+    error: FloatArray
+    counted: int
+    seconds: float
+    nis: float
+
+    @property
+    def rms(self) -> float:
+        """RMS of what counts."""
+        return float(np.sqrt(np.sum(self.error**2) / max(self.counted, 1)))
+
+
+def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
+    """Return how long a drive can be used for identification."""
+    stamps = drive.signals.stamps_ns
+    period_s = float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.0
+    return float(np.count_nonzero(usable_stamps(drive, vehicle))) * period_s
+
+
+def signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParameters) -> Signals:
+    """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
+    ratio = start.steering_ratio / vehicle.steering_ratio
+    return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
+
+
+def drive_errors(
+    drives: Sequence[FitDrive], start: VehicleParameters, vehicle: VehicleParameters, noise: FilterNoise
+) -> list[DriveError]:
+    """Return the errors of ``physics`` on drives."""
+    estimator = physics_filter(vehicle, noise)
+    found = []
+    for drive in drives:
+        steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
+        stamps = drive.signals.stamps_ns
+        period_s = float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
+        every = max(1, round(1.0 / (FIT_RATE_HZ * period_s)))
+        pick = slice(None, None, every)
+        error = wrap_angle(np.arctan2(steps.x[pick, 1], steps.x[pick, 0]) - drive.truth.sideslip_rad[pick])
+        use = usable_stamps(drive, start)[pick] & steps.valid[pick] & np.isfinite(error)
+        use &= (stamps[pick] - stamps[0]) * 1e-9 > SETTLE_S
+        known = steps.nis_dof > 0
+        nis = float(np.minimum(steps.nis[known], 50.0).sum() / max(steps.nis_dof[known].sum(), 1.0))
+        counted = int(np.count_nonzero(use))
+        found.append(DriveError(np.where(use, error, 0.0), counted, counted * every * period_s, max(nis, 1e-3)))
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhysicsFit:
+    """A fitted car: vehicle, noise, priors with θ, posterior 1-sigma in prior units, cost and RMS by drive."""
+
+    vehicle: VehicleParameters
+    noise: FilterNoise
+    priors: tuple[Prior, ...]
+    theta: FloatArray
+    std: FloatArray
+    cost: float
+    rms_deg: float
+
+
+def fit_physics(
+    drives: Sequence[FitDrive],
+    start: VehicleParameters,
+    parts: PhysicsParts,
+    *,
+    steering_wheel: bool = False,
+    first: dict[str, float] | None = None,
+    samples: AxleSamples | None = None,
+) -> PhysicsFit:
+    """Fit the parameters and noise of ``physics`` with the given parts to drives with truth.
+
+    Parameters
+    ----------
+    first : where to start, θ by the parameter's name.
+    """
+    usable_s = sum(usable_seconds(d, start) for d in drives)
+    samples = samples or axle_samples(drives, start)
+    priors = make_priors(start, parts, samples, usable_s, steering_wheel=steering_wheel)
+    def errors(theta: FloatArray) -> list[DriveError]:
+        return drive_errors(drives, start, *build_car(start, parts, priors, theta))
+
+    def cost(found: Sequence[DriveError], theta: FloatArray) -> float:
+        fit = sum(d.seconds / CORRELATION_S * math.log(_robust_square(d) + FLOOR_RAD**2) for d in found)
+        return fit + float(theta @ theta) + _nis_residual(found) ** 2
+
+    starts = STARTS if first is None else (first,)
+    ends = [_minimise(errors, cost, np.array([first.get(p.name, 0.0) for p in priors])) for first in starts]
+    theta, jac, found, value = min(ends, key=lambda end: end[3])
+    std = np.sqrt(np.diag(np.linalg.inv(jac.T @ jac + np.eye(theta.size))))
+    vehicle, noise = build_car(start, parts, priors, theta, digits=6)
+    squares = sum(float(np.sum(d.error**2)) for d in found)
+    rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in found))))
+    return PhysicsFit(vehicle, noise, priors, theta, std, value, rms)
+
+
+def _scale(drive: DriveError) -> float:
+    return math.sqrt(_robust_square(drive) + FLOOR_RAD**2)
+
+
+def _robust_square(drive: DriveError) -> float:
+    """Return the mean square of errors cut at :data:`ROBUST` times their RMS."""
+    limit = ROBUST * drive.rms
+    return float(np.sum(np.minimum(np.abs(drive.error), limit) ** 2) / max(drive.counted, 1))
+
+
+def _nis_residual(found: Sequence[DriveError]) -> float:
+    total = sum(d.seconds for d in found)
+    return math.log(sum(d.nis * d.seconds for d in found) / max(total, 1e-9)) / NIS_LOG_STD
+
+
+def _minimise(
+    errors: Callable[[FloatArray], list[DriveError]],
+    cost: Callable[[Sequence[DriveError], FloatArray], float],
+    theta: FloatArray,
+) -> tuple[FloatArray, FloatArray, list[DriveError], float]:
+    """Return θ, the Jacobian of the scaled errors there without the priors, the errors and the cost."""
+    found = errors(theta)
+    value = cost(found, theta)
+    damping = 1e-2
+
+    def scaled(there: Sequence[DriveError], at: Sequence[DriveError]) -> FloatArray:
+        parts = []
+        for d, now in zip(there, at, strict=True):
+            s = _scale(now)
+            weight = math.sqrt(now.seconds / CORRELATION_S / max(now.counted, 1))
+            parts.append(weight * np.clip(d.error, -ROBUST * s, ROBUST * s) / s)
+        return np.concatenate([*parts, [_nis_residual(there)]])
+
+    jac = np.zeros((1, theta.size))
+    for _ in range(MAX_ITERATIONS):
+        at = scaled(found, found)
+        jac = np.empty((at.size, theta.size))
+        for i in range(theta.size):
+            moved = theta.copy()
+            moved[i] += DERIVATIVE_STEP
+            jac[:, i] = (scaled(errors(moved), found) - at) / DERIVATIVE_STEP
+        normal = jac.T @ jac + np.eye(theta.size)
+        gradient = jac.T @ at + theta
+        better = False
+        for _ in range(6):
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            step *= min(1.0, MAX_STEP / float(np.max(np.abs(step))))
+            there = errors(theta + step)
+            new = cost(there, theta + step)
+            if new < value:
+                better = True
+                break
+            damping *= 6.0
+        if not better:
+            break
+        gain = value - new
+        theta, found, value = theta + step, there, new
+        damping = max(damping / 5.0, 1e-5)
+        if gain < MIN_GAIN * max(1.0, sum(d.seconds for d in found) / CORRELATION_S):
+            break
+    return theta, jac, found, value
+
+
+#: Parts in the order in which they are tried, the cheapest first.
+ORDER = (("lag",), ("load_transfer",), ("roll",), ("biases",), ("bank",), ("force_scale",), ("braking",))
+#: A part must lower the held-out error by this share, over all folds, and may not raise it in any by as much.
+LEAST_GAIN = 0.03
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """A set of parts that was tried: RMS on held-out folds in degrees, and whether it was taken."""
+
+    parts: PhysicsParts
+    held_out_deg: tuple[float, ...]
+    taken: bool
+
+
+def choose_parts(
+    folds: Sequence[tuple[Sequence[FitDrive], Sequence[FitDrive]]],
+    start: VehicleParameters,
+    *,
+    steering_wheel: bool = False,
+    say: Callable[[str], None] = lambda _text: None,
+) -> tuple[PhysicsParts, tuple[Tried, ...], dict[str, float]]:
+    """Choose the parts by driving that their fit has not seen: the next one stays only with evidence.
+
+    Parameters
+    ----------
+    folds : of drives to fit on and drives to score on, which share no stamp.
+    """
+    parts = PhysicsParts()
+    tried: list[Tried] = []
+    theta: list[dict[str, float] | None] = [None for _ in folds]
+
+    def scored(parts: PhysicsParts) -> tuple[FloatArray, list[dict[str, float] | None]]:
+        scores: list[float] = []
+        found: list[dict[str, float] | None] = []
+        for (fit, held_out), first in zip(folds, theta, strict=True):
+            done = fit_physics(fit, start, parts, steering_wheel=steering_wheel, first=first)
+            errors = drive_errors(held_out, start, done.vehicle, done.noise)
+            total = sum(e.seconds for e in errors)
+            scores.append(sum(e.seconds * math.log(e.rms**2 + FLOOR_RAD**2) for e in errors) / (2.0 * total))
+            found.append({p.name: float(t) for p, t in zip(done.priors, done.theta, strict=True)})
+        return np.array(scores), found
+
+    best, theta = scored(parts)
+    tried.append(Tried(parts, tuple(np.degrees(np.exp(best)).tolist()), True))
+    for names in ORDER:
+        more = parts.model_copy(update=dict.fromkeys(names, True))
+        scores, found = scored(more)
+        gain = best - scores
+        taken = bool(gain.mean() > LEAST_GAIN and gain.min() > 0.0)
+        tried.append(Tried(more, tuple(np.degrees(np.exp(scores)).tolist()), taken))
+        say(f"{'+'.join(more.names)}: {np.degrees(np.exp(scores)).round(4)} {'taken' if taken else ''}")
+        if taken:
+            parts, best, theta = more, scores, found
+    return parts, tuple(tried), theta[0]
