@@ -17,8 +17,10 @@ from typing import Any, TypeVar
 
 from pdhef_logtool.car.flat import FlatCar, read_flat
 from pdhef_logtool.car.parts import (
+    PHYSICS,
     FilterNoise,
     Fit,
+    FittedPhysics,
     Intervals,
     LearntOn,
     Noise,
@@ -73,6 +75,7 @@ class Car:
     vehicle : physics and sensors, what identification found included.
     own : physics and sensors as the person's file has them.
     noise : of filters, by the name of :data:`~.parts.NOISY_FILTERS`; only what belongs to ``vehicle``.
+    fitted_physics : what identification found through ``physics``, None without.
     network, network_name, network_folder : the residual network, None without; trust : what was found of it.
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives that ``vehicle`` was identified on.
@@ -88,6 +91,7 @@ class Car:
     trust: Trust | None = None
     intervals: Intervals | None = None
     learnt_on: tuple[LearntOn, ...] = ()
+    fitted_physics: FittedPhysics | None = None
     source: Path | None = None
     notes: tuple[str, ...] = ()
 
@@ -115,7 +119,7 @@ class Car:
 
         >>> car = Car.load("saloon")
         >>> car.vehicle.mass_kg, sorted(car.noise), car.allowed_trust.cap
-        (1440.0, ['pd-hef', 'phy-ukf-tuned', 'physics-plus'], 1.0)
+        (1440.0, ['pd-hef', 'phy-ukf-tuned', 'physics'], 1.0)
         """
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None
@@ -151,6 +155,12 @@ class Car:
     def physics_sha256(self) -> str:
         """Digest of the physics that estimators run with."""
         return physics_sha256(self.vehicle)
+
+    @property
+    def physics_vehicle(self) -> VehicleParameters:
+        """The vehicle as ``physics`` has it: with the values that were found through it, else every filter's."""
+        found = self.fitted_physics
+        return self.vehicle if found is None else found.values.applied_to(self.own)
 
     @property
     def noise_sha256(self) -> str:
@@ -190,35 +200,44 @@ class Car:
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
         vehicle = fit.values.applied_to(self.own)
-        if not vehicle.name.endswith("(identified)"):
+        if vehicle != self.own and not vehicle.name.endswith("(identified)"):
             vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
         here = physics_sha256(vehicle)
         noise = {n: one for n, one in self.noise.items() if one.physics_sha256 in (None, here)} | fit.filter
-        return replace(self, vehicle=vehicle, noise=noise, trust=None, learnt_on=fit.drives)
+        if fit.physics is not None:
+            noise[PHYSICS] = fit.physics.noise
+        trust = self.trust if vehicle == self.own else None
+        return replace(
+            self, vehicle=vehicle, noise=noise, trust=trust, learnt_on=fit.drives, fitted_physics=fit.physics
+        )
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
         """Return the car with another noise of one filter."""
         return replace(self, noise={**self.noise, name: noise})
 
     def with_vehicle(self, vehicle: VehicleParameters) -> Car:
-        """Return the car with other physics, made wrong on purpose, and everything else as it is, its trust too."""
+        """Return the car with other physics, made wrong on purpose, and everything else as it is, its trust too.
+
+        What was found through ``physics`` is left out: it would put the right values back.
+        """
         trust = self.trust
         if trust is not None and trust.physics_sha256 == self.physics_sha256:
             trust = trust.model_copy(update={"physics_sha256": None})
-        return replace(self, vehicle=vehicle, trust=trust)
+        return replace(self, vehicle=vehicle, trust=trust, fitted_physics=None)
 
 
 def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
     """Return the car with fit, noise and trust: those of the file, then those of the folder that are not stale."""
     notes: list[str] = []
     noise, trust, learnt_on = dict(flat.noise), flat.trust, flat.learnt_on
-    vehicle = car.own
+    vehicle, physics = car.own, flat.physics
     if folder is not None:
         own = physics_sha256(vehicle)
         fit = _part(folder / FIT_FILE, Fit)
         if fit is not None and fit.physics_sha256 == own:
             car = replace(car, noise=noise).with_fit(fit)
-            vehicle, noise, learnt_on, trust = car.vehicle, dict(car.noise), car.learnt_on, None
+            vehicle, noise, learnt_on, trust = car.vehicle, dict(car.noise), car.learnt_on, car.trust
+            physics = car.fitted_physics
         elif fit is not None:
             notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "pdhef identify"))
         tuned, stale = _part(folder / NOISE_FILE, Noise), list[str]()
@@ -231,7 +250,15 @@ def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
         if stale:
             notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "pdhef tune"))
         trust = _part(folder / NETWORK_FILE, Trust) or trust
-    return replace(car, vehicle=vehicle, noise=noise, trust=trust, learnt_on=learnt_on, notes=tuple(notes))
+    return replace(
+        car,
+        vehicle=vehicle,
+        noise=noise,
+        trust=trust,
+        learnt_on=learnt_on,
+        fitted_physics=physics,
+        notes=tuple(notes),
+    )
 
 
 def _stale(what: str, why: str, command: str) -> str:

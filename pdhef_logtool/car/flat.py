@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from pydantic import ConfigDict, Field
 
-from pdhef_logtool.car.parts import FilterNoise, FilterTables, LearntOn, Sha256, Trust
+from pdhef_logtool.car.parts import FilterNoise, FilterTables, FittedPhysics, LearntOn, Sha256, Trust
 from pdhef_logtool.car.vehicle import REMEDY, Record, VehicleParameters
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import VehicleError
@@ -35,6 +35,7 @@ class _Identification(Record):
     model_config = ConfigDict(frozen=True, extra="allow")
     drives: Annotated[tuple[str | LearntOn, ...], Field(strict=False)] = ()
     tuning_scores: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    physics: FittedPhysics | None = None
 
 
 class _FlatFile(VehicleParameters):
@@ -53,6 +54,7 @@ class FlatCar:
     noise: Mapping[str, FilterNoise] = field(default_factory=dict)
     trust: Trust | None = None
     learnt_on: tuple[LearntOn, ...] = ()
+    physics: FittedPhysics | None = None
 
 
 def read_flat(path: Path) -> FlatCar:
@@ -83,7 +85,7 @@ def read_flat(path: Path) -> FlatCar:
     trust = None
     if network is not None:
         trust = Trust(trust_cap=network.trust_cap, evidence=network.evidence, network_sha256=network.model_sha256)
-    return FlatCar(vehicle, noise, trust, tuple(drives))
+    return FlatCar(vehicle, noise, trust, tuple(drives), tables.identification.physics)
 
 
 def load_vehicle(path: Path) -> VehicleParameters:

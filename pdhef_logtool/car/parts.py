@@ -13,13 +13,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from pdhef_logtool.car.vehicle import NonNegative, Positive, Record, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import NonNegative, PhysicsParts, Positive, Record, Tyres, VehicleParameters
 from pdhef_logtool.records.documents import one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
+#: The filter on physics that has parts of its own.
+PHYSICS = "physics"
 #: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
-NOISY_FILTERS = ("phy-ukf-tuned", "physics-plus", "pd-hef", "pd-hef-smoothed")
+NOISY_FILTERS = ("phy-ukf-tuned", PHYSICS, "pd-hef", "pd-hef-smoothed")
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
@@ -66,6 +68,12 @@ class FittedValues(Record):
     friction: Positive | None = None
     sensors: FittedSensors | None = None
     tyres: Tyres | None = None
+    relaxation_length_m: NonNegative | None = None
+    load_sensitivity: NonNegative | None = None
+    roll_frequency_rad_s: Positive | None = None
+    roll_damping: Positive | None = None
+    cg_over_roll_axis_m: NonNegative | None = None
+    physics: PhysicsParts | None = None
 
     @classmethod
     def between(cls, own: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
@@ -89,7 +97,7 @@ class FilterNoise(Record):
     Attributes
     ----------
     q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
-        ``physics-plus`` also of the two axle forces. Empty: the filter's own.
+        ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
     physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, for filters that have one.
     score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
@@ -111,24 +119,41 @@ class FilterNoise(Record):
         return self
 
 
-def _axle_forces_belong_to_physics_plus(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
+def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
     for name, table in tables.items():
-        if len(table.q_std) == 6 and name != "physics-plus":
-            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics-plus's")
+        if len(table.q_std) == 6 and name != PHYSICS:
+            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics's")
     return tables
 
 
 #: Noise by filter.
 FilterTables = Annotated[
     dict[Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise],
-    AfterValidator(_axle_forces_belong_to_physics_plus),
+    AfterValidator(_axle_forces_belong_to_physics),
 ]
+
+
+class TriedParts(Record):
+    """A set of parts of ``physics`` that was tried: its error on folds that its fits had not seen, and the verdict."""
+
+    parts: Annotated[tuple[str, ...], Field(strict=False)]
+    held_out_deg: Annotated[tuple[float, ...], Field(strict=False)]
+    taken: bool
+
+
+class FittedPhysics(Record):
+    """What ``physics`` has of its own: values and noise that were found through it, and why it has its parts."""
+
+    values: FittedValues
+    noise: FilterNoise
+    tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 
 
 class Fit(Record):
     """``fit.toml``, written by ``pdhef identify``: the car's physics as the drives show it.
 
-    The noise in ``filter`` was found together with the values and belongs to them (METHOD §14).
+    The noise in ``filter`` was found together with the values and belongs to them (METHOD §14). ``physics`` are those
+    of the filter of that name, whose model has other parts: each filter's are found through itself.
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
@@ -136,6 +161,7 @@ class Fit(Record):
     physics_sha256: Sha256
     values: FittedValues
     filter: FilterTables = Field(default_factory=dict)
+    physics: FittedPhysics | None = None
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     scores: dict[str, dict[str, float]] = Field(default_factory=dict)
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()

@@ -144,6 +144,8 @@ def write_change(
     provenance = dict(change.told)
     if after.learnt_on:
         provenance["drives"] = [d.model_dump(mode="json") for d in after.learnt_on]
+    if after.fitted_physics is not None:
+        provenance["physics"] = after.fitted_physics.model_dump(mode="json", exclude_none=True)
     flat = flat_toml(text, source.own, after.vehicle, after.noise, after.trust, provenance, comments)
     write_bytes(output, flat.encode())
     for name, content in change.files.items():

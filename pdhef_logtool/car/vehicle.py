@@ -260,6 +260,22 @@ def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
     )
 
 
+def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehicleParameters) -> Signals:
+    """Return signals that were read and corrected with one vehicle as another one's ratio, offset and biases do it."""
+    before, after = was.sensors, vehicle.sensors
+    raw = replace(
+        signals,
+        steer_rad=(signals.steer_rad + was.steer_offset_rad) * (was.steering_ratio / vehicle.steering_ratio),
+        ax_m_s2=signals.ax_m_s2 + before.ax_bias_m_s2,
+        ay_m_s2=signals.ay_m_s2 + before.ay_bias_m_s2,
+        yaw_rate_rad_s=signals.yaw_rate_rad_s + before.yaw_rate_bias_rad_s,
+    )
+    same = (vehicle.steering_ratio, vehicle.steer_offset_rad, after) == (
+        was.steering_ratio, was.steer_offset_rad, before,
+    )  # fmt: skip
+    return signals if same else correct_signals(raw, vehicle)
+
+
 #: Table 3 of the paper, with METHOD §2's nominal axle tyres. Used when no vehicle file is given.
 DEFAULT_VEHICLE_NAME = "sedan"
 

@@ -7,11 +7,11 @@ part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lat
 - **Roll**: φ̈ = ω² (G a_y − φ) − 2 ζ ω φ̇ with the roll gradient G. The tyres see v_y + h_s φ̇, for the centre of gravity
   swings h_s above the roll axis; the accelerometer reads g φ beside the forces. Without it the body follows at once:
   (1 + g G) Σf.
-- **Load transfer** takes x = 2 h a_y / (g T) of a wheel's load to the other one of its axle; with roll a_y is φ / G, for
-  springs carry it. A tyre whose force per load falls by the share s_z for each relative excess of load leaves
+- **Load transfer** takes x = 2 h a_y / (g T) of a wheel's load to the other one of its axle; with roll a_y is φ / G,
+  for springs carry it. A tyre whose force per load falls by the share s_z for each relative excess of load leaves
   1 − s_z x² of an axle's force (Eq 7). A magic formula that was fitted to an axle holds that loss already for steady
   cornering, in which the axle's own force says what a_y was: what is left is the ratio of the two.
-- **Braking** (``ax`` below 0) moves the load a_x h / L to the front and takes from both axles' grip what it uses itself,
+- **Braking** (``ax`` below 0) moves the load a_x h / L to the front and takes from both axles' grip what it uses,
   √(1 − (a_x / μ g)²), with brakes that are shared as the loads are. Which axle drives is not known: nothing is done
   when the car accelerates.
 - **Bank**: −g · bank in v̇_y and nowhere else, an Ornstein-Uhlenbeck process.
@@ -19,8 +19,8 @@ part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lat
 
 A step moves all points at once in inner loops without branches, as :mod:`~pdhef_logtool.car.nominal_points` does. One
 evaluation of the tyres a step: the exponential kernel of the lag weighs what they were asked over the step, and stands
-for one instant of it, t*; the state there is that at the start, moved by its derivative. Velocities take the mean of the
-forces at both ends. Both are of second order in the step, and stable for any lag.
+for one instant of it, t*; the state there is that at the start, moved by its derivative. Velocities take the mean of
+the forces at both ends. Both are of second order in the step, and stable for any lag.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
 
 @_inline
 def _transfer_factor(ay, f):  # type: ignore[no-untyped-def]
-    """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x ends at 1, where the inner wheel is off the road."""
+    """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x ends at 1, the inner wheel off the road."""
     x = min(1.0, abs(f.transfer_per_ay * ay))
     return 1.0 - f.load_sensitivity * x * x
 
@@ -261,9 +261,7 @@ def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untype
                 ay = w * (mfc + mr) + (1.0 - w) * mx * mrate
                 middle, speed = phi + half * phi_dot, phi_dot + half * roll_acc
                 points[roll, j] = phi + h * speed
-                points[roll + 1, j] = phi_dot + h * (
-                    stiffness * (f.roll_gradient * ay - middle) - damping * speed
-                )
+                points[roll + 1, j] = phi_dot + h * (stiffness * (f.roll_gradient * ay - middle) - damping * speed)
             if banks:
                 points[bank, j] *= bank_kept
             if scales:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise
+from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators.physics import (
     BIAS_WALK_STD,
@@ -58,8 +58,6 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.table import Options
 
-NAME = "physics"
-
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own:
 #: by innovation likelihood over simulated drives (``studies.defaults.tune_physics_q``, its result in ``results/``).
 PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
@@ -98,7 +96,7 @@ def _draw(x, P, scale, layout, L, points):  # type: ignore[no-untyped-def]
 
 @_compiled
 def _moments(points, x, P, deviation):  # type: ignore[no-untyped-def]
-    """Write mean [n] and covariance [n, n] of points [n, 2n+1], and their deviations; the weights are those of _draw."""
+    """Write mean [n], covariance [n, n] and deviations of points [n, 2n+1] that :func:`_draw` drew."""
     n, s = points.shape
     weight = 0.5 / n
     for j in range(n):
@@ -294,6 +292,7 @@ class PhysicsFilter:
     use_speed : False is the paper's ``esp`` suite: the speed sensor only starts the filter.
     slip_gate : leave out the speed of wheels that spin or lock (:mod:`~.speed_slip`).
     standstill : hold the motion at zero while the car stands.
+    read_with : the vehicle with which its signals were read and corrected, where that is another; None: its own.
     """
 
     vehicle: VehicleParameters
@@ -302,7 +301,8 @@ class PhysicsFilter:
     use_speed: bool = True
     slip_gate: bool = True
     standstill: bool = True
-    name: str = NAME
+    read_with: VehicleParameters | None = None
+    name: str = PHYSICS
     causal: bool = True
 
     @property
@@ -369,6 +369,8 @@ class PhysicsFilter:
     def _steps(
         self, signals: Signals, carry: FilterCarry | None, extra_r: FloatArray | None, *, linked: bool
     ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
+        if self.read_with is not None:
+            signals = corrected_anew(signals, self.read_with, self.vehicle)
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
         window, tuning = shell.make_window(signals, carry, extra_r=extra_r), self._tuning
@@ -420,5 +422,13 @@ def physics_filter(
 
 
 def build(name: str, car: Car, options: Options) -> PhysicsFilter:
-    """Return ``physics`` of a car, with its noise where the car has one."""
-    return physics_filter(car.vehicle, car.noise.get(name), use_speed=options.use_speed)
+    """Return ``physics`` of a car."""
+    del name
+    return of_car(car, use_speed=options.use_speed)
+
+
+def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
+    """Return ``physics`` of a car, with what was found through it and its noise where the car has them."""
+    vehicle = car.physics_vehicle
+    found = physics_filter(vehicle, car.noise.get(PHYSICS), use_speed=use_speed)
+    return found if vehicle == car.vehicle else replace(found, read_with=car.vehicle)

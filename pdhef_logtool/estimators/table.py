@@ -125,8 +125,8 @@ SPECS: tuple[Spec, ...] = (
         "physics:build", _ESP, 0x0072B2,
     ),
     Spec(
-        "physics-plus", "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
-        "physics_plus:build", _ESP, 0x44AA99, tunable="always",
+        "physics", "the strongest filter on physics alone, with the parts that the car's driving gives evidence for",
+        "physics_ukf:build", _ESP, 0x44AA99, tunable="always",
     ),
     Spec(
         "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",

@@ -1,6 +1,6 @@
 """Find the process noise of a filter on physics by innovation likelihood, without any truth.
 
-    python -m studies.defaults.tune_physics_q {phy-ukf,physics-plus}
+    python -m studies.defaults.tune_physics_q {phy-ukf,physics}
 
 Maximises the mean over manoeuvres of the log-likelihood per scalar innovation, so that minutes of straight road do
 not outvote a lane change. R stays at sensor level (vehicle file). Nelder-Mead on the logarithms of the 1-sigma values,
@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from scipy.optimize import minimize
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from pdhef_logtool.records.signals import FloatArray
 from studies.defaults.tuning_drives import VEHICLE_FILE, TuningDrive, sideslip_rmse_deg, tuning_drives, write_result
 from studies.pages import options
@@ -63,7 +63,7 @@ SEARCHES = {
         {"xatol": 0.02, "fatol": 1e-5, "maxfev": 400},
         worthwhile=2e-4,
     ),
-    "physics-plus": Search(
+    "physics": Search(
         "physics_plus_q",
         (*STATES, "force_over_mass_m_s2"),
         ((0.1, 0.1, 0.05, 0.02, 2.0), (0.1, 0.3, 0.2, 0.02, 0.5)),

@@ -66,7 +66,7 @@ cornering_stiffness_n_per_rad = 108000.0
 """
 COMMENTS = ("# My car, weighed on 3 May.", "# with driver", "# tank full", "# guessed", "# end")
 DRIVES = (LearntOn(name="lap", sha256="cd" * 32, start_s=0.0, end_s=80.0),)
-TUNED, PLUS = "phy-ukf-tuned", "physics-plus"
+TUNED, PLUS = "phy-ukf-tuned", "physics"
 
 
 @pytest.fixture
@@ -214,7 +214,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert car.learnt_on == ()
     assert car.notes == (
         "fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew",
-        "noise of physics-plus is not used: it belongs to other physics; pdhef tune makes it anew",
+        "noise of physics is not used: it belongs to other physics; pdhef tune makes it anew",
         "network.toml allows no trust: it was found with other physics; pdhef trust makes it anew",
     )
     assert car.allowed_trust.cap == 0.0
@@ -261,7 +261,7 @@ def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     assert car.vehicle.friction == 0.7
     assert dict(car.noise) == fit.filter
     assert [note.split(":")[0] for note in car.notes] == [
-        "noise of physics-plus is not used",
+        "noise of physics is not used",
         "network.toml allows no trust",
     ]
     assert car.allowed_trust.cap == 0.0
@@ -340,7 +340,7 @@ TRUST = 'format = "pdhef-network"\nversion = 1\n'
         (NOISE_FILE, NOISE + "r_std = {ay = 1.0}\n", f"did you mean filter.{TUNED}.r_std.ay_m_s2?"),
         (NOISE_FILE, NOISE.replace("tuned", "tunde") + "q_std = []\n", f"did you mean filter.{TUNED}?"),
         (NOISE_FILE, NOISE + "q_std = [1.0]\n", "q_std needs 3 or 4 entries"),
-        (NOISE_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics-plus's"),
+        (NOISE_FILE, NOISE + f"q_std = {[0.1] * 6}\n", "6 are physics's"),
         (NOISE_FILE, NOISE.replace("noise", "fit"), "format: should be 'pdhef-noise'"),
         (NETWORK_FILE, TRUST + "trust_kap = 1.0\n", "trust_kap: unknown, did you mean trust_cap?"),
         (NETWORK_FILE, TRUST + "trust_cap = 1.5\n", "trust_cap: "),
@@ -363,14 +363,14 @@ def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: st
 FLAT = """
 [filter.phy-ukf-tuned]
 q_std = [0.1, 0.1, 0.1]
-[filter.physics-plus]
+[filter.physics]
 q_std = [0.1, 0.1, 0.1]
 [network]
 trust_cap = 0.25
 evidence = "a drive of 300 s"
 [identification]
 drives = ["lap: 0 to 80.5 s", {name = "other", sha256 = "cd", start_s = 1.0, end_s = 2.0}]
-tuning_scores = ["physics-plus: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
+tuning_scores = ["physics: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
 tool = "pdhef 0.1"
 """
 
@@ -392,7 +392,7 @@ def test_scores_and_drives_of_older_files_are_understood(tmp_path: Path) -> None
     [
         ("0.1092 deg at trial", "0.1092° at trial"),
         ("0.1092 deg at trial 63", "0.1092 deg"),
-        ("physics-plus: 0.1092", "physics-plus 0.1092"),
+        ("physics: 0.1092", "physics 0.1092"),
         ("lap: 0 to 80.5 s", "lap: all of it"),
     ],
 )

@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
 from reference_car import cut, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -18,7 +19,6 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
 from pdhef_logtool.estimators.pd_hef import build_smoothed
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
 from pdhef_logtool.estimators.smoothed import SmoothedHybrid
 from pdhef_logtool.estimators.table import Options
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
@@ -31,7 +31,7 @@ from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
-TABLES = {n: FilterNoise(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics-plus")}
+TABLES = {n: FilterNoise(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics")}
 COLUMNS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "covariance", "nis", "valid", "reason")
 
 
@@ -88,11 +88,11 @@ def test_windows_of_any_cut_join_bit_for_bit(faulty: Signals, inner: list[int]) 
 @pytest.mark.parametrize(
     ("tables", "scores", "name"),
     [
-        ((), [], "physics-plus"),
+        ((), [], "physics"),
         (("phy-ukf-tuned",), [], "phy-ukf-tuned"),
-        (("phy-ukf-tuned", "physics-plus"), [], "phy-ukf-tuned"),
-        (("phy-ukf-tuned", "physics-plus"), [0.14, 0.11], "physics-plus"),
-        (("phy-ukf-tuned", "physics-plus"), [0.11, 0.14], "phy-ukf-tuned"),
+        (("phy-ukf-tuned", "physics"), [], "phy-ukf-tuned"),
+        (("phy-ukf-tuned", "physics"), [0.14, 0.11], "physics"),
+        (("phy-ukf-tuned", "physics"), [0.11, 0.14], "phy-ukf-tuned"),
     ],
 )
 def test_drives_with_truth_choose_the_filter(tables: tuple[str, ...], scores: list[float], name: str) -> None:
@@ -100,7 +100,7 @@ def test_drives_with_truth_choose_the_filter(tables: tuple[str, ...], scores: li
     noise = {n: TABLES[n].model_copy(update={"score_deg": s}) for n, s in zip(tables, told, strict=True)}
     chosen = strongest_physics(Car.of(VEHICLE, noise=noise))
     assert chosen.name == name
-    assert isinstance(chosen, PhysicsPlusUkf) == (name == "physics-plus")
+    assert isinstance(chosen, PhysicsPlusUkf) == (name == "physics")
 
 
 def test_the_smoothed_one_has_the_noise_of_the_tuned_filter(faulty: Signals) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from reference_car import (
     FRICTION,
     REAR_M,
@@ -26,7 +27,6 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.filter_shell import sideslip_std
 from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
 

@@ -230,7 +230,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_filter_on_the_wrong_branch_is_flagged_at_once_in_every_output(
     sweep: Path, sample_logs_dir: Path, tmp_path: Path
 ) -> None:
-    names = ("phy-ukf", "physics-plus", "zero")
+    names = ("phy-ukf", "physics", "zero")
     config = RunConfig(car=sample_logs_dir / "vehicle_mu03.toml", estimators=names, annotate="none")
     result = run_logs([str(sweep)], tmp_path, config)
     folder = tmp_path / "logs" / "sweep"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from reference_car import cut, drive, rolling_drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import default_vehicle
@@ -15,7 +16,6 @@ from pdhef_logtool.estimators.filter_shell import U_SPEED
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.open_loop import OpenLoop
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.watches.speed_slip import TIMEOUT_S, without_slip

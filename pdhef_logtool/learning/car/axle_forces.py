@@ -67,8 +67,12 @@ def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
     return use
 
 
-def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> AxleSamples:
-    """Return slip angles and forces of all usable stamps of all drives, smoothed to ``SMOOTHING_HZ``."""
+def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, similar: bool = False) -> AxleSamples:
+    """Return slip angles and forces of all usable stamps of all drives, smoothed to ``SMOOTHING_HZ``.
+
+    ``similar`` : at the vehicle file's friction, for tyres that keep their stiffness: one curve of force over friction
+    by slip over friction.
+    """
     columns: list[tuple[FloatArray, ...]] = []
     lf, lr = vehicle.cg_to_front_axle_m, vehicle.cg_to_rear_axle_m
     for drive in drives:
@@ -87,8 +91,7 @@ def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> Axle
         total, moment = vehicle.mass_kg * ay, vehicle.yaw_inertia_kg_m2 * r_dot
         front = (lr * total + moment) / (lf + lr) / np.cos(steer)
         rear = (lf * total - moment) / (lf + lr)
-        # A tyre that keeps its stiffness has one curve of force over friction by slip over friction (similarity).
-        known = np.isfinite(drive.signals.friction)
+        known = similar & np.isfinite(drive.signals.friction)
         grip = np.where(known, drive.signals.friction / vehicle.assumed_friction, 1.0)
         slips = (steer - np.arctan((vy + lf * r) / vx), -np.arctan((vy - lr * r) / vx))
         columns.append((slips[0] / grip, front / grip, slips[1] / grip, rear / grip))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.logs.discovery import LogInput
@@ -65,6 +66,18 @@ def load_fit_drive(
     return record, FitDrive(record.name, whole.signals, whole.truth, independent, whole.log_start_ns, by_wheel)
 
 
+def period_s(drive: FitDrive) -> float:
+    """Return the usual time from one stamp to the next."""
+    stamps = drive.signals.stamps_ns
+    return float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
+
+
+def signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParameters) -> Signals:
+    """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
+    ratio = start.steering_ratio / vehicle.steering_ratio
+    return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
+
+
 def split_drive(drive: FitDrive, holdout: float) -> tuple[FitDrive, FitDrive | None]:
     """Split off the last ``holdout`` share of a drive, with ``GUARD_S`` between; None when nothing is held out."""
     if holdout <= 0.0:
@@ -73,10 +86,11 @@ def split_drive(drive: FitDrive, holdout: float) -> tuple[FitDrive, FitDrive | N
     cut = int(stamps[0]) + round((1.0 - holdout) * (int(stamps[-1]) - int(stamps[0])))
     first = int(np.searchsorted(stamps, cut))
     second = int(np.searchsorted(stamps, cut + round(GUARD_S * 1e9)))
-    return _part(drive, 0, first), _part(drive, second, len(stamps)) if second < len(stamps) else None
+    return part_of(drive, 0, first), part_of(drive, second, len(stamps)) if second < len(stamps) else None
 
 
-def _part(drive: FitDrive, a: int, b: int) -> FitDrive:
+def part_of(drive: FitDrive, a: int, b: int) -> FitDrive:
+    """Return the stamps [a, b) of a drive."""
     columns = {}
     for f in fields(StateTrack):
         value = getattr(drive.truth, f.name)

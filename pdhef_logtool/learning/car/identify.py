@@ -14,15 +14,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, Tyres, VehicleParameters, correct_signals
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.pass_through import PassThrough
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
+from pdhef_logtool.estimators.physics_ukf import physics_filter
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.axle_forces import (
     PEAK_LOG_STD,
@@ -36,10 +37,12 @@ from pdhef_logtool.learning.car.axle_forces import (
     fit_axle,
     usable_stamps,
 )
-from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.learning.car.fit_data import FitDrive, period_s, signals_of
+from pdhef_logtool.learning.car.physics_fit import PhysicsFit, find_physics
+from pdhef_logtool.learning.car.prior import Prior
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 #: Neighbouring samples are dependent: this much time is worth one independent sample.
 CORRELATION_S = 1.0
@@ -66,27 +69,6 @@ MIN_DRIVE_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Prior:
-    """Prior of one parameter, normal in its own or, if ``log``, in logarithmic scale; ``low`` bounds the value."""
-
-    name: str
-    unit: str
-    mean: float
-    std: float
-    log: bool = False
-    low: float | None = None
-    tuning: bool = False  # belongs to the filter, not to the car: never put back to its prior
-
-    def value(self, theta: float) -> float:
-        """Return the parameter at a normalised distance from the prior."""
-        return self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
-
-    def theta(self, value: float) -> float:
-        """Return the normalised distance of a value."""
-        return math.log(value / self.mean) / self.std if self.log else (value - self.mean) / self.std
-
-
-@dataclass(frozen=True, slots=True)
 class Identified:
     """One parameter: value with its 95 % interval, prior mean, and whether the drives excited it."""
 
@@ -109,20 +91,23 @@ class PartScore:
     zero_deg: float
     start_file_deg: float
     identified_deg: float
+    physics_deg: float
 
     def to_dict(self) -> dict[str, float]:
         """Return the figures as they stand with the car."""
         figures = {"seconds": self.seconds, "zero_deg": self.zero_deg}
         figures |= {"starting_car_deg": self.start_file_deg, "identified_deg": self.identified_deg}
+        figures["physics_deg"] = self.physics_deg
         return {name: round(value, 4) for name, value in figures.items()}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
-    """Everything that identification found; ``noise`` is that of ``phy-ukf-tuned``."""
+    """Everything that identification found: values with the noise of ``phy-ukf-tuned``, and those of ``physics``."""
 
     vehicle: VehicleParameters
     noise: FilterNoise
+    physics: FittedPhysics
     parameters: tuple[Identified, ...]
     scores: tuple[PartScore, ...]
     samples: AxleSamples
@@ -138,6 +123,7 @@ def fit_car(
     start: VehicleParameters,
     *,
     steering_wheel: bool = False,
+    parts: PhysicsParts | None = None,
     progress: Progress = lambda _text, _share: None,
 ) -> Identification:
     """Identify a vehicle on ``fit`` and score it, once, on ``held_out``.
@@ -147,13 +133,14 @@ def fit_car(
     fit, held_out : parts of drives that share no stamp.
     start : gives geometry, mass, priors (its tyres, inertia, roll gradient) and sensor noise.
     steering_wheel : the steering signal is a steering-wheel angle, so that the ratio is identified too.
+    parts : of ``physics``; None: chosen by what part of the drives says of the other.
 
     Raises
     ------
     EstimatorError
         There is too little usable driving with truth.
     """
-    usable_s = sum(float(np.count_nonzero(usable_stamps(d, start))) * _period_s(d) for d in fit)
+    usable_s = sum(float(np.count_nonzero(usable_stamps(d, start))) * period_s(d) for d in fit)
     if usable_s < MIN_DRIVE_S:
         raise EstimatorError(
             expected=f"at least {MIN_DRIVE_S:g} s of driving with truth, above twice the low-speed limit",
@@ -169,7 +156,7 @@ def fit_car(
     total = OUTER_PASSES + 1
     std = np.ones(len(priors))
     for outer in range(total):
-        progress("fitting the filter's sideslip to the truth", 0.9 * outer / total)
+        progress("fitting the filter's sideslip to the truth", 0.3 * outer / total)
         theta, std, rmse = _minimise(fit, start, priors, theta, active, sigma)
         sigma = np.maximum(MIN_SIGMA_RAD, rmse)
         if outer == OUTER_PASSES - 1:
@@ -178,10 +165,17 @@ def fit_car(
                 break
             active, theta = excited, np.where(excited, theta, np.clip(0.0, _low_theta(priors), None))
     vehicle, noise = build_vehicle(start, priors, theta, digits=6)
+    found, physics = find_physics(
+        fit,
+        start,
+        steering_wheel=steering_wheel,
+        parts=parts,
+        progress=lambda text, share: progress(text, 0.3 + 0.6 * share),
+    )
     progress("scoring", 0.95)
-    scores = [_score("fit", fit, start, vehicle, noise)]
+    scores = [_score("fit", fit, start, vehicle, noise, found)]
     if held_out:
-        scores.append(_score("held out", held_out, start, vehicle, noise))
+        scores.append(_score("held out", held_out, start, vehicle, noise, found))
     parameters = tuple(
         Identified(
             name=p.name,
@@ -195,7 +189,8 @@ def fit_car(
         )
         for p, t, s, a in zip(priors, theta, std, active, strict=True)
     )
-    return Identification(vehicle, noise, parameters, tuple(scores), samples, _notes(parameters, fit, usable_s))
+    notes = (*_notes(parameters, fit, usable_s), _told(physics))
+    return Identification(vehicle, noise, physics, parameters, tuple(scores), samples, notes)
 
 
 def make_priors(
@@ -405,23 +400,17 @@ def _sideslip_errors(
     estimator = physics_ukf_tuned(vehicle, noise)
     parts = []
     for drive in drives:
-        steps, _ = estimator.filter_steps(_signals_of(drive, start, vehicle), None)
-        every = max(1, round(1.0 / (FIT_RATE_HZ * _period_s(drive))))
+        steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
+        every = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive))))
         pick = slice(None, None, every)
         beta = np.arctan2(steps.x[pick, 1], steps.x[pick, 0])
         error = wrap_angle(beta - drive.truth.sideslip_rad[pick])
         stamps = drive.signals.stamps_ns
         use = usable_stamps(drive, start)[pick] & steps.valid[pick] & np.isfinite(error)
         use &= (stamps[pick] - stamps[0]) * 1e-9 > SETTLE_S
-        weight = math.sqrt(every * _period_s(drive) / CORRELATION_S)
+        weight = math.sqrt(every * period_s(drive) / CORRELATION_S)
         parts.append((np.where(use, error, 0.0), np.where(use, weight, 0.0)))
     return parts
-
-
-def _signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParameters) -> Signals:
-    """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
-    ratio = start.steering_ratio / vehicle.steering_ratio
-    return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
 
 
 # ---- the verdict ----
@@ -433,17 +422,19 @@ def _score(
     start: VehicleParameters,
     identified: VehicleParameters,
     noise: FilterNoise,
+    physics: PhysicsFit,
 ) -> PartScore:
-    """Score β = 0, the frozen filter with the starting file, and the tuned filter with the identified one."""
-    squares = np.zeros(3)
-    counts = np.zeros(3)
+    """Score β = 0, the frozen filter with the starting file, the tuned filter with the identified one, and physics."""
+    squares = np.zeros(4)
+    counts = np.zeros(4)
     slow = start.low_speed_blend_m_s
     for drive in drives:
-        before = _signals_of(drive, start, start)
+        before = signals_of(drive, start, start)
         tracks = (
             PassThrough("zero", claims_zero_sideslip=True).run(before, None)[0],
             PhysicsUkf(start).run(before, None)[0],
-            physics_ukf_tuned(identified, noise).run(_signals_of(drive, start, identified), None)[0],
+            physics_ukf_tuned(identified, noise).run(signals_of(drive, start, identified), None)[0],
+            physics_filter(physics.vehicle, physics.noise).run(signals_of(drive, start, physics.vehicle), None)[0],
         )
         for i, track in enumerate(tracks):
             error = signal_error(track, drive.truth, "sideslip_rad", slow)
@@ -452,6 +443,12 @@ def _score(
             counts[i] += error.size
     rmse = np.degrees(np.sqrt(squares / np.maximum(counts, 1)))
     return PartScore(part, sum(d.duration_s for d in drives), *(float(x) for x in rmse))
+
+
+def _told(physics: FittedPhysics) -> str:
+    parts = ", ".join(name.replace("_", " ") for name in (physics.values.physics or PhysicsParts()).names)
+    why = "by driving that its fits had not seen" if physics.tried else "as asked for, or for want of driving"
+    return f"physics has {parts or 'none of its parts'}, {why}"
 
 
 def _notes(parameters: Sequence[Identified], drives: Sequence[FitDrive], usable_s: float) -> tuple[str, ...]:
@@ -465,11 +462,6 @@ def _notes(parameters: Sequence[Identified], drives: Sequence[FitDrive], usable_
     if edge:
         notes.append(f"the sideslip asks for another value than the prior in: {', '.join(edge)}")
     return tuple(notes)
-
-
-def _period_s(drive: FitDrive) -> float:
-    stamps = drive.signals.stamps_ns
-    return float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
 
 
 def understeer_deg_per_g(vehicle: VehicleParameters) -> float:

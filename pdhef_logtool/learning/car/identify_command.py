@@ -9,8 +9,9 @@ from typing import Any
 
 from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
 from pdhef_logtool.car.flat import part_toml
-from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.parts import PHYSICS, Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change, Content, check_output, write_change
+from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
@@ -72,9 +73,11 @@ class IdentifyResult(LearnResult):
                     "zero": s.zero_deg,
                     "phy-ukf, starting file": s.start_file_deg,
                     f"{TUNED}, identified file": s.identified_deg,
+                    PHYSICS: s.physics_deg,
                 }
                 for s in found.scores
             ],
+            "physics": found.physics.model_dump(mode="json", exclude_none=True),
             "notes": list(found.notes),
         }
 
@@ -85,6 +88,7 @@ def identify(
     config: RunConfig,
     *,
     holdout: float = 0.25,
+    parts: PhysicsParts | None = None,
     progress: Callable[[str, float], None] = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> IdentifyResult:
@@ -94,6 +98,7 @@ def identify(
     ----------
     arguments : logs, folders, glob patterns; ``config.start`` and ``config.end`` cut each of them.
     holdout : share at the end of each slice that the fit never sees and that is scored once; 0 uses everything.
+    parts : of the model of ``physics``; None: chosen by what part of the drives says of the other.
 
     Raises
     ------
@@ -133,6 +138,7 @@ def identify(
         held_out,
         start,
         steering_wheel=any(drive.steering_wheel for drive in fit),
+        parts=parts,
         progress=lambda text, share: progress(text, 0.2 + 0.8 * share),
     )
     fitted = found.vehicle
@@ -144,6 +150,7 @@ def identify(
         physics_sha256=physics_sha256(start),
         values=FittedValues.between(start, fitted),
         filter={TUNED: found.noise.model_copy(update={"physics_sha256": physics_sha256(fitted)})},
+        physics=found.physics,
         drives=drives,
         scores={s.part: s.to_dict() for s in found.scores},
         notes=found.notes,

@@ -7,19 +7,19 @@ In normalised parameters θ (distance from the prior in its standard deviations)
 where s_i is the RMS of the filter's sideslip error on drive i, N_i its length over the time in which errors stay alike,
 and s_0 what is not believed to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
 and a poor start ends at the worse one (METHOD §16). The last term fixes the scale of Q and R, of which the gain knows
-the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i, with derivatives by differences.
+the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i, derivatives by differences.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, PhysicsParts, Tyres, VehicleParameters, correct_signals
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedSensors, FittedValues, TriedParts
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.learning.car.axle_forces import (
     PEAK_LOG_STD,
@@ -32,9 +32,10 @@ from pdhef_logtool.learning.car.axle_forces import (
     fit_axle,
     usable_stamps,
 )
-from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
+from pdhef_logtool.learning.car.prior import Prior
 from pdhef_logtool.records.geometry import wrap_angle
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import FloatArray
 
 #: Errors stay alike for this long, s; samples of the error a second; what the filter needs before it counts, s.
 CORRELATION_S, FIT_RATE_HZ, SETTLE_S = 1.0, 20.0, 2.0
@@ -49,26 +50,9 @@ MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
 #: Width of the tyres' priors about the axle-force fit, as a share of METHOD §14's widths about a vehicle file.
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
+Theta = dict[str, float]
 #: Where θ starts: the noise has two valleys, that of clean sensors and that of a filter that hardly hears a_y.
-STARTS: tuple[dict[str, float], ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
-
-
-@dataclass(frozen=True, slots=True)
-class Prior:
-    """Prior of one parameter, normal in its own or, if ``log``, in logarithmic scale; ``low`` bounds the value."""
-
-    name: str
-    unit: str
-    mean: float
-    std: float
-    log: bool = False
-    low: float | None = None
-    tuning: bool = False  # belongs to the filter, not to the car
-
-    def value(self, theta: float) -> float:
-        """Return the parameter at a normalised distance from the prior."""
-        value = self.mean * math.exp(self.std * theta) if self.log else self.mean + self.std * theta
-        return value if self.low is None else max(value, self.low)
+STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
 
 
 def make_priors(
@@ -87,7 +71,9 @@ def make_priors(
         curve = fit_axle(slip, force, prior=file_curve, mass_kg=start.mass_kg, independent=usable_s / CORRELATION_S)
         width = AXLE_FIT_SHARE
         priors += [
-            Prior(f"{axle} cornering stiffness", "N/rad", curve.stiffness_n_per_rad, width * STIFFNESS_LOG_STD, log=True),
+            Prior(
+                f"{axle} cornering stiffness", "N/rad", curve.stiffness_n_per_rad, width * STIFFNESS_LOG_STD, log=True
+            ),
             Prior(f"{axle} peak force", "N", curve.peak_n, width * PEAK_LOG_STD, log=True),
             Prior(f"{axle} shape", "1", curve.shape, width * SHAPE_STD, low=1.0),
         ]
@@ -126,6 +112,11 @@ def make_priors(
     return tuple(priors)
 
 
+def _value(prior: Prior, theta: float) -> float:
+    value = prior.value(theta)
+    return value if prior.low is None else max(value, prior.low)
+
+
 def build_car(
     start: VehicleParameters, parts: PhysicsParts, priors: Sequence[Prior], theta: FloatArray, *, digits: int = 17
 ) -> tuple[VehicleParameters, FilterNoise]:
@@ -134,7 +125,7 @@ def build_car(
     def rounded(value: float) -> float:
         return float(f"{value:.{digits}g}")
 
-    v = {p.name: rounded(p.value(float(t))) for p, t in zip(priors, theta, strict=True)}
+    v = {p.name: rounded(_value(p, float(t))) for p, t in zip(priors, theta, strict=True)}
     mu = start.assumed_friction
 
     def tyre(axle: str) -> AxleTyre:
@@ -188,15 +179,7 @@ class DriveError:
 
 def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
     """Return how long a drive can be used for identification."""
-    stamps = drive.signals.stamps_ns
-    period_s = float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.0
-    return float(np.count_nonzero(usable_stamps(drive, vehicle))) * period_s
-
-
-def signals_of(drive: FitDrive, start: VehicleParameters, vehicle: VehicleParameters) -> Signals:
-    """Return a drive's signals as a vehicle file reads them; they were loaded with the starting file's ratio."""
-    ratio = start.steering_ratio / vehicle.steering_ratio
-    return correct_signals(replace(drive.signals, steer_rad=drive.signals.steer_rad * ratio), vehicle)
+    return float(np.count_nonzero(usable_stamps(drive, vehicle))) * period_s(drive)
 
 
 def drive_errors(
@@ -208,8 +191,7 @@ def drive_errors(
     for drive in drives:
         steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
         stamps = drive.signals.stamps_ns
-        period_s = float(np.median(np.diff(stamps))) * 1e-9 if stamps.size > 1 else 0.01
-        every = max(1, round(1.0 / (FIT_RATE_HZ * period_s)))
+        every = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive))))
         pick = slice(None, None, every)
         error = wrap_angle(np.arctan2(steps.x[pick, 1], steps.x[pick, 0]) - drive.truth.sideslip_rad[pick])
         use = usable_stamps(drive, start)[pick] & steps.valid[pick] & np.isfinite(error)
@@ -217,7 +199,7 @@ def drive_errors(
         known = steps.nis_dof > 0
         nis = float(np.minimum(steps.nis[known], 50.0).sum() / max(steps.nis_dof[known].sum(), 1.0))
         counted = int(np.count_nonzero(use))
-        found.append(DriveError(np.where(use, error, 0.0), counted, counted * every * period_s, max(nis, 1e-3)))
+        found.append(DriveError(np.where(use, error, 0.0), counted, counted * every * period_s(drive), max(nis, 1e-3)))
     return found
 
 
@@ -240,18 +222,20 @@ def fit_physics(
     parts: PhysicsParts,
     *,
     steering_wheel: bool = False,
-    first: dict[str, float] | None = None,
-    samples: AxleSamples | None = None,
+    starts: Sequence[Theta] = STARTS,
+    iterations: int = MAX_ITERATIONS,
 ) -> PhysicsFit:
     """Fit the parameters and noise of ``physics`` with the given parts to drives with truth.
 
     Parameters
     ----------
-    first : where to start, θ by the parameter's name.
+    starts : where to start, θ by the parameter's name; the best end counts.
     """
     usable_s = sum(usable_seconds(d, start) for d in drives)
-    samples = samples or axle_samples(drives, start)
-    priors = make_priors(start, parts, samples, usable_s, steering_wheel=steering_wheel)
+    priors = make_priors(
+        start, parts, axle_samples(drives, start, similar=True), usable_s, steering_wheel=steering_wheel
+    )
+
     def errors(theta: FloatArray) -> list[DriveError]:
         return drive_errors(drives, start, *build_car(start, parts, priors, theta))
 
@@ -259,8 +243,8 @@ def fit_physics(
         fit = sum(d.seconds / CORRELATION_S * math.log(_robust_square(d) + FLOOR_RAD**2) for d in found)
         return fit + float(theta @ theta) + _nis_residual(found) ** 2
 
-    starts = STARTS if first is None else (first,)
-    ends = [_minimise(errors, cost, np.array([first.get(p.name, 0.0) for p in priors])) for first in starts]
+    firsts = [np.array([first.get(p.name, 0.0) for p in priors]) for first in starts]
+    ends = [_minimise(errors, cost, first, iterations) for first in firsts]
     theta, jac, found, value = min(ends, key=lambda end: end[3])
     std = np.sqrt(np.diag(np.linalg.inv(jac.T @ jac + np.eye(theta.size))))
     vehicle, noise = build_car(start, parts, priors, theta, digits=6)
@@ -288,6 +272,7 @@ def _minimise(
     errors: Callable[[FloatArray], list[DriveError]],
     cost: Callable[[Sequence[DriveError], FloatArray], float],
     theta: FloatArray,
+    iterations: int,
 ) -> tuple[FloatArray, FloatArray, list[DriveError], float]:
     """Return θ, the Jacobian of the scaled errors there without the priors, the errors and the cost."""
     found = errors(theta)
@@ -303,7 +288,7 @@ def _minimise(
         return np.concatenate([*parts, [_nis_residual(there)]])
 
     jac = np.zeros((1, theta.size))
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(iterations):
         at = scaled(found, found)
         jac = np.empty((at.size, theta.size))
         for i in range(theta.size):
@@ -333,57 +318,101 @@ def _minimise(
 
 
 #: Parts in the order in which they are tried, the cheapest first.
-ORDER = (("lag",), ("load_transfer",), ("roll",), ("biases",), ("bank",), ("force_scale",), ("braking",))
-#: A part must lower the held-out error by this share, over all folds, and may not raise it in any by as much.
+ORDER = ("lag", "load_transfer", "roll", "biases", "bank", "force_scale", "braking")
+#: A part must lower the error on folds that its fit has not seen by this share, and lower it on each of them.
 LEAST_GAIN = 0.03
+#: Steps of a fit that only says whether a part is worth having; it starts where the one without the part ended.
+TRIAL_ITERATIONS = 8
+#: Drives from which on folds are whole drives; a fold needs so much usable driving; nothing within this of a cut.
+WHOLE_DRIVES, LEAST_FOLD_S, GUARD_S = 4, 20.0, 2.5
+
+Fold = tuple[Sequence[FitDrive], Sequence[FitDrive]]
 
 
-@dataclass(frozen=True, slots=True)
-class Tried:
-    """A set of parts that was tried: RMS on held-out folds in degrees, and whether it was taken."""
-
-    parts: PhysicsParts
-    held_out_deg: tuple[float, ...]
-    taken: bool
+def make_folds(drives: Sequence[FitDrive], start: VehicleParameters) -> list[Fold]:
+    """Return two folds, what one fits on the other scores; none where there is too little driving for two."""
+    usable = [d for d in drives if usable_seconds(d, start) > 0.0]
+    halves: tuple[list[FitDrive], list[FitDrive]] = ([], [])
+    if len(usable) >= WHOLE_DRIVES:
+        halves = (usable[::2], usable[1::2])
+    else:
+        for drive in usable:
+            at = np.flatnonzero(usable_stamps(drive, start))
+            middle, guard = int(at[at.size // 2]), round(GUARD_S / period_s(drive))
+            halves[0].append(part_of(drive, 0, max(middle - guard, 0)))
+            halves[1].append(part_of(drive, min(middle + guard, len(drive.signals)), len(drive.signals)))
+    if min(sum(usable_seconds(d, start) for d in half) for half in halves) < LEAST_FOLD_S:
+        return []
+    return [(halves[0], halves[1]), (halves[1], halves[0])]
 
 
 def choose_parts(
-    folds: Sequence[tuple[Sequence[FitDrive], Sequence[FitDrive]]],
+    folds: Sequence[Fold],
     start: VehicleParameters,
     *,
     steering_wheel: bool = False,
-    say: Callable[[str], None] = lambda _text: None,
-) -> tuple[PhysicsParts, tuple[Tried, ...], dict[str, float]]:
-    """Choose the parts by driving that their fit has not seen: the next one stays only with evidence.
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> tuple[PhysicsParts, tuple[TriedParts, ...]]:
+    """Choose the parts by driving that their fits have not seen: each stays only with evidence."""
+    theta: list[Sequence[Theta]] = [STARTS for _ in folds]
+    tried: list[TriedParts] = []
+
+    def scored(parts: PhysicsParts, iterations: int) -> tuple[FloatArray, list[Sequence[Theta]]]:
+        """Return the logarithm of the RMS on the held-out half of each fold, and θ there."""
+        scores: list[float] = []
+        ends: list[Sequence[Theta]] = []
+        for (fit, held_out), starts in zip(folds, theta, strict=True):
+            found = fit_physics(fit, start, parts, steering_wheel=steering_wheel, starts=starts, iterations=iterations)
+            errors = drive_errors(held_out, start, found.vehicle, found.noise)
+            logs = sum(e.seconds * math.log(e.rms**2 + FLOOR_RAD**2) for e in errors)
+            scores.append(0.5 * logs / sum(e.seconds for e in errors))
+            ends.append(({p.name: float(t) for p, t in zip(found.priors, found.theta, strict=True)},))
+        return np.array(scores), ends
+
+    def tell(parts: PhysicsParts, scores: FloatArray, taken: bool) -> None:
+        held_out = tuple(round(float(x), 4) for x in np.degrees(np.exp(scores)))
+        tried.append(TriedParts(parts=parts.names, held_out_deg=held_out, taken=taken))
+
+    parts = PhysicsParts()
+    best, theta = scored(parts, MAX_ITERATIONS)
+    tell(parts, best, True)
+    for number, name in enumerate(ORDER):
+        progress(f"is {name.replace('_', ' ')} worth having", (number + 1) / (len(ORDER) + 1))
+        more = parts.model_copy(update={name: True})
+        scores, ends = scored(more, TRIAL_ITERATIONS)
+        gain = best - scores
+        taken = bool(gain.mean() > LEAST_GAIN and gain.min() > 0.0)
+        tell(more, scores, taken)
+        if taken:
+            parts, best, theta = more, scores, ends
+    return parts, tuple(tried)
+
+
+def find_physics(
+    drives: Sequence[FitDrive],
+    start: VehicleParameters,
+    *,
+    steering_wheel: bool = False,
+    parts: PhysicsParts | None = None,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> tuple[PhysicsFit, FittedPhysics]:
+    """Find what ``physics`` needs of a car on drives with truth, and return it as a car holds it, too.
 
     Parameters
     ----------
-    folds : of drives to fit on and drives to score on, which share no stamp.
+    parts : of the model; None: chosen by what part of the drives says of the other.
     """
-    parts = PhysicsParts()
-    tried: list[Tried] = []
-    theta: list[dict[str, float] | None] = [None for _ in folds]
-
-    def scored(parts: PhysicsParts) -> tuple[FloatArray, list[dict[str, float] | None]]:
-        scores: list[float] = []
-        found: list[dict[str, float] | None] = []
-        for (fit, held_out), first in zip(folds, theta, strict=True):
-            done = fit_physics(fit, start, parts, steering_wheel=steering_wheel, first=first)
-            errors = drive_errors(held_out, start, done.vehicle, done.noise)
-            total = sum(e.seconds for e in errors)
-            scores.append(sum(e.seconds * math.log(e.rms**2 + FLOOR_RAD**2) for e in errors) / (2.0 * total))
-            found.append({p.name: float(t) for p, t in zip(done.priors, done.theta, strict=True)})
-        return np.array(scores), found
-
-    best, theta = scored(parts)
-    tried.append(Tried(parts, tuple(np.degrees(np.exp(best)).tolist()), True))
-    for names in ORDER:
-        more = parts.model_copy(update=dict.fromkeys(names, True))
-        scores, found = scored(more)
-        gain = best - scores
-        taken = bool(gain.mean() > LEAST_GAIN and gain.min() > 0.0)
-        tried.append(Tried(more, tuple(np.degrees(np.exp(scores)).tolist()), taken))
-        say(f"{'+'.join(more.names)}: {np.degrees(np.exp(scores)).round(4)} {'taken' if taken else ''}")
-        if taken:
-            parts, best, theta = more, scores, found
-    return parts, tuple(tried), theta[0]
+    tried: tuple[TriedParts, ...] = ()
+    if parts is None:
+        folds = make_folds(drives, start)
+        parts = PhysicsParts()
+        if folds:
+            parts, tried = choose_parts(
+                folds, start, steering_wheel=steering_wheel, progress=lambda text, share: progress(text, 0.7 * share)
+            )
+    progress("fitting the physics filter's sideslip to the truth", 0.7)
+    found = fit_physics(drives, start, parts, steering_wheel=steering_wheel)
+    vehicle = found.vehicle
+    values = {name: getattr(vehicle, name) for name in FittedValues.model_fields}
+    values["sensors"] = FittedSensors(**{k: getattr(vehicle.sensors, k) for k in FittedSensors.model_fields})
+    return found, FittedPhysics(values=FittedValues(**values), noise=found.noise, tried=tried)

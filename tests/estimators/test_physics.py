@@ -1,4 +1,4 @@
-"""``physics-plus``: its model in closed form, its filter against filterpy, and drives of a car whose forces lag."""
+"""``physics``: its model in closed form, its filter against filterpy, and drives of a car whose forces lag."""
 
 from __future__ import annotations
 
@@ -8,6 +8,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+from pdhef_logtool.estimators.lagged_forces import (
+    force_parameters,
+    lagged_measured_ay,
+    lagged_rk4_step,
+    settled_forces,
+    steady_forces,
+)
+from pdhef_logtool.estimators.physics_plus import (
+    AY_BIAS,
+    FRONT_FORCE,
+    NAME,
+    PHYSICS_PLUS_Q_STD,
+    REAR_FORCE,
+    STEER_BIAS,
+    YAW_RATE_BIAS,
+    PhysicsPlusUkf,
+    physics_plus,
+)
 from reference_car import (
     FRICTION,
     FRONT_M,
@@ -28,25 +46,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
-from pdhef_logtool.estimators.lagged_forces import (
-    force_parameters,
-    lagged_measured_ay,
-    lagged_rk4_step,
-    settled_forces,
-    steady_forces,
-)
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import (
-    AY_BIAS,
-    FRONT_FORCE,
-    NAME,
-    PHYSICS_PLUS_Q_STD,
-    REAR_FORCE,
-    STEER_BIAS,
-    YAW_RATE_BIAS,
-    PhysicsPlusUkf,
-    physics_plus,
-)
 from pdhef_logtool.estimators.table import Options, default_names, make_estimator
 from pdhef_logtool.records.signals import Signals
 
