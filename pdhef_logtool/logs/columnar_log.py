@@ -100,12 +100,14 @@ class ColumnarLog:
         return self._occupied
 
     def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
-        """Return channels and log times of a span's messages [N]; None if they cannot be read."""
-        meter = self.containers[c].meter
+        """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
+        container = self.containers[c]
         try:
-            meter.check()
-            with meter.running():
-                return self.containers[c].times(span)
+            container.meter.check()
+            with container.meter.running():
+                channel, log_time = container.times(span)
+            known = np.isin(channel, list(container.channels))
+            return channel[known], log_time[known]
         except Exception:  # noqa: BLE001 (a read of the span reports the damage)
             return None
 

@@ -47,7 +47,8 @@ _WHAT = {
     TIME_JUMP: "messages are left out: the recorder's clock stepped back, and their times were recorded before",
 }
 
-#: Channels and log times of a span's messages, [N] each, a channel's in file order; None if the span is damaged.
+#: Channels and log times of a span's messages on known channels, [N] each, a channel's in file order; None if the
+#: span is damaged.
 SpanTimes = Callable[[int, Span], tuple[IntArray, IntArray] | None]
 
 
@@ -248,8 +249,6 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
                 found = times(c, span)
                 if found is None:
                     continue  # damaged: nothing of it can be read
-                known = np.isin(found[0], list(topics))
-                found = found[0][known], found[1][known]
                 disorder = any((np.diff(own) < -STEP_BACK_NS).any() for _, own in _by_channel(found))
                 if found[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
                     of = _Looked(c, span, topics, found)

@@ -213,8 +213,9 @@ _ENDLESS = (
     "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM r"
 )
 _HUGE_ROW = (
-    "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE VIEW messages AS SELECT id, topic_id, "
-    "timestamp, zeroblob(900000000) AS data FROM rows"
+    "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, "
+    "topic_id INTEGER, timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); "
+    "INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM rows"
 )
 _FLOAT, _CDR = b"float64 data\n", b"\0\1\0\0" + bytes(8)
 _ODD_NAME = b"/wheels[/red]\x1b[2J\nwarning: all is well\0\xe2\x80\xae"
