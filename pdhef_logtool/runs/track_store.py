@@ -51,21 +51,29 @@ class _Columns:
     others: dict[str, Any] = field(default_factory=dict)
 
 
-class StoredTrack(StateTrack):
-    """A track on disk: a column is read each time that it is asked for, and nothing of it is kept."""
+class _Stored:
+    """A record on disk: a column is read each time that it is asked for, and nothing of it is kept."""
 
-    __slots__ = ("_columns",)
+    __slots__ = ()
     _columns: dict[str, _Column]
 
-    def __init__(self, columns: _Columns) -> None:
-        object.__setattr__(self, "_columns", columns.columns)
-        object.__setattr__(self, "name", columns.others["name"])
+    def __init__(self, stored: _Columns) -> None:
+        for name, value in {"_columns": stored.columns, **stored.others}.items():
+            object.__setattr__(self, name, value)
 
     def __getattr__(self, name: str) -> Any:
-        return _read(self._columns, name)
+        if name.startswith("__") or name not in self._columns:
+            raise AttributeError(name)
+        return self._columns[name].read()
 
     def __len__(self) -> int:
         return self._columns["stamps_ns"].rows
+
+
+class StoredTrack(_Stored, StateTrack):
+    """A track on disk."""
+
+    __slots__ = ("_columns",)
 
     def rows(self, start: int, end: int) -> StateTrack:
         """Return the rows [start, end)."""
@@ -81,21 +89,10 @@ class StoredTrack(StateTrack):
         return np.asarray(np.sqrt(np.concatenate([*blocks])), dtype=np.float64)
 
 
-class StoredSignals(Signals):
-    """Signals on disk: a column is read each time that it is asked for, and nothing of it is kept."""
+class StoredSignals(_Stored, Signals):
+    """Signals on disk."""
 
     __slots__ = ("_columns",)
-    _columns: dict[str, _Column]
-
-    def __init__(self, columns: _Columns) -> None:
-        object.__setattr__(self, "_columns", columns.columns)
-        object.__setattr__(self, "available", columns.others["available"])
-
-    def __getattr__(self, name: str) -> Any:
-        return _read(self._columns, name)
-
-    def __len__(self) -> int:
-        return self._columns["stamps_ns"].rows
 
 
 class TrackStore:
@@ -154,9 +151,3 @@ class TrackStore:
     def __exit__(self, *_: object) -> None:
         """Remove the folder."""
         self.close()
-
-
-def _read(columns: dict[str, _Column], name: str) -> NDArray[Any]:
-    if name.startswith("__") or name not in columns:
-        raise AttributeError(name)
-    return columns[name].read()
