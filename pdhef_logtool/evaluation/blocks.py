@@ -32,7 +32,7 @@ def blocks_with_halo(stamped: Signals | StateTrack, span_s: float, rows: int) ->
 
     def beyond(start: int, way: int) -> int:
         start = i = min(max(start + way * rows, 0), n - 1)
-        last, step = (0 if way < 0 else n - 1), 16
+        last, step = (0 if way < 0 else n - 1), 1
         while i != last and abs(stamp(i) - stamp(start)) <= span_s * 1e9:
             i = min(max(i + way * step, 0), n - 1)
             step *= 2
