@@ -283,7 +283,7 @@ def _score_signal(
             sums[segment].add(errors)
         known = np.isfinite(error)
         asked.add(inside, np.where(_scorable(of_truth, signal, low_speed_m_s), 1.0, np.nan))
-        squares.add(inside, np.where(known, getattr(of_truth, signal) ** 2, np.nan))
+        squares.add(inside, error, np.where(known, getattr(of_truth, signal), np.nan) ** 2)
         sigma = _total_std(of_estimate, of_truth, signal)
         covered = np.abs(error) <= NORMAL_95 * sigma
         banded.add(inside, np.where(known & np.isfinite(sigma), covered, np.nan))
@@ -301,7 +301,7 @@ def _score_signal(
         figures = sums[segment].figures()
         for metric, value in figures.items():
             add(segment, metric, value, SCORED_SIGNALS[signal], n)
-        size = float(np.sqrt(references[segment][1][0] / n))
+        size = float(np.sqrt(references[segment][1][1] / n))
         add(segment, "rmse_relative", figures["rmse"] / size if size > 0 else float("nan"), "1", n)
         if segment in bands:
             within, (covered,) = bands[segment]

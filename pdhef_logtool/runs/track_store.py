@@ -1,4 +1,4 @@
-"""Whole tracks and signals of a log on disk, column by column, so that scoring holds only the columns that it needs.
+"""Whole tracks and signals of a log on disk, column by column, so that scoring holds only what it works on.
 
 Ten hours at 100 Hz are 3.6 million rows: a track of them takes 0.8 GB, a column 29 MB.
 """

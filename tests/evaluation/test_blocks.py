@@ -208,7 +208,8 @@ def test_masks_take_a_bit_each_and_refuse_another_shape():
 def test_scoring_a_stored_track_holds_no_column(tmp_path):
     signals, truth, estimate, _ = drive(3, seconds=600.0)
     with TrackStore(tmp_path / "tracks") as store, patch.object(metrics, "LAG_SPAN_NS", 10**10):
-        expected = score_track(estimate, truth, segment_masks(signals, truth, VEHICLE), log="drive", low_speed_m_s=3.0)
+        expected = score_track(estimate, truth, {}, log="drive", low_speed_m_s=3.0)
+        masks = segment_masks(signals, truth, VEHICLE)
         for track in (truth, estimate):
             store.append(track)
         store.append_signals(signals)
@@ -216,10 +217,20 @@ def test_scoring_a_stored_track_holds_no_column(tmp_path):
         with blocks_of(300):
             tracemalloc.start()
             try:
-                masks = segment_masks(store.signals(), of_truth, VEHICLE)
-                found = score_track(of_estimate, of_truth, masks, log="drive", low_speed_m_s=3.0)
+                stored = segment_masks(store.signals(), of_truth, VEHICLE)
+                found = score_track(of_estimate, of_truth, {}, log="drive", low_speed_m_s=3.0)
                 peak = tracemalloc.get_traced_memory()[1]
             finally:
                 tracemalloc.stop()
     assert_same_rows(found, expected)
+    assert all(np.array_equal(stored[name], masks[name]) for name in masks)
     assert peak < 4 * truth.vx_m_s.nbytes
+
+
+def test_a_truth_whose_square_is_beyond_floats_is_still_scored():
+    stamps = T0 + np.arange(4, dtype=np.int64) * 10_000_000
+    truth = make_track("truth", stamps, yaw_rate_rad_s=np.full(4, 1e200))
+    estimate = make_track("a", stamps, yaw_rate_rad_s=np.full(4, 1e200))
+    with np.errstate(over="ignore"):
+        rows = score_track(estimate, truth, {}, log="drive", low_speed_m_s=3.0)
+    assert {r.metric: r.value for r in rows if r.signal == "yaw_rate_rad_s"}["rmse_relative"] == 0.0
