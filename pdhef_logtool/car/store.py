@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,14 +17,12 @@ from pdhef_logtool.car.car import HISTORY_FILE, VEHICLE_FILE, Car
 from pdhef_logtool.car.flat import flat_toml, vehicle_toml
 from pdhef_logtool.car.parts import HistoryLine, LearntOn, digest
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.files import PendingFile, write_bytes, writing
+from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.outputs import LOCK_FILE, FolderLock, FolderTransaction
 from pdhef_logtool.records.version import __version__
 
 #: How long a change waits for another command that is changing the same car: such a change takes a moment.
 LONGEST_WAIT_S = 60.0
-#: Writes one file at the path that it is given, or is its content.
-Content = bytes | Callable[[Path], object]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,7 @@ class Change:
     Attributes
     ----------
     command : its name. part : the file of the part that it wrote, by name in the folder.
-    files : the part's file and what goes with it (records, plots), by name in the folder.
+    files : content of the part's file and of what goes with it (records, plots), by name in the folder.
     folders : copied whole into the car's folder, by name.
     settings, drives : of the command, for the history.
     told : of it in a flat file, under ``[identification]``.
@@ -42,7 +40,7 @@ class Change:
 
     command: str
     part: str
-    files: Mapping[str, Content]
+    files: Mapping[str, bytes]
     folders: Mapping[str, Path] = field(default_factory=dict)
     settings: Mapping[str, Any] = field(default_factory=dict)
     drives: Iterable[LearntOn] = ()
@@ -111,7 +109,7 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
                     shutil.rmtree(fresh / name)
                 shutil.copytree(folder, fresh / name, dirs_exist_ok=True)
             for name, content in change.files.items():
-                _write(fresh / name, content)
+                write_bytes(fresh / name, content)
             _log(fresh, change)
             lock.hold_next(fresh)
     except BaseException:
@@ -150,16 +148,8 @@ def write_change(
     write_bytes(output, flat.encode())
     for name, content in change.files.items():
         if name != change.part:
-            with PendingFile(output.with_name(f"{output.stem}.{name}")) as pending, writing(pending.target):
-                _write(pending.path, content)
+            write_bytes(output.with_name(f"{output.stem}.{name}"), content)
     return output
-
-
-def _write(path: Path, content: Content) -> None:
-    if isinstance(content, bytes):
-        write_bytes(path, content)
-    else:
-        content(path)
 
 
 def _log(folder: Path, change: Change) -> None:

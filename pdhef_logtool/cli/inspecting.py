@@ -32,12 +32,11 @@ def inspect(
     """Show what a log holds and what maps to what. Rates, gaps and jitter are shown too, and what is missing."""
     from pdhef_logtool.inspection import inspect_log, render_inspection
     from pdhef_logtool.inspection import write_mapping as write_mapping_file
-    from pdhef_logtool.logs.budget import DEFAULT_BUDGET
     from pdhef_logtool.mapping import load_mapping
 
     chosen = None if config.mapping is None else load_mapping(config.mapping)
-    budget = DEFAULT_BUDGET.times(config.budget)
-    inspection = inspect_log(Path(log), chosen, prefer_truth=config.prefer_truth, budget=budget)
+    reading = config.read_options
+    inspection = inspect_log(Path(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits)
     if write_mapping is not None:
         write_mapping_file(inspection, write_mapping)
         console.say(f"mapping written to {write_mapping}")

@@ -28,13 +28,17 @@ def identify(
     output: options.CarOutput,
     config: RunConfig,
     holdout: Annotated[float, Option(help="Share at the end of each slice that is only scored, once.")] = 0.25,
+    parts: Annotated[
+        str, Option(help="Of the model of physics: auto (by held-out driving), static, or names with commas.")
+    ] = "auto",
     as_json: options.JsonFlag = False,
 ) -> None:
     """Fit a car's tyres, steering and biases to its drives. Roll gradient and filter noise are fitted too."""
     from pdhef_logtool.learning.car.identify_command import identify as fit
+    from pdhef_logtool.learning.car.physics_fit import physics_parts
 
     with console.progress() as bar:
-        result = fit(logs, output, config, holdout=holdout, progress=bar, warn=console.warn)
+        result = fit(logs, output, config, holdout=holdout, parts=physics_parts(parts), progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_identification, as_json)
 
 

@@ -7,6 +7,7 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.records.errors import UsageError
 
 #: A bare integer from here on is nanoseconds, not seconds from the log's start.
@@ -25,7 +26,7 @@ class ReadOptions:
     friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log says, if anything.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
-    budget : factor on what reading a log may cost (:class:`~pdhef_logtool.logs.budget.Budget`).
+    budget : factor on what reading a log may cost.
     """
 
     start: str | None = None
@@ -40,6 +41,11 @@ class ReadOptions:
     def use_speed(self) -> bool:
         """Whether the filters use the speed sensor after their start."""
         return self.sensors == "full"
+
+    @property
+    def limits(self) -> Budget:
+        """What reading a log may cost."""
+        return DEFAULT_BUDGET.times(self.budget)
 
 
 def parse_time(text: str, start_ns: int, end_ns: int, *, option: str) -> int:

@@ -12,7 +12,6 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive
-from pdhef_logtool.logs.budget import DEFAULT_BUDGET
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -231,7 +230,7 @@ def read_drive(
         notes.append(text)
         tell(f"{log_input.stem}: {text}")
 
-    opened = open_log(log_input.path, DEFAULT_BUDGET.times(options.budget))
+    opened = open_log(log_input.path, options.limits)
     try:
         chosen, missing = choose_mapping(
             opened, mapping, told, prefer_truth=options.prefer_truth, require_signals=require_sensors

@@ -42,7 +42,7 @@ from pdhef_logtool.mapping import (
 )
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
-from pdhef_logtool.records.signals import Channel, Loss, Signals, cut_signals, join_signals
+from pdhef_logtool.records.signals import Channel, Loss, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: A silence of a channel is told from here on, and from this many of its periods.
@@ -314,7 +314,7 @@ def _with_following(held: deque[DriveWindow], look_ahead_ns: int) -> tuple[Drive
         return first, None
     following = join_signals([w.signals for w in held])
     until = int(np.searchsorted(following.stamps_ns, first.signals.stamps_ns[-1] + look_ahead_ns, side="right"))
-    return first, cut_signals(following, 0, until)
+    return first, following.rows(0, until)
 
 
 def _impossible(signals: Signals) -> list[Loss]:

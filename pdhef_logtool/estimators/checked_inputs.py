@@ -14,7 +14,7 @@ import numpy as np
 from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry
-from pdhef_logtool.records.signals import FloatArray, Signals, cut_signals
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.service import NetworkCarry
 from pdhef_logtool.watches.sensor_faults import FaultCarry, SensorFaults, find_faults
 
@@ -47,7 +47,7 @@ class CheckedInputs:
         """Return the steps ``first`` to ``end`` (exclusive)."""
         parts = {f.name: getattr(self.faults, f.name) for f in fields(self.faults)}
         cut: dict[str, Any] = {
-            n: cut_signals(x, first, end) if isinstance(x, Signals) else x[first:end] for n, x in parts.items()
+            n: x.rows(first, end) if isinstance(x, Signals) else x[first:end] for n, x in parts.items()
         }
         return CheckedInputs(SensorFaults(**cut), self.rate[first:end])
 

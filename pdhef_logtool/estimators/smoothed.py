@@ -35,7 +35,7 @@ from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import StepColumns
-from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, cut_signals, join_signals
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.service import NetworkService
 
@@ -235,7 +235,7 @@ class SmoothedHybrid:
                 horizon_ns = given.stamps_ns[end - 1] + round(self.look_ahead_s * 1e9)
                 seen = int(np.searchsorted(given.stamps_ns, horizon_ns, side="right"))
             taken = first + (0 if carry is None else len(carry.ahead))
-            fresh = cut_signals(given, taken, seen)
+            fresh = given.rows(taken, seen)
             inputs = None if carry is None else carry.inputs
             if known is None:
                 checked, inputs = check_inputs(self.hybrid, fresh, inputs)
@@ -247,7 +247,7 @@ class SmoothedHybrid:
             origin_ns = carry.origin_ns if carry else None
             if origin_ns is None and len(given):
                 origin_ns = int(given.stamps_ns[0])
-            parts.append(self._smoothed(cut_signals(given, first, end), steps, forward, origin_ns or 0))
+            parts.append(self._smoothed(given.rows(first, end), steps, forward, origin_ns or 0))
             carry = SmoothedCarry(inputs, forward, steps.since(end - first), origin_ns)
         assert carry is not None
         return concatenate(parts), carry

@@ -17,14 +17,22 @@ metric                    estimator     definition
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
 from pdhef_logtool.drive.interpolation import Bracket
-from pdhef_logtool.evaluation.metrics import MetricRow, known_by_segment, state_rows
-from pdhef_logtool.evaluation.segments import smooth
+from pdhef_logtool.evaluation.blocks import (
+    SegmentMasks,
+    SegmentSums,
+    blocks_with_halo,
+    median_step_ns,
+    packed,
+    row_blocks,
+)
+from pdhef_logtool.evaluation.metrics import MetricRow, state_rows
+from pdhef_logtool.evaluation.segments import reach_rows, smooth
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -47,21 +55,36 @@ def innovation_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: s
 
 def whiteness_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -> list[MetricRow]:
     """Return ``nis_autocorrelation`` of one estimator, a row a segment with at least ten pairs of stamps."""
-    known = np.isfinite(track.nis) & (track.nis_dof > 0)
-    ratio = np.where(known, track.nis / np.where(known, track.nis_dof, 1.0), np.nan)
+    masks = packed(masks, len(track))
+    first = SegmentSums()
+    for inside, before, after in _pairs(track, masks):
+        first.add(inside, before, after)
+    means = {segment: sums / n for segment, (n, sums) in first.totals().items() if n >= 10}
+    second = SegmentSums()
+    for inside, before, after in _pairs(track, masks):
+        for segment, mean in means.items():
+            use = inside[segment] & np.isfinite(before)
+            x, y = before[use] - mean[0], after[use] - mean[1]
+            second.add_to(segment, x**2, y**2, x * y)
     rows = []
-    for segment, mask in masks.items():
-        use = known & mask
-        pairs = use[1:] & use[:-1]
-        n = int(np.count_nonzero(pairs))
-        if n < 10:
-            continue
-        before, after = ratio[:-1][pairs], ratio[1:][pairs]
-        before, after = before - before.mean(), after - after.mean()
-        power = float(np.sqrt((before**2).sum() * (after**2).sum()))
-        value = float((before * after).sum()) / power if power > 0 else float("nan")
+    for segment, (n, (of_before, of_after, of_both)) in second.totals().items():
+        power = float(np.sqrt(of_before * of_after))
+        value = float(of_both) / power if power > 0 else float("nan")
         rows.append(MetricRow(log, track.name, "state", segment, "nis_autocorrelation", value, "1", n))
     return rows
+
+
+def _pairs(track: StateTrack, masks: SegmentMasks) -> Iterator[tuple[dict[str, BoolArray], FloatArray, FloatArray]]:
+    """Yield, by block, NIS / dof [M] of stamps and of those that follow, NaN where one lacks it, and their masks."""
+    for a, b in row_blocks(len(track)):
+        start = max(a - 1, 0)
+        part = track.rows(start, b)
+        nis, dof = part.nis, part.nis_dof
+        known = np.isfinite(nis) & (dof > 0)
+        ratio = np.where(known, nis / np.where(known, dof, 1.0), np.nan)
+        both = known[1:] & known[:-1]
+        inside = {segment: mask[1:] & mask[:-1] for segment, mask in masks.rows(start, b).items()}
+        yield inside, np.where(both, ratio[:-1], np.nan), np.where(both, ratio[1:], np.nan)
 
 
 def disagreement_rows(
@@ -69,27 +92,37 @@ def disagreement_rows(
 ) -> list[MetricRow]:
     """Return the rms difference of sideslip of every pair of estimates [N] at the same stamps, by segment."""
     rows = []
-    for a, b in combinations(tracks, 2):
-        moving = a.valid & b.valid & (a.vx_m_s > low_speed_m_s) & (b.vx_m_s > low_speed_m_s)
-        difference = wrap_angle(a.sideslip_rad - b.sideslip_rad)
-        for segment, inside in known_by_segment(np.where(moving, difference, np.nan), masks):
-            rms, n, pair = float(np.sqrt(np.mean(inside**2))), int(inside.size), f"{a.name}~{b.name}"
-            rows.append(MetricRow(log, pair, "sideslip_rad", segment, "disagreement_rms", rms, "rad", n))
+    for pair in combinations(tracks, 2):
+        masks = packed(masks, len(pair[0]))
+        sums = SegmentSums()
+        for start, end in row_blocks(len(pair[0])):
+            a, b = (t.rows(start, end) for t in pair)
+            moving = a.valid & b.valid & (a.vx_m_s > low_speed_m_s) & (b.vx_m_s > low_speed_m_s)
+            difference = np.where(moving, wrap_angle(a.sideslip_rad - b.sideslip_rad), np.nan)
+            sums.add(masks.rows(start, end), difference, difference**2)
+        name = "~".join(t.name for t in pair)
+        for segment, (n, (_, squares)) in sums.totals().items():
+            rms = float(np.sqrt(squares / n))
+            rows.append(MetricRow(log, name, "sideslip_rad", segment, "disagreement_rms", rms, "rad", n))
     return rows
 
 
 def sensor_rows(signals: Signals, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float) -> list[MetricRow]:
     """Return the residuals of the sensors against one another; no rows where a sensor is missing."""
-    speed = _carried_speed(signals)
-    lateral = signals.ay_m_s2 - speed * signals.yaw_rate_rad_s
-    lateral = smooth(signals.stamps_ns, np.where(speed > low_speed_m_s, lateral, np.nan), SMOOTHING_HZ)
+    masks = packed(masks, len(signals))
+    step_ns = median_step_ns(signals)
+    of_lateral, of_speed = SegmentSums(), SegmentSums()
+    for first, a, b, end in blocks_with_halo(signals, SPEED_SPAN_S + MAX_STEP_S, reach_rows(step_ns, SMOOTHING_HZ)):
+        part, core = signals.rows(first, end), slice(a - first, b - first)
+        speed = _carried_speed(part)
+        lateral = np.where(speed > low_speed_m_s, part.ay_m_s2 - speed * part.yaw_rate_rad_s, np.nan)
+        lateral = smooth(part.stamps_ns, lateral, SMOOTHING_HZ, step_ns)
+        for sums, residual in ((of_lateral, lateral[core]), (of_speed, _speed_change_residual(part)[core])):
+            sums.add(masks.rows(a, b), residual, residual**2)
     rows = []
-    for signal, residual, unit in (
-        ("ay_m_s2", lateral, "m/s^2"),
-        ("vx_m_s", _speed_change_residual(signals), "m/s"),
-    ):
-        for segment, inside in known_by_segment(residual, masks):
-            n, rms, bias = int(inside.size), float(np.sqrt(np.mean(inside**2))), float(np.mean(inside))
+    for signal, sums, unit in (("ay_m_s2", of_lateral, "m/s^2"), ("vx_m_s", of_speed, "m/s")):
+        for segment, (n, (total, squares)) in sums.totals().items():
+            rms, bias = float(np.sqrt(squares / n)), float(total) / n
             rows.append(MetricRow(log, SENSORS, signal, segment, "residual_rms", rms, unit, n))
             rows.append(MetricRow(log, SENSORS, signal, segment, "residual_bias", bias, unit, n))
     return rows

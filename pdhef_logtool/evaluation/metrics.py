@@ -36,7 +36,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.drive.correlation import find_shift, on_common_grid
-from pdhef_logtool.records.geometry import dead_reckon, wrap_angle
+from pdhef_logtool.evaluation.blocks import ErrorSums, SegmentMasks, SegmentSums, known_by_segment, packed, row_blocks
+from pdhef_logtool.records.geometry import DeadReckoner, wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -104,8 +105,10 @@ def score_track(
     ------
     ValueError : The tracks or masks are not at the same stamps.
     """
-    _check_shapes(estimate, truth, masks)
-    masks = {ALL: np.ones(len(truth), dtype=np.bool_), **masks}
+    _check_stamps(estimate, truth)
+    if ALL not in masks:
+        masks = {ALL: np.ones(len(truth), dtype=np.bool_), **masks}
+    masks = packed(masks, len(truth))
     rows: list[MetricRow] = []
     for signal in SCORED_SIGNALS:
         rows += _score_signal(estimate, truth, masks, signal, log, low_speed_m_s)
@@ -125,28 +128,24 @@ def score_track(
 
 def state_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -> list[MetricRow]:
     """Return ``nis``, ``nis_dof`` and ``diverged`` of a track, which need no truth; no NIS rows for a track without."""
-    rows = []
-    innovation = np.isfinite(track.nis) & (track.nis_dof > 0)
-    for segment, mask in masks.items():
-        use = mask & innovation
-        n = int(np.count_nonzero(use))
-        if n:
-            mean, dof = float(np.mean(track.nis[use])), float(np.mean(track.nis_dof[use]))
-            rows.append(MetricRow(log, track.name, "state", segment, "nis", mean, "1", n))
-            rows.append(MetricRow(log, track.name, "state", segment, "nis_dof", dof, "1", n))
-        inside = int(np.count_nonzero(mask))
-        if inside:
-            share = float(np.mean(track.diverged[mask]))
-            rows.append(MetricRow(log, track.name, "state", segment, "diverged", share, "1", inside))
-    return rows
-
-
-def known_by_segment(values: FloatArray, masks: Mapping[str, BoolArray]) -> Iterator[tuple[str, FloatArray]]:
-    """Yield the finite ones of values [N] of each segment that has any."""
-    for segment, mask in masks.items():
-        inside = values[mask & np.isfinite(values)]
-        if inside.size:
-            yield segment, inside
+    masks = packed(masks, len(track))
+    innovation, diverged = SegmentSums(), SegmentSums()
+    for a, b in row_blocks(len(track)):
+        part, inside = track.rows(a, b), masks.rows(a, b)
+        dof = part.nis_dof
+        innovation.add(inside, np.where(dof > 0, part.nis, np.nan), dof)
+        diverged.add(inside, part.diverged)
+    found = [
+        (segment, metric, float(total[i]) / n, n)
+        for sums, metrics in ((innovation, ("nis", "nis_dof")), (diverged, ("diverged",)))
+        for segment, (n, total) in sums.totals().items()
+        for i, metric in enumerate(metrics)
+    ]
+    place = list(masks).index
+    return [
+        MetricRow(log, track.name, "state", *figure[:3], "1", figure[3])
+        for figure in sorted(found, key=lambda f: place(f[0]))
+    ]
 
 
 def truth_speed(truth: StateTrack) -> FloatArray:
@@ -165,14 +164,9 @@ def signal_error(estimate: StateTrack, truth: StateTrack, signal: str, low_speed
 
 def summarise_errors(error: FloatArray) -> dict[str, float]:
     """Return rmse, mae, bias, p95_abs and max_abs of finite errors [N], N ≥ 1."""
-    size = np.abs(error)
-    return {
-        "rmse": float(np.sqrt(np.mean(error**2))),
-        "mae": float(np.mean(size)),
-        "bias": float(np.mean(error)),
-        "p95_abs": float(np.percentile(size, 95.0)),
-        "max_abs": float(np.max(size)),
-    }
+    sums = ErrorSums(len(error))
+    sums.add(error)
+    return sums.figures()
 
 
 def lag_s(stamps_ns: IntArray, estimate: FloatArray, truth: FloatArray) -> float:
@@ -198,45 +192,76 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def position_error(estimate: StateTrack, truth: StateTrack) -> FloatArray:
     """Return the distance [N] in m between truth and dead reckoning; NaN before the start and without a truth pose."""
-    error = np.full(len(truth), np.nan)
-    pose = _pose_known(truth)
-    ready = np.flatnonzero(pose & _motion_known(estimate))
-    if ready.size:
-        first = int(ready[0])
-        start = (float(truth.x_m[first]), float(truth.y_m[first]), float(truth.yaw_rad[first]))
-        x, y, _ = _dead_reckon(estimate, first, start)
-        error[first:] = np.where(pose[first:], np.hypot(x - truth.x_m[first:], y - truth.y_m[first:]), np.nan)
-    return error
+    return np.concatenate([*_position_errors(estimate, truth)])
+
+
+def _position_errors(estimate: StateTrack, truth: StateTrack) -> Iterator[FloatArray]:
+    reckoner = None
+    for a, b in row_blocks(len(truth)):
+        of_truth, of_estimate = truth.rows(a, b), estimate.rows(a, b)
+        pose = _pose_known(of_truth)
+        error = np.full(b - a, np.nan)
+        first = 0
+        if reckoner is None:
+            ready = np.flatnonzero(pose & _motion_known(of_estimate))
+            if ready.size:
+                first = int(ready[0])
+                start = of_truth.rows(first, first + 1)
+                reckoner = DeadReckoner((float(start.x_m[0]), float(start.y_m[0]), float(start.yaw_rad[0])))
+        if reckoner is not None:
+            x, y, _ = _dead_reckon(of_estimate.rows(first, b - a), reckoner)
+            distance = np.hypot(x - of_truth.x_m[first:], y - of_truth.y_m[first:])
+            error[first:] = np.where(pose[first:], distance, np.nan)
+        yield error
 
 
 def lateral_errors_after_one_second(estimate: StateTrack, truth: StateTrack) -> FloatArray:
     """Return the lateral error [K] in m at the end of each second that can be scored; positive = estimate left."""
-    pose, motion = _pose_known(truth), _motion_known(estimate)
-    if not (pose & motion).any():
-        return np.empty(0)
-    t = truth.stamps_ns
-    first = int(np.flatnonzero(pose & motion)[0])
-    marks = np.arange(int(t[first]), int(t[-1]) + 1, round(ANCHOR_S * 1e9))
-    anchors = np.searchsorted(t, marks)
-    i, j = anchors[:-1], anchors[1:]
-    lost = np.concatenate([[0], np.cumsum(~motion)])
-    gaps = np.concatenate([[0], np.cumsum(np.diff(t) > round(MAX_STEP_S * 1e9))])
-    whole = (lost[j + 1] == lost[i]) & (gaps[j] == gaps[i]) & pose[i] & pose[j] & (j > i)
-    i, j = i[whole], j[whole]
+    anchors = np.concatenate([*_anchors(estimate, truth)], axis=1)
+    begin, end = anchors[:, :-1], anchors[:, 1:]
+    at, pose, lost, _, gaps = range(5)
+    whole = (end[3] == begin[lost]) & (end[gaps] == begin[gaps]) & (begin[pose] * end[pose] > 0) & (end[at] > begin[at])
+    x, y, yaw, true_x, true_y, true_yaw = begin[5:, whole]
+    x_end, y_end, _, true_x_end, true_y_end, true_yaw_end = end[5:, whole]
     # One dead reckoning serves all seconds: a new start pose only turns and moves it.
-    x, y, yaw = _dead_reckon(estimate, 0, (0.0, 0.0, 0.0))
-    turn = truth.yaw_rad[i] - yaw[i]
-    dx = np.cos(turn) * (x[j] - x[i]) - np.sin(turn) * (y[j] - y[i]) - (truth.x_m[j] - truth.x_m[i])
-    dy = np.sin(turn) * (x[j] - x[i]) + np.cos(turn) * (y[j] - y[i]) - (truth.y_m[j] - truth.y_m[i])
-    return np.asarray(-np.sin(truth.yaw_rad[j]) * dx + np.cos(truth.yaw_rad[j]) * dy, dtype=np.float64)
+    turn = true_yaw - yaw
+    dx = np.cos(turn) * (x_end - x) - np.sin(turn) * (y_end - y) - (true_x_end - true_x)
+    dy = np.sin(turn) * (x_end - x) + np.cos(turn) * (y_end - y) - (true_y_end - true_y)
+    return np.asarray(-np.sin(true_yaw_end) * dx + np.cos(true_yaw_end) * dy, dtype=np.float64)
 
 
-def _check_shapes(estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray]) -> None:
-    if not np.array_equal(estimate.stamps_ns, truth.stamps_ns):
+def _anchors(estimate: StateTrack, truth: StateTrack) -> Iterator[FloatArray]:
+    """Yield, by block, [11, K] at the first stamp of each second from the first common stamp on.
+
+    Rows: place, whether the true pose is known, stamps before it and up to it without motion, gaps before it, dead
+    reckoning x, y, yaw and true x, y, yaw.
+    """
+    reckoner = DeadReckoner((0.0, 0.0, 0.0))
+    second = round(ANCHOR_S * 1e9)
+    mark: int | None = None
+    lost = gaps = 0
+    stamps: IntArray = np.empty(0, dtype=np.int64)
+    for a, b in row_blocks(len(truth)):
+        of_truth, of_estimate = truth.rows(a, b), estimate.rows(a, b)
+        pose, motion = _pose_known(of_truth), _motion_known(of_estimate)
+        before, stamps = stamps[-1:], of_truth.stamps_ns
+        gap = np.diff(stamps, prepend=before if a else stamps[:1]) > round(MAX_STEP_S * 1e9)
+        if mark is None and (pose & motion).any():
+            mark = int(stamps[np.argmax(pose & motion)])
+        marks = np.empty(0, dtype=np.int64) if mark is None else np.arange(mark, int(stamps[-1]) + 1, second)
+        at = np.searchsorted(stamps, marks)
+        up_to = lost + np.cumsum(~motion)
+        columns = (a + np.arange(b - a), pose, up_to - ~motion, up_to, gaps + np.cumsum(gap))
+        poses = (*_dead_reckon(of_estimate, reckoner), of_truth.x_m, of_truth.y_m, of_truth.yaw_rad)
+        yield np.stack([np.asarray(c[at], dtype=np.float64) for c in (*columns, *poses)])
+        mark = None if mark is None else mark + second * len(marks)
+        lost, gaps = lost + int(np.count_nonzero(~motion)), gaps + int(np.count_nonzero(gap))
+
+
+def _check_stamps(estimate: StateTrack, truth: StateTrack) -> None:
+    blocks = ((estimate.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth)))
+    if len(estimate) != len(truth) or not all(np.array_equal(e.stamps_ns, t.stamps_ns) for e, t in blocks):
         raise ValueError(f"estimate {estimate.name} and truth must be at the same stamps")
-    for name, mask in masks.items():
-        if mask.shape != (len(truth),):
-            raise ValueError(f"mask {name}: expected shape ({len(truth)},), got {mask.shape}")
 
 
 def _scorable(truth: StateTrack, signal: str, low_speed_m_s: float) -> BoolArray:
@@ -247,42 +272,56 @@ def _scorable(truth: StateTrack, signal: str, low_speed_m_s: float) -> BoolArray
 
 
 def _score_signal(
-    estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray], signal: str, log: str, low_speed_m_s: float
+    estimate: StateTrack, truth: StateTrack, masks: SegmentMasks, signal: str, log: str, low_speed_m_s: float
 ) -> list[MetricRow]:
-    scorable = _scorable(truth, signal, low_speed_m_s)
-    error = signal_error(estimate, truth, signal, low_speed_m_s)
-    reference: FloatArray = getattr(truth, signal)
-    sigma = _total_std(estimate, truth, signal)
+    sums = {segment: ErrorSums(int(np.count_nonzero(mask))) for segment, mask in masks.items()}
+    asked, squares, banded = SegmentSums(), SegmentSums(), SegmentSums()
+    for a, b in row_blocks(len(truth)):
+        of_estimate, of_truth, inside = estimate.rows(a, b), truth.rows(a, b), masks.rows(a, b)
+        error = signal_error(of_estimate, of_truth, signal, low_speed_m_s)
+        for segment, errors in known_by_segment(error, inside):
+            sums[segment].add(errors)
+        known = np.isfinite(error)
+        asked.add(inside, np.where(_scorable(of_truth, signal, low_speed_m_s), 1.0, np.nan))
+        squares.add(inside, error, np.where(known, getattr(of_truth, signal), np.nan) ** 2)
+        sigma = _total_std(of_estimate, of_truth, signal)
+        covered = np.abs(error) <= NORMAL_95 * sigma
+        banded.add(inside, np.where(known & np.isfinite(sigma), covered, np.nan))
+    references, bands = squares.totals(), banded.totals()
     rows: list[MetricRow] = []
 
     def add(segment: str, metric: str, value: float, unit: str, n: int) -> None:
         rows.append(MetricRow(log, estimate.name, signal, segment, metric, value, unit, n))
 
-    for segment, mask in masks.items():
-        asked = mask & scorable
-        expected = int(np.count_nonzero(asked))
-        if expected == 0:
-            continue
-        use = asked & np.isfinite(error)
-        n = int(np.count_nonzero(use))
+    for segment, (expected, _) in asked.totals().items():
+        n = sums[segment].n
         add(segment, "availability", n / expected, "1", expected)
         if n == 0:
             continue
-        figures = summarise_errors(error[use])
+        figures = sums[segment].figures()
         for metric, value in figures.items():
             add(segment, metric, value, SCORED_SIGNALS[signal], n)
-        size = float(np.sqrt(np.mean(reference[use] ** 2)))
+        size = float(np.sqrt(references[segment][1][1] / n))
         add(segment, "rmse_relative", figures["rmse"] / size if size > 0 else float("nan"), "1", n)
-        banded = use & np.isfinite(sigma)
-        if banded.any():
-            covered = np.abs(error[banded]) <= NORMAL_95 * sigma[banded]
-            add(segment, "coverage95", float(np.mean(covered)), "1", int(covered.size))
+        if segment in bands:
+            within, (covered,) = bands[segment]
+            add(segment, "coverage95", float(covered) / within, "1", within)
         if segment == ALL:
-            stamps = truth.stamps_ns
-            hour = slice(0, int(np.searchsorted(stamps, stamps[0] + LAG_SPAN_NS)))
-            values = np.where(use[hour], getattr(estimate, signal)[hour], np.nan)
-            add(segment, "lag_s", lag_s(stamps[hour], values, reference[hour]), "s", n)
+            add(segment, "lag_s", _lag_of_first_hour(estimate, truth, masks, signal, low_speed_m_s), "s", n)
     return rows
+
+
+def _lag_of_first_hour(
+    estimate: StateTrack, truth: StateTrack, masks: SegmentMasks, signal: str, low_speed_m_s: float
+) -> float:
+    end_ns, end = truth.rows(0, 1).stamps_ns[0] + LAG_SPAN_NS, 0
+    for a, b in row_blocks(len(truth)):
+        end = a + int(np.searchsorted(truth.rows(a, b).stamps_ns, end_ns))
+        if end < b:
+            break
+    estimate, truth = estimate.rows(0, end), truth.rows(0, end)
+    use = masks.rows(0, end)[ALL] & np.isfinite(signal_error(estimate, truth, signal, low_speed_m_s))
+    return lag_s(truth.stamps_ns, np.where(use, getattr(estimate, signal), np.nan), getattr(truth, signal))
 
 
 def _total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArray:
@@ -300,32 +339,35 @@ def _total_std(estimate: StateTrack, truth: StateTrack, signal: str) -> FloatArr
 
 def _score_position(estimate: StateTrack, truth: StateTrack, log: str) -> list[MetricRow]:
     rows = []
-    for signal, error in (
-        ("position_m", position_error(estimate, truth)),
-        ("lateral_1s_m", lateral_errors_after_one_second(estimate, truth)),
+    for signal, blocks in (
+        ("position_m", _position_errors(estimate, truth)),
+        ("lateral_1s_m", iter([lateral_errors_after_one_second(estimate, truth)])),
     ):
-        error = error[np.isfinite(error)]
-        if error.size:
-            figures = summarise_errors(error)
+        sums = ErrorSums(len(truth))
+        for error in blocks:
+            sums.add(error[np.isfinite(error)])
+        if sums.n:
+            figures = sums.figures()
             if signal == "position_m":
                 del figures["bias"]  # a distance has no sign
             rows += [
-                MetricRow(log, estimate.name, signal, ALL, metric, value, "m", int(error.size))
+                MetricRow(log, estimate.name, signal, ALL, metric, value, "m", sums.n)
                 for metric, value in figures.items()
             ]
     return rows
 
 
-def _nees_rows(estimate: StateTrack, truth: StateTrack, masks: Mapping[str, BoolArray], log: str) -> list[MetricRow]:
-    n = len(estimate)
+def _nees_rows(estimate: StateTrack, truth: StateTrack, masks: SegmentMasks, log: str) -> list[MetricRow]:
     if estimate.rows(0, 1).covariance.shape[0] == 0:
         return []
-    starts = range(0, n, NEES_ROWS)
-    blocks = [_nees_of(*(t.rows(a, a + NEES_ROWS) for t in (estimate, truth))) for a in starts]
-    value = np.concatenate(blocks)
+    sums = SegmentSums()
+    for a, b in row_blocks(len(truth)):
+        parts = range(a, b, NEES_ROWS)
+        value = [_nees_of(*(t.rows(i, min(i + NEES_ROWS, b)) for t in (estimate, truth))) for i in parts]
+        sums.add(masks.rows(a, b), np.concatenate(value))
     return [
-        MetricRow(log, estimate.name, "state", segment, "nees", float(np.mean(inside)), "1", int(inside.size))
-        for segment, inside in known_by_segment(value, masks)
+        MetricRow(log, estimate.name, "state", segment, "nees", float(total) / n, "1", n)
+        for segment, (n, (total,)) in sums.totals().items()
     ]
 
 
@@ -347,8 +389,6 @@ def _motion_known(track: StateTrack) -> BoolArray:
     return known & np.isfinite(track.yaw_rate_rad_s)
 
 
-def _dead_reckon(
-    track: StateTrack, first: int, start: tuple[float, float, float]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _dead_reckon(track: StateTrack, reckoner: DeadReckoner) -> tuple[FloatArray, FloatArray, FloatArray]:
     vx = np.where(track.valid, track.vx_m_s, np.nan)
-    return dead_reckon(track.stamps_ns[first:], vx[first:], track.vy_m_s[first:], track.yaw_rate_rad_s[first:], start)
+    return reckoner.add(track.stamps_ns, vx, track.vy_m_s, track.yaw_rate_rad_s)

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.tracks import StateTrack
@@ -125,10 +126,12 @@ class ReasonIntervals:
 
 def summarise_reasons(track: StateTrack) -> tuple[ReasonFacts, ...] | None:
     """Return the summary of a whole track; None where the source gives no reasons."""
-    if not len(track.reason) == len(track) > 0:
+    if not len(track.rows(0, 1).reason) == len(track.rows(0, 1)) > 0:
         return None
     found = ReasonIntervals()
-    found.append(track.stamps_ns, track.reason)
+    for a, b in row_blocks(len(track)):
+        part = track.rows(a, b)
+        found.append(part.stamps_ns, part.reason)
     return found.summary()
 
 

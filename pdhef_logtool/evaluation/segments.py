@@ -23,11 +23,12 @@ log's friction, else the vehicle file's, else 1.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.evaluation.blocks import SegmentMasks, blocks_with_halo, median_step_ns, packed, row_blocks
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -52,6 +53,8 @@ STRAIGHT_M_S2, STRAIGHT_S = 0.5, 2.0
 CORNERING_M_S2, CORNERING_S = 1.0, 1.5
 SWING_M_S2, SLALOM_M_S2, SLALOM_PEAKS, SLALOM_SPACING_S = 0.5, 1.5, 3, 2.5
 BRAKING_M_S2, ACCELERATING_M_S2, PEDAL_S = -1.5, 1.0, 0.5
+#: What is further away than this decides nothing: three swings of a slalom, and a corner after it, take 16 s.
+HALO_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,33 +66,40 @@ class Segment:
     end_ns: int
 
 
-def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehicleParameters) -> dict[str, BoolArray]:
+def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehicleParameters) -> SegmentMasks:
     """Return the masks [N] of every segment by name, in the order of this file's table; none is left out when empty.
 
     Parameters
     ----------
     signals : what the sensors say at the scored stamps. truth : at the same stamps, or None.
     """
-    # One quantity after the other: of hours of driving a column takes tens of megabytes.
+    step_ns, of_truth, bits = median_step_ns(signals), _known_of(truth), []
+    for first, a, b, end in blocks_with_halo(signals, HALO_S, reach_rows(step_ns, MANOEUVRE_SMOOTHING_HZ)):
+        part = truth.rows(first, end) if truth else None
+        masks = _masks(signals.rows(first, end), part, of_truth, step_ns, vehicle)
+        bits.append(packed(masks, end - first).bits[a - first : b - first])
+    return SegmentMasks(SEGMENTS, np.concatenate(bits))
+
+
+def _masks(
+    signals: Signals, truth: StateTrack | None, of_truth: frozenset[str], step_ns: float, vehicle: VehicleParameters
+) -> dict[str, BoolArray]:
+    """Return the masks of a part of a drive, right where it reaches far enough to both sides or to the drive's end."""
     stamps = signals.stamps_ns
     slow = vehicle.low_speed_blend_m_s
-    lateral = truth.ay_m_s2 if truth else None
-    linear, nonlinear = _grip_masks(signals, stamps, _preferred(lateral, signals.ay_m_s2), vehicle)
-    ay = smooth(stamps, _preferred(lateral, signals.ay_m_s2), MANOEUVRE_SMOOTHING_HZ)
-    del lateral
+    lateral = _taken(signals, truth, of_truth, "ay_m_s2")
+    linear, nonlinear = _grip_masks(signals, stamps, lateral, step_ns, vehicle)
+    ay = smooth(stamps, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns)
     slalom = _slalom(stamps, ay)
     left = _lasting(stamps, (ay > CORNERING_M_S2) & ~slalom, CORNERING_S)
     right = _lasting(stamps, (ay < -CORNERING_M_S2) & ~slalom, CORNERING_S)
-    speed = _speed(signals, truth)
+    speed = _speed(signals, truth, of_truth)
     straight = _lasting(stamps, (speed > slow) & (np.abs(ay) < STRAIGHT_M_S2), STRAIGHT_S)
-    standing = speed < vehicle.standstill_m_s
-    del ay, speed
-    rate = _preferred(truth.yaw_rate_rad_s if truth else None, signals.yaw_rate_rad_s)
-    rate = smooth(stamps, rate, MANOEUVRE_SMOOTHING_HZ)
-    standing = _lasting(stamps, standing & (np.abs(rate) < STANDSTILL_YAW_RATE_RAD_S), STANDSTILL_S)
+    rate = _taken(signals, truth, of_truth, "yaw_rate_rad_s")
+    turning = np.abs(smooth(stamps, rate, MANOEUVRE_SMOOTHING_HZ, step_ns)) < STANDSTILL_YAW_RATE_RAD_S
+    standing = _lasting(stamps, (speed < vehicle.standstill_m_s) & turning, STANDSTILL_S)
     moving = ~standing
-    del rate
-    ax = smooth(stamps, signals.ax_m_s2, MANOEUVRE_SMOOTHING_HZ)
+    ax = smooth(stamps, signals.ax_m_s2, MANOEUVRE_SMOOTHING_HZ, step_ns)
     return {
         "all": np.ones(len(signals), dtype=np.bool_),
         "linear": linear,
@@ -105,10 +115,10 @@ def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehiclePa
 
 
 def _grip_masks(
-    signals: Signals, stamps: IntArray, ay: FloatArray, vehicle: VehicleParameters
+    signals: Signals, stamps: IntArray, ay: FloatArray, step_ns: float, vehicle: VehicleParameters
 ) -> tuple[BoolArray, BoolArray]:
     """Return where the grip is used little and much, [N]."""
-    grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ))
+    grip = np.abs(smooth(stamps, ay, GRIP_SMOOTHING_HZ, step_ns))
     friction = signals.friction
     grip /= np.where(np.isfinite(friction), friction, vehicle.assumed_friction) * GRAVITY_M_S2
     return grip < LINEAR_SHARE, grip > NONLINEAR_SHARE
@@ -119,42 +129,81 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
     ``signals``, ``truth`` as for :func:`segment_masks`.
     """
-    speed = _speed(signals, truth)
-    known = np.isfinite(speed).any()
-    return np.asarray(speed > vehicle.low_speed_blend_m_s if known else np.ones(len(signals)), dtype=np.bool_)
+    of_truth = _known_of(truth)
+    if "vx_m_s" not in of_truth and not _known_anywhere(signals, "speed_m_s"):
+        return np.ones(len(signals), dtype=np.bool_)
+    blocks = []
+    for first, a, b, end in blocks_with_halo(signals, RUN_GAP_S, 0):
+        speed = _speed(signals.rows(first, end), truth.rows(first, end) if truth else None, of_truth)
+        blocks.append(speed[a - first : b - first] > vehicle.low_speed_blend_m_s)
+    return np.concatenate(blocks)
 
 
-def _speed(signals: Signals, truth: StateTrack | None) -> FloatArray:
+def _known_of(truth: StateTrack | None) -> frozenset[str]:
+    """Return what is taken from the truth: all that it ever knows, so that a drive does not mix two sources."""
+    if truth is None:
+        return frozenset()
+    return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s") if _known_anywhere(truth, c))
+
+
+def _taken(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str], column: str) -> FloatArray:
+    values: FloatArray = getattr(truth if column in of_truth else signals, column)
+    return values
+
+
+def _known_anywhere(record: Signals | StateTrack, column: str) -> bool:
+    return any(np.isfinite(getattr(record.rows(a, b), column)).any() for a, b in row_blocks(len(record)))
+
+
+def _speed(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str]) -> FloatArray:
     """Return the speed [N] in m/s, of one source."""
-    return _preferred(np.abs(truth.vx_m_s) if truth else None, _last_known(signals.stamps_ns, signals.speed_m_s))
+    if truth is not None and "vx_m_s" in of_truth:
+        return np.abs(truth.vx_m_s)
+    return _last_known(signals.stamps_ns, signals.speed_m_s)
 
 
-def find_intervals(stamps_ns: IntArray, masks: Mapping[str, BoolArray]) -> list[Segment]:
+def find_intervals(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]) -> list[Segment]:
     """Turn masks [N] into intervals in order of time; a step of more than ``RUN_GAP_S`` ends an interval.
 
     ``end_ns`` is one past the last stamp inside.
     """
-    found = [
-        Segment(name, int(stamps_ns[a]), int(stamps_ns[b - 1]) + 1)
-        for name, mask in masks.items()
-        for a, b in _runs(stamps_ns, mask)
-    ]
-    return sorted(found, key=lambda s: (s.start_ns, s.end_ns, s.name))
+    masks = packed(masks, len(stamped))
+    found: dict[str, list[Segment]] = {name: [] for name in masks}
+    for a, b in row_blocks(len(stamped)):
+        # From the last row of the block before on: what goes across the border overlaps there.
+        start = max(a - 1, 0)
+        stamps = stamped.rows(start, b).stamps_ns
+        for name, mask in masks.rows(start, b).items():
+            for i, j in _runs(stamps, mask):
+                new = Segment(name, int(stamps[i]), int(stamps[j - 1]) + 1)
+                if found[name] and new.start_ns < found[name][-1].end_ns:
+                    new = replace(new, start_ns=found[name].pop().start_ns)
+                found[name].append(new)
+    return sorted((s for spans in found.values() for s in spans), key=lambda s: (s.start_ns, s.end_ns, s.name))
 
 
-def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float) -> FloatArray:
+def reach_rows(step_ns: float, cutoff_hz: float) -> int:
+    """Return how many rows to each side :func:`smooth` takes."""
+    return int(4.0 * _sigma_rows(step_ns, cutoff_hz) + 0.5)
+
+
+def _sigma_rows(step_ns: float, cutoff_hz: float) -> float:
+    sigma_s = np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz)
+    return float(sigma_s / (step_ns * 1e-9))
+
+
+def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: float | None = None) -> FloatArray:
     """Smooth [N] without phase by a Gaussian whose gain is 1/√2 at ``cutoff_hz``; NaN stays, but does not spread.
 
     The Gaussian runs over samples of the median step, cut off at 4 σ, and does not reach across steps of more than
-    ``RUN_GAP_S``.
+    ``RUN_GAP_S``. ``step_ns``: the median step, of the whole drive for a part of it.
     """
     from scipy.ndimage import gaussian_filter1d
 
     out = np.full(values.shape, np.nan)
     if values.shape[0] < 2:
         return values.astype(np.float64)
-    sigma_s = np.sqrt(np.log(2.0)) / (2.0 * np.pi * cutoff_hz)
-    sigma = sigma_s / (float(np.median(np.diff(stamps_ns))) * 1e-9)
+    sigma = _sigma_rows(float(np.median(np.diff(stamps_ns))) if step_ns is None else step_ns, cutoff_hz)
     known = np.isfinite(values)
     for a, b in _runs(stamps_ns, np.ones(values.shape[0], dtype=np.bool_)):
         weight = gaussian_filter1d(known[a:b].astype(np.float64), sigma, mode="constant")
@@ -162,11 +211,6 @@ def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float) -> FloatAr
         here = known[a:b]
         out[a:b][here] = total[here] / weight[here]
     return out
-
-
-def _preferred(first: FloatArray | None, second: FloatArray) -> FloatArray:
-    """Take the first source wherever it has any value at all: two sources are not mixed within a drive."""
-    return second if first is None or not np.isfinite(first).any() else first
 
 
 def _last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:

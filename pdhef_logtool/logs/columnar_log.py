@@ -6,7 +6,6 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -101,12 +100,14 @@ class ColumnarLog:
         return self._occupied
 
     def _times(self, c: int, span: Span) -> tuple[IntArray, IntArray] | None:
-        """Return channels and log times of a span's messages [N]; None if they cannot be read."""
-        meter = self.containers[c].meter
+        """Return channels and log times of a span's messages on known channels [N]; None if they cannot be read."""
+        container = self.containers[c]
         try:
-            meter.check()
-            with meter.running():
-                return self.containers[c].times(span)
+            container.meter.check()
+            with container.meter.running():
+                channel, log_time = container.times(span)
+            known = np.isin(channel, list(container.channels))
+            return channel[known], log_time[known]
         except Exception:  # noqa: BLE001 (a read of the span reports the damage)
             return None
 
@@ -114,14 +115,15 @@ class ColumnarLog:
     def lost(self) -> tuple[Loss, ...]:
         """What could not be read, as far as is known by now."""
         found = [*self._opened_lost, *self.occupied.losses]
+        damaged, schemas = sorted(self._damaged.items()), sorted(self._schemas.items())
         for c, container in enumerate(self.containers):
             found.extend(container.lost)
-            found.extend(loss for (of, _), loss in sorted(self._damaged.items()) if of == c)
+            found.extend(loss for (of, _), loss in damaged if of == c)
             found.extend(loss for (of, _, _), loss in self._partial.items() if of == c)
             if c in self._late:
                 found.append(_out_of_time(container, list(self._late[c].values())))
             found.extend(self._undecodable_losses(c, container))
-            for (of, channel), schema in sorted(self._schemas.items(), key=itemgetter(0)):
+            for (of, channel), schema in schemas:
                 if of == c and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
                     what = f"its messages cannot be decoded: {schema}"
                     found.append(Loss("bad-schema", what, container.channels[channel].topic))

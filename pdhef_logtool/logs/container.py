@@ -25,6 +25,7 @@ MAX_TIME_NS = int(np.iinfo(np.int64).max) - 1
 _LOSSES_OF_A_KIND = 20  # of one file; what comes behind them is told as one
 _IDS_TOLD = 5
 _TOLD_CHARACTERS = 300
+_RECORDS_A_CHECK = 256  # of the time that a walk takes
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,6 +319,15 @@ class FileContainer(Container):
     @abstractmethod
     def _walk(self) -> None:
         """Find channels, spans and losses, keeping :attr:`at` up to date."""
+
+    def _places(self) -> Iterator[int]:
+        """Yield where the walk is, up to the file's end, looking at the time that it takes now and then."""
+        n = 0
+        while self.at < self.source.size:
+            n += 1
+            if n % _RECORDS_A_CHECK == 0:
+                self.meter.check()
+            yield self.at
 
     @abstractmethod
     def _finish(self) -> None:

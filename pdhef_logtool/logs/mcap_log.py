@@ -55,7 +55,6 @@ _FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
 _CHUNK_HEAD_BYTES = 49 + 4  # with the longest name of a compression
-_RECORDS_A_CHECK = 256  # of the time that a walk takes
 _MESSAGES_A_CHECK = 1 << 16
 #: Plain numbers: comparing with the members of an enumeration takes longer than reading a record.
 _OP_MESSAGE, _OP_CHUNK, _OP_MESSAGE_INDEX = int(Opcode.MESSAGE), int(Opcode.CHUNK), int(Opcode.MESSAGE_INDEX)
@@ -113,12 +112,7 @@ class McapContainer(FileContainer):
     def _walk(self) -> None:
         source, size, walk = self.source, self.source.size, self._walked
         header_seen = False
-        records = 0
-        while self.at < size:
-            at = self.at
-            records += 1
-            if records % _RECORDS_A_CHECK == 0:
-                self.meter.check()
+        for at in self._places():
             if size - at == len(MCAP_MAGIC) and source.read(at, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self.account.decode(at, size)
                 walk.closed = True

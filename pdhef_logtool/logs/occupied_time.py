@@ -47,7 +47,8 @@ _WHAT = {
     TIME_JUMP: "messages are left out: the recorder's clock stepped back, and their times were recorded before",
 }
 
-#: Channels and log times of a span's messages, [N] each, a channel's in file order; None if the span is damaged.
+#: Channels and log times of a span's messages on known channels, [N] each, a channel's in file order; None if the
+#: span is damaged.
 SpanTimes = Callable[[int, Span], tuple[IntArray, IntArray] | None]
 
 
@@ -90,12 +91,7 @@ class OccupiedTime:
         """Tell which of a topic's messages in a span (all of them, in file order) are left out; None: none of them."""
         if not self.left_out:
             return None
-        unused = ~_inside(log_time_ns, self.intervals)
-        for cut in self.cuts:
-            if cut.topic == topic and (c, span.index) >= cut.place[:2]:
-                first = cut.place[2] if (c, span.index) == cut.place[:2] else 0
-                later = log_time_ns[first:]
-                unused[first:] |= (later >= cut.low_ns) & (later <= cut.high_ns)
+        unused = ~_inside(log_time_ns, self.intervals) | _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
         return unused if unused.any() else None
 
 
@@ -181,17 +177,15 @@ def survey(containers: Sequence[Container], times: SpanTimes, where: str) -> Occ
             rows = np.flatnonzero(which)
             losses.append(_loss(reason, where, start[rows], end[rows], int(count[rows].sum()), total))
     cuts = _cuts(look, intervals)
-    span_of: dict[tuple[int, int], Span] = {(c, s.index): s for c, of in enumerate(containers) for s in of.spans}
     twice: list[IntArray] = []
-    within = OccupiedTime(tuple(intervals), tuple(cuts), {"": {}})
-    for (c, index), span in span_of.items() if cuts else ():
-        if not any((c, index) >= cut.place[:2] and _touches(span, cut) for cut in cuts):
+    for c, span in ((c, span) for c, of in enumerate(containers) for span in of.spans) if cuts else ():
+        place = (c, span.index)
+        if not any(place >= cut.place[:2] and _touches(span, cut) for cut in cuts):
             continue
         found = times(c, span)
         for id_, own in _by_channel(found) if found is not None else ():
             topic = containers[c].channels[id_].topic
-            unused = within.unused(topic, c, span, own)
-            again = own[_inside(own, intervals) & unused] if unused is not None else own[:0]
+            again = own[_inside(own, intervals) & _cut_out(own, topic, place, cuts)]
             if again.size:
                 left_out.setdefault(topic, Counter())[TIME_JUMP] += again.size
                 twice.append(again)
@@ -255,8 +249,6 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
                 found = times(c, span)
                 if found is None:
                     continue  # damaged: nothing of it can be read
-                known = np.isin(found[0], list(topics))
-                found = found[0][known], found[1][known]
                 disorder = any((np.diff(own) < -STEP_BACK_NS).any() for _, own in _by_channel(found))
                 if found[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
                     of = _Looked(c, span, topics, found)
@@ -313,6 +305,17 @@ def _inside(times_ns: IntArray, intervals: Sequence[tuple[int, int]]) -> BoolArr
     for start, end in intervals:
         inside |= (times_ns >= start) & (times_ns < end)
     return inside
+
+
+def _cut_out(times_ns: IntArray, topic: str, place: tuple[int, int], cuts: Iterable[Cut]) -> BoolArray:
+    """Tell which of a topic's messages in the span of a place, file and span, the cuts leave out."""
+    left_out = np.zeros(times_ns.shape[0], np.bool_)
+    for cut in cuts:
+        if cut.topic == topic and place >= cut.place[:2]:
+            first = cut.place[2] if place == cut.place[:2] else 0
+            later = times_ns[first:]
+            left_out[first:] |= (later >= cut.low_ns) & (later <= cut.high_ns)
+    return left_out
 
 
 def _by_channel(found: tuple[IntArray, IntArray]) -> Iterable[tuple[int, IntArray]]:

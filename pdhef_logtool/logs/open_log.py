@@ -173,7 +173,7 @@ def _read_metadata(path: Path, budget: Budget) -> Mapping[str, Any]:
 
 def _open_rosbag2_folder(path: Path, meter: Meter) -> ColumnarLog:
     information = _read_metadata(path, meter.budget)
-    per_message = str(information.get("compression_mode") or "").lower() == "message"
+    per_message = _text(information.get("compression_mode")).lower() == "message"
     encodings = _declared_encodings(information)
     containers: list[Container] = []
     forms: set[str] = set()

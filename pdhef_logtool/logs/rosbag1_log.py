@@ -34,7 +34,6 @@ _U32 = struct.Struct("<I")
 _TIME = struct.Struct("<II")
 _ZERO_BLOCK_BYTES = 1 << 20
 _LEAST_MESSAGE_BYTES = 8 + 3 * 4 + len(b"op=") + 1 + len(b"conn=") + 4 + len(b"time=") + 8
-_RECORDS_A_CHECK = 256  # of the time that a walk takes
 _MESSAGES_A_CHECK = 1 << 16
 
 
@@ -71,12 +70,7 @@ class Rosbag1Container(FileContainer):
 
     def _walk(self) -> None:
         size = self.source.size
-        records = 0
-        while self.at < size:
-            at = self.at
-            records += 1
-            if records % _RECORDS_A_CHECK == 0:
-                self.meter.check()
+        for at in self._places():
             record = self._record_at(at)
             if record is None:
                 index_at = self._header[0] if self._header else 0

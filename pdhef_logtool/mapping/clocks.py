@@ -171,16 +171,12 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
         raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
         seen, at, _ = (np.concatenate(column) for column in zip(*whole.get(key, parts[key]), strict=True))
         unusable = "" if source.stamp == "log_time" else why_unusable(seen, at)
-        if unusable:
-            period_s = np.concatenate([np.diff(part[1]) for part in parts[key]]) * 1e-9
-            clock = _clock_of(replace(source, clock="utc"), log_time, log_time, period_s)
-            clocks[key] = replace(clock, unusable=unusable)
-        else:
-            clocks[key] = _clock_of(source, raw, log_time, steps)
+        if unusable:  # they do not tell the period either
+            steps = np.concatenate([np.diff(part[1]) for part in parts[key]]) * 1e-9
+        clocks[key] = _clock_of(source, raw, log_time, steps, unusable)
     for key, why in _of_other_clocks(clocks).items():
-        source = wanted[key]
-        _, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
-        clocks[key] = replace(_clock_of(replace(source, clock="utc"), log_time, log_time, steps), unusable=why)
+        raw, log_time, steps = (np.concatenate(column) for column in zip(*parts[key], strict=True))
+        clocks[key] = _clock_of(wanted[key], raw, log_time, steps, why)
     return clocks
 
 
@@ -316,7 +312,11 @@ def _survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
     return [(int(s), int(s) + SURVEY_WINDOW_NS) for s in starts]
 
 
-def _clock_of(source: SignalSource, stamps_ns: IntArray, log_time_ns: IntArray, steps_s: FloatArray) -> ClockModel:
+def _clock_of(
+    source: SignalSource, stamps_ns: IntArray, log_time_ns: IntArray, steps_s: FloatArray, unusable: str = ""
+) -> ClockModel:
+    if unusable:
+        source, stamps_ns = replace(source, clock="utc"), log_time_ns
     n = int(stamps_ns.shape[0])
     period_s = float(np.median(steps_s)) if steps_s.shape[0] else float("nan")
     if n == 0:
@@ -344,4 +344,5 @@ def _clock_of(source: SignalSource, stamps_ns: IntArray, log_time_ns: IntArray, 
         min_delay_s=low_ns * 1e-9,
         median_period_s=period_s,
         samples=n,
+        unusable=unusable,
     )

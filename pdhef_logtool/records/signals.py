@@ -154,6 +154,11 @@ class Signals:
         """Return the number of stamps."""
         return int(self.stamps_ns.shape[0])
 
+    def rows(self, start: int, end: int) -> Signals:
+        """Return the stamps [start, end)."""
+        columns = {f.name: getattr(self, f.name)[start:end] for f in fields(Signals) if f.name != "available"}
+        return Signals(**columns, available=self.available)
+
 
 def join_signals(windows: Sequence[Signals]) -> Signals:
     """Join consecutive windows of one drive in time order."""
@@ -161,9 +166,3 @@ def join_signals(windows: Sequence[Signals]) -> Signals:
         f.name: np.concatenate([getattr(w, f.name) for w in windows]) for f in fields(Signals) if f.name != "available"
     }
     return Signals(**columns, available=windows[0].available)
-
-
-def cut_signals(signals: Signals, first: int, end: int) -> Signals:
-    """Return the stamps [first, end) of a drive."""
-    columns = {f.name: getattr(signals, f.name)[first:end] for f in fields(Signals) if f.name != "available"}
-    return Signals(**columns, available=signals.available)

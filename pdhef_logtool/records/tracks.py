@@ -92,9 +92,8 @@ class StateTrack:
         return self._std(2)
 
     def _std(self, i: int) -> FloatArray:
-        if self.covariance.shape[0] == 0:
-            return np.full(len(self), np.nan)
-        return np.sqrt(self.covariance[:, i, i])
+        covariance = self.covariance
+        return np.full(len(self), np.nan) if covariance.shape[0] == 0 else np.sqrt(covariance[:, i, i])
 
     def columns(self) -> dict[str, FloatArray | IntArray | BoolArray]:
         """Return the columns of estimates.parquet by name, in order; without those that the source has not."""

@@ -14,7 +14,7 @@ from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.drive.windows import with_look_ahead
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, run_window
-from pdhef_logtool.records.geometry import dead_reckon
+from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.intervals import TrackCalibrator
@@ -97,24 +97,17 @@ class DeadReckoning:
     """Dead-reckons one track from window to window, from the true pose at the start where there is one."""
 
     def __init__(self) -> None:
-        self._last: tuple[int, float, float, float] | None = None
-        self._pose: tuple[float, float, float] | None = None
+        self._reckoner: DeadReckoner | None = None
 
     def add(self, track: StateTrack, start: tuple[float, float, float]) -> StateTrack:
         """Return the next window of the track with its pose; ``start`` is where the first window begins."""
         if len(track) == 0:
             return track
-        stamps, vx, vy, rate = track.stamps_ns, track.vx_m_s, track.vy_m_s, track.yaw_rate_rad_s
+        vx, vy = track.vx_m_s, track.vy_m_s
         if not np.isfinite(vy).any():
             vy = np.where(np.isfinite(vx), 0.0, np.nan)  # no claim on v_y: drawn along the heading
-        if self._last is not None:
-            stamps = np.concatenate([[self._last[0]], stamps])
-            vx, vy, rate = (np.concatenate([[v], c]) for v, c in zip(self._last[1:], (vx, vy, rate), strict=True))
-        x, y, yaw = dead_reckon(stamps, vx, vy, rate, self._pose or start)
-        self._last = (int(stamps[-1]), float(vx[-1]), float(vy[-1]), float(rate[-1]))
-        self._pose = (float(x[-1]), float(y[-1]), float(yaw[-1]))
-        skip = len(x) - len(track)
-        return track.with_pose(x[skip:], y[skip:], yaw[skip:])
+        self._reckoner = self._reckoner or DeadReckoner(start)
+        return track.with_pose(*self._reckoner.add(track.stamps_ns, vx, vy, track.yaw_rate_rad_s))
 
 
 def first_pose(truth: StateTrack | None) -> tuple[float, float, float]:

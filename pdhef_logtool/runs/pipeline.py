@@ -28,7 +28,7 @@ from pdhef_logtool.records.errors import (
 )
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, IntArray, Loss, Signals
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.scoring import evaluate, in_time
@@ -243,7 +243,7 @@ def run_log(
                 signals = _estimate(drive, ready, intervals, sinks, store, progress)
                 found = evaluate(drive, [e.name for e in ready], store.read, signals)
                 if drive.friction.bank is not None:
-                    observable = friction_events(drive.friction, signals.stamps_ns)
+                    observable = friction_events(drive.friction, signals)
                     found = replace(found, events=sorted([*found.events, *observable], key=in_time))
             rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
             events = found.events
@@ -358,11 +358,11 @@ def _estimate(
     return store.signals()
 
 
-def friction_events(friction: FrictionSource, stamps_ns: IntArray) -> list[Event]:
-    """Return when an estimated friction was observable; ``stamps_ns`` are those of all windows."""
+def friction_events(friction: FrictionSource, signals: Signals) -> list[Event]:
+    """Return when an estimated friction was observable; ``signals`` are those of all windows."""
     from pdhef_logtool.evaluation.segments import find_intervals
 
-    found = find_intervals(stamps_ns, {"friction observable": friction.observable})
+    found = find_intervals(signals, {"friction observable": friction.observable})
     return [Event(s.name, s.start_ns, s.end_ns, "the estimate of friction can be relied on") for s in found]
 
 

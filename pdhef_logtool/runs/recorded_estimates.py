@@ -290,7 +290,7 @@ class _Scoring:
         from pdhef_logtool.evaluation.segments import segment_masks
 
         masks = segment_masks(signals, truth, self.car.vehicle)
-        events = segment_events(truth.stamps_ns, masks) + [e for r in recorded for e in diverged_events(r.track)]
+        events = segment_events(truth, masks) + [e for r in recorded for e in diverged_events(r.track)]
         return sorted(events, key=in_time)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.records.signals import BoolArray, IntArray, Signals
+from pdhef_logtool.evaluation.blocks import row_blocks
+from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.sinks.base import TRUTH, Event
 
@@ -38,11 +39,11 @@ class Evaluation:
 def evaluate(
     drive: Drive, names: Sequence[str], read: Callable[[str], StateTrack | None], signals: Signals
 ) -> Evaluation:
-    """Score the tracks of a drive, one whole track in memory at a time besides the truth.
+    """Score the tracks of a drive, block by block where they are on disk.
 
     Parameters
     ----------
-    names : of the estimators. read : returns the whole track of a name, ``truth`` too; None if there is none.
+    names : of the estimators. read : returns the track of a name, ``truth`` too; None if there is none.
     signals : what the estimators saw.
     """
     from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
@@ -57,11 +58,11 @@ def evaluate(
     slow = vehicle.low_speed_blend_m_s
     rows: list[MetricRow] = []
     reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
-    events = segment_events(signals.stamps_ns, masks)
+    events = segment_events(signals, masks)
     for name in names:
         track = read(name)
         assert track is not None
-        if moving.any() and not (moving & track.valid & track.something_known).any():
+        if moving.any() and not _known_at(track, moving):
             silent.append(name)
         if truth is not None:
             rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
@@ -83,12 +84,17 @@ def in_time(event: Event) -> tuple[int, int, str]:
     return event.start_ns, event.end_ns, event.name
 
 
-def segment_events(stamps_ns: IntArray, masks: dict[str, BoolArray]) -> list[Event]:
+def _known_at(track: StateTrack, mask: BoolArray) -> bool:
+    parts = ((track.rows(a, b), mask[a:b]) for a, b in row_blocks(len(track)))
+    return any((inside & part.valid & part.something_known).any() for part, inside in parts)
+
+
+def segment_events(stamped: Signals | StateTrack, masks: Mapping[str, BoolArray]) -> list[Event]:
     """Return the segments that are worth an event: not the whole drive, nor what is only not nonlinear."""
     from pdhef_logtool.evaluation.segments import find_intervals
 
-    worth = {name: mask for name, mask in masks.items() if name not in ("all", "linear")}
-    return [Event(s.name, s.start_ns, s.end_ns, "") for s in find_intervals(stamps_ns, worth)]
+    spans = find_intervals(stamped, masks)
+    return [Event(s.name, s.start_ns, s.end_ns, "") for s in spans if s.name not in ("all", "linear")]
 
 
 def diverged_events(track: StateTrack) -> list[Event]:
@@ -96,5 +102,5 @@ def diverged_events(track: StateTrack) -> list[Event]:
     from pdhef_logtool.evaluation.segments import find_intervals
 
     name, text = f"{track.name} diverged", "the estimator reports its own divergence"
-    spans = find_intervals(track.stamps_ns, {"diverged": track.diverged})
+    spans = find_intervals(track, {"diverged": track.diverged})
     return [Event(name, s.start_ns, s.end_ns, text) for s in spans]

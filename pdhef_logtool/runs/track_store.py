@@ -1,4 +1,4 @@
-"""Whole tracks and signals of a log on disk, column by column, so that scoring holds only the columns that it needs.
+"""Whole tracks and signals of a log on disk, column by column, so that scoring holds only what it works on.
 
 Ten hours at 100 Hz are 3.6 million rows: a track of them takes 0.8 GB, a column 29 MB.
 """
@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from pdhef_logtool.records.files import open_new, writing
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 _SIGNALS = "signals"
-#: Rows of a wide column that are in memory at once.
-_BLOCK_ROWS = 1 << 16
 
 
 @dataclass(slots=True)
@@ -36,8 +34,8 @@ class _Column:
             file.write(np.ascontiguousarray(values).data)
         self.rows += values.shape[0]
 
-    def read(self, start: int = 0, end: int | None = None) -> NDArray[Any]:
-        rows = (self.rows if end is None else min(end, self.rows)) - start
+    def read(self, start: int, end: int) -> NDArray[Any]:
+        rows = max(min(end, self.rows) - start, 0)
         width = int(np.prod(self.row, dtype=np.int64))
         values = np.fromfile(self.path, self.dtype, rows * width, offset=start * width * np.dtype(self.dtype).itemsize)
         return values.reshape(rows, *self.row)
@@ -51,51 +49,42 @@ class _Columns:
     others: dict[str, Any] = field(default_factory=dict)
 
 
-class StoredTrack(StateTrack):
-    """A track on disk: a column is read each time that it is asked for, and nothing of it is kept."""
+class _Stored:
+    """Rows of a record on disk: a column is read each time that it is asked for, and nothing of it is kept."""
 
-    __slots__ = ("_columns",)
-    _columns: dict[str, _Column]
+    __slots__ = ()
+    _stored: _Columns
+    _start: int
+    _end: int
 
-    def __init__(self, columns: _Columns) -> None:
-        object.__setattr__(self, "_columns", columns.columns)
-        object.__setattr__(self, "name", columns.others["name"])
-
-    def __getattr__(self, name: str) -> Any:
-        return _read(self._columns, name)
-
-    def __len__(self) -> int:
-        return self._columns["stamps_ns"].rows
-
-    def rows(self, start: int, end: int) -> StateTrack:
-        """Return the rows [start, end)."""
-        n = len(self)
-        columns = {k: c.read(start, end) if c.rows == n else c.read() for k, c in self._columns.items()}
-        return StateTrack(name=self.name, **columns)
-
-    def _std(self, i: int) -> FloatArray:
-        n, covariance = len(self), self._columns["covariance"]
-        if covariance.rows == 0:
-            return np.full(n, np.nan)
-        blocks = (covariance.read(a, a + _BLOCK_ROWS)[:, i, i] for a in range(0, n, _BLOCK_ROWS))
-        return np.asarray(np.sqrt(np.concatenate([*blocks])), dtype=np.float64)
-
-
-class StoredSignals(Signals):
-    """Signals on disk: a column is read each time that it is asked for, and nothing of it is kept."""
-
-    __slots__ = ("_columns",)
-    _columns: dict[str, _Column]
-
-    def __init__(self, columns: _Columns) -> None:
-        object.__setattr__(self, "_columns", columns.columns)
-        object.__setattr__(self, "available", columns.others["available"])
+    def __init__(self, stored: _Columns, start: int = 0, end: int | None = None) -> None:
+        end = stored.columns["stamps_ns"].rows if end is None else end
+        for name, value in {"_stored": stored, "_start": start, "_end": end, **stored.others}.items():
+            object.__setattr__(self, name, value)
 
     def __getattr__(self, name: str) -> Any:
-        return _read(self._columns, name)
+        if name.startswith("_") or name not in self._stored.columns:
+            raise AttributeError(name)
+        return self._stored.columns[name].read(self._start, self._end)
 
     def __len__(self) -> int:
-        return self._columns["stamps_ns"].rows
+        return self._end - self._start
+
+    def rows(self, start: int, end: int) -> Self:
+        """Return the rows [start, end), of which nothing is read before a column is asked for."""
+        return type(self)(self._stored, self._start + start, min(self._start + end, self._end))
+
+
+class StoredTrack(_Stored, StateTrack):
+    """A track on disk."""
+
+    __slots__ = ("_end", "_start", "_stored")
+
+
+class StoredSignals(_Stored, Signals):
+    """Signals on disk."""
+
+    __slots__ = ("_end", "_start", "_stored")
 
 
 class TrackStore:
@@ -154,9 +143,3 @@ class TrackStore:
     def __exit__(self, *_: object) -> None:
         """Remove the folder."""
         self.close()
-
-
-def _read(columns: dict[str, _Column], name: str) -> NDArray[Any]:
-    if name.startswith("__") or name not in columns:
-        raise AttributeError(name)
-    return columns[name].read()

@@ -14,7 +14,8 @@ import shutil
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,10 @@ from studies.torture.bombs import BOMBS, judge_bomb
 from studies.torture.configs import config_judge
 from studies.torture.killing import contents, faults, kill_many, kill_run, leftovers
 from studies.torture.logs import log_judge
-from studies.torture.numerics import NUMERICS, judge_numerics, read_samples, write_hours
+from studies.torture.numerics import odd_drives, write_hours
 from studies.torture.outside import measured
-from studies.torture.places import PLACES, SkippedError
-from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Tally, run_cases
+from studies.torture.places import PLACES
+from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Tally, Verdict, run_cases
 
 _SHARED = ROOT.parent / "shared" / "torture"
 _THREE = ("--estimators", "zero,kinematic,phy-ukf")
@@ -56,45 +57,18 @@ def _sum(tallies: Iterable[Tally], count: int) -> dict[str, Any]:
     }
 
 
-def bombs(work: Path) -> list[dict[str, Any]]:
-    """Inspect every bomb in a process of its own."""
+def one_by_one(part: str, work: Path, cases: Mapping[str, Callable[[Path], Verdict]]) -> list[dict[str, Any]]:
+    """Judge the cases of a part, each in a folder of its own that goes with it."""
     found = []
-    for i, bomb in enumerate(BOMBS):
-        folder = work / f"bomb-{i}"
-        verdict, wall_s, peak = judge_bomb(bomb, folder)
-        shutil.rmtree(folder, ignore_errors=True)
-        found.append({"name": bomb.name, "end": verdict.end, "problem": verdict.problem, "s": wall_s, "bytes": peak})
-        _say(f"bombs: {bomb.name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
-    return found
-
-
-def numerics(work: Path) -> list[dict[str, Any]]:
-    """Run every estimator on every odd drive."""
-    drive = read_samples(ROOT / "sample_logs" / "dlc.mcap")
-    found = []
-    for i, name in enumerate(NUMERICS):
-        folder = work / f"numerics-{i}"
-        verdict, process = judge_numerics(name, folder, drive)
-        shutil.rmtree(folder, ignore_errors=True)
-        found.append({"name": name, "end": verdict.end, "problem": verdict.problem, "s": process.wall_s})
-        _say(f"numerics: {name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
-    return found
-
-
-def places(work: Path) -> list[dict[str, Any]]:
-    """Run in places where something is in the way."""
-    found = []
-    for i, (name, judge_place) in enumerate(PLACES.items()):
-        folder = work / f"place-{i}"
-        folder.mkdir(parents=True)
+    for i, (name, judge_case) in enumerate(cases.items()):
+        folder = work / f"{part}-{i}"
+        folder.mkdir(parents=True, exist_ok=True)
         try:
-            verdict = judge_place(folder)
-            found.append({"name": name, "end": verdict.end, "problem": verdict.problem})
-        except SkippedError as reason:
-            found.append({"name": name, "end": f"skipped: {reason}", "problem": ""})
+            verdict = judge_case(folder)
         finally:
             shutil.rmtree(folder, ignore_errors=True)
-        _say(f"places: {name}: {found[-1]['end']}{found[-1]['problem'] and ', WRONG: ' + found[-1]['problem']}")
+        found.append({"name": name, "end": verdict.end, "problem": verdict.problem, **verdict.costs})
+        _say(f"{part}: {name}: {verdict.end}{verdict.problem and ', WRONG: ' + verdict.problem}")
     return found
 
 
@@ -235,10 +209,10 @@ def main() -> int:
     work: Path = given.work
     work.mkdir(parents=True, exist_ok=True)
     todo: dict[str, Callable[[], Any]] = {
-        "bombs": lambda: bombs(work),
+        "bombs": lambda: one_by_one("bombs", work, {b.name: partial(judge_bomb, b) for b in BOMBS}),
         "shared": shared_cases,
-        "places": lambda: places(work),
-        "numerics": lambda: numerics(work),
+        "places": lambda: one_by_one("places", work, PLACES),
+        "numerics": lambda: one_by_one("numerics", work, odd_drives()),
         "mutations": lambda: mutations(work, given.seed, given.jobs, given.logs, given.configs),
         "kills": lambda: kills(work, given.seed, given.kills),
         "hours": lambda: hours(work, given.hours),

@@ -16,8 +16,8 @@ from functools import partial
 from pathlib import Path
 
 from studies.torture.outside import measured
-from studies.torture.seeds import START_NS, write_seeds
-from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Ended, Verdict, judge
+from studies.torture.seeds import SEEDS, START_NS
+from studies.torture.workers import LIMIT_BYTES, LIMIT_S, Verdict, judge
 
 _MAGIC = b"\x89MCAP0\r\n"
 _LOST, _NO_LOG, _EITHER = (3,), (1,), (1, 3)
@@ -201,7 +201,7 @@ def _database(statement: str, folder: Path) -> Path:
     import sqlite3
 
     path = folder / "drive.db3"
-    path.write_bytes(write_seeds(folder / "seeds")["rosbag2.db3"])
+    SEEDS["rosbag2.db3"](path)
     with sqlite3.connect(path) as database:
         database.executescript(statement)
     database.close()
@@ -213,8 +213,9 @@ _ENDLESS = (
     "SELECT id, 1 AS topic_id, id AS timestamp, x'00' AS data FROM r"
 )
 _HUGE_ROW = (
-    "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE VIEW messages AS SELECT id, topic_id, "
-    "timestamp, zeroblob(900000000) AS data FROM rows"
+    "CREATE TABLE rows AS SELECT * FROM messages; DROP TABLE messages; CREATE TABLE messages (id INTEGER PRIMARY KEY, "
+    "topic_id INTEGER, timestamp INTEGER, data BLOB GENERATED ALWAYS AS (zeroblob(900000000)) VIRTUAL); "
+    "INSERT INTO messages (id, topic_id, timestamp) SELECT id, topic_id, timestamp FROM rows"
 )
 _FLOAT, _CDR = b"float64 data\n", b"\0\1\0\0" + bytes(8)
 _ODD_NAME = b"/wheels[/red]\x1b[2J\nwarning: all is well\0\xe2\x80\xae"
@@ -357,15 +358,13 @@ BOMBS = (
 )
 
 
-def judge_bomb(bomb: Bomb, folder: Path) -> tuple[Verdict, float, int]:
-    """Make a bomb, inspect it in a process of its own; return how it ended, seconds and bytes."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = bomb.make(folder)
-    process = measured("inspect", str(path), limit_s=3 * LIMIT_S)
-    verdict = judge(Ended(process.code, process.out, process.err), bomb.codes)
+def judge_bomb(bomb: Bomb, folder: Path) -> Verdict:
+    """Make a bomb in a folder and inspect it in a process of its own."""
+    process = measured("inspect", str(bomb.make(folder)), limit_s=3 * LIMIT_S)
+    verdict = judge(process, bomb.codes)
     problems = [verdict.problem] if verdict.problem else []
     if process.late or process.wall_s > LIMIT_S:
         problems.append(f"{process.wall_s:.1f} s")
     if process.peak_bytes > LIMIT_BYTES:
         problems.append(f"{process.peak_bytes >> 20} MiB")
-    return Verdict(verdict.end, "; ".join(problems)), process.wall_s, process.peak_bytes
+    return Verdict(verdict.end, "; ".join(problems), {"s": process.wall_s, "bytes": process.peak_bytes})

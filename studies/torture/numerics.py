@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,8 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.signals import FloatArray, IntArray
 from studies.pages import ROOT
-from studies.torture.outside import Process, measured
-from studies.torture.workers import Ended, Verdict, judge
+from studies.torture.outside import measured
+from studies.torture.workers import Verdict, judge
 from truthsim.recording import STEERING_REPORT
 
 _IMU = ("angular_velocity.z", "linear_acceleration.x", "linear_acceleration.y")
@@ -201,21 +202,26 @@ NUMERICS: dict[str, tuple[Callable[[Drive], Drive | list[Drive]], tuple[int, ...
 }
 
 
-def judge_numerics(name: str, folder: Path, drive: Drive) -> tuple[Verdict, Process]:
+def odd_drives() -> dict[str, Callable[[Path], Verdict]]:
+    """Return what judges each of them in a folder."""
+    drive = read_samples(ROOT / "sample_logs" / "dlc.mcap")
+    return {name: partial(_judge, drive, *case) for name, case in NUMERICS.items()}
+
+
+def _judge(
+    drive: Drive, change: Callable[[Drive], Drive | list[Drive]], codes: tuple[int, ...], folder: Path
+) -> Verdict:
     """Write a changed drive and run all estimators on it; what they call valid must be finite and of this world."""
-    change, codes = NUMERICS[name]
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "drive.mcap"
     changed = change(drive)
     write_samples(path, changed if isinstance(changed, list) else [changed])
     process = measured(
         "run", str(path), "-o", str(folder / "out"), "--car", "saloon", "--annotate", "none", limit_s=120.0
     )
-    verdict = judge(Ended(process.code, process.out, process.err), codes)
+    verdict = judge(process, codes)
     table = folder / "out" / "logs" / "drive" / "estimates.parquet"
-    if not verdict.problem and table.is_file():
-        verdict = replace(verdict, problem=_nonsense(table))
-    return verdict, process
+    problem = verdict.problem or (_nonsense(table) if table.is_file() else "")
+    return Verdict(verdict.end, problem, {"s": process.wall_s})
 
 
 def _nonsense(table: Path) -> str:

@@ -11,21 +11,18 @@ import tempfile
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from studies.pages import ROOT
+from studies.torture.workers import Ended
 
 #: Harms nobody's machine, whatever a case does; what a case may take is checked against what it took.
 _HARD_LIMIT_BYTES = 8 << 30
 
 
 @dataclass(frozen=True, slots=True)
-class Process:
+class Process(Ended):
     """An ended process; ``code`` is negative for a signal, ``late`` if it had to be killed."""
 
-    code: int
-    out: str
-    err: str
     wall_s: float
     peak_bytes: int
     late: bool = False
@@ -72,8 +69,3 @@ def measured(*arguments: str, limit_s: float = 60.0, **options: object) -> Proce
 def _limit() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (_HARD_LIMIT_BYTES, _HARD_LIMIT_BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def files_below(folder: Path) -> dict[str, bytes]:
-    """Return every file below a folder with its content, hidden ones too."""
-    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}

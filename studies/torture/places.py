@@ -6,14 +6,15 @@ import contextlib
 import os
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import IO
 
 from studies.pages import ROOT
+from studies.torture.killing import hidden
 from studies.torture.numerics import write_hours
-from studies.torture.outside import Process, files_below, measured, start
+from studies.torture.outside import measured, start
 from studies.torture.workers import Ended, Verdict, judge
 
 _SAMPLE = ROOT / "sample_logs" / "dlc.mcap"
@@ -21,18 +22,10 @@ _CAR = ("--car", "saloon")
 _NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups", "--")
 
 
-class SkippedError(Exception):
-    """Cannot be tried here; the text says why."""
-
-
-def _judged(process: Process, codes: tuple[int, ...]) -> Verdict:
-    return judge(Ended(process.code, process.out, process.err), codes)
-
-
 def as_nobody(work: Path) -> Verdict:
     """Run from an installation that nobody may write, without a home."""
     if os.geteuid() != 0 or shutil.which("setpriv") is None:
-        raise SkippedError("another user needs root and setpriv")
+        return Verdict("skipped: another user needs root and setpriv")
     installed = work / "installed"
     for name in ("pdhef_logtool", "truthsim", "schemas"):
         shutil.copytree(ROOT / name, installed / name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -43,7 +36,7 @@ def as_nobody(work: Path) -> Verdict:
     os.chown(output, 65534, 65534)
     for folder in (output, *output.parents):
         if not folder.stat().st_mode & 0o001:
-            raise SkippedError(f"nobody may not enter {folder}")
+            return Verdict(f"skipped: nobody may not enter {folder}")
     env = {
         "PATH": os.environ["PATH"],
         "HOME": "/nonexistent",
@@ -52,7 +45,7 @@ def as_nobody(work: Path) -> Verdict:
     }
     log = str(work / "dlc.mcap")
     ended = measured("run", log, "-o", str(output), *_CAR, prefix=_NOBODY, env=env, cwd="/", limit_s=400.0)
-    return _judged(ended, (0,))
+    return judge(ended, (0,))
 
 
 def full_disk(work: Path) -> Verdict:
@@ -63,17 +56,13 @@ def full_disk(work: Path) -> Verdict:
         os.geteuid() != 0
         or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(disk)], check=False).returncode
     ):
-        raise SkippedError("a small file system needs root and mount")
+        return Verdict("skipped: a small file system needs root and mount")
     try:
-        verdict = _judged(measured("run", str(_SAMPLE), "-o", str(disk / "out"), *_CAR, limit_s=120.0), (1, 3))
-        left = [p for p in disk.rglob("*") if p.suffix in (".parquet", ".mcap", ".rrd") and not _hidden(p, disk)]
+        verdict = judge(measured("run", str(_SAMPLE), "-o", str(disk / "out"), *_CAR, limit_s=120.0), (1, 3))
+        left = [p for p in disk.rglob("*") if p.suffix in (".parquet", ".mcap", ".rrd") and not hidden(p, disk)]
         return Verdict(verdict.end, verdict.problem or (f"left {left}" if left and verdict.end == "exit 1" else ""))
     finally:
         subprocess.run(["umount", "-l", str(disk)], check=False)
-
-
-def _hidden(path: Path, root: Path) -> bool:
-    return any(part.startswith(".") for part in path.relative_to(root).parts)
 
 
 def second_run(work: Path) -> Verdict:
@@ -87,10 +76,10 @@ def second_run(work: Path) -> Verdict:
             time.sleep(0.05)
         time.sleep(1.0)
         second = measured("run", str(_SAMPLE), "-o", str(work / "out"), *_CAR)
-        verdict = _judged(second, (1, 2))
+        verdict = judge(second, (1, 2))
         if first.wait(300) != 0:
             return Verdict(verdict.end, f"the first run ended with {first.returncode}")
-    if "dlc" in "".join(files_below(work / "out")):
+    if any((work / "out").rglob("*dlc*")):
         return Verdict(verdict.end, "the second run wrote something")
     return verdict
 
@@ -128,7 +117,7 @@ def output_is_input(work: Path) -> Verdict:
     shutil.copy(work / "out" / "logs" / name / "annotated.mcap", inner / "annotated.mcap")
     before = (inner / "annotated.mcap").read_bytes()
     ended = measured("run", str(inner / "annotated.mcap"), "-o", str(work / "out"), "--annotate", "sidecar", *_CAR)
-    verdict = _judged(ended, (1, 2))
+    verdict = judge(ended, (1, 2))
     same = (inner / "annotated.mcap").is_file() and (inner / "annotated.mcap").read_bytes() == before
     return Verdict(verdict.end, verdict.problem or ("" if same else "the recording changed"))
 
@@ -136,20 +125,24 @@ def output_is_input(work: Path) -> Verdict:
 def full_stdout(work: Path) -> Verdict:
     """Print to a device that is full."""
     del work
-    call = ("inspect", str(_SAMPLE))
-    with Path("/dev/full").open("wb") as full, start(*call, stdout=full, stderr=subprocess.PIPE) as process:
-        err = process.communicate(timeout=60)[1].decode()
-    return judge(Ended(process.returncode, "", err), (1,))
+    return judge(_inspected(Path("/dev/full").open("wb")), (1,))
 
 
 def closed_pipe(work: Path) -> Verdict:
-    """Print to a reader that goes away."""
+    """Print to a reader that went away."""
     del work
-    code = "from pdhef_logtool.cli.app import main; main()"
-    line = f'"{sys.executable}" -c "{code}" inspect "{_SAMPLE}" | head -1'
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(["sh", "-c", line], capture_output=True, text=True, env=env, timeout=60, check=False)
-    return Verdict(f"exit {done.returncode}", done.stderr)
+    read, write = os.pipe()
+    os.close(read)
+    ended = _inspected(os.fdopen(write, "wb"))
+    verdict = judge(ended, (141,))
+    return Verdict(verdict.end, verdict.problem or ended.err)
+
+
+def _inspected(output: IO[bytes]) -> Ended:
+    """Print to a file and close it."""
+    with output, start("inspect", str(_SAMPLE), stdout=output, stderr=subprocess.PIPE) as process:
+        err = process.communicate(timeout=60)[1].decode()
+    return Ended(process.returncode, "", err)
 
 
 PLACES: dict[str, Callable[[Path], Verdict]] = {

@@ -12,7 +12,7 @@ import sys
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -27,7 +27,7 @@ _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\u
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a command ended in this process."""
+    """How a command ended."""
 
     code: int
     out: str
@@ -36,10 +36,11 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """How a case ended: a word such as ``exit 3``, and what is wrong with it, empty if nothing."""
+    """How a case ended: a word such as ``exit 3``, what is wrong with it, empty if nothing, and what it cost."""
 
     end: str
     problem: str = ""
+    costs: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(slots=True)

@@ -496,14 +496,11 @@ def test_a_failure_in_the_middle_leaves_the_old_car_and_nothing_else(
     folder: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, place: str, new: bool
 ) -> None:
     car, before = load(folder), files_of(folder)
-    change = noise_change(NEW)
-    if place == "file":
-        change = Change("tune", NOISE_FILE, {**change.files, "noise.png": _raise(error)})
-    else:
-        monkeypatch.setattr(*{"log": (store, "_log"), "exchange": (outputs, "_exchanged")}[place], _raise(error))
+    places = {"file": (store, "write_bytes"), "log": (store, "_log"), "exchange": (outputs, "_exchanged")}
+    monkeypatch.setattr(*places[place], _raise(error))
     output = folder.with_name("new") if new else folder
     with pytest.raises(OutputError if isinstance(error, OSError) else type(error)):
-        update_car(car, output, change)
+        update_car(car, output, noise_change(NEW))
     assert files_of(folder) == before
     assert [p.name for p in folder.parent.iterdir()] == [folder.name]
 

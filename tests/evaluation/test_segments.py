@@ -44,8 +44,8 @@ def signals(t, speed, ax, ay, noise=0.0, friction=np.nan):
     )
 
 
-def spans(masks, stamps, name):
-    return [((s.start_ns - T0) * 1e-9, (s.end_ns - T0) * 1e-9) for s in find_intervals(stamps, {name: masks[name]})]
+def spans(masks, stamped, name):
+    return [((s.start_ns - T0) * 1e-9, (s.end_ns - T0) * 1e-9) for s in find_intervals(stamped, {name: masks[name]})]
 
 
 EXPECTED = {
@@ -65,7 +65,7 @@ def test_staged_manoeuvres_are_found_where_they_are(noise):
     masks = segment_masks(s, None, VEHICLE)
     assert masks["all"].all()
     for name, expected in EXPECTED.items():
-        found = spans(masks, s.stamps_ns, name)
+        found = spans(masks, s, name)
         assert len(found) == len(expected), (name, found)
         np.testing.assert_allclose(found, expected, atol=0.35, err_msg=name)
 
@@ -116,7 +116,7 @@ def test_a_gap_in_the_stamps_ends_an_interval_and_is_not_smoothed_across():
     t, speed, ax, ay = staged()
     keep = (t < 27) | (t > 28)
     s = signals(t[keep], speed[keep], ax[keep], ay[keep])
-    found = spans(segment_masks(s, None, VEHICLE), s.stamps_ns, "cornering-left")
+    found = spans(segment_masks(s, None, VEHICLE), s, "cornering-left")
     np.testing.assert_allclose(found, [(25, 27), (28, 30)], atol=0.1)
     step = np.where(t[keep] < 27.5, 0.0, 5.0)
     np.testing.assert_allclose(smooth(s.stamps_ns, step, 1.0), step, atol=1e-12)
@@ -138,7 +138,7 @@ def test_intervals_give_the_masks_back():
     s = signals(*staged(), noise=0.3)
     masks = segment_masks(s, None, VEHICLE)
     rebuilt = {name: np.zeros(len(s), bool) for name in masks}
-    found = find_intervals(s.stamps_ns, masks)
+    found = find_intervals(s, masks)
     for i in found:
         rebuilt[i.name] |= (s.stamps_ns >= i.start_ns) & (s.stamps_ns < i.end_ns)
     for name in masks:

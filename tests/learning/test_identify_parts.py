@@ -606,10 +606,10 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
         identify_command.identify([str(folder)], tmp_path / "other", RunConfig(), holdout=0.9)
 
 
-def test_the_plot_shows_samples_curves_intervals_and_errors(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_plot_shows_samples_curves_intervals_and_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     figures: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: (figures.append(self), file.write(b"png")))
-    identify_plot.plot_identification(FOUND, tmp_path / "fit.png")
+    identify_plot.plot_identification(FOUND)
     front, rear, parameters, scores = figures[0].axes
     assert [a.get_title() for a in figures[0].axes] == ["front axle", "rear axle", "parameters", "error of the filter"]
     assert (front.get_xlabel(), scores.get_ylabel()) == ("slip angle (°)", "sideslip RMSE (°)")

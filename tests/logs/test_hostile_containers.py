@@ -224,6 +224,22 @@ def test_too_many_channels_cost_the_surplus_and_end(tmp_path: Path) -> None:
     assert _outcome(path)[:2] == (400, ())
 
 
+def test_a_channel_that_nothing_declares_in_a_log_whose_clock_is_set_back(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, use_chunking=False)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        for i in range(2000):
+            at = T0 + (i - 500 * (i // 1000)) * 10_000_000
+            for id_ in (channel, 9):
+                writer.add_message(id_, at, b"{}", at)
+        writer.finish()
+    read, lost, _ = _outcome(path)
+    assert 0 < read < 2000
+    assert {loss.kind for loss in lost} == {"unknown-channel", "time-jump"}
+
+
 def test_a_log_that_takes_too_long_loses_its_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = _write(tmp_path / "a.mcap")
     now = [0.0]

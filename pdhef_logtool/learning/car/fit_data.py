@@ -12,7 +12,7 @@ from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.records.signals import Signals, cut_signals
+from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Between the fit part and the held-out part: filter states and slow disturbances must have forgotten the former.
@@ -95,4 +95,4 @@ def part_of(drive: FitDrive, a: int, b: int) -> FitDrive:
     for f in fields(StateTrack):
         value = getattr(drive.truth, f.name)
         columns[f.name] = value if f.name == "name" or value.shape[0] != len(drive.truth) else value[a:b]
-    return replace(drive, signals=cut_signals(drive.signals, a, b), truth=StateTrack(**columns))
+    return replace(drive, signals=drive.signals.rows(a, b), truth=StateTrack(**columns))

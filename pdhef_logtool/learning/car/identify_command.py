@@ -10,11 +10,12 @@ from typing import Any
 from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import PHYSICS, Fit, FittedValues, LearntOn, physics_sha256
-from pdhef_logtool.car.store import Change, Content, check_output, write_change
+from pdhef_logtool.car.store import Change, check_output, write_change
 from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
+from pdhef_logtool.learning.car.identify_plot import plot_identification
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     LearnResult,
@@ -161,21 +162,12 @@ def identify(
     )
     comments = _comments(found)
     text = part_toml(part, head, {f"values.{k}": v for k, v in comments.items()})
-    files: dict[str, Content] = {FIT_FILE: text.encode(), "fit.png": _plot(found)}
+    files = {FIT_FILE: text.encode(), "fit.png": plot_identification(found)}
     settings = {**config_document(config), "holdout": holdout}
     told = {"holdout_share": holdout, "notes": list(found.notes)}
     change = Change("identify", FIT_FILE, files, settings=settings, drives=drives, told=told)
     write_change(car, car.with_fit(part), output, change, comments)
     return IdentifyResult(car=output, records=tuple(records), identification=found)
-
-
-def _plot(found: Identification) -> Callable[[Path], None]:
-    def draw(path: Path) -> None:
-        from pdhef_logtool.learning.car.identify_plot import plot_identification
-
-        plot_identification(found, path)
-
-    return draw
 
 
 def describe(parameter: Identified) -> str:

@@ -3,32 +3,21 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.car.identify import Identification
-from pdhef_logtool.records.files import PendingFile, open_new, writing
+from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.signals import FloatArray
 
 _POINTS = 6000
 
 
-def plot_identification(found: Identification, path: Path) -> None:
-    """Write the plot as PNG.
-
-    Raises
-    ------
-    OutputError
-        The file cannot be written.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 7.0), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
+def plot_identification(found: Identification) -> bytes:
+    """Return the plot as PNG."""
+    figure = new_figure(11.0, 7.0)
     top = figure.subplots(2, 2, height_ratios=[3, 2])
     samples = found.samples
     for axes, name, is_front, slip, force in (
@@ -45,8 +34,7 @@ def plot_identification(found: Identification, path: Path) -> None:
         axes.legend(loc="upper left", frameon=False)
     _plot_parameters(top[1][0], found)
     _plot_scores(top[1][1], found)
-    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
-        figure.savefig(file, format="png", metadata={"Software": None})
+    return png_bytes(figure)
 
 
 def _force(vehicle: VehicleParameters, is_front: bool, slip_rad: FloatArray) -> FloatArray:
@@ -74,10 +62,10 @@ def _plot_parameters(axes: Any, found: Identification) -> None:
 
 
 def _plot_scores(axes: Any, found: Identification) -> None:
-    names = ("β = 0", "starting file", "identified")
+    names = ("β = 0", "starting file", "identified", "physics")
     width = 0.8 / len(found.scores)
     for i, score in enumerate(found.scores):
-        values = (score.zero_deg, score.start_file_deg, score.identified_deg)
+        values = (score.zero_deg, score.start_file_deg, score.identified_deg, score.physics_deg)
         at = np.arange(len(names)) + (i - (len(found.scores) - 1) / 2) * width
         bars = axes.bar(at, values, width * 0.95, label=f"{score.part}, {score.seconds:.0f} s")
         axes.bar_label(bars, fmt="%.3f", fontsize=8)

@@ -34,6 +34,7 @@ from pdhef_logtool.learning.car.axle_forces import (
 )
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
 from pdhef_logtool.learning.car.prior import Prior
+from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 
@@ -232,9 +233,8 @@ def fit_physics(
     starts : where to start, θ by the parameter's name; the best end counts.
     """
     usable_s = sum(usable_seconds(d, start) for d in drives)
-    priors = make_priors(
-        start, parts, axle_samples(drives, start, similar=True), usable_s, steering_wheel=steering_wheel
-    )
+    samples = axle_samples(drives, start, similar=True)
+    priors = make_priors(start, parts, samples, usable_s, steering_wheel=steering_wheel)
 
     def errors(theta: FloatArray) -> list[DriveError]:
         return drive_errors(drives, start, *build_car(start, parts, priors, theta))
@@ -325,6 +325,24 @@ LEAST_GAIN = 0.03
 TRIAL_ITERATIONS = 8
 #: Drives from which on folds are whole drives; a fold needs so much usable driving; nothing within this of a cut.
 WHOLE_DRIVES, LEAST_FOLD_S, GUARD_S = 4, 20.0, 2.5
+
+
+def physics_parts(text: str) -> PhysicsParts | None:
+    """Return the parts that a text names: ``auto`` is None, ``static`` none, else names with commas.
+
+    Raises
+    ------
+    UsageError
+        A name is unknown.
+    """
+    if text == "auto":
+        return None
+    names = [] if text == "static" else text.split(",")
+    if unknown := [name for name in names if name not in PhysicsParts.model_fields]:
+        known = ", ".join(PhysicsParts.model_fields)
+        raise UsageError(expected=f"auto, static, or names out of {known}", got=", ".join(unknown), where="--parts")
+    return PhysicsParts(**dict.fromkeys(names, True))
+
 
 Fold = tuple[Sequence[FitDrive], Sequence[FitDrive]]
 

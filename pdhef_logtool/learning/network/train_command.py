@@ -13,8 +13,9 @@ import numpy as np
 
 from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
+from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.errors import ModelError, UsageError
-from pdhef_logtool.records.files import PendingFile, open_new, writing
+from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
@@ -136,8 +137,8 @@ def train_on(
         "training_hours": round(sum(len(s.weight) for s in splits["train"]) * recipe.period_s / 3600.0, 3),
     }
     bundle = replace(bundle, provenance=provenance)
-    _write_history(output / HISTORY_FILE, history)
-    _plot_history(output / PLOT_FILE, history)
+    write_bytes(output / HISTORY_FILE, _history_table(history))
+    write_bytes(output / PLOT_FILE, _plot_history(history))
     bundle.save(output)
     (output / CHECKPOINT).unlink(missing_ok=True)
     return TrainResult(output, bundle, tuple(history), test_loss)
@@ -185,21 +186,16 @@ def _sequences(drives: Iterable[DatasetDrive], target: str = RESIDUAL) -> Iterab
                 yield FeatureSequence(drive.name, features, values, weight)
 
 
-def _write_history(path: Path, history: Iterable[Epoch]) -> None:
+def _history_table(history: Iterable[Epoch]) -> bytes:
     import polars as pl
 
-    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
-        whole = io.BytesIO()  # polars has errors of its own for a disk that is full
-        pl.DataFrame([asdict(e) for e in history]).write_parquet(whole)
-        file.write(whole.getvalue())
+    whole = io.BytesIO()  # polars has errors of its own for a disk that is full
+    pl.DataFrame([asdict(e) for e in history]).write_parquet(whole)
+    return whole.getvalue()
 
 
-def _plot_history(path: Path, history: list[Epoch]) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.0), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
+def _plot_history(history: list[Epoch]) -> bytes:
+    figure = new_figure(7.0, 4.0)
     axes = figure.subplots()
     at = [e.epoch for e in history]
     axes.semilogy(at, [e.train_loss for e in history], label="training", color="#0072B2")
@@ -207,5 +203,4 @@ def _plot_history(path: Path, history: list[Epoch]) -> None:
     axes.set(xlabel="epoch", ylabel="mean square of normalised targets")
     axes.grid(alpha=0.3)
     axes.legend(frameon=False)
-    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
-        figure.savefig(file, format="png", metadata={"Software": None})
+    return png_bytes(figure)

@@ -13,7 +13,7 @@ import numpy as np
 from pdhef_logtool.car.car import NOISE_FILE, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Noise
-from pdhef_logtool.car.store import Change, Content, write_change
+from pdhef_logtool.car.store import Change, write_change
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.learning.drives import (
@@ -48,9 +48,9 @@ from pdhef_logtool.learning.noise.search import (
     search,
 )
 from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
+from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.files import open_new, writing
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT = "pdhef-tuning"
@@ -199,10 +199,10 @@ def tune(
     )
     comments = {f"filter.{n}.q_std": "v_x, v_y, yaw rate" for n in noise}
     head = "Written by pdhef tune. It belongs to the physics of this car: use it with no other."
-    files: dict[str, Content] = {
+    files = {
         NOISE_FILE: part_toml(part, head, comments).encode(),
         "noise.record.json": json_bytes(record),
-        "noise.png": lambda path: _plot(result, path),
+        "noise.png": _plot(result),
     }
     in_words = {f"tuning_{k}": v for k, v in part.search.items()}
     change = Change("tune", NOISE_FILE, files, settings=settings.to_dict(), drives=part.drives, told=in_words)
@@ -293,13 +293,9 @@ def _record(result: TuneResult, settings: TuneSettings, car: Car) -> dict[str, A
     }
 
 
-def _plot(result: TuneResult, path: Path) -> None:
+def _plot(result: TuneResult) -> bytes:
     """Draw the best objective so far over the trials, and every trial as a dot."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8.0, 4.5), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8.0, 4.5)
     axes = figure.subplots()
     for i, t in enumerate(result.tuned):
         colour = _COLOURS[i % len(_COLOURS)]
@@ -318,5 +314,4 @@ def _plot(result: TuneResult, path: Path) -> None:
     )
     axes.grid(alpha=0.3, which="both")
     axes.legend(frameon=False)
-    with writing(path), open_new(path) as file:
-        figure.savefig(file, format="png", metadata={"Software": None})
+    return png_bytes(figure)

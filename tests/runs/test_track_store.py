@@ -1,0 +1,46 @@
+"""Tracks and signals on disk: windows go in, any rows of any column come out, and nothing else is read."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import concatenate, make_track
+from pdhef_logtool.runs.track_store import TrackStore
+
+STAMPS = np.arange(10, dtype=np.int64)
+
+
+def test_rows_of_a_stored_record_are_those_of_the_record(tmp_path):
+    covariance = np.arange(90, dtype=float).reshape(10, 3, 3)
+    windows = [
+        make_track("ukf", STAMPS[p], vx_m_s=STAMPS[p] * 2.0, covariance=covariance[p]) for p in (slice(4), slice(4, 10))
+    ]
+    whole = concatenate(windows)
+    columns = [STAMPS * float(i) for i in range(6)]
+    signals = Signals(STAMPS, STAMPS, *columns, wheel_speed_m_s=np.ones((10, 4)), available=frozenset({"ay_m_s2"}))
+    with TrackStore(tmp_path / "tracks") as store:
+        for window in windows:
+            store.append(window)
+        store.append_signals(signals)
+        pairs = ((store.read("ukf"), whole), (store.signals(), signals))
+        for start, end in ((0, 10), (3, 7), (6, 99), (10, 10)):
+            for stored, record in pairs:
+                part, expected = stored.rows(start, end), record.rows(start, end)
+                again = part.rows(1, 3), expected.rows(1, 3)
+                for a, b in ((part, expected), *((again,) if len(expected) > 1 else ())):
+                    assert len(a) == len(b)
+                    for name in ("stamps_ns", *(c for c in ("vx_m_s", "covariance", "reason") if hasattr(record, c))):
+                        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+        assert store.signals().rows(2, 4).available == {"ay_m_s2"}
+        np.testing.assert_array_equal(store.read("ukf").rows(5, 8).vy_std_m_s, whole.vy_std_m_s[5:8])
+        with patch.object(np, "fromfile", wraps=np.fromfile) as read:
+            part = store.read("ukf").rows(2, 5).rows(1, 3)
+            assert not read.called
+            np.testing.assert_array_equal(part.vx_m_s, [6.0, 8.0])
+            assert [call.args[2] for call in read.call_args_list] == [2]
+        with pytest.raises(AttributeError):
+            _ = part.no_such_column
