@@ -12,8 +12,8 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.service import NetworkService
 
-#: Fields of an estimator that are no option: what it is called and what is told of it.
-_TOLD = {"name", "causal", "notes"}
+#: Fields of an estimator that are no option: what it is called and told of it, and what its signals come back from.
+_TOLD = {"name", "causal", "notes", "read_with"}
 _NOISE = {"q_std", "r_std"}
 
 
