@@ -31,18 +31,21 @@ from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import (
     FilterNoise,
     Fit,
+    FittedPhysics,
     FittedSensors,
     FittedValues,
     LearntOn,
     Noise,
     Record,
+    TriedParts,
     Trust,
     digest,
     physics_sha256,
 )
 from pdhef_logtool.car.store import Change, check_output, update_car, write_change
-from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.cautious import strongest_physics
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records import outputs
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
@@ -189,6 +192,64 @@ def test_a_cars_network_may_be_its_own_or_named_by_the_cars_folder(folder: Path,
     other = Car.load(tmp_path / "bare.toml", network=folder)
     assert other.network is not None and car.network is not None
     assert other.network.sha256 == car.network.sha256
+
+
+# --- what was found through physics --------------------------------------------------------------------------------
+
+FOUND = FittedPhysics(
+    values=FittedValues(
+        yaw_inertia_kg_m2=1700.0,
+        steering_ratio=15.0,
+        sensors=FittedSensors(ay_bias_m_s2=0.05, yaw_rate_bias_rad_s=-0.002),
+        relaxation_length_m=0.7,
+        cg_over_roll_axis_m=0.45,
+        physics=PhysicsParts(lag=True, roll=True),
+    ),
+    noise=FilterNoise(q_std=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6), r_std={"ay_m_s2": 0.5}),
+    tried=(
+        TriedParts(parts=(), held_out_deg=(0.3, 0.4), taken=True),
+        TriedParts(parts=("lag",), held_out_deg=(0.2, 0.3), taken=True),
+    ),
+)
+
+
+def add_physics(folder: Path) -> Fit:
+    fit = add_fit(folder).model_copy(update={"physics": FOUND})
+    write_part(folder / FIT_FILE, fit)
+    return fit
+
+
+def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path) -> None:
+    """A folder and a flat export give it back equal; other filters do not see it."""
+    add_physics(folder)
+    car = load(folder)
+    assert car.fitted_physics == FOUND
+    assert dict(car.noise) == {TUNED: car.noise[TUNED], PLUS: FOUND.noise}
+    assert car.vehicle.physics == PhysicsParts()
+    assert car.physics_vehicle == FOUND.values.applied_to(car.own)
+    assert (car.physics_vehicle.friction, car.vehicle.friction) == (car.own.friction, 0.6)
+    assert car.physics_vehicle.physics.names == ("lag", "roll")
+    assert make_estimator(PLUS, car).vehicle == car.physics_vehicle
+    assert make_estimator(TUNED, car).vehicle == car.vehicle
+    flat = write_change(car, car, tmp_path / "flat.toml", noise_change(NEW))
+    again = load(flat)
+    assert again.fitted_physics == FOUND
+    assert again.noise[PLUS].q_std == FOUND.noise.q_std
+    assert write_change(again, again, tmp_path / "again.toml", noise_change(NEW)).read_text() == flat.read_text()
+    for comment in COMMENTS:
+        assert flat.read_text().count(comment) == 1
+
+
+def test_other_physics_and_a_vehicle_made_wrong_leave_it_out(folder: Path) -> None:
+    add_physics(folder)
+    car = load(folder)
+    wrong = car.with_vehicle(car.vehicle.model_copy(update={"mass_kg": 1600.0}))
+    assert wrong.fitted_physics is None
+    assert wrong.physics_vehicle.mass_kg == 1600.0
+    edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
+    car = load(folder)
+    assert car.fitted_physics is None
+    assert (dict(car.noise), car.physics_vehicle) == ({}, car.own)
 
 
 # --- staleness -----------------------------------------------------------------------------------------------------

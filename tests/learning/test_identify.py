@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.physics_tuned import NAME
 from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.learning.car import physics_fit
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, axle_samples, fit_axle
 from pdhef_logtool.learning.car.fit_data import GUARD_S, FitDrive, split_drive
 from pdhef_logtool.learning.car.identify import _projected_levenberg_marquardt, fit_car
@@ -25,6 +27,18 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.pipeline import run_logs
 
 pytestmark = pytest.mark.slow
+
+#: Where the choice of the parts of physics does not matter: it takes long.
+STATIC = PhysicsParts()
+quick_physics = pytest.mark.usefixtures("two_steps")
+
+
+@pytest.fixture
+def two_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let physics take two steps from one start, for tests of what else is identified."""
+    quick = partial(physics_fit.fit_physics, starts=physics_fit.STARTS[:1], iterations=2)
+    monkeypatch.setattr(physics_fit, "fit_physics", quick)
+
 
 CAR = VehicleParameters(
     name="test car",
@@ -129,7 +143,7 @@ def test_axle_fit_stays_at_its_prior_without_data() -> None:
 
 
 def test_stiffness_and_steering_offset_are_found_from_a_wrong_start(drives: tuple[FitDrive, FitDrive]) -> None:
-    found = fit_car([drives[0]], [drives[1]], _wrong_start(75_000.0, 180_000.0))
+    found = fit_car([drives[0]], [drives[1]], _wrong_start(75_000.0, 180_000.0), parts=STATIC)
     by_name = {p.name: p for p in found.parameters}
     assert by_name["front cornering stiffness"].value == pytest.approx(10.0 * 1.35 * 8300 * 0.9, rel=0.10)
     assert by_name["rear cornering stiffness"].value == pytest.approx(16.0 * 1.35 * 6700 * 0.9, rel=0.10)
@@ -137,14 +151,16 @@ def test_stiffness_and_steering_offset_are_found_from_a_wrong_start(drives: tupl
     assert by_name["steering offset"].excited
     fit, held_out = found.scores
     assert held_out.identified_deg < 0.5 * held_out.start_file_deg
+    assert held_out.physics_deg < 1.1 * held_out.identified_deg
     assert fit.seconds == pytest.approx(60.0, abs=0.1)
     assert len(found.noise.q_std) == 4
     assert found.noise.physics_sha256 is None  # whose it is, is for the car to say
 
 
+@quick_physics
 def test_what_straight_driving_does_not_excite_is_said_and_kept() -> None:
     straight = _drive(CAR, seed=5, seconds=40.0, amplitude=0.0003)
-    found = fit_car([straight], [], CAR)
+    found = fit_car([straight], [], CAR, parts=STATIC)
     by_name = {p.name: p for p in found.parameters}
     for name in ("front peak force", "rear peak force", "front shape", "rear shape", "yaw inertia"):
         assert not by_name[name].excited, name
@@ -166,14 +182,18 @@ def test_fit_and_held_out_parts_share_no_stamp_and_keep_a_guard(drives: tuple[Fi
     assert split_drive(drives[0], 0.0) == (drives[0], None)
 
 
+@quick_physics
 def test_held_out_part_changes_nothing_in_the_fit(drives: tuple[FitDrive, FitDrive]) -> None:
     start = _wrong_start(90_000.0, 140_000.0)
     fit, held_out = split_drive(drives[0], 0.3)
     assert held_out is not None
     spoiled = replace(held_out, truth=replace(held_out.truth, sideslip_rad=held_out.truth.sideslip_rad + 0.1))
-    assert fit_car([fit], [held_out], start).vehicle == fit_car([fit], [spoiled], start).vehicle
+    one, other = (fit_car([fit], [part], start, parts=STATIC) for part in (held_out, spoiled))
+    assert (one.vehicle, one.noise, one.physics) == (other.vehicle, other.noise, other.physics)
+    assert one.scores[1] != other.scores[1]
 
 
+@quick_physics
 def test_command_writes_a_file_that_runs_and_says_where_its_numbers_come_from(
     sample_logs_dir: Path, tmp_path: Path
 ) -> None:
@@ -184,10 +204,13 @@ def test_command_writes_a_file_that_runs_and_says_where_its_numbers_come_from(
     config = RunConfig(car=guess, end="80")
     log = [str(sample_logs_dir / "road.mcap")]
     out, folder = tmp_path / "car.toml", tmp_path / "mycar"
-    result = identify(log, out, config, holdout=0.25)
+    result = identify(log, out, config, holdout=0.25, parts=STATIC)
     car, found = Car.load(out), result.identification
     assert car.vehicle == found.vehicle.model_copy(update={"name": car.vehicle.name})
-    assert car.noise == {NAME: found.noise}
+    assert car.noise == {NAME: found.noise, "physics": found.physics.noise}
+    assert car.fitted_physics == found.physics
+    physics = car.physics_vehicle
+    assert (physics.tyres, physics.physics) == (found.physics.values.tyres, STATIC)
     assert car.allowed_trust.cap == 0.0 and "no evidence" in car.allowed_trust.reason
     (drive,) = car.learnt_on
     assert (drive.name, drive.start_s) == ("road", 0.0)
@@ -196,11 +219,15 @@ def test_command_writes_a_file_that_runs_and_says_where_its_numbers_come_from(
     assert (tmp_path / "car.fit.png").read_bytes().startswith(b"\x89PNG")
     json.dumps(result.to_dict(), allow_nan=False)
     make_estimator(NAME, car)
+    make_estimator("physics", car)
 
-    identify(log, folder, config, holdout=0.25)
+    identify(log, folder, config, holdout=0.25, parts=STATIC)
     same = Car.load(folder)
     assert (same.vehicle, same.learnt_on) == (car.vehicle, car.learnt_on)
     assert same.noise[NAME].model_copy(update={"physics_sha256": None}) == car.noise[NAME]
+    assert same.fitted_physics == car.fitted_physics
+    assert same.noise["physics"] == car.noise["physics"]
+    assert same.physics_vehicle.model_copy(update={"name": physics.name}) == physics
     assert same.allowed_trust.cap == 0.0
     assert (folder / "vehicle.toml").read_text() == text
     assert "95 %" in (folder / "fit.toml").read_text()
@@ -220,13 +247,14 @@ def test_command_refuses_what_it_cannot_use(sample_logs_dir: Path, tmp_path: Pat
     assert [p.name for p in tmp_path.iterdir()] == ["car.json"]
 
 
+@quick_physics
 def test_250_lm_identified_on_its_first_half_is_good_on_its_second(shared_dir: Path, tmp_path: Path) -> None:
     """METHOD §14: 0.30 to 0.34° is to be expected of an identified filter on 155 to 300 s."""
     reference = Path(__file__).resolve().parents[1] / "reference"
     mapping = reference / "mappings" / "revs_250lm.toml"
     log = [str(shared_dir / "data/drives/revs_250lm_a.mcap")]
     first = RunConfig(car=reference / "vehicles" / "revs_250lm.toml", mapping=mapping, end="150")
-    identify(log, tmp_path / "car.toml", first, holdout=0.0)
+    identify(log, tmp_path / "car.toml", first, holdout=0.0, parts=STATIC)
     second = RunConfig(car=tmp_path / "car.toml", mapping=mapping, start="155", annotate="none")
     result = run_logs(log, tmp_path / "out", second)
     rmse = {

@@ -14,11 +14,12 @@ from matplotlib.figure import Figure
 from reference_car import drive, slalom
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import AxleTyre, Sensors, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Sensors, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
+from pdhef_logtool.estimators.physics_ukf import physics_filter
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car import fit_data, identify, identify_command, identify_plot
 from pdhef_logtool.learning.car.axle_forces import AxleCurve, AxleSamples, axle_samples, fit_axle, usable_stamps
@@ -33,6 +34,7 @@ from pdhef_logtool.learning.car.identify import (
     make_priors,
     understeer_deg_per_g,
 )
+from pdhef_logtool.learning.car.physics_fit import PhysicsFit
 from pdhef_logtool.learning.drives import DriveRecord
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
@@ -47,6 +49,16 @@ CAR = default_vehicle().model_copy(
         )
     }
 )
+STATIC = PhysicsParts()
+PHYSICS = FittedPhysics(
+    values=FittedValues(yaw_inertia_kg_m2=1700.0, physics=PhysicsParts(roll=True)),
+    noise=FilterNoise(q_std=(0.1,) * 6),
+    tried=(
+        TriedParts(parts=(), held_out_deg=(0.2, 0.3), taken=True),
+        TriedParts(parts=("roll",), held_out_deg=(0.1, 0.2), taken=True),
+    ),
+)
+FITTED: Any = object()
 NO_SAMPLES = AxleSamples(*(np.empty(0) for _ in range(4)))
 
 
@@ -147,9 +159,22 @@ def test_axle_forces_follow_from_newton_and_euler() -> None:
     np.testing.assert_allclose(lf * forward - lr * rear, iz * 0.1, rtol=1e-4)
     np.testing.assert_allclose(samples.front_slip_rad[at], 0.2 - np.arctan((-0.4 + lf * r[at]) / 20), atol=1e-9)
     np.testing.assert_allclose(samples.rear_slip_rad[at], -np.arctan((-0.4 - lr * r[at]) / 20), atol=1e-9)
-    two = replace(signals, **{k: getattr(signals, k)[:2] for k in ("stamps_ns", "steer_rad")})
+    two = replace(signals, **{k: getattr(signals, k)[:2] for k in ("stamps_ns", "steer_rad", "friction")})
     short = make_track("t", stamps[:2], **{k: getattr(truth, k)[:2] for k in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")})
     assert axle_samples([FitDrive("t", two, short, True, 0)], CAR).front_force_n.size == 0
+
+
+def test_forces_at_another_friction_are_those_of_one_curve() -> None:
+    """Similarity: force over friction by slip over friction; without it, or without a friction, as they are."""
+    n = len(DRIVE.signals)
+    plain = axle_samples([DRIVE], CAR)
+    icy = replace(DRIVE, signals=replace(DRIVE.signals, friction=np.full(n, 0.34)))
+    one = axle_samples([icy], CAR, similar=True)
+    grip = 0.34 / 0.85
+    for name in ("front_slip_rad", "front_force_n", "rear_slip_rad", "rear_force_n"):
+        np.testing.assert_allclose(getattr(one, name), getattr(plain, name) / grip)
+        np.testing.assert_array_equal(getattr(axle_samples([icy], CAR), name), getattr(plain, name))
+        np.testing.assert_array_equal(getattr(axle_samples([DRIVE], CAR, similar=True), name), getattr(plain, name))
 
 
 def test_the_curve_is_the_magic_formula() -> None:
@@ -318,7 +343,7 @@ def test_errors_are_the_filters_at_20_hz_after_it_has_settled() -> None:
 def test_signals_are_read_with_the_ratio_offset_and_biases_that_are_tried() -> None:
     sensors = Sensors(ax_bias_m_s2=0.1, ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.01)
     tried = CAR.model_copy(update={"steering_ratio": 20.0, "steer_offset_rad": 0.003, "sensors": sensors})
-    found = identify._signals_of(DRIVE, CAR, tried)
+    found = fit_data.signals_of(DRIVE, CAR, tried)
     np.testing.assert_allclose(found.steer_rad, DRIVE.signals.steer_rad * 16.0 / 20.0 - 0.003)
     np.testing.assert_allclose(found.ay_m_s2, DRIVE.signals.ay_m_s2 - 0.2)
     np.testing.assert_allclose(found.yaw_rate_rad_s, DRIVE.signals.yaw_rate_rad_s - 0.01)
@@ -397,11 +422,17 @@ def _identification(monkeypatch: pytest.MonkeyPatch, std: dict[str, float], **na
     monkeypatch.setattr(identify, "_minimise", minimise)
     monkeypatch.setattr(identify, "axle_samples", lambda *_: NO_SAMPLES)
 
-    def score(part: str, drives: Any, start: Any, vehicle: Any, noise: Any) -> PartScore:
-        assert start is CAR and noise.q_std and vehicle.tyres.front.B
-        return PartScore(part, len(drives), 3.0, 2.0, 1.0)
+    def score(part: str, drives: Any, start: Any, vehicle: Any, noise: Any, physics: Any) -> PartScore:
+        assert start is CAR and noise.q_std and vehicle.tyres.front.B and physics is FITTED
+        return PartScore(part, len(drives), 3.0, 2.0, 1.0, 0.5)
+
+    def find(drives: Any, start: Any, *, steering_wheel: bool, parts: Any, progress: Any) -> tuple[Any, FittedPhysics]:
+        assert (len(drives), start, steering_wheel, parts) == (1, CAR, named.get("steering_wheel", False), None)
+        progress("finding physics", 0.5)
+        return FITTED, PHYSICS
 
     monkeypatch.setattr(identify, "_score", score)
+    monkeypatch.setattr(identify, "find_physics", find)
     found = fit_car(
         [fit_drive(25.0, 0.05)], named.pop("held_out", []), CAR, progress=lambda *x: told.append(x), **named
     )
@@ -430,7 +461,14 @@ def test_what_is_not_excited_goes_back_to_its_prior_and_the_rest_is_fitted_again
     assert calls[1][1].all() and (~calls[2][1]).sum() == 2
     assert [(s.part, s.seconds) for s in found.scores] == [("fit", 1), ("held out", 1)]
     fitting = "fitting the filter's sideslip to the truth"
-    assert told == [(fitting, 0.0), (fitting, pytest.approx(0.3)), (fitting, pytest.approx(0.6)), ("scoring", 0.95)]
+    assert told == [
+        (fitting, 0.0), (fitting, pytest.approx(0.1)), (fitting, pytest.approx(0.2)), ("finding physics", 0.6),
+        ("scoring", 0.95),
+    ]  # fmt: skip
+    assert found.physics is PHYSICS
+    assert found.notes[-1] == "physics has roll, by driving that its fits had not seen"
+    given = PHYSICS.model_copy(update={"values": FittedValues(physics=STATIC), "tried": ()})
+    assert identify._told(given) == "physics has none of its parts, as asked for, or for want of driving"
 
 
 def test_an_all_excited_fit_ends_after_two_passes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -454,7 +492,11 @@ def test_scores_are_over_all_stamps_of_all_drives() -> None:
     other = fit_drive(4.0)
     identified = CAR.model_copy(update={"steer_offset_rad": 0.002, "steering_ratio": 15.0})
     noise = FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5})
-    score = identify._score("fit", [DRIVE, other], CAR, identified, noise)
+    strongest = PhysicsFit(
+        CAR.model_copy(update={"steer_offset_rad": 0.003, "steering_ratio": 14.0, "physics": PhysicsParts(lag=True)}),
+        FilterNoise(q_std=(0.1,) * 6, r_std={"ay_m_s2": 0.4}), (), np.empty(0), np.empty(0), 0.0, 0.0,
+    )  # fmt: skip
+    score = identify._score("fit", [DRIVE, other], CAR, identified, noise, strongest)
 
     def rmse(*tracks: Any) -> float:
         errors = [signal_error(t, d.truth, "sideslip_rad", 3.0) for t, d in zip(tracks, (DRIVE, other), strict=True)]
@@ -467,9 +509,13 @@ def test_scores_are_over_all_stamps_of_all_drives() -> None:
     tuned = physics_ukf_tuned(identified, noise)
     seen = [replace(d.signals, steer_rad=d.signals.steer_rad * 16 / 15 - 0.002) for d in drives]
     assert score.identified_deg == pytest.approx(rmse(*(tuned.run(s, None)[0] for s in seen)))
+    seen = [replace(d.signals, steer_rad=d.signals.steer_rad * 16 / 14 - 0.003) for d in drives]
+    physics = physics_filter(strongest.vehicle, strongest.noise)
+    assert score.physics_deg == pytest.approx(rmse(*(physics.run(s, None)[0] for s in seen)))
     assert score.seconds == pytest.approx(10.0)
-    rounded = PartScore("fit", 1.23456, 2.00004, 3.00006, 4.123449).to_dict()
-    assert rounded == {"seconds": 1.2346, "zero_deg": 2.0, "starting_car_deg": 3.0001, "identified_deg": 4.1234}
+    rounded = PartScore("fit", 1.23456, 2.00004, 3.00006, 4.123449, 0.12344).to_dict()
+    assert rounded == {"seconds": 1.2346, "zero_deg": 2.0, "starting_car_deg": 3.0001, "identified_deg": 4.1234,
+                       "physics_deg": 0.1234}  # fmt: skip
 
 
 def _parameter(name: str = "yaw inertia", **changes: Any) -> Identified:
@@ -512,8 +558,9 @@ PARAMETERS = (
 FOUND = Identification(
     CAR.model_copy(update={"yaw_inertia_kg_m2": 1600.0}),
     FilterNoise(q_std=(0.1, 0.2, 0.3)),
+    PHYSICS,
     PARAMETERS,
-    (PartScore("fit", 60.0, 3.0, 2.0, 1.0), PartScore("held out", 20.0, 3.5, 2.5, 1.5)),
+    (PartScore("fit", 60.0, 3.0, 2.0, 1.0, 0.5), PartScore("held out", 20.0, 3.5, 2.5, 1.5, 0.75)),
     AxleSamples(*(np.linspace(-1.0, 1.0, 12_000) * k for k in (0.1, 5000.0, 0.05, 4000.0))),
     ("a note",),
 )
@@ -555,8 +602,10 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
         one, why = made[log.stem]
         return DriveRecord(log.stem, log.path.name, sha256=f"{'abc'.index(log.stem)}" * 64, left_out=why), one
 
-    def fit(drives: Any, held_out: Any, start: Any, *, steering_wheel: bool, progress: Any) -> Identification:
-        asked.append((len(drives), len(held_out), start, steering_wheel))
+    def fit(
+        drives: Any, held_out: Any, start: Any, *, steering_wheel: bool, parts: Any, progress: Any
+    ) -> Identification:
+        asked.append((len(drives), len(held_out), start, steering_wheel, parts))
         progress("fitting", 0.5)
         return FOUND
 
@@ -570,6 +619,7 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
         tmp_path / "car",
         RunConfig(),
         holdout=0.1,
+        parts=STATIC,
         progress=lambda *x: told.append(x),
         warn=warned.append,
     )
@@ -579,7 +629,7 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
         "no --car: mass, geometry and priors are those of the default sedan",
         "b is left out: no true sideslip",
     ]
-    assert asked == [(2, 0, default_vehicle(), True)]
+    assert asked == [(2, 0, default_vehicle(), True, STATIC)]
     car = Car.load(tmp_path / "car")
     assert (tmp_path / "car/fit.png").read_bytes() == b"png"
     # To the hundredth of a second, which is what two slices are compared by.
@@ -596,8 +646,12 @@ def test_the_command_tells_its_progress_and_remembers_what_it_learnt_on(
     }  # fmt: skip
     assert document["sideslip_rmse_deg"][1] == {
         "part": "held out", "seconds": 20.0, "zero": 3.5, "phy-ukf, starting file": 2.5,
-        "phy-ukf-tuned, identified file": 1.5,
+        "phy-ukf-tuned, identified file": 1.5, "physics": 0.75,
     }  # fmt: skip
+    assert document["physics"] == PHYSICS.model_dump(mode="json", exclude_none=True)
+    assert car.fitted_physics == PHYSICS
+    assert dict(car.noise)["physics"] == PHYSICS.noise
+    assert (car.physics_vehicle.yaw_inertia_kg_m2, car.physics_vehicle.physics.names) == (1700.0, ("roll",))
     assert document["notes"] == ["a note"]
     made.update(a=(None, "x"), c=(None, "x"))
     with pytest.raises(EstimatorError, match="identify"):
@@ -630,11 +684,11 @@ def test_the_plot_shows_samples_curves_intervals_and_errors(monkeypatch: pytest.
     assert list(kept.get_xdata()) == [0.0]  # yaw inertia stands at its prior
     np.testing.assert_allclose(lines[-2].get_xdata(), [0.05 / 0.11 * 100])  # a prior of 0 has no per cent
     assert [[round(p.get_height(), 3) for p in bars] for bars in scores.containers] == [
-        [3.0, 2.0, 1.0],
-        [3.5, 2.5, 1.5],
+        [3.0, 2.0, 1.0, 0.5],
+        [3.5, 2.5, 1.5, 0.75],
     ]
-    np.testing.assert_allclose([p.get_x() + p.get_width() / 2 for p in scores.containers[0]], [-0.2, 0.8, 1.8])
-    np.testing.assert_allclose([p.get_x() + p.get_width() / 2 for p in scores.containers[1]], [0.2, 1.2, 2.2])
+    np.testing.assert_allclose([p.get_x() + p.get_width() / 2 for p in scores.containers[0]], [-0.2, 0.8, 1.8, 2.8])
+    np.testing.assert_allclose([p.get_x() + p.get_width() / 2 for p in scores.containers[1]], [0.2, 1.2, 2.2, 3.2])
 
 
 def test_a_curved_tyre_is_drawn_with_its_curvature() -> None:

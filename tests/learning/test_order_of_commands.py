@@ -12,6 +12,7 @@ import torch
 
 from pdhef_logtool.car.car import Car, read_history
 from pdhef_logtool.car.parts import digest
+from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.learning.car import identify_command
 from pdhef_logtool.learning.drives import LearnSettings
 from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
@@ -72,7 +73,9 @@ class Commands:
         config = RunConfig(car=self.car if self.car.exists() else self.guess)
         logs = self._logs[name]
         if name == "identify":
-            identify_command.identify(logs, self.car, replace(config, end="34"), holdout=0.0)
+            identify_command.identify(
+                logs, self.car, replace(config, end="34"), holdout=0.0, parts=PhysicsParts(roll=True)
+            )
         elif name == "tune":
             tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf-tuned", "physics"), trials=4))
         elif name == "trust":
@@ -159,7 +162,8 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         car = Car.load(commands.car)
         assert _stale(car.notes) == expected, (number, command)
         assert car.vehicle.name.endswith("(identified)") == identified
-        assert ("physics" in car.noise) == tuned
+        assert ("physics" in car.noise) == (tuned or identified)
+        assert (car.fitted_physics is not None) == identified
         assert ("trust" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
         assert ("trust" in expected) == ("pdhef trust gives it anew" in car.allowed_trust.reason)
         before = after

@@ -1,0 +1,286 @@
+"""The identification of a car for ``physics``, on small drives of cars in plain Python."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from physics_oracle import Oracle, parts
+from reference_car import FRONT_TYRE, MASS_KG, REAR_TYRE, Drive, drive, keep, with_noise
+
+from pdhef_logtool.car.parts import FittedPhysics
+from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
+from pdhef_logtool.learning.car import physics_fit
+from pdhef_logtool.learning.car.axle_forces import axle_samples
+from pdhef_logtool.learning.car.fit_data import FitDrive, part_of
+from pdhef_logtool.learning.car.physics_fit import (
+    GUARD_S,
+    STARTS,
+    build_car,
+    choose_parts,
+    drive_errors,
+    find_physics,
+    fit_physics,
+    make_folds,
+    make_priors,
+    physics_parts,
+    usable_seconds,
+)
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.tracks import make_track
+
+STATIC = PhysicsParts()
+#: Slope of the true tyres at no slip, N/rad at friction 0.85.
+STIFFNESS = tuple(0.85 * b * c * d for b, c, d, _ in (FRONT_TYRE, REAR_TYRE))
+
+
+def weaving(seed: int):
+    rng = np.random.default_rng(seed)
+    tones = [(rng.uniform(0.1, 1.0), rng.uniform(0.0, 6.3)) for _ in range(4)]
+    return lambda t: 0.017 * sum(math.sin(2.0 * math.pi * f * t + p) for f, p in tones)
+
+
+def fit_drive(made: Drive, seed: int, **changes) -> FitDrive:
+    """Drive as identification sees it, at 50 Hz: sensors with noise, truth without."""
+    half = np.arange(len(made.signals)) % 2 == 0
+    signals = keep(with_noise(made.signals, seed), half)
+    columns = {"vx_m_s": made.vx, "vy_m_s": made.vy, "yaw_rate_rad_s": made.r, "ay_m_s2": made.ay}
+    truth = make_track("truth", signals.stamps_ns, valid=np.ones(half.sum(), dtype=bool),
+                       **{name: column[half] for name, column in columns.items()})  # fmt: skip
+    return replace(FitDrive(f"made {seed}", signals, truth, True, int(signals.stamps_ns[0])), **changes)
+
+
+@cache
+def static_drive(seed: int, seconds: float = 24.0) -> FitDrive:
+    return fit_drive(drive(weaving(seed), seconds, speed=24.0, speed_every=1), seed)
+
+
+@cache
+def rolling_car(seed: int, seconds: float = 12.0) -> FitDrive:
+    oracle = Oracle(parts("roll"), swing_m=0.6, roll_frequency=9.0, roll_damping=0.25)
+    made = oracle.drive(lambda t: 1.3 * weaving(seed)(1.3 * t), seconds, n=2)
+    return fit_drive(replace(made, signals=replace(made.signals, speed_m_s=made.vx)), seed)
+
+
+def guess(front: float = 1.0, rear: float = 1.0, **changes) -> VehicleParameters:
+    """The sedan without roll, its tyres known by a stiffness that is wrong by these factors."""
+    tyres = [AxleTyre(cornering_stiffness_n_per_rad=k * s) for k, s in zip((front, rear), STIFFNESS, strict=True)]
+    update = {"tyres": Tyres(front=tyres[0], rear=tyres[1]), "roll_gradient_rad_per_m_s2": 0.0, **changes}
+    return default_vehicle().model_copy(update=update)
+
+
+@pytest.fixture(scope="module")
+def static() -> FitDrive:
+    return static_drive(1)
+
+
+# ---- the fit ----
+
+
+@pytest.mark.slow
+def test_stiffness_is_found_within_the_posteriors_interval(static: FitDrive) -> None:
+    start = guess(0.7, 1.4)
+    found = fit_physics([static], start, STATIC, starts=STARTS[:1], iterations=12)
+    by_name = {p.name: (p.value(t), p.value(t - 2.5 * s), p.value(t + 2.5 * s), s)
+               for p, t, s in zip(found.priors, found.theta, found.std, strict=True)}  # fmt: skip
+    for axle, true, front in (("front", STIFFNESS[0], True), ("rear", STIFFNESS[1], False)):
+        value, low, high, std = by_name[f"{axle} cornering stiffness"]
+        assert low < true < high
+        assert value == pytest.approx(true, rel=0.1)
+        assert std < 0.7, "the drive must say more than the prior"
+        assert found.vehicle.cornering_stiffness_n_per_rad(front, 0.85) == pytest.approx(value, rel=1e-4)
+    (before,) = drive_errors([static], start, *build_car(start, STATIC, found.priors, np.zeros(len(found.priors))))
+    assert found.rms_deg < 0.6 * math.degrees(before.rms)
+    (after,) = drive_errors([static], start, found.vehicle, found.noise)
+    assert math.degrees(after.rms) == pytest.approx(found.rms_deg, rel=1e-3)
+    (unseen,) = drive_errors([static_drive(2)], start, found.vehicle, found.noise)
+    assert math.degrees(unseen.rms) < 0.1
+    assert 0.3 < after.nis < 3.0
+
+
+@pytest.mark.slow
+def test_of_two_starts_of_the_noise_the_better_end_counts(static: FitDrive) -> None:
+    short = part_of(static, 0, 500)
+    ends = [fit_physics([short], guess(), STATIC, starts=[s], iterations=2) for s in STARTS]
+    both = fit_physics([short], guess(), STATIC, iterations=2)
+    assert ends[0].cost != ends[1].cost
+    assert both.cost == min(e.cost for e in ends)
+    assert {name for start in STARTS for name in start} <= {p.name for p in both.priors if p.tuning}
+    none = fit_physics([short], guess(), STATIC, starts=STARTS[1:], iterations=0)
+    assert none.noise.r_std["ay_m_s2"] == pytest.approx(0.3 * math.exp(1.5 * physics_fit.NOISE_LOG_STD), rel=1e-4)
+
+
+def test_errors_count_where_truth_is_usable_and_the_filter_has_settled(static: FitDrive) -> None:
+    priors = make_priors(guess(), STATIC, axle_samples([static], guess()), 24.0, steering_wheel=False)
+    vehicle, noise = build_car(guess(), STATIC, priors, np.zeros(len(priors)))
+    (whole,) = drive_errors([static], guess(), vehicle, noise)
+    assert whole.error.size == math.ceil(len(static.signals) / 2)  # 50 Hz: every other one, 25 a second
+    assert (whole.error[:51] == 0.0).all() and (whole.error[51:] != 0.0).all()
+    assert whole.counted == whole.error.size - 51
+    assert whole.seconds == pytest.approx(22.0, abs=0.05)
+    assert whole.rms == pytest.approx(math.sqrt(np.mean(whole.error[51:] ** 2)))
+    hidden = replace(static, truth=replace(static.truth, valid=np.arange(len(static.signals)) < 600))
+    (half,) = drive_errors([hidden], guess(), vehicle, noise)
+    assert (half.error[300:] == 0.0).all()
+    assert half.counted == 300 - 51
+    np.testing.assert_array_equal(half.error[:300], whole.error[:300])
+
+
+# ---- priors and the car that they make ----
+
+CORE = [f"{axle} {what}" for axle in ("front", "rear") for what in ("cornering stiffness", "peak force", "shape")]
+CORE += ["yaw inertia", "steering offset", "roll gradient", "a_y bias", "yaw rate bias"]
+OF_PARTS = {
+    "lag": {"relaxation length"},
+    "load_transfer": {"load sensitivity"},
+    "roll": {"roll frequency", "roll damping", "CG over roll axis"},
+}
+
+
+@pytest.mark.parametrize("names", [(), *((name,) for name in PhysicsParts.model_fields)], ids="+".join)
+def test_only_parameters_that_the_parts_use_are_fitted(names: tuple[str, ...]) -> None:
+    nothing = axle_samples([part_of(static_drive(1, 2.0), 0, 100)], guess())
+    priors = make_priors(guess(), parts(*names), nothing, 0.0, steering_wheel=False)
+    fitted = {p.name for p in priors if not p.tuning}
+    assert fitted == {*CORE}.union(*(OF_PARTS.get(name, ()) for name in names))
+    by_wheel = make_priors(guess(), parts(*names), nothing, 0.0, steering_wheel=True)
+    assert {p.name for p in by_wheel} - {p.name for p in priors} == {"steering ratio"}
+
+
+def test_the_car_at_theta_has_its_values_and_keeps_the_rest() -> None:
+    start = guess(1.1, 0.9, roll_gradient_rad_per_m_s2=0.008)
+    has = parts("lag", "roll", "load_transfer")
+    none = axle_samples([part_of(static_drive(1, 2.0), 0, 100)], start)
+    priors = make_priors(start, has, none, 0.0, steering_wheel=True)
+    theta = np.linspace(-1.0, 1.0, len(priors))
+    vehicle, noise = build_car(start, has, priors, theta)
+    v = {p.name: max(p.value(t), -math.inf if p.low is None else p.low) for p, t in zip(priors, theta, strict=True)}
+    assert vehicle.physics == has
+    for front, axle in ((True, "front"), (False, "rear")):
+        assert vehicle.cornering_stiffness_n_per_rad(front, 0.85) == pytest.approx(v[f"{axle} cornering stiffness"])
+        assert vehicle.magic_formula(front, 0.85)[2] == pytest.approx(v[f"{axle} peak force"])
+        assert getattr(vehicle.tyres, axle).keeps_stiffness  # at another friction, too
+        slope = vehicle.cornering_stiffness_n_per_rad(front, 0.3)
+        assert slope == pytest.approx(v[f"{axle} cornering stiffness"])
+    for name, entry in (
+        ("yaw inertia", "yaw_inertia_kg_m2"), ("steering offset", "steer_offset_rad"),
+        ("steering ratio", "steering_ratio"), ("roll gradient", "roll_gradient_rad_per_m_s2"),
+        ("relaxation length", "relaxation_length_m"), ("load sensitivity", "load_sensitivity"),
+        ("roll frequency", "roll_frequency_rad_s"), ("roll damping", "roll_damping"),
+        ("CG over roll axis", "cg_over_roll_axis_m"),
+    ):  # fmt: skip
+        assert getattr(vehicle, entry) == pytest.approx(v[name]), name
+    assert (vehicle.mass_kg, vehicle.track_m) == (MASS_KG, start.track_m)
+    q_force = v["q axle force"]
+    assert noise.q_std == (PHYSICS_Q_STD[0], v["q v_y"], v["q yaw rate"], v["q a_x bias"], q_force, q_force)
+    rounded, _ = build_car(start, has, priors, theta, digits=3)
+    assert rounded.yaw_inertia_kg_m2 == float(f"{v['yaw inertia']:.3g}")
+
+
+# ---- parts ----
+
+
+def test_parts_are_named_in_words() -> None:
+    assert physics_parts("auto") is None
+    assert physics_parts("static") == STATIC
+    assert physics_parts("lag,roll") == PhysicsParts(lag=True, roll=True)
+    assert physics_parts("lag,roll").names == ("lag", "roll")  # type: ignore[union-attr]
+    with pytest.raises(UsageError, match=r"--parts.*expected auto, static, or names out of lag, load_transfer.*swing"):
+        physics_parts("lag,swing")
+    with pytest.raises(UsageError, match="--parts"):
+        physics_parts("")
+
+
+def test_few_drives_are_cut_and_many_are_dealt_out(static: FitDrive) -> None:
+    long = static_drive(3, 50.0)
+    (one, other), back = make_folds([long], guess())
+    assert back == (other, one)
+    ((first,), (second,)) = one, other
+    gap = float(second.signals.stamps_ns[0] - first.signals.stamps_ns[-1]) * 1e-9
+    assert gap == pytest.approx(2.0 * GUARD_S, abs=0.05)
+    assert first.duration_s == pytest.approx(second.duration_s, abs=0.1)
+    # The cut goes by driving that can be used, not by the clock.
+    late = replace(long, truth=replace(long.truth, valid=np.arange(len(long.truth)) >= 200))
+    (((first,), (second,)), _) = make_folds([late], guess())
+    assert usable_seconds(first, guess()) == pytest.approx(usable_seconds(second, guess()), abs=0.1)
+    assert first.duration_s > second.duration_s + 3.0
+    many = [replace(static, name=str(i)) for i in range(5)]
+    idle = replace(static, name="idle", truth=replace(static.truth, valid=np.zeros(len(static.truth), dtype=bool)))
+    ((one, other), back) = make_folds([idle, *many], guess())
+    assert [[d.name for d in half] for half in (one, other)] == [["0", "2", "4"], ["1", "3"]]
+    assert back == (other, one)
+    assert make_folds([part_of(long, 0, 2200)], guess()) == []  # 44 s, of which the guard takes 5
+    assert make_folds([], guess()) == []
+    assert make_folds([idle], guess()) == []
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer parts and iterations than a car deserves."""
+    monkeypatch.setattr(physics_fit, "ORDER", ("lag", "biases", "roll"))
+    monkeypatch.setattr(physics_fit, "MAX_ITERATIONS", 6)
+    monkeypatch.setattr(physics_fit, "TRIAL_ITERATIONS", 5)
+    monkeypatch.setattr(physics_fit, "STARTS", STARTS[:1])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(("make", "taken"), [(rolling_car, {"roll"}), (static_drive, set())])
+def test_a_car_gets_the_parts_that_it_has(make, taken: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(physics_fit, "ORDER", ("roll", "lag", "biases"))
+    one, other = [make(1, 12.0)], [make(2, 12.0)]
+    told: list[tuple[str, float]] = []
+    start = guess(roll_gradient_rad_per_m_s2=0.0105) if taken else guess()
+    found, tried = choose_parts([(one, other), (other, one)], start, progress=lambda *x: told.append(x))
+    assert set(found.names) == taken
+    assert [t.taken for t in tried] == [True, "roll" in taken, False, False]
+    assert [t.parts for t in tried[:2]] == [(), ("roll",)]
+    assert all(len(t.held_out_deg) == 2 for t in tried)
+    if taken:
+        assert max(tried[1].held_out_deg) < 0.5 * min(tried[0].held_out_deg)
+    assert [share for _, share in told] == [0.25, 0.5, 0.75]
+    assert told[0][0] == "is roll worth having"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_roll_is_taken_also_where_a_part_before_it_has_some_of_its_gain() -> None:
+    found, tried = choose_parts([([rolling_car(1, 12.0)], [rolling_car(2, 12.0)])], guess())
+    assert found.roll
+    assert not found.biases
+    taken = [t for t in tried if t.taken]
+    assert [np.mean(t.held_out_deg) for t in taken] == sorted((np.mean(t.held_out_deg) for t in taken), reverse=True)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_what_is_found_puts_the_car_right(static: FitDrive, monkeypatch: pytest.MonkeyPatch) -> None:
+    fits: list[PhysicsParts] = []
+
+    def fit(drives, start, has, **settings):
+        fits.append(has)
+        return fit_physics(drives, start, has, **settings | {"starts": STARTS[:1], "iterations": 2})
+
+    monkeypatch.setattr(physics_fit, "fit_physics", fit)
+    start, told = guess(0.8, 1.2, name="mine"), []
+    short = part_of(static, 0, 600)
+    found, held = find_physics([short], start, parts=parts("lag"), progress=lambda *x: told.append(x))
+    assert fits == [parts("lag")]
+    assert held.values.applied_to(start) == found.vehicle != start
+    assert found.vehicle.physics == parts("lag")
+    assert (held.noise, held.tried) == (found.noise, ())
+    assert told == [("fitting the physics filter's sideslip to the truth", 0.7)]
+    assert FittedPhysics.model_validate(held.model_dump(mode="json")) == held
+    assert find_physics([short], start)[1].values.physics == STATIC, "too little driving to choose by"
+    assert fits[1:] == [STATIC]
+    monkeypatch.setattr(physics_fit, "LEAST_FOLD_S", 8.0)
+    fits.clear()
+    _, held = find_physics([static], start)
+    assert held.tried[0].parts == ()
+    assert len(held.tried) == 4
+    assert fits[:2] == [STATIC, STATIC]
+    assert held.values.physics == fits[-1]
