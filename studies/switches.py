@@ -36,7 +36,7 @@ from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
 FIRST_SEED = 11000
-ESTIMATORS = ("phy-ukf-tuned", "physics", "pd-hef")
+ESTIMATORS = ("phy-ukf-tuned", "physics-plus", "pd-hef")
 #: Ratios nearer to 1 than this are no difference that matters.
 TRIFLE = 0.01
 #: Names of the drives that the table of conditions makes, and how the others are made.
@@ -129,7 +129,7 @@ def option_switch(title: str, drives: str, name: str, default: dict[str, bool]) 
 
 
 _ALL = dict.fromkeys(ESTIMATORS, True)
-_BIAS_STATES = {"phy-ukf-tuned": False, "physics": True, "pd-hef": False}
+_BIAS_STATES = {"phy-ukf-tuned": False, "physics-plus": True, "pd-hef": False}
 SWITCHES = (
     option_switch("bias states of a_y, yaw rate, steering", "bias", "bias_states", _BIAS_STATES),
     option_switch("bias states of a_y, yaw rate, steering", "in-domain", "bias_states", _BIAS_STATES),
@@ -237,7 +237,7 @@ def compare(switch: Switch, estimator: Estimator, drive: ConditionDrive) -> list
 
 
 NOTES = """How each is switched:
-- *Bias states*: the filter estimates the biases of a_y, yaw rate and steering angle, or does not. `physics` ships
+- *Bias states*: the filter estimates the biases of a_y, yaw rate and steering angle, or does not. `physics-plus` ships
   with them, `pd-hef` and `phy-ukf-tuned` without; the noise is that of the shipped file either way.
 - *Body-roll correction*: the filter's a_y holds g times the roll gradient, or is taken for planar.
 - *Standstill*: motion is held at zero while the car stands, and the bias of a_x is learnt there, or it just filters on.

@@ -125,8 +125,12 @@ SPECS: tuple[Spec, ...] = (
         "physics:build", _ESP, 0x0072B2,
     ),
     Spec(
-        "physics", "the strongest filter on physics alone, with the parts that the car's driving gives evidence for",
-        "physics_ukf:build", _ESP, 0x44AA99, tunable="always",
+        "physics-plus", "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
+        "physics_plus:build", _ESP, 0x44AA99, tunable="always",
+    ),
+    Spec(
+        "physics", "physics with the parts, values and noise that this car's driving gave evidence for (pdhef identify)",
+        "physics_ukf:build", _ESP, 0x88CCEE, needs_noise=True,
     ),
     Spec(
         "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",

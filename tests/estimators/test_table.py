@@ -180,7 +180,7 @@ def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
     assert was.structure == is_now.structure
 
 
-@pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics", "pd-hef", "pd-hef-smoothed"])
+@pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics-plus", "pd-hef", "pd-hef-smoothed"])
 def test_other_noise_is_another_basis_of_the_same_structure(name: str) -> None:
     was = ran(name, CAR.with_noise(name, NOISE))
     for change in ({"q_std": (0.1, 0.2, 0.2)}, {"r_std": {"ay_m_s2": 1.0}}):
@@ -242,7 +242,7 @@ def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> No
 
 
 def test_without_its_own_it_has_those_of_the_filter_that_it_is(signals: Signals) -> None:
-    of_filter, own = ran("physics", BARE), ran("pd-hef", BARE)
+    of_filter, own = ran("physics-plus", BARE), ran("pd-hef", BARE)
     assert with_intervals(BARE, intervals_for(of_filter), signals)[0] == pytest.approx(2.0)
     assert with_intervals(CAR, intervals_for(of_filter), signals)[0] == 1.0
     both = intervals_for(of_filter).entries + intervals_for(own, factor=3.0).entries
@@ -255,9 +255,9 @@ def test_without_its_own_it_has_those_of_the_filter_that_it_is(signals: Signals)
 
 def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:
     """Evidence makes pd-hef another algorithm; the intervals of all others hold, and nobody calls them foreign."""
-    entries = intervals_for(ran("physics", BARE))
+    entries = intervals_for(ran("physics-plus", BARE))
     for car in (BARE, CAR):
-        estimator = make_estimator("physics", car)
+        estimator = make_estimator("physics-plus", car)
         applied = calibrator(replace(car, intervals=entries), [estimator])
         applied.add(estimator.run(signals, None)[0], signals)
-        assert applied.notes("physics") == ("intervals calibrated on car for friction and vehicle as told",)
+        assert applied.notes("physics-plus") == ("intervals calibrated on car for friction and vehicle as told",)

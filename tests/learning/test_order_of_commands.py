@@ -12,7 +12,6 @@ import torch
 
 from pdhef_logtool.car.car import Car, read_history
 from pdhef_logtool.car.parts import digest
-from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.learning.car import identify_command
 from pdhef_logtool.learning.drives import LearnSettings
 from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
@@ -73,16 +72,14 @@ class Commands:
         config = RunConfig(car=self.car if self.car.exists() else self.guess)
         logs = self._logs[name]
         if name == "identify":
-            identify_command.identify(
-                logs, self.car, replace(config, end="34"), holdout=0.0, parts=PhysicsParts(roll=True)
-            )
+            identify_command.identify(logs, self.car, replace(config, end="34"), holdout=0.0)
         elif name == "tune":
-            tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf-tuned", "physics"), trials=4))
+            tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf-tuned", "physics-plus"), trials=4))
         elif name == "trust":
             network = self.car.parent / "model"
             trust(logs, self.car, LearnSettings(config=replace(config, network=network, end="+5s")))
         else:
-            config = replace(config, estimators=("physics",), end="+5s")
+            config = replace(config, estimators=("physics-plus",), end="+5s")
             calibrate(logs, self.car, CalibrateSettings(config=config, spread=0.0))
 
     def drives(self, name: str) -> list[str]:
@@ -97,7 +94,7 @@ class Commands:
     def run(self, out: Path, log: str) -> tuple[list[str], dict[str, list[str]]]:
         """Return what a run says of the car's parts, and the notes on its estimators."""
         told: list[str] = []
-        config = RunConfig(car=self.car, estimators=("physics", "pd-hef"), annotate="none", end="+3s")
+        config = RunConfig(car=self.car, estimators=("physics-plus", "pd-hef"), annotate="none", end="+3s")
         result = run_logs([log], out, config, warn=told.append)
         report = result.results[0].report
         assert report is not None
@@ -162,8 +159,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         car = Car.load(commands.car)
         assert _stale(car.notes) == expected, (number, command)
         assert car.vehicle.name.endswith("(identified)") == identified
-        assert ("physics" in car.noise) == (tuned or identified)
-        assert (car.fitted_physics is not None) == identified
+        assert ("physics-plus" in car.noise) == tuned
         assert ("trust" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
         assert ("trust" in expected) == ("pdhef trust gives it anew" in car.allowed_trust.reason)
         before = after
@@ -172,12 +168,12 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
             assert expected == {"tune", "trust", "calibrate"}
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert _stale(said) == expected
-            assert "those intervals were made with other physics" in notes["physics"]
+            assert "those intervals were made with other physics" in notes["physics-plus"]
         if (ORDER[number - 2], command) == ("calibrate", "trust"):
             assert "calibrate" not in expected
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert said == []
-            assert notes["physics"] == [
+            assert notes["physics-plus"] == [
                 "intervals calibrated on truthsim saloon (identified) for friction and vehicle as told"
             ]
 
