@@ -136,7 +136,7 @@ FilterTables = Annotated[
 class TriedParts(Record):
     """A set of parts of ``physics`` that was tried: its error on folds that its fits had not seen, and the verdict."""
 
-    parts: Annotated[tuple[str, ...], Field(strict=False)]
+    parts: Annotated[tuple[str, ...], Field(strict=False)] = ()
     held_out_deg: Annotated[tuple[float, ...], Field(strict=False)]
     taken: bool
 
@@ -159,7 +159,7 @@ class Fit(Record):
     format: Literal["pdhef-fit"] = "pdhef-fit"
     version: Literal[1] = 1
     physics_sha256: Sha256
-    values: FittedValues
+    values: FittedValues = FittedValues()
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()

@@ -1,0 +1,66 @@
+"""Fit ``physics`` of the shipped car: its parts, values and noise, on five minutes of simulated driving.
+
+    python -m studies.defaults.fit_physics [-o FOLDER] [--work out/fit-physics] [--jobs 2]
+
+Drives of 12.5 s as networks are trained on, with the friction told, on perfect truth. None is one of the paper's
+scenarios: those have a speed and a friction of their own. Everything else of the car stays: its vehicle file is right.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, SHIPPED_CARS, Car
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import Fit, FittedValues, LearntOn, physics_sha256
+from pdhef_logtool.car.store import Change, update_car
+from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.learning.car.physics_fit import find_physics
+from pdhef_logtool.residual_model.bundle import NO_MODEL
+from studies.condition_drives import read_drive
+from studies.pages import options
+
+SEED, DRIVES = 5000, 24
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Simulate, fit, write."""
+    parser = options("defaults.fit_physics", __doc__)
+    parser.add_argument("-o", "--output", type=Path, default=SHIPPED_CARS["saloon"], help="the car's folder")
+    parser.add_argument("--work", type=Path, default=Path("out/fit-physics"), help="logs; kept")
+    parser.add_argument("--jobs", type=int, default=2)
+    given = parser.parse_args(arguments)
+    simulate = ("simulate", "suite", "--count", str(DRIVES), "--seed", str(SEED), "--jobs", str(given.jobs))
+    subprocess.run([sys.executable, "-m", "pdhef_logtool", *simulate, "-o", str(given.work)], check=True)
+    car = Car.load(given.output, network=NO_MODEL, intervals=NO_INTERVALS)
+    drawn = json.loads((given.work / "manifest.json").read_text(encoding="utf-8"))["drives"]
+    drives, learnt_on = [], []
+    for entry in drawn:
+        read = read_drive(given.work / entry["file"], Car.of(car.own))
+        assert read.truth is not None
+        start_ns = int(read.signals.stamps_ns[0])
+        drives.append(FitDrive(read.name, read.signals, read.truth, independent_yaw_rate=True, log_start_ns=start_ns))
+        learnt_on.append(LearntOn(name=read.name, sha256=entry["sha256"], end_s=entry["duration_s"]))
+
+    def say(text: str, share: float) -> None:
+        print(f"{100 * share:3.0f} % {text}", flush=True)
+
+    found, physics = find_physics(drives, car.own, progress=say)
+    print(f"sideslip RMSE on what it was fitted to: {found.rms_deg:.4f} deg")
+    for tried in physics.tried:
+        print(f"{', '.join(tried.parts) or 'static'}: {tried.held_out_deg} {'taken' if tried.taken else ''}")
+    part = Fit(physics_sha256=physics_sha256(car.own), values=FittedValues(), physics=physics, drives=tuple(learnt_on))
+    text = part_toml(part, "Written by python -m studies.defaults.fit_physics.")
+    settings = {"seed": SEED, "drives": len(drives)}
+    change = Change(
+        "studies.defaults.fit_physics", FIT_FILE, {FIT_FILE: text.encode()}, settings=settings, drives=tuple(learnt_on)
+    )
+    print(update_car(car, given.output, change))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
