@@ -129,7 +129,7 @@ SPECS: tuple[Spec, ...] = (
         "physics_plus:build", _ESP, 0x44AA99, tunable="always",
     ),
     Spec(
-        "physics", "physics with the parts, values and noise that this car's driving gave evidence for (pdhef identify)",
+        "physics", "filter on physics with the parts and noise that driving of this car gave evidence for",
         "physics_ukf:build", _ESP, 0x88CCEE, needs_noise=True,
     ),
     Spec(

@@ -319,8 +319,8 @@ def _minimise(
 
 #: Parts in the order in which it is tried to do without them, what is least known of first.
 ORDER = ("braking", "force_scale", "bank", "biases", "load_transfer", "roll", "lag")
-#: A part stays if driving that its fit has not seen is worse by this share without it, and worse in each fold.
-LEAST_GAIN = 0.03
+#: A part stays if driving that its fits have not seen is worse by this share without it, on average over the folds.
+LEAST_GAIN = 0.01
 #: Steps of a fit that only says whether a part is worth having; it starts where the one without the part ended.
 TRIAL_ITERATIONS = 8
 #: Drives from which on folds are whole drives; usable driving that a fold needs, for 75 s chose worse than none would
@@ -406,13 +406,11 @@ def choose_parts(
         progress(f"is {name.replace('_', ' ')} worth having", (number + 2) / (len(ORDER) + 2))
         fewer = parts.model_copy(update={name: False})
         scores, ends = scored(fewer, TRIAL_ITERATIONS)
-        loss = scores - best
-        taken = not (loss.mean() > LEAST_GAIN and loss.min() > 0.0)
+        taken = bool((scores - best).mean() <= LEAST_GAIN)
         tell(fewer, scores, taken)
         if taken:
             parts, best, theta = fewer, scores, ends
-    gain = static - best
-    if not (gain.mean() > LEAST_GAIN and gain.min() > 0.0):
+    if (static - best).mean() <= LEAST_GAIN:
         parts = none
     return parts, tuple(tried)
 
