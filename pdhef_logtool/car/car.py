@@ -119,7 +119,7 @@ class Car:
 
         >>> car = Car.load("saloon")
         >>> car.vehicle.mass_kg, sorted(car.noise), car.allowed_trust.cap
-        (1440.0, ['pd-hef', 'phy-ukf-tuned'], 1.0)
+        (1440.0, ['pd-hef', 'phy-ukf-tuned', 'physics-plus'], 1.0)
         """
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None

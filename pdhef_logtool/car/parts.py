@@ -122,7 +122,7 @@ class FilterNoise(Record):
 def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
     for name, table in tables.items():
         if len(table.q_std) == 6 and name not in (PHYSICS, "physics-plus"):
-            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are those of physics and physics-plus")
+            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics's and physics-plus's")
     return tables
 
 

@@ -20,7 +20,8 @@ part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lat
 A step moves all points at once in inner loops without branches, as :mod:`~pdhef_logtool.car.nominal_points` does. One
 evaluation of the tyres a step: the exponential kernel of the lag weighs what they were asked over the step, and stands
 for one instant of it, t*; the state there is that at the start, moved by its derivative. Velocities take the mean of
-the forces at both ends. Both are of second order in the step, and stable for any lag.
+the forces at both ends. Second order in the step but for what changes slowly over one (speed in the lag, bank, force
+scale, and the load transfer where nothing rolls), and stable for any lag.
 """
 
 from __future__ import annotations

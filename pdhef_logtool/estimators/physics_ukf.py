@@ -128,6 +128,7 @@ def _cross(before, deviation, out):  # type: ignore[no-untyped-def]
             out[a, b] = weight * total
 
 
+# positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
 def _predict(x, P, over, dt, noise, layout, p, f, work):  # type: ignore[no-untyped-def]
     """Move state and covariance by ``dt`` s in place; the deviations of the sigma points are left in ``work``."""
@@ -149,6 +150,7 @@ def _predict(x, P, over, dt, noise, layout, p, f, work):  # type: ignore[no-unty
         P[layout.force_scale, layout.force_scale] += FORCE_SCALE_STD**2 * forgotten
 
 
+# positional: as _predict.
 @_compiled
 def _measure(x, P, steer, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
     """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [n, 3]."""

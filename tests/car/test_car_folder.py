@@ -69,7 +69,7 @@ cornering_stiffness_n_per_rad = 108000.0
 """
 COMMENTS = ("# My car, weighed on 3 May.", "# with driver", "# tank full", "# guessed", "# end")
 DRIVES = (LearntOn(name="lap", sha256="cd" * 32, start_s=0.0, end_s=80.0),)
-TUNED, PLUS = "phy-ukf-tuned", "physics"
+TUNED, PLUS = "phy-ukf-tuned", "physics-plus"
 
 
 @pytest.fixture
@@ -224,17 +224,17 @@ def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path)
     add_physics(folder)
     car = load(folder)
     assert car.fitted_physics == FOUND
-    assert dict(car.noise) == {TUNED: car.noise[TUNED], PLUS: FOUND.noise}
+    assert dict(car.noise) == {TUNED: car.noise[TUNED], "physics": FOUND.noise}
     assert car.vehicle.physics == PhysicsParts()
     assert car.physics_vehicle == FOUND.values.applied_to(car.own)
     assert (car.physics_vehicle.friction, car.vehicle.friction) == (car.own.friction, 0.6)
     assert car.physics_vehicle.physics.names == ("lag", "roll")
-    assert make_estimator(PLUS, car).vehicle == car.physics_vehicle
+    assert make_estimator("physics", car).vehicle == car.physics_vehicle
     assert make_estimator(TUNED, car).vehicle == car.vehicle
     flat = write_change(car, car, tmp_path / "flat.toml", noise_change(NEW))
     again = load(flat)
     assert again.fitted_physics == FOUND
-    assert again.noise[PLUS].q_std == FOUND.noise.q_std
+    assert again.noise["physics"].q_std == FOUND.noise.q_std
     assert write_change(again, again, tmp_path / "again.toml", noise_change(NEW)).read_text() == flat.read_text()
     for comment in COMMENTS:
         assert flat.read_text().count(comment) == 1
@@ -275,7 +275,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert car.learnt_on == ()
     assert car.notes == (
         "fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew",
-        "noise of physics is not used: it belongs to other physics; pdhef tune makes it anew",
+        "noise of physics-plus is not used: it belongs to other physics; pdhef tune makes it anew",
         "network.toml allows no trust: it was found with other physics; pdhef trust makes it anew",
     )
     assert car.allowed_trust.cap == 0.0
@@ -322,7 +322,7 @@ def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     assert car.vehicle.friction == 0.7
     assert dict(car.noise) == fit.filter
     assert [note.split(":")[0] for note in car.notes] == [
-        "noise of physics is not used",
+        "noise of physics-plus is not used",
         "network.toml allows no trust",
     ]
     assert car.allowed_trust.cap == 0.0
@@ -424,14 +424,14 @@ def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: st
 FLAT = """
 [filter.phy-ukf-tuned]
 q_std = [0.1, 0.1, 0.1]
-[filter.physics]
+[filter.physics-plus]
 q_std = [0.1, 0.1, 0.1]
 [network]
 trust_cap = 0.25
 evidence = "a drive of 300 s"
 [identification]
 drives = ["lap: 0 to 80.5 s", {name = "other", sha256 = "cd", start_s = 1.0, end_s = 2.0}]
-tuning_scores = ["physics: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
+tuning_scores = ["physics-plus: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
 tool = "pdhef 0.1"
 """
 
@@ -453,7 +453,7 @@ def test_scores_and_drives_of_older_files_are_understood(tmp_path: Path) -> None
     [
         ("0.1092 deg at trial", "0.1092° at trial"),
         ("0.1092 deg at trial 63", "0.1092 deg"),
-        ("physics: 0.1092", "physics 0.1092"),
+        ("physics-plus: 0.1092", "physics-plus 0.1092"),
         ("lap: 0 to 80.5 s", "lap: all of it"),
     ],
 )

@@ -57,7 +57,7 @@ def make_model(seed: int = 1) -> ModelBundle:
 
 MODEL = make_model()
 #: It has all that any estimator needs.
-CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf-tuned": NOISE}, trust=EVIDENCE)
+CAR = Car.of(VEHICLE, network=MODEL, noise={"phy-ukf-tuned": NOISE, "physics": NOISE}, trust=EVIDENCE)
 
 
 @pytest.fixture(scope="module")

@@ -163,7 +163,7 @@ def identify(
     comments = _comments(found)
     text = part_toml(part, head, {f"values.{k}": v for k, v in comments.items()})
     files = {FIT_FILE: text.encode(), "fit.png": plot_identification(found)}
-    settings = {**config_document(config), "holdout": holdout}
+    settings = {**config_document(config), "holdout": holdout, "parts": "auto" if parts is None else parts.names}
     told = {"holdout_share": holdout, "notes": list(found.notes)}
     change = Change("identify", FIT_FILE, files, settings=settings, drives=drives, told=told)
     write_change(car, car.with_fit(part), output, change, comments)
