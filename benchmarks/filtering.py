@@ -2,6 +2,7 @@
 
 Both run the same state, noise and measurements on one thread; only the filter around the model differs. The posteriors
 are compared before anything is printed. Ours also gates, watches for divergence and keeps what the output needs.
+``physics`` with all its parts stands beside them.
 """
 
 from __future__ import annotations
@@ -10,9 +11,10 @@ import numpy as np
 
 from benchmarks.measuring import Figure, best_seconds
 from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model_parameters, rk4_step, substeps
-from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.filter_shell import INITIAL_STD
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 STEPS = 60_000
@@ -92,10 +94,13 @@ def run() -> list[Figure]:
     if not np.allclose(steps.x[:PEER_STEPS], theirs, rtol=1e-4, atol=1e-4):
         worst = np.abs(steps.x[:PEER_STEPS] - theirs).max(axis=0)
         raise SystemExit(f"the two filters disagree: {worst}")
+    parts = PhysicsParts(**dict.fromkeys(PhysicsParts.model_fields, True))
+    whole = PhysicsFilter(default_vehicle().model_copy(update={"physics": parts}), r_std=R_STD)
     seconds = best_seconds(
         {
             "ours": lambda: estimator.filter_steps(signals, None),
             "filterpy": lambda: run_filterpy(signals, steps.x[0], PEER_STEPS),
+            "physics": lambda: whole.filter_steps(signals, None),
         }
     )
     ours, peer = 1e6 * seconds["ours"] / STEPS, 1e6 * seconds["filterpy"] / PEER_STEPS
@@ -103,4 +108,5 @@ def run() -> list[Figure]:
         Figure("filtering", "phy-ukf", ours, "µs/step"),
         Figure("filtering", "filterpy UKF, same compiled model", peer, "µs/step"),
         Figure("filtering", "filterpy / phy-ukf", peer / ours, "x"),
+        Figure("filtering", "physics, all parts on", 1e6 * seconds["physics"] / STEPS, "µs/step", 8.0, "at most"),
     ]
