@@ -25,6 +25,8 @@ from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.signals import Loss
 
 _LARGEST_ID = 0xFFFF
+#: Times of MCAP are unsigned; those that readers give are not.
+_UNSIGNED = (1 << 64) - 1
 _HEADER = "std_msgs/msg/Header"
 
 #: Number of a channel in the log: file of the log, and channel id in that file.
@@ -294,9 +296,14 @@ class _Cursor:
         return int(self._rows[self.taken][1])
 
     def take(self, c: int, channels: SourceChannels) -> RawMessage | None:
-        """Return the next message; None if its channel or the message itself cannot be copied."""
+        """Return the next message; None if its channel or the message itself cannot be copied.
+
+        A database may hold times before 1970, which an MCAP file cannot.
+        """
         channel, log_time, publish_time, sequence, offset, length = self._rows[self.taken]
         self.taken += 1
+        if log_time < 0:
+            return None
         key = (c, channel)
         id_ = channels.ids.get(key)
         if id_ is None:
@@ -307,7 +314,7 @@ class _Cursor:
             if key in channels.numbered:
                 sequence = int.from_bytes(data[:4], "little")
             data = convert(data)
-        return None if data is None else RawMessage(id_, log_time, publish_time, sequence, data)
+        return None if data is None else RawMessage(id_, log_time, publish_time & _UNSIGNED, sequence, data)
 
 
 def _columnar(log: DriveLog) -> ColumnarLog:

@@ -502,10 +502,11 @@ def _map_truth_position(found: _Finding, candidates: list[TopicInfo], velocity: 
     base = POSE_FIELDS[_type(chosen)]
     for name, axis in (("x_m", "x"), ("y_m", "y")):
         found.take(found.truth, name, chosen.name, _join(base, f"position.{axis}"))
-    quat = np.stack([found.values(chosen.name, _join(base, f"orientation.{a}")) for a in "wxyz"])
-    norms = np.linalg.norm(quat, axis=0)
+    paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")
+    if not all(found.is_given(chosen.name, path) for path in paths):  # the log's own definition decides
+        return
+    norms = np.linalg.norm(np.stack([found.values(chosen.name, path) for path in paths]), axis=0)
     if norms.shape[0] == 0 or bool(np.any(np.abs(norms - 1.0) < 0.01)):
-        paths = tuple(_join(base, f"orientation.{a}") for a in "wxyz")
         found.take(found.truth, "quat_wxyz", chosen.name, paths)
 
 
