@@ -24,12 +24,12 @@ from pdhef_logtool.records.tracks import StateTrack, concatenate
 
 pytestmark = pytest.mark.slow
 
-#: With the noise that ``phy-ukf-tuned`` looks for in the car.
+#: With the noise that ``phy-ukf-tuned`` and ``physics`` look for in the car.
 NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle()
 NAMES = tuple(s.name for s in SPECS if not s.network)
 #: Those that claim a lateral velocity by a model or by integration.
-FILTERS = ("phy-ukf", "physics-plus", "phy-ukf-tuned")
+FILTERS = ("phy-ukf", "physics-plus", "physics", "phy-ukf-tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
     update={
@@ -44,7 +44,7 @@ MIRRORED = ("vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")
 
 
 def car_of(vehicle: VehicleParameters = VEHICLE) -> Car:
-    return Car.of(vehicle, noise={"phy-ukf-tuned": NOISE})
+    return Car.of(vehicle, noise={"phy-ukf-tuned": NOISE, "physics": NOISE})
 
 
 def run(name: str, signals: Signals, **options) -> StateTrack:
@@ -421,8 +421,8 @@ def test_what_cannot_run_is_skipped_with_the_reason():
     assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
     assert runnable(NAMES, car_of(), frozenset(ALIGNED_SIGNALS))[1] == []
     skipped = runnable(NAMES, Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))[1]
-    assert [s.name for s in skipped] == ["phy-ukf-tuned"]
-    assert "no noise for phy-ukf-tuned; pdhef identify" in skipped[0].reason
+    assert [s.name for s in skipped] == ["physics", "phy-ukf-tuned"]
+    assert all(f"no noise for {s.name}; pdhef identify" in s.reason for s in skipped)
 
 
 def test_the_tuned_filter_takes_its_noise_from_the_car():
