@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from studies.pages import ROOT
+from studies.torture import outside
 from studies.torture.bombs import BOMBS, Bomb, judge_bomb
 from studies.torture.logs import log_judge
 from studies.torture.mutating import mutant
@@ -123,3 +124,11 @@ def test_what_dies_hangs_or_grows_is_told_and_the_rest_goes_on(tmp_path: Path, m
 )
 def test_what_counts_as_wrong(ended: Ended, wrong: bool) -> None:
     assert bool(judge(ended).problem) is wrong
+
+
+@pytest.mark.slow
+def test_a_large_process_does_not_put_its_memory_on_what_it_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(outside, "LIMIT_BYTES", 1 << 40)
+    assert outside.measured("--version").peak_bytes > 0
+    monkeypatch.setattr(outside, "LIMIT_BYTES", 1)
+    assert outside.measured("--version").peak_bytes == 0  # this process is larger: nothing is known
