@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from pdhef_logtool.car.vehicle import NonNegative, PhysicsParts, Positive, Record, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import NonNegative, PhysicsParts, Positive, Record, Sensors, Tyres, VehicleParameters
 from pdhef_logtool.records.documents import one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -78,9 +78,14 @@ class FittedValues(Record):
     @classmethod
     def between(cls, own: VehicleParameters, fitted: VehicleParameters) -> FittedValues:
         """Return the entries of ``fitted`` that are another vehicle's than ``own``."""
-        found = {k: getattr(fitted, k) for k in cls.model_fields if getattr(fitted, k) != getattr(own, k)}
-        if "sensors" in found:
-            found["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
+        same = {k: None for k in cls.model_fields if getattr(fitted, k) == getattr(own, k)}
+        return cls.of(fitted).model_copy(update=same)
+
+    @classmethod
+    def of(cls, fitted: VehicleParameters) -> FittedValues:
+        """Return all entries of a vehicle."""
+        found = {k: getattr(fitted, k) for k in cls.model_fields}
+        found["sensors"] = FittedSensors(**{k: getattr(fitted.sensors, k) for k in FittedSensors.model_fields})
         return cls(**found)
 
     def applied_to(self, vehicle: VehicleParameters) -> VehicleParameters:
@@ -111,6 +116,11 @@ class FilterNoise(Record):
     network_sha256: Sha256 | None = None
     score_deg: Positive | None = None
     trial: int | None = None
+
+    def measurement_std(self, sensors: Sensors) -> tuple[float, float, float]:
+        """Return the 1-sigma of a_y, yaw rate and speed; what it leaves out is the sensors'."""
+        ay, rate, speed = (self.r_std.get(m, own) for m, own in zip(MEASUREMENTS, sensors.measurement_std, strict=True))
+        return ay, rate, speed
 
     @model_validator(mode="after")
     def _one_entry_a_state(self) -> FilterNoise:

@@ -105,6 +105,11 @@ class Sensors(Record):
     yaw_rate_bias_std_rad_s: AngleStd = 0.0015
     steer_bias_std_rad: AngleStd = 0.0008
 
+    @property
+    def measurement_std(self) -> tuple[float, float, float]:
+        """1-sigma of what filters measure: a_y, yaw rate, speed."""
+        return self.ay_std_m_s2, self.yaw_rate_std_rad_s, self.speed_std_m_s
+
 
 class PhysicsParts(Record):
     """Which parts of the model ``physics`` has beside the static single track (METHOD §16); each needs evidence."""
@@ -263,6 +268,8 @@ def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
 def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehicleParameters) -> Signals:
     """Return signals that were read and corrected with one vehicle as another one's ratio, offset and biases do it."""
     before, after = was.sensors, vehicle.sensors
+    if (was.steering_ratio, was.steer_offset_rad, before) == (vehicle.steering_ratio, vehicle.steer_offset_rad, after):
+        return signals
     raw = replace(
         signals,
         steer_rad=(signals.steer_rad + was.steer_offset_rad) * (was.steering_ratio / vehicle.steering_ratio),
@@ -270,10 +277,7 @@ def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehiclePar
         ay_m_s2=signals.ay_m_s2 + before.ay_bias_m_s2,
         yaw_rate_rad_s=signals.yaw_rate_rad_s + before.yaw_rate_bias_rad_s,
     )
-    same = (vehicle.steering_ratio, vehicle.steer_offset_rad, after) == (
-        was.steering_ratio, was.steer_offset_rad, before,
-    )  # fmt: skip
-    return signals if same else correct_signals(raw, vehicle)
+    return correct_signals(raw, vehicle)
 
 
 #: Table 3 of the paper, with METHOD §2's nominal axle tyres. Used when no vehicle file is given.

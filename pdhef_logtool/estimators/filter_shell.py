@@ -303,6 +303,12 @@ def meanwhile(now, memory):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def held_inputs(inputs, k):  # type: ignore[no-untyped-def]
+    """Return the inputs of step k, which a prediction holds."""
+    return Meanwhile(inputs[k, U_STEER], inputs[k, U_AX], inputs[k, U_AX_KNOWN] > 0.0, inputs[k, U_FRICTION])
+
+
+@njit(cache=True)
 def starts(now, rear_m, initial_std, x, P, memory):  # type: ignore[no-untyped-def]
     """Start with the first sample of speed and steering; return whether this is it.
 

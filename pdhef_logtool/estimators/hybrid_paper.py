@@ -249,12 +249,7 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
         if k >= 0:
             x[:] = held_x[k]
             P[:, :] = held_P[k]
-            over = shell.Meanwhile(
-                inputs[k, shell.U_STEER],
-                inputs[k, shell.U_AX],
-                inputs[k, shell.U_AX_KNOWN] > 0.0,
-                inputs[k, shell.U_FRICTION],
-            )
+            over = shell.held_inputs(inputs, k)
             rate_vy, rate_r = trust[k] * rate[k, 0], trust[k] * rate[k, 1]
             if horizon_s[m] > 0.0:
                 draw_sigma_points(x, P, scale, L, chi)

@@ -164,7 +164,7 @@ def _measure(chi, steer, friction, rate_vy, layout, p, points, zeta):  # type: i
 
 
 @njit(cache=True)
-def _add_process_noise(P, q_std, ax_known, dt, layout):  # type: ignore[no-untyped-def]
+def add_process_noise(P, q_std, ax_known, dt, layout):  # type: ignore[no-untyped-def]
     """Add what a step of ``dt`` s makes uncertain: random walks, and the force scale that returns to 0."""
     shell.add_process_noise(P, q_std, ax_known, dt)
     if layout.force_scale >= 0:
@@ -215,7 +215,7 @@ def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-u
             mean_and_covariance(chi, wm, wc, x, P)
             if linked:
                 _cross_covariance(chi_before, chi, x, wc, out_cross[k])
-            _add_process_noise(P, q_std, over.ax_known, now.dt, layout)
+            add_process_noise(P, q_std, over.ax_known, now.dt, layout)
             alive = shell.all_finite(x, P)
             if linked:
                 out_predicted_P[k] = P
@@ -287,17 +287,12 @@ def _predict_outputs(due, held, tuning, layout, p, predicted):  # type: ignore[n
         x[:] = held_x[k]
         P[:, :] = held_P[k]
         rate_vy, rate_r = residual_rate[k, 0], residual_rate[k, 1]
-        over = shell.Meanwhile(
-            inputs[k, shell.U_STEER],
-            inputs[k, shell.U_AX],
-            inputs[k, shell.U_AX_KNOWN] > 0.0,
-            inputs[k, shell.U_FRICTION],
-        )
+        over = shell.held_inputs(inputs, k)
         if horizon_s[m] > 0.0:
             draw_sigma_points(x, P, scale, L, chi)
             _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], layout, p, points)
             mean_and_covariance(chi, wm, wc, x, P)
-            _add_process_noise(P, q_std, over.ax_known, horizon_s[m], layout)
+            add_process_noise(P, q_std, over.ax_known, horizon_s[m], layout)
             if not shell.all_finite(x, P):
                 x[:] = math.nan
                 P[:, :] = math.nan
@@ -343,8 +338,7 @@ class PhysicsUkf:
     @property
     def measurement_std(self) -> FloatArray:
         """1-sigma of [a_y, r, v_x], [3]."""
-        s = self.vehicle.sensors
-        return np.array(self.r_std or (s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s))
+        return np.array(self.r_std or self.vehicle.sensors.measurement_std)
 
     @property
     def layout(self) -> StateLayout:

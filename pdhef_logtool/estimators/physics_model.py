@@ -29,20 +29,20 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S, dynamic_share, substeps
+from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S, MAX_SUBSTEPS, dynamic_share, substeps
 from pdhef_logtool.car.nominal_points import arctangent, sine
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.estimators.physics import FORCE_SCALE_TIME_S
 from pdhef_logtool.records.compiled import njit
 
 #: Entries of the state that every car has, and how many of the others its parts add.
 VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR = range(6)
 CORE = 6
 
-#: Time constants with which bank and force scale return to 0 (METHOD §16).
-BANK_TIME_S, FORCE_SCALE_TIME_S = 5.0, 2.0
+#: Time constant with which the bank returns to 0 (METHOD §16).
+BANK_TIME_S = 5.0
 #: Largest product of step and the roll mode's frequency; longer steps are divided.
 _MAX_ROLL_STEP = 0.5
-_MAX_SUBSTEPS = 32
 #: Grip is never taken to be used up by braking alone: a car that still steers has this share.
 _LEAST_GRIP = 0.2
 #: A body that hardly rolls, rad/(m/s²), tells nothing of the load transfer, which then follows the acceleration.
@@ -136,7 +136,7 @@ def step_count(vx, dt, friction, layout, p, f):  # type: ignore[no-untyped-def]
     n = substeps(vx, dt, friction, p)
     if layout.roll >= 0:
         n = max(n, math.ceil(dt * f.roll_frequency_rad_s / _MAX_ROLL_STEP))
-    return min(n, _MAX_SUBSTEPS)
+    return min(n, MAX_SUBSTEPS)
 
 
 @njit(cache=True)

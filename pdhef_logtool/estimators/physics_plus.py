@@ -194,12 +194,7 @@ def _predict_outputs(due, held, tuning, p, f, predicted):  # type: ignore[no-unt
             continue
         x[:] = held_x[k]
         P[:, :] = held_P[k]
-        over = shell.Meanwhile(
-            inputs[k, shell.U_STEER],
-            inputs[k, shell.U_AX],
-            inputs[k, shell.U_AX_KNOWN] > 0.0,
-            inputs[k, shell.U_FRICTION],
-        )
+        over = shell.held_inputs(inputs, k)
         if horizon_s[m] > 0.0:
             draw_sigma_points(x, P, scale, L, chi)
             _propagate(chi, over, horizon_s[m], p, f)
@@ -244,8 +239,7 @@ class PhysicsPlusUkf:
     @property
     def measurement_std(self) -> FloatArray:
         """1-sigma of [a_y, r, v_x], [3]."""
-        s = self.vehicle.sensors
-        return np.array(self.r_std or (s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s))
+        return np.array(self.r_std or self.vehicle.sensors.measurement_std)
 
     @property
     def _parameters(self) -> tuple[ModelParameters, ForceParameters]:
@@ -296,17 +290,12 @@ def physics_plus(
     vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
 ) -> PhysicsPlusUkf:
     """Return the filter with a noise; what that leaves out is :data:`PHYSICS_PLUS_Q_STD` and the sensors' noise."""
-    sensors = vehicle.sensors
     if noise is None:
         return PhysicsPlusUkf(vehicle, use_speed=use_speed)
     return PhysicsPlusUkf(
         vehicle,
         q_std=(*noise.q_std, *PHYSICS_PLUS_Q_STD[len(noise.q_std) :]),
-        r_std=(
-            noise.r_std.get("ay_m_s2", sensors.ay_std_m_s2),
-            noise.r_std.get("yaw_rate_rad_s", sensors.yaw_rate_std_rad_s),
-            noise.r_std.get("speed_m_s", sensors.speed_std_m_s),
-        ),
+        r_std=noise.measurement_std(vehicle.sensors),
         use_speed=use_speed,
     )
 

@@ -17,16 +17,11 @@ NAME = "phy-ukf-tuned"
 
 def physics_ukf_tuned(vehicle: VehicleParameters, noise: FilterNoise, *, use_speed: bool = True) -> PhysicsUkf:
     """Return the filter with a noise; what that leaves out is ``phy-ukf``'s."""
-    sensors = vehicle.sensors
     q = (*noise.q_std, *PHY_UKF_Q_STD[len(noise.q_std) :])
     return PhysicsUkf(
         vehicle,
         q_std=(q[0], q[1], q[2], q[3]),
-        r_std=(
-            noise.r_std.get("ay_m_s2", sensors.ay_std_m_s2),
-            noise.r_std.get("yaw_rate_rad_s", sensors.yaw_rate_std_rad_s),
-            noise.r_std.get("speed_m_s", sensors.speed_std_m_s),
-        ),
+        r_std=noise.measurement_std(vehicle.sensors),
         use_speed=use_speed,
         roll_correction=True,
         name=NAME,

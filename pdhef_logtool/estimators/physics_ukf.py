@@ -28,12 +28,12 @@ from pdhef_logtool.estimators.physics import (
     FilterCarry,
     LinkColumns,
     StepLinks,
+    add_process_noise,
 )
 from pdhef_logtool.estimators.physics_model import (
     AX_BIAS,
     BANK_TIME_S,
     CORE,
-    FORCE_SCALE_TIME_S,
     FRONT,
     REAR,
     VX,
@@ -48,6 +48,7 @@ from pdhef_logtool.estimators.physics_model import (
     settle_forces,
     step_count,
 )
+from pdhef_logtool.estimators.physics_plus import PHYSICS_PLUS_Q_STD
 from pdhef_logtool.estimators.unscented import cholesky_lower, kalman_update, repair_covariance
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -58,9 +59,9 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.table import Options
 
-#: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own:
-#: by innovation likelihood over simulated drives (``studies.defaults.tune_physics_q``, its result in ``results/``).
-PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
+#: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
+#: and where identification looks for it: that of the filter which had these states before.
+PHYSICS_Q_STD = PHYSICS_PLUS_Q_STD
 #: 1-sigma of the axles' forces over the mass at the start, and at a standstill, m/s².
 _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
 #: 1-sigma of roll (rad) and roll rate (rad/s) at the start and at a standstill, and the roll rate's walk per √s.
@@ -142,12 +143,9 @@ def _predict(x, P, over, dt, noise, layout, p, f, work):  # type: ignore[no-unty
             for i in range(count, points.shape[1]):
                 points[j, i] = points[j, 0]
     _moments(points, x, P, deviation)
-    shell.add_process_noise(P, q_std, over.ax_known, dt)
+    add_process_noise(P, q_std, over.ax_known, dt, layout)
     if layout.bank >= 0:
         P[layout.bank, layout.bank] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
-    if layout.force_scale >= 0:
-        forgotten = 1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S)
-        P[layout.force_scale, layout.force_scale] += FORCE_SCALE_STD**2 * forgotten
 
 
 # positional: as _predict.
@@ -265,12 +263,7 @@ def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignor
             continue
         x[:] = held_x[k]
         P[:, :] = held_P[k]
-        over = shell.Meanwhile(
-            inputs[k, shell.U_STEER],
-            inputs[k, shell.U_AX],
-            inputs[k, shell.U_AX_KNOWN] > 0.0,
-            inputs[k, shell.U_FRICTION],
-        )
+        over = shell.held_inputs(inputs, k)
         if horizon_s[m] > 0.0:
             _predict(x, P, over, horizon_s[m], (q_std, scale), layout, p, f, (points, deviation, L))
             if not shell.all_finite(x, P):
@@ -310,8 +303,7 @@ class PhysicsFilter:
     @property
     def measurement_std(self) -> FloatArray:
         """1-sigma of [a_y, r, v_x], [3]."""
-        s = self.vehicle.sensors
-        return np.array(self.r_std or (s.ay_std_m_s2, s.yaw_rate_std_rad_s, s.speed_std_m_s))
+        return np.array(self.r_std or self.vehicle.sensors.measurement_std)
 
     @property
     def layout(self) -> Layout:
@@ -408,17 +400,12 @@ def physics_filter(
     vehicle: VehicleParameters, noise: FilterNoise | None = None, *, use_speed: bool = True
 ) -> PhysicsFilter:
     """Return the filter with a noise; what that leaves out is :data:`PHYSICS_Q_STD` and the sensors' noise."""
-    sensors = vehicle.sensors
     if noise is None:
         return PhysicsFilter(vehicle, use_speed=use_speed)
     return PhysicsFilter(
         vehicle,
         q_std=(*noise.q_std, *PHYSICS_Q_STD[len(noise.q_std) :]),
-        r_std=(
-            noise.r_std.get("ay_m_s2", sensors.ay_std_m_s2),
-            noise.r_std.get("yaw_rate_rad_s", sensors.yaw_rate_std_rad_s),
-            noise.r_std.get("speed_m_s", sensors.speed_std_m_s),
-        ),
+        r_std=noise.measurement_std(vehicle.sensors),
         use_speed=use_speed,
     )
 

@@ -12,10 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.filter_shell import PosteriorSteps
 from pdhef_logtool.evaluation.segments import smooth
-from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.learning.car.fit_data import FitDrive, period_s
+from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
+#: Error samples that fits use; more only cost time.
+FIT_RATE_HZ = 20.0
 #: Forces are smoothed without phase; accelerometers on real cars show the road above this.
 SMOOTHING_HZ = 2.0
 #: Used where the true speed is above this multiple of the low-speed limit.
@@ -65,6 +69,27 @@ def usable_stamps(drive: FitDrive, vehicle: VehicleParameters) -> BoolArray:
     tame = np.abs(truth.sideslip_rad) < MAX_SIDESLIP_RAD
     use: BoolArray = known & moving & tame & np.isfinite(drive.signals.steer_rad)
     return use
+
+
+def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
+    """Return how long a drive can be used for identification."""
+    return float(np.count_nonzero(usable_stamps(drive, vehicle))) * period_s(drive)
+
+
+def sampled_errors(
+    drive: FitDrive, vehicle: VehicleParameters, steps: PosteriorSteps, settle_s: float
+) -> tuple[FloatArray, BoolArray, float]:
+    """Return a filter's sideslip errors in rad at :data:`FIT_RATE_HZ`, 0 where it does not count, where it does, and s.
+
+    ``settle_s`` : what the filter needs before its error counts. The last value is the time that each error stands for.
+    """
+    every = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive))))
+    pick = slice(None, None, every)
+    error = wrap_angle(np.arctan2(steps.x[pick, 1], steps.x[pick, 0]) - drive.truth.sideslip_rad[pick])
+    stamps = drive.signals.stamps_ns
+    use = usable_stamps(drive, vehicle)[pick] & steps.valid[pick] & np.isfinite(error)
+    use &= (stamps[pick] - stamps[0]) * 1e-9 > settle_s
+    return np.where(use, error, 0.0), use, every * period_s(drive)
 
 
 def axle_samples(drives: Sequence[FitDrive], vehicle: VehicleParameters, *, similar: bool = False) -> AxleSamples:

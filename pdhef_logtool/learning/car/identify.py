@@ -35,19 +35,17 @@ from pdhef_logtool.learning.car.axle_forces import (
     AxleSamples,
     axle_samples,
     fit_axle,
-    usable_stamps,
+    sampled_errors,
+    usable_seconds,
 )
-from pdhef_logtool.learning.car.fit_data import FitDrive, period_s, signals_of
+from pdhef_logtool.learning.car.fit_data import FitDrive, signals_of
 from pdhef_logtool.learning.car.physics_fit import PhysicsFit, find_physics
 from pdhef_logtool.learning.car.prior import Prior
 from pdhef_logtool.records.errors import EstimatorError
-from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
 #: Neighbouring samples are dependent: this much time is worth one independent sample.
 CORRELATION_S = 1.0
-#: Error samples that the fit uses; more only cost time.
-FIT_RATE_HZ = 20.0
 #: The filter needs this long from its start before its error counts.
 SETTLE_S = 3.0
 #: The error that remains is not believed to be smaller than this.
@@ -140,7 +138,7 @@ def fit_car(
     EstimatorError
         There is too little usable driving with truth.
     """
-    usable_s = sum(float(np.count_nonzero(usable_stamps(d, start))) * period_s(d) for d in fit)
+    usable_s = sum(usable_seconds(d, start) for d in fit)
     if usable_s < MIN_DRIVE_S:
         raise EstimatorError(
             expected=f"at least {MIN_DRIVE_S:g} s of driving with truth, above twice the low-speed limit",
@@ -401,15 +399,8 @@ def _sideslip_errors(
     parts = []
     for drive in drives:
         steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
-        every = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive))))
-        pick = slice(None, None, every)
-        beta = np.arctan2(steps.x[pick, 1], steps.x[pick, 0])
-        error = wrap_angle(beta - drive.truth.sideslip_rad[pick])
-        stamps = drive.signals.stamps_ns
-        use = usable_stamps(drive, start)[pick] & steps.valid[pick] & np.isfinite(error)
-        use &= (stamps[pick] - stamps[0]) * 1e-9 > SETTLE_S
-        weight = math.sqrt(every * period_s(drive) / CORRELATION_S)
-        parts.append((np.where(use, error, 0.0), np.where(use, weight, 0.0)))
+        error, use, each_s = sampled_errors(drive, start, steps, SETTLE_S)
+        parts.append((error, np.where(use, math.sqrt(each_s / CORRELATION_S), 0.0)))
     return parts
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedSensors, FittedValues, TriedParts
+from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.learning.car.axle_forces import (
@@ -30,16 +30,17 @@ from pdhef_logtool.learning.car.axle_forces import (
     AxleSamples,
     axle_samples,
     fit_axle,
+    sampled_errors,
+    usable_seconds,
     usable_stamps,
 )
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
 from pdhef_logtool.learning.car.prior import Prior
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.signals import FloatArray
 
-#: Errors stay alike for this long, s; samples of the error a second; what the filter needs before it counts, s.
-CORRELATION_S, FIT_RATE_HZ, SETTLE_S = 1.0, 20.0, 2.0
+#: Errors stay alike for this long, s; what the filter needs before its error counts, s.
+CORRELATION_S, SETTLE_S = 1.0, 2.0
 #: An RMS below this is not believed to be better still.
 FLOOR_RAD = math.radians(0.05)
 #: Spread of log(NIS / dof) about 0.
@@ -165,7 +166,7 @@ def build_car(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveError:
-    """Sideslip errors in rad on one drive at :data:`FIT_RATE_HZ`, 0 where it does not count, and the mean NIS / dof."""
+    """Sideslip errors of one drive as :func:`~.axle_forces.sampled_errors` gives them, and the mean NIS / dof."""
 
     error: FloatArray
     counted: int
@@ -178,11 +179,6 @@ class DriveError:
         return float(np.sqrt(np.sum(self.error**2) / max(self.counted, 1)))
 
 
-def usable_seconds(drive: FitDrive, vehicle: VehicleParameters) -> float:
-    """Return how long a drive can be used for identification."""
-    return float(np.count_nonzero(usable_stamps(drive, vehicle))) * period_s(drive)
-
-
 def drive_errors(
     drives: Sequence[FitDrive], start: VehicleParameters, vehicle: VehicleParameters, noise: FilterNoise
 ) -> list[DriveError]:
@@ -191,16 +187,11 @@ def drive_errors(
     found = []
     for drive in drives:
         steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
-        stamps = drive.signals.stamps_ns
-        every = max(1, round(1.0 / (FIT_RATE_HZ * period_s(drive))))
-        pick = slice(None, None, every)
-        error = wrap_angle(np.arctan2(steps.x[pick, 1], steps.x[pick, 0]) - drive.truth.sideslip_rad[pick])
-        use = usable_stamps(drive, start)[pick] & steps.valid[pick] & np.isfinite(error)
-        use &= (stamps[pick] - stamps[0]) * 1e-9 > SETTLE_S
+        error, use, each_s = sampled_errors(drive, start, steps, SETTLE_S)
         known = steps.nis_dof > 0
         nis = float(np.minimum(steps.nis[known], 50.0).sum() / max(steps.nis_dof[known].sum(), 1.0))
         counted = int(np.count_nonzero(use))
-        found.append(DriveError(np.where(use, error, 0.0), counted, counted * every * period_s(drive), max(nis, 1e-3)))
+        found.append(DriveError(error, counted, counted * each_s, max(nis, 1e-3)))
     return found
 
 
@@ -321,7 +312,7 @@ def _minimise(
 ORDER = ("braking", "force_scale", "bank", "biases", "load_transfer", "roll", "lag")
 #: A part stays if driving that its fits have not seen is worse by this share without it, on average over the folds.
 LEAST_GAIN = 0.01
-#: Steps of a fit that only says whether a part is worth having; it starts where the one without the part ended.
+#: Steps of a fit that only says whether a part is worth having; it starts where the one with the part ended.
 TRIAL_ITERATIONS = 8
 #: Drives from which on folds are whole drives; usable driving that a fold needs, for 75 s chose worse than none would
 #: have (METHOD §14: 150 s cannot choose a structure); nothing within this of a cut.
@@ -439,7 +430,4 @@ def find_physics(
             )
     progress("fitting the physics filter's sideslip to the truth", 0.7)
     found = fit_physics(drives, start, parts, steering_wheel=steering_wheel)
-    vehicle = found.vehicle
-    values = {name: getattr(vehicle, name) for name in FittedValues.model_fields}
-    values["sensors"] = FittedSensors(**{k: getattr(vehicle.sensors, k) for k in FittedSensors.model_fields})
-    return found, FittedPhysics(values=FittedValues(**values), noise=found.noise, tried=tried)
+    return found, FittedPhysics(values=FittedValues.of(found.vehicle), noise=found.noise, tried=tried)
