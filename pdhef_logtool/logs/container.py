@@ -90,7 +90,7 @@ class Block:
         if not len(self):
             return {}
         # 16 bits, where they are enough, sort much faster.
-        fit = self.channel.min() >= 0 and self.channel.max() < 1 << 16
+        fit = self.channel.view(np.uint64).max() < 1 << 16  # an id below 0 is a huge one
         order = np.argsort(self.channel.astype(np.uint16) if fit else self.channel, kind="stable")
         ordered = self.channel[order]
         firsts = [0, *(np.flatnonzero(ordered[1:] != ordered[:-1]) + 1).tolist()]
@@ -101,6 +101,12 @@ class Block:
     def counts(self) -> dict[int, int]:
         """Messages by channel."""
         return {channel: len(rows) for channel, rows in self.rows.items()}
+
+    @property
+    def ordered(self) -> bool:
+        """Whether the log times of no channel step back."""
+        by_channel = (self.log_time_ns[rows] for rows in self.rows.values())
+        return all(bool((times[1:] >= times[:-1]).all()) for times in by_channel)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

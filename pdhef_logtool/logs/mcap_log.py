@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
+from itertools import accumulate
 from pathlib import Path
 from typing import TypeAlias
 
@@ -434,7 +435,7 @@ class McapContainer(FileContainer):
             self.account.decode(extent.at, extent.end)
             return
         first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
-        self.add_span(extent, Span(0, first, last + 1, held))
+        self.add_span(extent, Span(0, first, last + 1, held, block.ordered))
 
     def add_span(self, extent: _Extent, span: Span) -> None:
         """Add a span at the end."""
@@ -484,7 +485,7 @@ class _Walk:
         self.index_end = 0
         self.head = (0, 0, 0)  # of the chunk: first and last log time, size
         self.index_counts: Counter[int] = Counter()
-        self.index_times: list[int] = []  # first and last time of each message index
+        self.index_at: list[tuple[int, int]] = []  # extents of the pairs of time and offset in each message index
         self.index_sound = True
         self.statistics: tuple[int, dict[int, int]] | None = None
         self.statistics_at = (0, 0)
@@ -510,7 +511,7 @@ class _Walk:
             first, last, size, _ = _CHUNK.unpack(source.read(at + 9, _CHUNK.size))
             self.chunk, self.index_end = (at, end), end
             self.head = (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS), size)
-            self.index_counts, self.index_times, self.index_sound = Counter(), [], True
+            self.index_counts, self.index_at, self.index_sound = Counter(), [], True
         elif opcode == Opcode.ATTACHMENT:
             of.note_attachment(at, end)
         elif opcode == Opcode.DATA_END:
@@ -583,33 +584,26 @@ class _Walk:
             raise SpanDamageError(f"a message index that names {n / 16:.10g} messages of channel {channel}")
         if n:
             self.index_counts[channel] = n // 16
-            self.index_times.append(int.from_bytes(of.source.read(at + 15, 8), "little"))
-            self.index_times.append(int.from_bytes(of.source.read(at + 15 + n - 16, 8), "little"))
+            self.index_at.append((at + 15, at + 15 + n))
         self.index_sound = sound
         of.account.decode(at, end)
 
-    def _index_agrees(self) -> bool:
-        """Tell whether the chunk's indexes can be believed without opening it: where all that is told agrees."""
+    def _index_agrees(self) -> tuple[bool, bool]:
+        """Tell whether the chunk's indexes can be believed without opening it, and whether no channel steps back."""
         assert self.chunk is not None
-        size = self.head[2]
-        of = self.of
-        held = self.index_counts.total() * MESSAGE_HEAD.itemsize
+        of, size, counts = self.of, self.head[2], self.index_counts
+        held = counts.total() * MESSAGE_HEAD.itemsize
         if not self.index_sound or not held or held > size or size > of.meter.budget.chunk_bytes:
-            return False
-        if not self.index_counts.keys() <= of._raw_channels.keys():
-            return False
-        return self._times_agree(min(self.index_times), max(self.index_times)) or self._times_agree(*self._all_times())
-
-    def _times_agree(self, first: int, last: int) -> bool:
-        return (min(first, MAX_TIME_NS), min(last, MAX_TIME_NS)) == self.head[:2]
-
-    def _all_times(self) -> tuple[int, int]:
-        """Return the first and the last time in the chunk's indexes, which need not be in order."""
-        assert self.chunk is not None
-        record = self.of.source.read(self.chunk[1], self.index_end - self.chunk[1])
-        indexes = _message_indexes(record, 0)
-        times = np.concatenate([own for _, own, _ in indexes or ()] or [np.zeros(1, dtype=np.uint64)])
-        return int(times.min()), int(times.max())
+            return False, False
+        if not counts.keys() <= of._raw_channels.keys():
+            return False, False
+        first = self.chunk[1]
+        record = of.source.read(first, self.index_end - first)
+        times = np.frombuffer(b"".join([record[a - first : b - first] for a, b in self.index_at]), dtype="<u8")[0::2]
+        back = times[1:] < times[:-1]
+        back[[n - 1 for n in accumulate(counts.values())][:-1]] = False  # from a channel to the next one
+        span = min(int(times.min()), MAX_TIME_NS), min(int(times.max()), MAX_TIME_NS)
+        return span == self.head[:2], not back.any()
 
     def _data_end(self, at: int, end: int) -> None:
         """Note the CRC of the data section."""
@@ -649,9 +643,9 @@ class _Walk:
         if self.chunk is None:
             return
         first, last, size = self.head
-        sound = self._index_agrees()
+        sound, ordered = self._index_agrees()
         fits = self.index_sound and self.index_counts.total() * MESSAGE_HEAD.itemsize <= size
-        span = Span(0, first, last + 1, dict(self.index_counts) if fits else {})
+        span = Span(0, first, last + 1, dict(self.index_counts) if fits else {}, ordered)
         extent, self.chunk = _Extent(*self.chunk, True, self.index_end), None
         if sound and index_complete:
             self.of.add_span(extent, span)

@@ -225,6 +225,10 @@ class _Looked:
                 by_topic[self.topics[id_]] += m
             yield int(times[rows[0]]), int(times[rows[-1]]) + 1, rows.shape[0], by_topic
 
+    def last_ns(self, id_: int) -> int:
+        """Return the last time of a channel, 0 without any."""
+        return self.span.end_ns - 1 if self.found is None else int(self.of_channel(id_).max(initial=0))
+
     def of_channel(self, id_: int) -> IntArray:
         """Return the times of a channel in file order; of a span in order its bounds stand for them."""
         if self.found is None:
@@ -253,8 +257,7 @@ def _look(containers: Sequence[Container], times: SpanTimes) -> list[_Looked]:
                 if found[0].size and (lasts <= 0 or lasts > SILENCE_NS or behind or disorder):
                     of = _Looked(c, span, topics, found)
             for id_ in span.counts:
-                own = of.of_channel(id_)
-                newest[topics[id_]] = max(newest.get(topics[id_], 0), int(own.max()) if own.size else 0)
+                newest[topics[id_]] = max(newest.get(topics[id_], 0), of.last_ns(id_))
             looked.append(of)
     return looked
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
 
 from pdhef_logtool.logs.drive_log import windows
 from pdhef_logtool.logs.occupied_time import (
@@ -19,6 +21,7 @@ from pdhef_logtool.logs.occupied_time import (
     shown_time,
     steps_back,
 )
+from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.signals import IntArray
 
 S = 1_000_000_000
@@ -121,3 +124,24 @@ def test_any_time_can_be_shown() -> None:
     assert shown_time(0) == "1970-01-01 00:00:00 UTC"
     assert shown_time(-1) == "1969-12-31 23:59:59 UTC"
     assert shown_time(LATEST).startswith("2262-04-11")
+
+
+@pytest.mark.parametrize("back_s", [0, 3])
+def test_indexes_say_whether_a_chunk_must_be_looked_at(back_s: int, tmp_path: Path) -> None:
+    """A chunk of 20 s whose first and last time tell nothing of a clock that steps back in its middle."""
+    path = tmp_path / "log.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 30)
+        writer.start()
+        ids = [writer.register_channel(topic, "json", 0) for topic in ("/fast", "/slow")]
+        for i in range(2000):
+            ns = T0 + i * S // 100 - (back_s * S if i >= 1000 else 0)
+            for id_ in ids if i % 10 == 0 else ids[:1]:
+                writer.add_message(id_, ns, b"{}", ns)
+        writer.finish()
+    log = open_log(path)
+    (container,) = log.containers
+    (span,) = container.spans
+    assert span.ordered == (back_s == 0)
+    assert [loss.kind for loss in log.lost] == ([] if back_s == 0 else ["time-jump"])
+    log.close()
