@@ -29,7 +29,7 @@ def block_bootstrap_interval(
     ----------
     errors : NaN does not count. stamps_ns : int64 [N]. block_s : METHOD asks for at least 10 s. n : resamples.
     """
-    sums, counts = _block_sums([errors], stamps_ns, block_s)
+    sums, counts, _ = block_sums([errors], stamps_ns, block_s)
     return _interval(lambda s, c: np.sqrt(s[0] / c), sums, counts, n, seed, level)
 
 
@@ -47,19 +47,24 @@ def block_bootstrap_difference(
 
     ``errors`` belong to the better estimator when the whole interval lies below 0.
     """
-    sums, counts = _block_sums([errors, other_errors], stamps_ns, block_s)
+    sums, counts, _ = block_sums([errors, other_errors], stamps_ns, block_s)
     return _interval(lambda s, c: np.sqrt(s[0] / c) - np.sqrt(s[1] / c), sums, counts, n, seed, level)
 
 
-def _block_sums(columns: list[FloatArray], stamps_ns: IntArray, block_s: float) -> tuple[FloatArray, FloatArray]:
-    """Return sums of squares [columns, blocks] and counts [blocks] of the blocks that hold samples."""
+def block_sums(
+    columns: list[FloatArray], stamps_ns: IntArray, block_s: float = 10.0
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that hold any.
+
+    Blocks are counted from the first stamp at which all columns [N] are known, and hold such stamps alone.
+    """
     known = np.isfinite(np.stack(columns)).all(axis=0)
     if not known.any():
-        return np.zeros((len(columns), 0)), np.zeros(0)
+        return np.zeros((len(columns), 0)), np.zeros(0), np.zeros(0, dtype=np.int64)
     block = (stamps_ns[known] - stamps_ns[known][0]) // round(block_s * 1e9)
-    _, index = np.unique(block, return_inverse=True)
+    numbers, index = np.unique(block, return_inverse=True)
     sums = [np.bincount(index, weights=c[known] ** 2) for c in columns]
-    return np.stack(sums).astype(np.float64), np.bincount(index).astype(np.float64)
+    return np.stack(sums).astype(np.float64), np.bincount(index).astype(np.float64), numbers
 
 
 def _interval(
