@@ -1,7 +1,7 @@
 """Torture, counted: ``docs/reliability.md``.
 
     python -m studies.torture [--work out/torture] [--seed 1] [--logs 200000] [--configs 20000] [--kills 200]
-                              [--hours 10] [--jobs 2] [--only logs ...] [--out docs/reliability.md]
+                              [--hours 10] [--jobs 2] [--only mutations ...] [--out docs/reliability.md]
 
 Resumable: what stands in the work folder is not done again; remove it after a change of the code. Exit code 1:
 something ended as it should not.
@@ -217,6 +217,8 @@ def main() -> int:
         "kills": lambda: kills(work, given.seed, given.kills),
         "hours": lambda: hours(work, given.hours),
     }
+    if unknown := set(given.only or ()) - set(todo):
+        parser.error(f"--only: expected parts out of {', '.join(todo)}, got {', '.join(sorted(unknown))}")
     results: dict[str, Any] = {}
     for name, do in todo.items():
         kept = work / f"{name}.json"
