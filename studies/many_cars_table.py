@@ -79,7 +79,7 @@ def train_networks() -> None:
 
 
 def with_shipped_noise(vehicle: VehicleParameters) -> Car:
-    """Return a car of a vehicle with the filter noise of the shipped one, but that of ``physics``: it has parts there."""
+    """Return a car of a vehicle with the shipped one's filter noise, but that of ``physics``, which has parts there."""
     noise = Car.load("saloon", network="none").noise
     return Car.of(vehicle, noise={n: one for n, one in noise.items() if n != PHYSICS})
 
