@@ -6,8 +6,8 @@ Short drives of one simulated car whose vehicle file is right, with the friction
 network, the regression and the paper's network see the same rows. ``physics`` is fitted on five minutes of other drives
 (:mod:`studies.defaults.fit_physics`), its noise with it. Filter noise of all tuned estimators is chosen on validation
 drives in one search (``pdhef tune``). Seeds other than 0 train networks for spreads and take fit and noise of the
-shipped car. A second set, other cars of the same kind, is for the model card. Logs that are there already as they should
-be are kept.
+shipped car. A second set, of other cars of the same kind, is for the model card. Logs that are there already as they
+should be are kept.
 """
 
 from __future__ import annotations
