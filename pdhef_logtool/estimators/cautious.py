@@ -5,9 +5,9 @@ chosen with a network. Without evidence (METHOD §14) the estimate comes from a 
 detector of ``pd-hef`` takes stuck, dead and spiking samples away from it. Which filter is decided by drives with truth:
 
 - ``physics``, where ``pdhef identify`` found the car through it;
-- else the better of ``phy-ukf-tuned`` and ``physics-plus`` by the scores that ``pdhef tune`` left beside their noise;
+- else the better of ``phy-ukf-tuned`` and ``physics`` by the scores that ``pdhef tune`` left beside their noise;
 - without such scores ``phy-ukf-tuned``, where ``pdhef identify`` chose its noise on this car;
-- else ``physics-plus``, the better one on simulated cars (docs/many_cars.md).
+- else ``physics``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.adaptive_hybrid import MixtureSteps
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import NAME as PLUS
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
@@ -52,13 +51,13 @@ class CautiousPhysics:
     notes : what the report says of it.
     """
 
-    physics: PhysicsUkf | PhysicsPlusUkf | PhysicsFilter
+    physics: PhysicsUkf | PhysicsFilter
     name: str = "pd-hef"
     causal: bool = True
     notes: tuple[str, ...] = ()
 
     @property
-    def calibrated_as(self) -> PhysicsUkf | PhysicsPlusUkf | PhysicsFilter:
+    def calibrated_as(self) -> PhysicsUkf | PhysicsFilter:
         """Whose calibrated intervals hold for it where it has none of its own."""
         return self.physics
 
@@ -78,17 +77,15 @@ class CautiousPhysics:
         return track, CautiousCarry(fault_carry, physics, steps.since(newest))
 
 
-def strongest_physics(car: Car, *, use_speed: bool = True) -> PhysicsUkf | PhysicsPlusUkf | PhysicsFilter:
+def strongest_physics(car: Car, *, use_speed: bool = True) -> PhysicsUkf | PhysicsFilter:
     """Return the filter on physics that drives with truth say is the best on this car (see the head of the file)."""
-    if car.fitted_physics is not None:
-        return of_car(car, use_speed=use_speed)
-    scores = {n: s for n in (TUNED, PLUS) if n in car.noise and (s := car.noise[n].score_deg) is not None}
-    if TUNED not in car.noise:
-        better = PLUS
+    scores = {n: s for n in (TUNED, PHYSICS) if n in car.noise and (s := car.noise[n].score_deg) is not None}
+    if car.fitted_physics is not None or TUNED not in car.noise:
+        better = PHYSICS
     elif len(scores) < 2:
         better = TUNED
     else:
-        better = min(TUNED, PLUS, key=lambda name: scores[name])
+        better = min(TUNED, PHYSICS, key=lambda name: scores[name])
     if better == TUNED:
         return physics_ukf_tuned(car.vehicle, car.noise[TUNED], use_speed=use_speed)
-    return physics_plus(car.vehicle, car.noise.get(PLUS), use_speed=use_speed)
+    return of_car(car, use_speed=use_speed)

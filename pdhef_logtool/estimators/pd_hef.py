@@ -38,7 +38,7 @@ def build(name: str, car: Car, options: Options) -> Estimator:
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedHybrid:
     """Return the hybrid filter smoothed; where trust is 0 and ``phy-ukf-tuned`` is best, that one smoothed.
 
-    ``physics-plus`` has no smoother: where it is best, the hybrid filter at trust 0 is smoothed.
+    Where ``physics`` is best, the hybrid filter at trust 0 is smoothed.
     """
     trust, notes = _trust(car, options)
     network, use_speed = options.service(car), options.use_speed

@@ -1,11 +1,12 @@
-"""Make the car that the package ships from nothing: simulate, extract, train, tune, trust, calibrate.
+"""Make the car that the package ships from nothing: simulate, extract, train, fit, tune, trust, calibrate.
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--jobs 2]
 
 Short drives of one simulated car whose vehicle file is right, with the friction told. The residual network, the direct
-network, the regression and the paper's network see the same rows. Filter noise of all tuned estimators is chosen on
-validation drives in one search (``pdhef tune``). Seeds other than 0 train networks for spreads and take the noise of
-the shipped car. A second set, other cars of the same kind, is for the model card. Logs that are there already as they
+network, the regression and the paper's network see the same rows. ``physics`` is fitted on five minutes of other drives
+(:mod:`studies.defaults.fit_physics`), its noise with it. Filter noise of all tuned estimators is chosen on validation
+drives in one search (``pdhef tune``). Seeds other than 0 train networks for spreads and take fit and noise of the
+shipped car. A second set, of other cars of the same kind, is for the model card. Logs that are there already as they
 should be are kept.
 """
 
@@ -21,13 +22,14 @@ from pathlib import Path
 
 import torch
 
-from pdhef_logtool.car.car import NETWORK_FOLDER, NOISE_FILE, SHIPPED_CARS, UNSURE_FILE, VEHICLE_FILE
+from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, NOISE_FILE, SHIPPED_CARS, UNSURE_FILE, VEHICLE_FILE
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
 from pdhef_logtool.residual_model.bundle import PAPER_FOLDER, SHIPPED
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
+from studies.defaults import fit_physics
 from studies.pages import SAMPLE_VEHICLE, options
 
 HOME = SHIPPED_CARS["saloon"]
@@ -73,7 +75,8 @@ def main(arguments: list[str] | None = None) -> int:
         car.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(SAMPLE_VEHICLE, car / VEHICLE_FILE)
         if given.seed:
-            shutil.copyfile(HOME / NOISE_FILE, car / NOISE_FILE)
+            for part in (FIT_FILE, NOISE_FILE):
+                shutil.copyfile(HOME / part, car / part)
     mapping = work / "mapping.toml"
     mapping.write_text(MAPPING, encoding="utf-8")
     for name, (seed, vehicles) in SETS.items():
@@ -105,6 +108,8 @@ def main(arguments: list[str] | None = None) -> int:
     told += ["--network", SHIPPED if car.resolve() == HOME else network]
     validation = [work / "one_car", "--split", "validation", *told]
     if given.seed == 0:
+        say("fit physics")
+        fit_physics.main(["-o", str(car), "--work", str(work / "fit"), "--jobs", str(given.jobs)])
         say("tune the noise of all tuned estimators alike, on validation drives")
         pdhef("tune", *validation, "--trials", given.trials, "--jobs", given.jobs, "-o", car)
     say("evidence that the network helps on this car")

@@ -18,7 +18,7 @@ from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
 from pdhef_logtool.estimators.pd_hef import build_smoothed
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf, physics_plus
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.smoothed import SmoothedHybrid
 from pdhef_logtool.estimators.table import Options
 from pdhef_logtool.records.reasons import STUCK_YAW_RATE
@@ -31,7 +31,7 @@ from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 pytestmark = pytest.mark.slow
 
 VEHICLE = default_vehicle().model_copy(update={"roll_gradient_rad_per_m_s2": 0.0})
-TABLES = {n: FilterNoise(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics-plus")}
+TABLES = {n: FilterNoise(q_std=(0.1, 0.1, 0.05), r_std={"ay_m_s2": 1.0}) for n in ("phy-ukf-tuned", "physics")}
 COLUMNS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "covariance", "nis", "valid", "reason")
 
 
@@ -51,8 +51,8 @@ def faulty() -> Signals:
 
 def test_without_faults_it_is_the_filter_on_physics() -> None:
     signals = noisy(stuck=False)
-    ours, _ = CautiousPhysics(physics_plus(VEHICLE, None)).run(signals, None)
-    plain, _ = physics_plus(VEHICLE, None).run(signals, None)
+    ours, _ = CautiousPhysics(physics_filter(VEHICLE, None)).run(signals, None)
+    plain, _ = physics_filter(VEHICLE, None).run(signals, None)
     quiet = np.cumsum(ours.reason != 0) == 0  # until the detector's first false alarm, if any
     assert quiet.sum() > 300
     np.testing.assert_array_equal(ours.vy_m_s[quiet], plain.vy_m_s[quiet])
@@ -62,9 +62,9 @@ def test_without_faults_it_is_the_filter_on_physics() -> None:
 
 def test_a_stuck_gyro_is_left_out_and_said(faulty: Signals) -> None:
     truth = drive(slalom(0.035, 0.5), 10.0, speed=22.0)
-    ours, _ = CautiousPhysics(physics_plus(VEHICLE, None)).run(faulty, None)
-    plain, _ = physics_plus(VEHICLE, None).run(faulty, None)
-    healthy, _ = physics_plus(VEHICLE, None).run(noisy(stuck=False), None)
+    ours, _ = CautiousPhysics(physics_filter(VEHICLE, None)).run(faulty, None)
+    plain, _ = physics_filter(VEHICLE, None).run(faulty, None)
+    healthy, _ = physics_filter(VEHICLE, None).run(noisy(stuck=False), None)
     assert len(truth.signals) == len(faulty)
     hurt, heeded = (np.nanmax(np.abs(t.sideslip_rad - healthy.sideslip_rad)) for t in (plain, ours))
     assert heeded < 0.5 * hurt
@@ -74,7 +74,7 @@ def test_a_stuck_gyro_is_left_out_and_said(faulty: Signals) -> None:
 @settings(derandomize=True, deadline=None, max_examples=10)
 @given(st.lists(st.integers(0, 1001), max_size=6))
 def test_windows_of_any_cut_join_bit_for_bit(faulty: Signals, inner: list[int]) -> None:
-    estimator = CautiousPhysics(physics_plus(VEHICLE, None))
+    estimator = CautiousPhysics(physics_filter(VEHICLE, None))
     whole, _ = estimator.run(faulty, None)
     parts, carry = [], None
     for first, end in pairwise([0, *sorted(min(i, len(faulty)) for i in inner), len(faulty)]):
@@ -88,11 +88,11 @@ def test_windows_of_any_cut_join_bit_for_bit(faulty: Signals, inner: list[int]) 
 @pytest.mark.parametrize(
     ("tables", "scores", "name"),
     [
-        ((), [], "physics-plus"),
+        ((), [], "physics"),
         (("phy-ukf-tuned",), [], "phy-ukf-tuned"),
-        (("phy-ukf-tuned", "physics-plus"), [], "phy-ukf-tuned"),
-        (("phy-ukf-tuned", "physics-plus"), [0.14, 0.11], "physics-plus"),
-        (("phy-ukf-tuned", "physics-plus"), [0.11, 0.14], "phy-ukf-tuned"),
+        (("phy-ukf-tuned", "physics"), [], "phy-ukf-tuned"),
+        (("phy-ukf-tuned", "physics"), [0.14, 0.11], "physics"),
+        (("phy-ukf-tuned", "physics"), [0.11, 0.14], "phy-ukf-tuned"),
     ],
 )
 def test_drives_with_truth_choose_the_filter(tables: tuple[str, ...], scores: list[float], name: str) -> None:
@@ -100,7 +100,7 @@ def test_drives_with_truth_choose_the_filter(tables: tuple[str, ...], scores: li
     noise = {n: TABLES[n].model_copy(update={"score_deg": s}) for n, s in zip(tables, told, strict=True)}
     chosen = strongest_physics(Car.of(VEHICLE, noise=noise))
     assert chosen.name == name
-    assert isinstance(chosen, PhysicsPlusUkf) == (name == "physics-plus")
+    assert isinstance(chosen, PhysicsFilter) == (name == "physics")
 
 
 def test_the_smoothed_one_has_the_noise_of_the_tuned_filter(faulty: Signals) -> None:

@@ -215,7 +215,7 @@ def _noise(tuned: Tuned, car: Car) -> FilterNoise:
     network = car.network if spec_of(tuned.name).network else None
     return filter_tuning(tuned.best.values).model_copy(
         update={
-            "physics_sha256": car.physics_sha256,
+            "physics_sha256": car.physics_of(tuned.name),
             "network_sha256": None if network is None else network.sha256,
             "score_deg": round(tuned.best.score.objective_deg, 4),
             "trial": tuned.best.number,

@@ -15,10 +15,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.drive.reading import MAX_BYTES, too_big
 from pdhef_logtool.drive.reading import Drive as ReadDrive
-from pdhef_logtool.estimators.table import SPECS, Options, spec_of
+from pdhef_logtool.estimators.table import SPECS, Options, former, spec_of
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.noise.search import DriveError, drive_error
 from pdhef_logtool.logs.discovery import LogInput
@@ -49,7 +49,8 @@ def choose_names(names: Sequence[str] | None, car: Car, *, with_network: bool) -
 
     Parameters
     ----------
-    names : None = every one that is always tuned and that the car suits. with_network : among them those with one.
+    names : None = every one that is always tuned and that the car suits, without ``physics`` where the car has a fit of
+        it: its noise was found together with its values. with_network : among them those with one.
 
     Raises
     ------
@@ -59,11 +60,15 @@ def choose_names(names: Sequence[str] | None, car: Car, *, with_network: bool) -
     tunable = {s.name: s for s in SPECS if s.tunable}
     if names is None:
         usual = (s for s in tunable.values() if s.tunable == "always" and (with_network or not s.network))
-        return tuple(s.name for s in usual if not (s.network and car.network is None))
+        fitted = () if car.fitted_physics is None else (PHYSICS,)
+        return tuple(s.name for s in usual if s.name not in fitted and not (s.network and car.network is None))
     wrong = sorted({n for n in names if n not in tunable or names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
-            expected=f"estimators out of {', '.join(tunable)}", got=", ".join(wrong) or "none", where="--estimators"
+            expected=f"estimators out of {', '.join(tunable)}",
+            got=", ".join(wrong) or "none",
+            where="--estimators",
+            remedy=former(wrong),
         )
     if car.network is None and (without := [n for n in names if tunable[n].network]):
         raise UsageError(expected="a network", got="none", where=", ".join(without), remedy="give --network")
