@@ -46,7 +46,7 @@ VARY = 0.1
 COLUMNS = {
     "phy-ukf-tuned": ("phy-ukf-tuned", "one"),
     "physics-plus": ("physics-plus", "one"),
-    "trust 0": ("pd-hef-trust0", "one"),
+    "trust 0": ("physics", "one"),
     "one car": ("pd-hef-trust1", "one"),
     "many cars": ("pd-hef-trust1", "many"),
 }

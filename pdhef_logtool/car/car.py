@@ -34,6 +34,7 @@ from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     NO_MODEL,
+    PHYSICS_MODEL,
     SHIPPED,
     SHIPPED_FOLDERS,
     ModelBundle,
@@ -166,6 +167,11 @@ class Car:
     def noise_sha256(self) -> str:
         """Digest of the filters' noise."""
         return noise_sha256(self.noise)
+
+    @property
+    def residual_network(self) -> ModelBundle | None:
+        """The network, if it says what ``physics`` lacks; that of the paper says what ``phy-ukf`` lacks."""
+        return self.network if self.network is not None and self.network.model == PHYSICS_MODEL else None
 
     @property
     def allowed_trust(self) -> AllowedTrust:

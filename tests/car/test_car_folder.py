@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from pdhef_logtool.estimators.cautious import strongest_physics
 
 from pdhef_logtool.car import store
 from pdhef_logtool.car.car import (
@@ -44,7 +45,6 @@ from pdhef_logtool.car.parts import (
 )
 from pdhef_logtool.car.store import Change, check_output, update_car, write_change
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
-from pdhef_logtool.estimators.cautious import strongest_physics
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records import outputs
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pdhef_logtool.estimators.cautious import CautiousPhysics
 from reference_car import drive, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
@@ -16,7 +17,6 @@ from pdhef_logtool.car.parts import Algorithm, FilterNoise, IntervalEntry, Inter
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead, run_window
-from pdhef_logtool.estimators.cautious import CautiousPhysics
 from pdhef_logtool.estimators.table import SPECS, Options, default_names, make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals

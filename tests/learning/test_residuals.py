@@ -44,7 +44,7 @@ def noisy(motion: Motion) -> DriveWindow:
 
 def rows_of(*windows: DriveWindow, half_window: int = 0, **changes: float) -> ResidualRows:
     car = CAR.model_copy(update=changes)
-    return join_rows(residual_windows(windows, car, period_s=0.01, half_window=half_window))
+    return join_rows(residual_windows(windows, parallel_filter(car), period_s=0.01, half_window=half_window))
 
 
 def rates(rows: ResidualRows) -> np.ndarray:

@@ -16,13 +16,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
+from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
-from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import LearnSettings, choose_drives, load_drive

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pdhef_logtool.estimators.hybrid import hybrid_ukf
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.hybrid import hybrid_ukf
 from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.evaluation.metrics import score_track
 from pdhef_logtool.learning.drives import choose_drives

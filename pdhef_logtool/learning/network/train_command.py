@@ -14,11 +14,13 @@ import numpy as np
 from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.learning.plots import new_figure, png_bytes
-from pdhef_logtool.records.errors import ModelError, UsageError
+from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
+    NOMINAL_MODEL,
+    PHYSICS_MODEL,
     RESIDUAL,
     WEIGHTS_FILE,
     ModelBundle,
@@ -82,12 +84,33 @@ def run_training(
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
-    data = read_dataset(dataset)
+    data = dataset_for(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
     bundle = None if init is None else open_model(init)
+    if bundle is not None and bundle.model != data.model:
+        raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=str(init))
     start = None if init is None else model_folder(init)
     check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
+
+
+def dataset_for(folder: Path, model: str) -> Dataset:
+    """Open a dataset whose residuals are those of a model.
+
+    Raises
+    ------
+    OutputError
+        It is none, or one of another model.
+    """
+    data = read_dataset(folder)
+    if data.model != model:
+        raise OutputError(
+            expected=f"residuals of {model}",
+            got=f"those of {data.model}",
+            where=str(folder),
+            remedy=f"pdhef extract LOG... -o DATASET --model {model} writes them, into another folder",
+        )
+    return data
 
 
 def make_recipe(*, paper: bool, seed: int, epochs: int | None, device: str) -> Recipe:
@@ -136,7 +159,7 @@ def train_on(
         "test_loss": test_loss,
         "training_hours": round(sum(len(s.weight) for s in splits["train"]) * recipe.period_s / 3600.0, 3),
     }
-    bundle = replace(bundle, provenance=provenance)
+    bundle = replace(bundle, provenance=provenance, model=data.model, physics_sha256=data.physics_sha256)
     write_bytes(output / HISTORY_FILE, _history_table(history))
     write_bytes(output / PLOT_FILE, _plot_history(history))
     bundle.save(output)
