@@ -45,8 +45,7 @@ VARY = 0.1
 #: Estimator by the name in the table: registered name, and which network it has.
 COLUMNS = {
     "phy-ukf-tuned": ("phy-ukf-tuned", "one"),
-    "physics-plus": ("physics-plus", "one"),
-    "trust 0": ("physics", "one"),
+    "physics": ("physics", "one"),
     "one car": ("pd-hef-trust1", "one"),
     "many cars": ("pd-hef-trust1", "many"),
 }
@@ -118,7 +117,7 @@ def fine_tuned(network: ModelBundle, work: Path) -> dict[str, Errors]:
         drawn = with_shipped_noise(load_vehicle(vehicle_file))
         columns = {
             "phy-ukf-tuned": ("phy-ukf-tuned", network),
-            "physics-plus": ("physics-plus", network),
+            "physics": ("physics", network),
             "many cars": ("pd-hef-trust1", network),
             "many cars, fine-tuned": ("pd-hef-trust1", own),
         }
@@ -140,15 +139,15 @@ def score(cases: Iterable[Case], columns: Mapping[str, tuple[str, ModelBundle]])
 
 
 def error_table(found: Mapping[str, Errors]) -> str:
-    """Return a Markdown table: median and pooled RMSE, and the ratio of medians to ``physics-plus`` with its bounds."""
+    """Return a Markdown table: median and pooled RMSE, and the ratio of medians to ``physics`` with its bounds."""
     body = []
-    yardstick = np.array(found["physics-plus"])[:, 0]
+    yardstick = np.array(found["physics"])[:, 0]
     for column, errors in found.items():
         rmse, samples = np.array(errors).T
         b = median_ratio(rmse, yardstick)
         figures = (f"{np.nanmedian(rmse):.3f}", f"{pooled_rmse(rmse, samples):.3f}")
         body.append([column, *figures, f"{b.value:.2f} [{b.low:.2f}, {b.high:.2f}]"])
-    return table(["estimator", "median °", "pooled °", "median over that of `physics-plus`"], body)
+    return table(["estimator", "median °", "pooled °", "median over that of `physics`"], body)
 
 
 def main() -> None:
@@ -181,8 +180,7 @@ def main() -> None:
 def page(found: Mapping[str, Mapping[str, Errors]], models: dict[str, ModelBundle]) -> str:
     """Return the page."""
     parts = [
-        f"## {title}\n\n{len(scores['physics-plus'])} drives.\n\n{error_table(scores)}\n"
-        for title, scores in found.items()
+        f"## {title}\n\n{len(scores['physics'])} drives.\n\n{error_table(scores)}\n" for title, scores in found.items()
     ]
     networks = "\n".join(
         f"- **{name}**: {len(m.feature_names)} features, {m.layers} × {m.hidden}, validation loss"

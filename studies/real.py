@@ -213,7 +213,7 @@ def run_case(case: Case, network: Path, trials: int) -> list[Result]:
         config = replace(config, network=folder / "last")
         tune(log, folder / "tuned", TuneSettings(config=config, trials=trials), warn=say)
         tuned = Car.load(folder / "tuned", network=NO_MODEL)
-        add("tuned", tuned, [n for n in physics if n in ("phy-ukf-tuned", "physics-plus")])
+        add("tuned", tuned, [n for n in physics if n in ("phy-ukf-tuned", "physics")])
         add(f"tuned, {last}", with_evidence(case, tuned, bundle), hybrids)
     return results
 

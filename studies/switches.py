@@ -37,7 +37,7 @@ from truthsim.drive import simulate_drive, write_drive
 from truthsim.faults import parse_fault
 
 FIRST_SEED = 11000
-ESTIMATORS = ("phy-ukf-tuned", "physics-plus", "pd-hef")
+ESTIMATORS = ("phy-ukf-tuned", "physics", "pd-hef")
 #: Ratios nearer to 1 than this are no difference that matters.
 TRIFLE = 0.01
 #: Names of the drives that the table of conditions makes, and how the others are made.
@@ -124,13 +124,18 @@ def option_switch(title: str, drives: str, name: str, default: dict[str, bool]) 
 
 
 _ALL = dict.fromkeys(ESTIMATORS, True)
-_BIAS_STATES = {"phy-ukf-tuned": False, "physics-plus": True, "pd-hef": False}
+_OF_HYBRID = {"phy-ukf-tuned": False, "pd-hef": False}
+_ROLLING = {"phy-ukf-tuned": True, "pd-hef": True}
+_PART = {"physics": True}
 SWITCHES = (
-    option_switch("bias states of a_y, yaw rate, steering", "bias", "bias_states", _BIAS_STATES),
-    option_switch("bias states of a_y, yaw rate, steering", "in-domain", "bias_states", _BIAS_STATES),
-    option_switch("bias states of a_y, yaw rate, steering", "bank-and-grade", "bias_states", _BIAS_STATES),
-    option_switch("body-roll correction of a_y", "in-domain", "roll_correction", _ALL),
-    option_switch("body-roll correction of a_y", "bank-and-grade", "roll_correction", _ALL),
+    option_switch("bias states of a_y, yaw rate, steering", "bias", "bias_states", _OF_HYBRID),
+    option_switch("bias states of a_y, yaw rate, steering", "in-domain", "bias_states", _OF_HYBRID),
+    option_switch("bias states of a_y, yaw rate, steering", "bank-and-grade", "bias_states", _OF_HYBRID),
+    option_switch("part biases", "bias", "biases", _PART),
+    *(option_switch(f"part {p.replace('_', ' ')}", "in-domain", p, _PART) for p in PhysicsParts.model_fields),
+    option_switch("part bank", "bank-and-grade", "bank", _PART),
+    option_switch("body-roll correction of a_y", "in-domain", "roll_correction", _ROLLING),
+    option_switch("body-roll correction of a_y", "bank-and-grade", "roll_correction", _ROLLING),
     option_switch("standstill", "stops", "standstill", _ALL),
     option_switch("slip gate", "starts", "slip_gate", _ALL),
     option_switch("slip gate", "in-domain", "slip_gate", _ALL),
@@ -232,19 +237,21 @@ def compare(switch: Switch, estimator: Estimator, drive: ConditionDrive) -> list
 
 
 NOTES = """How each is switched:
-- *Bias states*: the filter estimates the biases of a_y, yaw rate and steering angle, or does not. `physics-plus` ships
-  with them, `pd-hef` and `phy-ukf-tuned` without; the noise is that of the shipped file either way.
+- *Bias states*: the filter estimates the biases of a_y, yaw rate and steering angle, or does not; the noise is that of
+  the shipped file either way.
+- *Parts* of `physics`: with values and noise that were found with all of its parts, also where one is switched off;
+  what one is worth when the others are fitted without it, stands in `tried` of the car's `fit.toml`.
 - *Body-roll correction*: the filter's a_y holds g times the roll gradient, or is taken for planar.
 - *Standstill*: motion is held at zero while the car stands, and the bias of a_x is learnt there, or it just filters on.
 - *Slip gate*: speed samples of wheels that spin or lock are left out, or used
   ([estimators.md](estimators.md#wheel-slip-which-speed-is-believed)).
 - *Prediction over the latency*: the newest step that had arrived is predicted to the stamp, or stands there as it is.
 - *The steering's own measurement time*: each channel is put where it was measured, however late it came, and the step
-  waits for it; or the steering counts as measured when it arrived, and nothing waits. The two filters on physics alone
+  waits for it; or the steering counts as measured when it arrived, and nothing waits. A filter on physics alone may be
   are better with a steering angle that is old even where the right one is there in time: presumably it stands for the
   lag of body and tyres that their model lacks. What does harm there is the model, not the timing.
-- *Grade* has no switch: the bias of a_x, which takes it up, is a state of every filter. *Bank* has no state of its own;
-  where there is a bias of a_y that takes it up, which is the third row.
+- *Grade* has no switch: the bias of a_x, which takes it up, is a state of every filter. *Bank* is a part of `physics`;
+  the other filters have no state of it, a bias of a_y takes it up where there is one.
 
 `pd-hef` is switched in its two filters; the parallel filter that feeds its network stays as it was trained with, save
 the slip gate and the two of latency, which hold for all of it. The noise was tuned with the switches as they ship (the

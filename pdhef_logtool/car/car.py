@@ -17,10 +17,12 @@ from typing import Any, TypeVar
 
 from pdhef_logtool.car.flat import FlatCar, read_flat
 from pdhef_logtool.car.parts import (
+    FORMER_FILTERS,
     PHYSICS,
     FilterNoise,
     Fit,
     FittedPhysics,
+    FittedValues,
     Intervals,
     LearntOn,
     Noise,
@@ -120,7 +122,7 @@ class Car:
 
         >>> car = Car.load("saloon")
         >>> car.vehicle.mass_kg, sorted(car.noise), car.allowed_trust.cap
-        (1440.0, ['pd-hef', 'phy-ukf-tuned', 'physics-plus'], 1.0)
+        (1440.0, ['pd-hef', 'phy-ukf-tuned', 'physics'], 1.0)
         """
         source = SHIPPED_CARS.get(str(path), None if path is None else Path(path))
         folder = source if source is not None and source.is_dir() else None
@@ -162,6 +164,14 @@ class Car:
         """The vehicle as ``physics`` has it: with the values that were found through it, else every filter's."""
         found = self.fitted_physics
         return self.vehicle if found is None else found.values.applied_to(self.own)
+
+    def physics_of(self, name: str) -> str:
+        """Return the digest of the physics that the filter of a name runs with, and that its noise belongs to."""
+        return physics_sha256(self.physics_vehicle if name == PHYSICS else self.vehicle)
+
+    def owns_noise(self, name: str, noise: FilterNoise) -> bool:
+        """Whether noise of a filter belongs to the physics that it has here."""
+        return noise.physics_sha256 in (None, self.physics_of(name))
 
     @property
     def noise_sha256(self) -> str:
@@ -206,16 +216,14 @@ class Car:
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
         vehicle = fit.values.applied_to(self.own)
+        found = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
         if vehicle != self.own and not vehicle.name.endswith("(identified)"):
             vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
-        here = physics_sha256(vehicle)
-        noise = {n: one for n, one in self.noise.items() if one.physics_sha256 in (None, here)} | fit.filter
+        noise = {n: one for n, one in self.noise.items() if found.owns_noise(n, one)} | fit.filter
         if fit.physics is not None:
             noise[PHYSICS] = fit.physics.noise
         trust = self.trust if vehicle == self.own else None
-        return replace(
-            self, vehicle=vehicle, noise=noise, trust=trust, learnt_on=fit.drives, fitted_physics=fit.physics
-        )
+        return replace(found, vehicle=vehicle, noise=noise, trust=trust, learnt_on=fit.drives)
 
     def with_noise(self, name: str, noise: FilterNoise) -> Car:
         """Return the car with another noise of one filter."""
@@ -224,47 +232,41 @@ class Car:
     def with_vehicle(self, vehicle: VehicleParameters) -> Car:
         """Return the car with other physics, made wrong on purpose, and everything else as it is, its trust too.
 
-        What was found through ``physics`` is left out: it would put the right values back.
+        What was found through ``physics`` stays but for the entries that are changed: it would put the right ones back.
         """
-        trust = self.trust
+        trust, physics = self.trust, self.fitted_physics
+        other = {k: v for k, v in vehicle if v != getattr(self.vehicle, k)}
+        if physics is not None:
+            told = {k: None for k in FittedValues.model_fields if k in other}
+            physics = physics.model_copy(update={"values": physics.values.model_copy(update=told)})
         if trust is not None and trust.physics_sha256 == self.physics_sha256:
             trust = trust.model_copy(update={"physics_sha256": None})
-        return replace(self, vehicle=vehicle, trust=trust, fitted_physics=None)
+        own = self.own.model_copy(update=other)
+        return replace(self, vehicle=vehicle, own=own, trust=trust, fitted_physics=physics)
 
 
 def _with_parts(car: Car, flat: FlatCar, folder: Path | None) -> Car:
     """Return the car with fit, noise and trust: those of the file, then those of the folder that are not stale."""
     notes: list[str] = []
-    noise, trust, learnt_on = dict(flat.noise), flat.trust, flat.learnt_on
-    vehicle, physics = car.own, flat.physics
+    car = replace(car, noise=dict(flat.noise), trust=flat.trust, learnt_on=flat.learnt_on, fitted_physics=flat.physics)
+    tuned: Mapping[str, FilterNoise] = {}
     if folder is not None:
-        own = physics_sha256(vehicle)
         fit = _part(folder / FIT_FILE, Fit)
-        if fit is not None and fit.physics_sha256 == own:
-            car = replace(car, noise=noise).with_fit(fit)
-            vehicle, noise, learnt_on, trust = car.vehicle, dict(car.noise), car.learnt_on, car.trust
-            physics = car.fitted_physics
+        if fit is not None and fit.physics_sha256 == physics_sha256(car.own):
+            car = car.with_fit(fit)
         elif fit is not None:
             notes.append(_stale(FIT_FILE, f"{VEHICLE_FILE} has changed since", "pdhef identify"))
-        tuned, stale = _part(folder / NOISE_FILE, Noise), list[str]()
-        here = physics_sha256(vehicle)
-        for name, one in ({} if tuned is None else tuned.filter).items():
-            if one.physics_sha256 in (None, here):
-                noise[name] = one
-            else:
-                stale.append(name)
-        if stale:
-            notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "pdhef tune"))
-        trust = _part(folder / NETWORK_FILE, Trust) or trust
-    return replace(
-        car,
-        vehicle=vehicle,
-        noise=noise,
-        trust=trust,
-        learnt_on=learnt_on,
-        fitted_physics=physics,
-        notes=tuple(notes),
-    )
+        found = _part(folder / NOISE_FILE, Noise)
+        tuned = {} if found is None else found.filter
+        car = replace(car, trust=_part(folder / NETWORK_FILE, Trust) or car.trust)
+    noise = {**car.noise, **{n: one for n, one in tuned.items() if car.owns_noise(n, one)}}
+    if stale := [n for n, one in tuned.items() if n not in FORMER_FILTERS and not car.owns_noise(n, one)]:
+        notes.append(_stale(f"noise of {', '.join(stale)}", "it belongs to other physics", "pdhef tune"))
+    for name in sorted(FORMER_FILTERS.keys() & (noise.keys() | tuned.keys())):
+        now = FORMER_FILTERS[name]
+        notes.append(_stale(f"noise of {name}", f"{name} is {now} now", "pdhef tune"))
+        noise.pop(name, None)
+    return replace(car, noise=noise, notes=tuple(notes))
 
 
 def _stale(what: str, why: str, command: str) -> str:

@@ -21,7 +21,15 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 #: The filter on physics that has parts of its own.
 PHYSICS = "physics"
 #: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
-NOISY_FILTERS = ("phy-ukf-tuned", "physics-plus", PHYSICS, "pd-hef", "pd-hef-smoothed")
+NOISY_FILTERS = ("phy-ukf-tuned", PHYSICS)
+#: Filters of older versions by name, and what stands for them or for their noise now. A file may hold noise of theirs;
+#: it is not used.
+FORMER_FILTERS = {
+    "physics-plus": PHYSICS,
+    "pd-hef-trust0": PHYSICS,
+    "pd-hef": "physics with a network",
+    "pd-hef-smoothed": "physics with a network",
+}
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
@@ -102,7 +110,7 @@ class FilterNoise(Record):
     Attributes
     ----------
     q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
-        ``physics`` and ``physics-plus`` also of the two axle forces. Empty: the filter's own.
+        ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
     physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, for filters that have one.
     score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
@@ -131,14 +139,17 @@ class FilterNoise(Record):
 
 def _axle_forces_belong_to_physics(tables: dict[str, FilterNoise]) -> dict[str, FilterNoise]:
     for name, table in tables.items():
-        if len(table.q_std) == 6 and name not in (PHYSICS, "physics-plus"):
-            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics's and physics-plus's")
+        if len(table.q_std) == 6 and name not in (PHYSICS, *FORMER_FILTERS):
+            raise ValueError(f"q_std of {name} needs 3 or 4 entries, 6 are physics's")
     return tables
 
 
 #: Noise by filter.
 FilterTables = Annotated[
-    dict[Annotated[str, one_of(NOISY_FILTERS), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})], FilterNoise],
+    dict[
+        Annotated[str, one_of((*NOISY_FILTERS, *FORMER_FILTERS)), Field(json_schema_extra={"enum": [*NOISY_FILTERS]})],
+        FilterNoise,
+    ],
     AfterValidator(_axle_forces_belong_to_physics),
 ]
 

@@ -52,7 +52,6 @@ from pdhef_logtool.estimators.physics_model import (
     settle_forces,
     step_count,
 )
-from pdhef_logtool.estimators.physics_plus import PHYSICS_PLUS_Q_STD
 from pdhef_logtool.estimators.unscented import cholesky_lower, kalman_update, repair_covariance
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -63,8 +62,9 @@ if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
 
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
-#: and where identification looks for it: that of the filter which had these states before.
-PHYSICS_Q_STD = PHYSICS_PLUS_Q_STD
+#: and where identification looks for it. By innovation likelihood over simulated drives, as that of ``phy-ukf``
+#: (``studies.defaults.tune_physics_q``, its result in ``results/``), of a filter with lag, load transfer and biases.
+PHYSICS_Q_STD = (0.085, 0.12, 0.012, 0.086, 0.41, 0.41)
 #: 1-sigma of the axles' forces over the mass at the start, and at a standstill, m/s².
 _FORCE_STD, _STANDSTILL_FORCE_STD = 0.5, 0.05
 #: 1-sigma of roll (rad) and roll rate (rad/s) at the start and at a standstill, and the roll rate's walk per √s.
@@ -477,7 +477,14 @@ def physics_filter(
 
 
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:
-    """Return ``physics`` of a car, with what was found through it and its noise where the car has them."""
-    vehicle = car.physics_vehicle
-    found = physics_filter(vehicle, car.noise.get(PHYSICS), use_speed=use_speed)
+    """Return ``physics`` of a car, with what was found through it and its noise where the car has them.
+
+    A car of which nothing was found has no part: a static single track with the sensors' noise. What tuned noise leaves
+    out of the process noise is what was found through the filter.
+    """
+    vehicle, noise = car.physics_vehicle, car.noise.get(PHYSICS)
+    if noise is not None and car.fitted_physics is not None:
+        fitted = car.fitted_physics.noise.q_std
+        noise = noise.model_copy(update={"q_std": (*noise.q_std, *fitted[len(noise.q_std) :])})
+    found = physics_filter(vehicle, noise, use_speed=use_speed)
     return found if vehicle == car.vehicle else replace(found, read_with=car.vehicle)

@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Literal
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import FORMER_FILTERS
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
@@ -131,12 +132,8 @@ SPECS: tuple[Spec, ...] = (
         "physics:build", _ESP, 0x0072B2,
     ),
     Spec(
-        "physics-plus", "the strongest filter on physics alone: lagging axle forces, load transfer, roll, biases",
-        "physics_plus:build", _ESP, 0x44AA99, tunable=True,
-    ),
-    Spec(
-        "physics", "filter on physics with the parts and noise that driving of this car gave evidence for",
-        "adaptive_physics:build", _ESP, 0x88CCEE, needs_noise=True,
+        "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
+        "adaptive_physics:build", _ESP, 0x44AA99, tunable=True,
     ),
     Spec(
         "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",
@@ -194,8 +191,16 @@ def check_names(names: Sequence[str]) -> None:
     wrong = [n for n in names if n not in known] + sorted({n for n in names if names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
-            expected=f"estimators out of {', '.join(known)}", got=", ".join(wrong) or "none", where="--estimators"
+            expected=f"estimators out of {', '.join(known)}",
+            got=", ".join(wrong) or "none",
+            where="--estimators",
+            remedy=former(wrong),
         )
+
+
+def former(names: Sequence[str]) -> str:
+    """Return what stands now for estimators of older versions, empty if none of the names is one."""
+    return "; ".join(f"{n} is {FORMER_FILTERS[n]} now" for n in names if n in FORMER_FILTERS)
 
 
 def default_names(car: Car) -> tuple[str, ...]:

@@ -1,11 +1,12 @@
 """Find the process noise of a filter on physics by innovation likelihood, without any truth.
 
-    python -m studies.defaults.tune_physics_q {phy-ukf,physics-plus}
+    python -m studies.defaults.tune_physics_q {phy-ukf,physics}
 
 Maximises the mean over manoeuvres of the log-likelihood per scalar innovation, so that minutes of straight road do
 not outvote a lane change. R stays at sensor level (vehicle file). Nelder-Mead on the logarithms of the 1-sigma values,
 from several starts, and of ``phy-ukf`` then anew from the best, for as long as that gains. The results
-results/physics_q.json and results/physics_plus_q.json are entered as PHY_UKF_Q_STD and PHYSICS_PLUS_Q_STD.
+results/physics_q.json and results/physics_parts_q.json are entered as PHY_UKF_Q_STD and PHYSICS_Q_STD; ``physics`` has
+lag, load transfer and bias states there, with the values of the vehicle file.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray
 from studies.defaults.tuning_drives import VEHICLE_FILE, TuningDrive, sideslip_rmse_deg, tuning_drives, write_result
 from studies.pages import options
@@ -29,7 +30,7 @@ CRITERION = "mean over manoeuvres of the Gaussian log-likelihood per scalar inno
 LOWEST, HIGHEST = 1e-4, 10.0
 STATES = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ax_bias_m_s2")
 Q = tuple[float, ...]
-Build = Callable[[VehicleParameters, Q], PhysicsUkf | PhysicsPlusUkf]
+Build = Callable[[VehicleParameters, Q], PhysicsUkf | PhysicsFilter]
 
 
 @dataclass(frozen=True)
@@ -49,9 +50,10 @@ def _phy_ukf(vehicle: VehicleParameters, q_std: Q) -> PhysicsUkf:
     return PhysicsUkf(vehicle, q_std=(a, b, c, d))
 
 
-def _physics_plus(vehicle: VehicleParameters, q_std: Q) -> PhysicsPlusUkf:
+def _physics(vehicle: VehicleParameters, q_std: Q) -> PhysicsFilter:
     """Both axles' forces share one value."""
-    return PhysicsPlusUkf(vehicle, q_std=(*q_std, q_std[-1]))
+    parts = PhysicsParts(lag=True, load_transfer=True, biases=True)
+    return PhysicsFilter(vehicle.model_copy(update={"physics": parts}), q_std=(*q_std, q_std[-1]))
 
 
 SEARCHES = {
@@ -63,11 +65,11 @@ SEARCHES = {
         {"xatol": 0.02, "fatol": 1e-5, "maxfev": 400},
         worthwhile=2e-4,
     ),
-    "physics-plus": Search(
-        "physics_plus_q",
+    "physics": Search(
+        "physics_parts_q",
         (*STATES, "force_over_mass_m_s2"),
         ((0.1, 0.1, 0.05, 0.02, 2.0), (0.1, 0.3, 0.2, 0.02, 0.5)),
-        _physics_plus,
+        _physics,
         {"xatol": 0.05, "fatol": 1e-4, "maxfev": 200},
     ),
 }

@@ -25,7 +25,7 @@ from studies.pictures import STYLE, save, subplots
 
 COLOURS = {"truth": "#8c8c8c", **{s.name: f"#{s.colour:06x}" for s in SPECS}}
 DASHES = {"phy-ukf": (0, (4, 1.5)), "pure-lstm": (0, (1.5, 1)), "pd-hef-paper": (0, (5, 1, 1, 1))}
-BARS = ("phy-ukf", "phy-ukf-tuned", "physics-plus", "pure-lstm", "pd-hef-paper", "pd-hef-fixed-r", "pd-hef")
+BARS = ("phy-ukf", "phy-ukf-tuned", "physics", "pure-lstm", "pd-hef-paper", "pd-hef-fixed-r", "pd-hef")
 
 #: Signal, factor to the unit drawn, label.
 SIGNALS = {

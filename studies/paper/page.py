@@ -397,7 +397,7 @@ def _figure_21(r: Results) -> str:
 def _figure_22(r: Results) -> str:
     found = Findings()
     for scenario in (A.name, B.name):
-        for baseline in ("phy-ukf", "phy-ukf-tuned", "physics-plus"):
+        for baseline in ("phy-ukf", "phy-ukf-tuned", "physics"):
             gain = r.improvement(scenario, HYBRID, baseline)
             if gain is not None:
                 text = f"sideslip in {scenario} against `{baseline}` {gain_text(gain)}"

@@ -69,7 +69,7 @@ cornering_stiffness_n_per_rad = 108000.0
 """
 COMMENTS = ("# My car, weighed on 3 May.", "# with driver", "# tank full", "# guessed", "# end")
 DRIVES = (LearntOn(name="lap", sha256="cd" * 32, start_s=0.0, end_s=80.0),)
-TUNED, PLUS = "phy-ukf-tuned", "physics-plus"
+TUNED, OURS = "phy-ukf-tuned", "physics"
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def add_fit(folder: Path, **values: Any) -> Fit:
     return fit
 
 
-def add_noise(folder: Path, name: str = PLUS, **entries: Any) -> FilterNoise:
+def add_noise(folder: Path, name: str = OURS, **entries: Any) -> FilterNoise:
     noise = FilterNoise(q_std=(0.4, 0.5, 0.6), physics_sha256=load(folder).physics_sha256, **entries)
     write_part(folder / NOISE_FILE, Noise(filter={name: noise}))
     return noise
@@ -158,7 +158,7 @@ def test_parts_come_one_by_one(folder: Path) -> None:
     assert car.learnt_on == DRIVES
     noise = add_noise(folder)
     car = load(folder)
-    assert dict(car.noise) == {**fit.filter, PLUS: noise}
+    assert dict(car.noise) == {**fit.filter, OURS: noise}
     trust = add_trust(folder)
     car = load(folder, "default")
     assert car.trust == trust
@@ -240,12 +240,17 @@ def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path)
         assert flat.read_text().count(comment) == 1
 
 
-def test_other_physics_and_a_vehicle_made_wrong_leave_it_out(folder: Path) -> None:
+def test_a_vehicle_made_wrong_is_wrong_for_physics_too_and_nothing_else_of_it(folder: Path) -> None:
     add_physics(folder)
     car = load(folder)
-    wrong = car.with_vehicle(car.vehicle.model_copy(update={"mass_kg": 1600.0}))
-    assert wrong.fitted_physics is None
-    assert wrong.physics_vehicle.mass_kg == 1600.0
+    told = {"mass_kg": 1600.0, "yaw_inertia_kg_m2": 1800.0}
+    wrong = car.with_vehicle(car.vehicle.model_copy(update=told))
+    assert wrong.physics_vehicle == car.physics_vehicle.model_copy(update=told)
+    assert wrong.vehicle.friction == 0.6 != wrong.physics_vehicle.friction
+
+
+def test_other_physics_leave_it_out(folder: Path) -> None:
+    add_physics(folder)
     edit(folder, "mass_kg = 1440.0 ", "mass_kg = 1450.0 ")
     car = load(folder)
     assert car.fitted_physics is None
@@ -275,7 +280,7 @@ def test_other_physics_leave_fit_noise_and_trust_out_and_say_so(folder: Path, ol
     assert car.learnt_on == ()
     assert car.notes == (
         "fit.toml is not used: vehicle.toml has changed since; pdhef identify makes it anew",
-        "noise of physics-plus is not used: it belongs to other physics; pdhef tune makes it anew",
+        "noise of physics is not used: it belongs to other physics; pdhef tune makes it anew",
         "network.toml allows no trust: it was found with other physics; pdhef trust makes it anew",
     )
     assert car.allowed_trust.cap == 0.0
@@ -322,7 +327,7 @@ def test_another_fit_leaves_the_noise_of_the_first_out(folder: Path) -> None:
     assert car.vehicle.friction == 0.7
     assert dict(car.noise) == fit.filter
     assert [note.split(":")[0] for note in car.notes] == [
-        "noise of physics-plus is not used",
+        "noise of physics is not used",
         "network.toml allows no trust",
     ]
     assert car.allowed_trust.cap == 0.0
@@ -424,14 +429,14 @@ def test_wrong_entries_of_every_part_are_told_in_one_line(folder: Path, name: st
 FLAT = """
 [filter.phy-ukf-tuned]
 q_std = [0.1, 0.1, 0.1]
-[filter.physics-plus]
+[filter.physics]
 q_std = [0.1, 0.1, 0.1]
 [network]
 trust_cap = 0.25
 evidence = "a drive of 300 s"
 [identification]
 drives = ["lap: 0 to 80.5 s", {name = "other", sha256 = "cd", start_s = 1.0, end_s = 2.0}]
-tuning_scores = ["physics-plus: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
+tuning_scores = ["physics: 0.1092 deg at trial 63", "phy-ukf-tuned: 0.1378 deg at trial 7"]
 tool = "pdhef 0.1"
 """
 
@@ -440,8 +445,8 @@ def test_scores_and_drives_of_older_files_are_understood(tmp_path: Path) -> None
     path = tmp_path / "old.toml"
     path.write_text(PERSONS + FLAT)
     car = load(path)
-    assert {n: (one.score_deg, one.trial) for n, one in car.noise.items()} == {PLUS: (0.1092, 63), TUNED: (0.1378, 7)}
-    assert strongest_physics(car).name == PLUS
+    assert {n: (one.score_deg, one.trial) for n, one in car.noise.items()} == {OURS: (0.1092, 63), TUNED: (0.1378, 7)}
+    assert strongest_physics(car).name == OURS
     assert [(d.name, d.start_s, d.end_s) for d in car.learnt_on] == [("other", 1.0, 2.0), ("lap", 0.0, 80.5)]
     assert car.allowed_trust.cap == 0.25
     path.write_text(PERSONS + FLAT.replace("0.1092", "0.2092"))
@@ -453,7 +458,7 @@ def test_scores_and_drives_of_older_files_are_understood(tmp_path: Path) -> None
     [
         ("0.1092 deg at trial", "0.1092° at trial"),
         ("0.1092 deg at trial 63", "0.1092 deg"),
-        ("physics-plus: 0.1092", "physics-plus 0.1092"),
+        ("physics: 0.1092", "physics 0.1092"),
         ("lap: 0 to 80.5 s", "lap: all of it"),
     ],
 )
@@ -475,7 +480,7 @@ def noise_change(noise: dict[str, FilterNoise], **more: Any) -> Change:
     return Change("tune", NOISE_FILE, {NOISE_FILE: data}, settings={"trials": 8}, drives=DRIVES, **more)
 
 
-NEW = {PLUS: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.7}, score_deg=0.11, trial=5)}
+NEW = {OURS: FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.7}, score_deg=0.11, trial=5)}
 
 
 def files_of(folder: Path) -> dict[str, bytes]:
@@ -488,7 +493,7 @@ def test_a_new_folder_gets_the_persons_file_byte_for_byte_and_the_parts(folder: 
     assert written == tmp_path / "deep" / "new" / NOISE_FILE
     assert {*files_of(written.parent)} == {VEHICLE_FILE, FIT_FILE, NOISE_FILE, HISTORY_FILE}
     assert (written.parent / VEHICLE_FILE).read_bytes() == (folder / VEHICLE_FILE).read_bytes()
-    assert load(written.parent).noise[PLUS] == NEW[PLUS]
+    assert load(written.parent).noise[OURS] == NEW[OURS]
     assert {p.name for p in folder.iterdir()} == {VEHICLE_FILE, FIT_FILE}
     assert [p.name for p in (tmp_path / "deep").iterdir()] == ["new"]
 
@@ -517,7 +522,7 @@ def test_the_same_folder_is_updated_and_every_command_leaves_a_line(folder: Path
     (folder / "notes.txt").write_text("mine too")
     vehicle = (folder / VEHICLE_FILE).read_bytes()
     update_car(load(folder), folder, noise_change(NEW))
-    update_car(load(folder), folder, noise_change({TUNED: NEW[PLUS]}))
+    update_car(load(folder), folder, noise_change({TUNED: NEW[OURS]}))
     assert (folder / VEHICLE_FILE).read_bytes() == vehicle
     assert (folder / "notes.txt").read_text() == "mine too"
     assert set(load(folder).noise) == {TUNED}
@@ -619,7 +624,7 @@ def test_a_flat_export_keeps_a_persons_comments_and_changes_only_what_differs(fo
     car = load(folder, "default")
     flat = tmp_path / "flat.toml"
     change = noise_change({**car.noise, **NEW})
-    assert write_change(car, car.with_noise(PLUS, NEW[PLUS]), flat, change) == flat
+    assert write_change(car, car.with_noise(OURS, NEW[OURS]), flat, change) == flat
     text = flat.read_text()
     for comment in COMMENTS:
         assert text.count(comment) == 1
@@ -641,7 +646,7 @@ def test_a_flat_export_again_and_again_does_not_grow(tmp_path: Path) -> None:
     sizes = []
     for number in range(3):
         car = load(source)
-        source = write_change(car, car.with_noise(PLUS, NEW[PLUS]), tmp_path / f"{number}.toml", noise_change(NEW))
+        source = write_change(car, car.with_noise(OURS, NEW[OURS]), tmp_path / f"{number}.toml", noise_change(NEW))
         sizes.append(len(source.read_text()))
         assert all(source.read_text().count(comment) == 1 for comment in COMMENTS)
     assert sizes[0] == sizes[1] == sizes[2] < 2 * len(PERSONS + FLAT)
@@ -659,13 +664,13 @@ def test_tables_of_older_files_are_changed_where_they_stand(tmp_path: Path) -> N
     car = load(old)
     trusted = Trust(trust_cap=0.75, evidence="another drive")
     flat = write_change(
-        car, replace(car.with_noise(PLUS, NEW[PLUS]), trust=trusted), tmp_path / "flat.toml", noise_change(NEW)
+        car, replace(car.with_noise(OURS, NEW[OURS]), trust=trusted), tmp_path / "flat.toml", noise_change(NEW)
     )
     text = flat.read_text()
     for comment in (*COMMENTS, "# my guess", "# tyres of last summer"):
         assert text.count(comment) == 1, comment
     again = load(flat)
-    assert (again.noise[PLUS].q_std, again.noise[TUNED].q_std) == ((0.1, 0.2, 0.3), (0.1, 0.1, 0.1))
+    assert (again.noise[OURS].q_std, again.noise[TUNED].q_std) == ((0.1, 0.2, 0.3), (0.1, 0.1, 0.1))
     assert (again.allowed_trust.cap, again.vehicle) == (0.75, car.vehicle)
 
 
@@ -713,3 +718,42 @@ def test_cars_beside_one_another_are_changed_at_once(folder: Path) -> None:
             list(pool.map(lambda output: update_car(car, output, change), names))
         assert all((name / "part.toml").is_file() for name in names)
     assert not [p for p in folder.parent.iterdir() if p.name.startswith(".")]
+
+
+# --- filters of older versions -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("where", ["noise.toml", "fit.toml", "vehicle.toml"])
+def test_noise_of_a_filter_that_is_no_more_is_left_out_with_one_notice(folder: Path, where: str) -> None:
+    former = FilterNoise(q_std=(0.1,) * 6, r_std={"ay_m_s2": 1.4}, score_deg=0.1, trial=3)
+    kept = FilterNoise(q_std=(0.4, 0.5, 0.6))
+    if where == "noise.toml":
+        write_part(folder / NOISE_FILE, Noise(filter={TUNED: kept, "physics-plus": former}))
+    elif where == "fit.toml":
+        fit = Fit(physics_sha256=physics_sha256(load(folder).own), filter={TUNED: kept, "physics-plus": former})
+        write_part(folder / FIT_FILE, fit)
+    else:
+        edit(
+            folder, "# end", "[filter.phy-ukf-tuned]\nq_std = [0.4, 0.5, 0.6]\n[filter.physics-plus]\nq_std = []\n# end"
+        )
+    car = load(folder)
+    assert dict(car.noise) == {TUNED: kept}
+    assert car.notes == ("noise of physics-plus is not used: physics-plus is physics now; pdhef tune makes it anew",)
+
+
+def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folder: Path) -> None:
+    fit = add_fit(folder)
+    found = FittedPhysics(values=FittedValues(roll_damping=0.5), noise=FilterNoise(q_std=(0.1,) * 6))
+    write_part(folder / FIT_FILE, fit.model_copy(update={"physics": found}))
+    car = load(folder)
+    assert car.noise[OURS] == found.noise
+    here = physics_sha256(car.physics_vehicle)
+    assert (car.physics_of(OURS), car.physics_of(TUNED)) == (here, car.physics_sha256)
+    assert here != car.physics_sha256
+    tuned = FilterNoise(q_std=(0.4, 0.5, 0.6), physics_sha256=here)
+    write_part(folder / NOISE_FILE, Noise(filter={OURS: tuned}))
+    assert load(folder).noise[OURS] == tuned
+    write_part(folder / NOISE_FILE, Noise(filter={OURS: tuned.model_copy(update={"physics_sha256": "ab" * 32})}))
+    car = load(folder)
+    assert car.noise[OURS] == found.noise
+    assert car.notes == ("noise of physics is not used: it belongs to other physics; pdhef tune makes it anew",)

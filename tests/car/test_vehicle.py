@@ -166,10 +166,10 @@ def test_noise_of_three_or_four_states_is_read(tmp_path, entries):
     assert read_flat(write(tmp_path, text)).noise["phy-ukf-tuned"].q_std == tuple(entries)
 
 
-def test_physics_plus_has_two_states_more(tmp_path):
-    text = EXAMPLE.replace("filter.phy-ukf-tuned", "filter.physics-plus")
+def test_physics_has_two_states_more(tmp_path):
+    text = EXAMPLE.replace("filter.phy-ukf-tuned", "filter.physics")
     text = text.replace("q_std = [0.02, 0.006, 0.002]", f"q_std = {[0.02] * 6}")
-    assert len(read_flat(write(tmp_path, text)).noise["physics-plus"].q_std) == 6
+    assert len(read_flat(write(tmp_path, text)).noise["physics"].q_std) == 6
 
 
 def test_a_mass_in_tonnes_contradicts_the_other_entries(tmp_path):

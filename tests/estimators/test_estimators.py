@@ -29,7 +29,7 @@ NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle()
 NAMES = tuple(s.name for s in SPECS if not s.network)
 #: Those that claim a lateral velocity by a model or by integration.
-FILTERS = ("phy-ukf", "physics-plus", "physics", "phy-ukf-tuned")
+FILTERS = ("phy-ukf", "physics", "phy-ukf-tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
 STIFFNESS_VEHICLE = VEHICLE.model_copy(
     update={

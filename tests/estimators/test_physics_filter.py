@@ -26,7 +26,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.filter_shell import sideslip_std
 from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
 
@@ -191,7 +191,7 @@ def test_standstill_holds_and_lets_go(bias):
     assert steps.valid.all()
 
 
-@pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsPlusUkf])
+@pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsFilter])
 @pytest.mark.slow
 def test_standstill_can_be_switched_off(maker):
     made = stop_and_go()

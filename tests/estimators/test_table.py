@@ -13,11 +13,28 @@ from pdhef_logtool.estimators.cautious import CautiousPhysics
 from reference_car import drive, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import Algorithm, FilterNoise, IntervalEntry, Intervals, Trust
+from pdhef_logtool.car.parts import (
+    Algorithm,
+    FilterNoise,
+    FittedPhysics,
+    FittedValues,
+    IntervalEntry,
+    Intervals,
+    Trust,
+)
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead, run_window
-from pdhef_logtool.estimators.table import SPECS, Options, default_names, make_estimator, runnable, spec_of
+from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
+from pdhef_logtool.estimators.table import (
+    SPECS,
+    Options,
+    check_names,
+    default_names,
+    make_estimator,
+    runnable,
+    spec_of,
+)
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -139,6 +156,34 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
     assert (spec.name in default_names(Car.of(VEHICLE))) == (spec.default and not lacks)
 
 
+def test_physics_runs_on_any_car_and_without_a_fit_it_has_no_part() -> None:
+    bare = Car.of(VEHICLE)
+    assert "physics" in default_names(bare)
+    adaptive = make_estimator("physics", bare)
+    assert isinstance(adaptive, AdaptivePhysics)
+    estimator = adaptive.physics
+    assert (estimator.vehicle, estimator.q_std, estimator.r_std) == (VEHICLE, PHYSICS_Q_STD, None)
+    assert estimator.vehicle.physics.names == ()
+
+
+def test_tuned_noise_keeps_the_axle_forces_noise_of_the_fit() -> None:
+    fitted = FittedPhysics(
+        values=FittedValues(roll_damping=0.5), noise=FilterNoise(q_std=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
+    )
+    adaptive = make_estimator("physics", replace(CAR, fitted_physics=fitted))
+    assert isinstance(adaptive, AdaptivePhysics)
+    estimator = adaptive.physics
+    assert estimator.q_std == (*NOISE.q_std, 0.4, 0.5, 0.6)
+    assert estimator.vehicle.roll_damping == 0.5
+
+
+def test_a_name_of_an_older_version_is_said_to_be_what_it_is_now() -> None:
+    with pytest.raises(UsageError, match=r"physics-plus; physics-plus is physics now$"):
+        check_names(("zero", "physics-plus"))
+    with pytest.raises(UsageError, match=r"got physics-pluss$"):
+        check_names(("physics-pluss",))
+
+
 # --- what runs under a name ------------------------------------------------------------------------------------------
 
 #: Nothing of the car but its signals.
@@ -180,7 +225,7 @@ def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
     assert was.structure == is_now.structure
 
 
-@pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics-plus", "pd-hef", "pd-hef-smoothed"])
+@pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics", "pd-hef", "pd-hef-smoothed"])
 def test_other_noise_is_another_basis_of_the_same_structure(name: str) -> None:
     was = ran(name, CAR.with_noise(name, NOISE))
     for change in ({"q_std": (0.1, 0.2, 0.2)}, {"r_std": {"ay_m_s2": 1.0}}):
@@ -242,7 +287,7 @@ def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> No
 
 
 def test_without_its_own_it_has_those_of_the_filter_that_it_is(signals: Signals) -> None:
-    of_filter, own = ran("physics-plus", BARE), ran("pd-hef", BARE)
+    of_filter, own = ran("physics", BARE), ran("pd-hef", BARE)
     assert with_intervals(BARE, intervals_for(of_filter), signals)[0] == pytest.approx(2.0)
     assert with_intervals(CAR, intervals_for(of_filter), signals)[0] == 1.0
     both = intervals_for(of_filter).entries + intervals_for(own, factor=3.0).entries
@@ -255,9 +300,9 @@ def test_without_its_own_it_has_those_of_the_filter_that_it_is(signals: Signals)
 
 def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:
     """Evidence makes pd-hef another algorithm; the intervals of all others hold, and nobody calls them foreign."""
-    entries = intervals_for(ran("physics-plus", BARE))
+    entries = intervals_for(ran("phy-ukf", BARE))
     for car in (BARE, CAR):
-        estimator = make_estimator("physics-plus", car)
+        estimator = make_estimator("phy-ukf", car)
         applied = calibrator(replace(car, intervals=entries), [estimator])
         applied.add(estimator.run(signals, None)[0], signals)
-        assert applied.notes("physics-plus") == ("intervals calibrated on car for friction and vehicle as told",)
+        assert applied.notes("phy-ukf") == ("intervals calibrated on car for friction and vehicle as told",)

@@ -508,7 +508,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     )
     assert told[-1] == ("trial 6 of 6", pytest.approx(1.0))
     ((setup, jobs),) = FakeBenches.made
-    assert jobs == 3 and setup.names == ("physics-plus", "phy-ukf-tuned", "pd-hef")
+    assert jobs == 3 and setup.names == ("phy-ukf-tuned", "pd-hef")
     assert warned[0].startswith("drives of split train: a network is better there")
     assert warned[1] == "c is left out: no true sideslip"
     assert list(result.notes) == warned[2:]
@@ -541,9 +541,9 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     assert lines[2].get_ydata()[0] == pytest.approx(result.tuned[0].before.objective_deg)
     assert lines[-1].get_xdata()[0] == 3.5  # between the third trial, the last that explores, and the fourth
     shown = result.to_dict()["estimators"]["pd-hef"]
-    assert (shown["trials"], shown["best_trial"]) == (6, result.tuned[2].best.number)
+    assert (shown["trials"], shown["best_trial"]) == (6, result.tuned[1].best.number)
     warned.clear()
-    physics = replace(settings, names=("physics-plus",))
+    physics = replace(settings, names=("physics",))
     tune_command.tune(arguments[:2], tmp_path / "physics", physics, warn=warned.append)
     assert not [w for w in warned if "split train" in w]
     with pytest.raises(EstimatorError, match="tune"):
@@ -565,17 +565,20 @@ def test_only_a_search_that_ends_badly_is_noted() -> None:
 
 def test_what_a_person_wrote_is_no_search_s() -> None:
     searched = FilterNoise(q_std=(0.1, 0.1, 0.1), trial=3, score_deg=0.5)
-    car = Car.of(VEHICLE, noise={"pd-hef": searched, "physics-plus": FilterNoise(q_std=(0.2, 0.2, 0.2))})
+    car = Car.of(VEHICLE, noise={"pd-hef": searched, "physics": FilterNoise(q_std=(0.2, 0.2, 0.2))})
     assert tune_command._kept(car) == {"pd-hef": searched.model_copy(update={"score_deg": None})}
 
 
 def test_names_are_those_of_the_tables_in_their_order() -> None:
     car = Car.load("saloon")
     bare = replace(car, network=None)
-    assert choose_names(None, car, with_network=True) == ("physics-plus", "phy-ukf-tuned", "pd-hef")
-    assert choose_names(None, car, with_network=False) == ("physics-plus", "phy-ukf-tuned")
-    assert choose_names(None, bare, with_network=True) == ("physics-plus", "phy-ukf-tuned")
-    assert choose_names(("pd-hef", "physics-plus"), car, with_network=False) == ("physics-plus", "pd-hef")
+    assert choose_names(None, car, with_network=True) == ("phy-ukf-tuned", "pd-hef")
+    assert choose_names(None, car, with_network=False) == ("phy-ukf-tuned",)
+    assert choose_names(None, bare, with_network=True) == ("phy-ukf-tuned",)
+    # Where no fit of it holds the noise of physics, it is tuned as all are.
+    unfitted = replace(car, fitted_physics=None)
+    assert choose_names(None, unfitted, with_network=True) == ("physics", "phy-ukf-tuned", "pd-hef")
+    assert choose_names(("pd-hef", "physics"), car, with_network=False) == ("physics", "pd-hef")
     for wrong in ((), ("zero",), ("pd-hef", "pd-hef")):
         with pytest.raises(UsageError, match="--estimators"):
             choose_names(wrong, car, with_network=True)
@@ -585,7 +588,7 @@ def test_names_are_those_of_the_tables_in_their_order() -> None:
 
 def test_a_bench_keeps_drives_by_number_and_scores_filters_at_full_trust(monkeypatch: pytest.MonkeyPatch) -> None:
     car = Car.of(VEHICLE)
-    setup = TuneSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf-tuned", "physics-plus"))
+    setup = TuneSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf-tuned", "physics"))
     asked: list[Any] = []
 
     def load(_log: Any, used: Car, _mapping: Any, _options: Any, *, refuse: Any, **named: Any) -> Any:
@@ -600,7 +603,7 @@ def test_a_bench_keeps_drives_by_number_and_scores_filters_at_full_trust(monkeyp
     bench.load(4, LogInput(Path("b"), "b"), None, 17)
     used, why, named = asked[0]
     lacks = "ay_m_s2, yaw_rate_rad_s"
-    assert used is car and why == f"phy-ukf-tuned needs {lacks}; physics-plus needs {lacks}"
+    assert used is car and why == f"phy-ukf-tuned needs {lacks}; physics needs {lacks}"
     assert named == {"split": "test", "least_scored": 100, "max_bytes": 17}
     noise = FilterNoise(q_std=(0.1, 0.2, 0.3), r_std={"ay_m_s2": 0.5, "yaw_rate_rad_s": 0.004})
     found = bench.score({"phy-ukf-tuned": noise})

@@ -264,7 +264,7 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
         broken.load()
     document = json.loads((copy / MANIFEST).read_text())
     (copy / MANIFEST).write_text(json.dumps({**document, "version": 99}))
-    with pytest.raises(OutputError, match="extract it again"):
+    with pytest.raises(OutputError, match="makes it anew"):
         read_dataset(copy)
     (copy / MANIFEST).unlink()
     with pytest.raises(OutputError, match="--resume"):

@@ -74,12 +74,12 @@ class Commands:
         if name == "identify":
             identify_command.identify(logs, self.car, replace(config, end="34"), holdout=0.0)
         elif name == "tune":
-            tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf-tuned", "physics-plus"), trials=4))
+            tune(logs, self.car, TuneSettings(config=config, names=("phy-ukf-tuned", "physics"), trials=4))
         elif name == "trust":
             network = self.car.parent / "model"
             trust(logs, self.car, LearnSettings(config=replace(config, network=network, end="+5s")))
         else:
-            config = replace(config, estimators=("physics-plus",), end="+5s")
+            config = replace(config, estimators=("physics",), end="+5s")
             calibrate(logs, self.car, CalibrateSettings(config=config, spread=0.0))
 
     def drives(self, name: str) -> list[str]:
@@ -94,7 +94,7 @@ class Commands:
     def run(self, out: Path, log: str) -> tuple[list[str], dict[str, list[str]]]:
         """Return what a run says of the car's parts, and the notes on its estimators."""
         told: list[str] = []
-        config = RunConfig(car=self.car, estimators=("physics-plus", "pd-hef"), annotate="none", end="+3s")
+        config = RunConfig(car=self.car, estimators=("physics", "pd-hef"), annotate="none", end="+3s")
         result = run_logs([log], out, config, warn=told.append)
         report = result.results[0].report
         assert report is not None
@@ -159,7 +159,7 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         car = Car.load(commands.car)
         assert _stale(car.notes) == expected, (number, command)
         assert car.vehicle.name.endswith("(identified)") == identified
-        assert ("physics-plus" in car.noise) == tuned
+        assert ("physics" in car.noise) == tuned
         assert ("trust" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
         assert ("trust" in expected) == ("pdhef trust gives it anew" in car.allowed_trust.reason)
         before = after
@@ -168,12 +168,12 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
             assert expected == {"tune", "trust", "calibrate"}
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert _stale(said) == expected
-            assert "those intervals were made with other physics" in notes["physics-plus"]
+            assert "those intervals were made with other physics" in notes["physics"]
         if (ORDER[number - 2], command) == ("calibrate", "trust"):
             assert "calibrate" not in expected
             said, notes = commands.run(commands.car.parent / "out", dlc)
             assert said == []
-            assert notes["physics-plus"] == [
+            assert notes["physics"] == [
                 "intervals calibrated on truthsim saloon (identified) for friction and vehicle as told"
             ]
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from residual_car import CAR, FRICTION, START_NS, Motion, Wave, drive, pick, truth_of, window
 
 from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.estimators.parallel_physics import parallel_filter
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
     difference_noise,

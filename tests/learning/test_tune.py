@@ -288,7 +288,7 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
             math.sqrt(math.hypot(errors["dlc"], 0.05) * math.hypot(errors["step"], 0.05)), rel=1e-9
         )
 
-    runnable = {"phy-ukf-tuned": "phy-ukf-tuned", "physics-plus": "physics-plus", "pd-hef": "pd-hef-fixed-r"}
+    runnable = {"phy-ukf-tuned": "phy-ukf-tuned", "physics": "physics", "pd-hef": "pd-hef-fixed-r"}
     shown = tuple(runnable[n] for n in names)
     config = RunConfig(car=tmp_path / "mycar", network=tmp_path / "model", estimators=shown, annotate="none")
     rows = run_logs([str(drives / "dlc.mcap")], tmp_path / "out", config).results[0].rows
@@ -424,14 +424,14 @@ def test_wrong_options_are_usage_errors(sample_logs_dir: Path, drives: Path, tmp
 def test_noise_of_an_earlier_search_stays_without_its_score(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = [str(sample_logs_dir / "dlc.mcap")]
     settings = _settings(sample_logs_dir, split=None)
-    tune(log, tmp_path / "mycar", replace(settings, names=("physics-plus",)))
-    first = Car.load(tmp_path / "mycar").noise["physics-plus"]
+    tune(log, tmp_path / "mycar", replace(settings, names=("physics",)))
+    first = Car.load(tmp_path / "mycar").noise["physics"]
     assert first.score_deg is not None
     again = replace(settings, config=replace(settings.config, car=tmp_path / "mycar"), names=("phy-ukf-tuned",))
     tune(log, tmp_path / "mycar", again)
     noise = Car.load(tmp_path / "mycar").noise
     # It is as good as it was, but was not compared with the other on the same drives.
-    assert noise["physics-plus"] == first.model_copy(update={"score_deg": None})
+    assert noise["physics"] == first.model_copy(update={"score_deg": None})
     assert noise["phy-ukf-tuned"].score_deg is not None
     tune(log, tmp_path / "mycar", again)
     assert Car.load(tmp_path / "mycar").noise == noise

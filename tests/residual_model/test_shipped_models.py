@@ -39,7 +39,7 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     assert car.trust is not None and car.trust.network_sha256 == model.sha256
     assert car.allowed_trust.cap == 1.0
     assert car.notes == ()
-    assert {"phy-ukf-tuned", "physics-plus", "pd-hef"} <= set(car.noise)
+    assert {"phy-ukf-tuned", "physics", "pd-hef"} <= set(car.noise)
     assert {n.network_sha256 for n in car.noise.values()} == {None, model.sha256}
     for chosen in (None, UNSURE):
         intervals = Car.load("saloon", intervals=chosen).intervals

@@ -44,8 +44,8 @@ def drive() -> ConditionDrive:
 
 
 def line(on: list[float], off: list[float], *, default: bool = True) -> switches.Line:
-    switch = switches.Switch("standstill", "stops", switches.run_plain, switches.run_plain, {"physics-plus": default})
-    return switches.Line(switch, "physics-plus", np.array(on), np.array(off), np.full(len(on), 100.0))
+    switch = switches.Switch("standstill", "stops", switches.run_plain, switches.run_plain, {"physics": default})
+    return switches.Line(switch, "physics", np.array(on), np.array(off), np.full(len(on), 100.0))
 
 
 def test_without_prediction_the_newest_arrived_step_stands_as_it_is(drive: ConditionDrive) -> None:
@@ -106,7 +106,7 @@ def test_harm_is_said_and_so_is_a_better_setting_than_the_shipped_one(monkeypatc
         assert case.says == says
     monkeypatch.setattr(switches, "SWITCHES", tuple(x.switch for x in cases.values()))
     text = switches.page([cases["**harms**"]], "command", "0" * 64, "car")
-    assert text.count("- standstill, `physics-plus` on `stops` (ships on): median 1.50") == 2
+    assert text.count("- standstill, `physics` on `stops` (ships on): median 1.50") == 2
     assert "Nothing, as far" not in text
     monkeypatch.setattr(switches, "SWITCHES", (cases["helps"].switch,))
     text = switches.page([cases["helps"]], "command", "0" * 64, "car")

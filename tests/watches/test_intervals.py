@@ -219,7 +219,7 @@ def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
 
 def test_without_an_entry_a_track_stays_as_it_is() -> None:
     signals, track = _drive(60)
-    other = ALGORITHM.model_copy(update={"algorithm": "physics-plus-ukf"})
+    other = ALGORITHM.model_copy(update={"algorithm": "physics-filter"})
     for intervals, ran in ((None, ALGORITHM), (_intervals(entries=()), ALGORITHM), (_intervals(), other)):
         calibrator = _calibrator(intervals, ran)
         assert calibrator.add(track, signals) is track

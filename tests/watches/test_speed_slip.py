@@ -15,14 +15,14 @@ from pdhef_logtool.estimators.filter_shell import U_SPEED
 from pdhef_logtool.estimators.kinematic import Kinematic
 from pdhef_logtool.estimators.open_loop import OpenLoop
 from pdhef_logtool.estimators.physics import PhysicsUkf
-from pdhef_logtool.estimators.physics_plus import PhysicsPlusUkf
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.watches.speed_slip import TIMEOUT_S, without_slip
 
 VEHICLE = default_vehicle()
 STD = 0.08
-ESTIMATORS = (Kinematic(), OpenLoop(VEHICLE), PhysicsUkf(VEHICLE), PhysicsPlusUkf(VEHICLE))
+ESTIMATORS = (Kinematic(), OpenLoop(VEHICLE), PhysicsUkf(VEHICLE), PhysicsFilter(VEHICLE))
 
 
 def start_and_stop(t: np.ndarray) -> np.ndarray:
@@ -180,7 +180,7 @@ def test_windows_change_no_bit_and_nothing_is_seen_ahead(good, data):
     np.testing.assert_array_equal(believed(later)[: cuts[0]], whole[: cuts[0]])
 
 
-@pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsPlusUkf])
+@pytest.mark.parametrize("maker", [PhysicsUkf, PhysicsFilter])
 @pytest.mark.slow
 def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(maker, good):
     """The accelerometer says braking, the speed sensor falls silent: v_x runs below zero."""

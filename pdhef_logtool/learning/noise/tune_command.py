@@ -152,7 +152,7 @@ def tune(
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     car = open_car(config, output, warn)
-    names = choose_names(settings.names)
+    names = choose_names(settings.names, car)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     check_file_output(inputs, config, output)
     setup = TuneSetup(config, car, open_mapping(config), names)
@@ -208,7 +208,7 @@ def _noise(tuned: Tuned, car: Car) -> FilterNoise:
     """Return the noise of the best trial with what it belongs to."""
     return filter_tuning(tuned.best.values).model_copy(
         update={
-            "physics_sha256": car.physics_sha256,
+            "physics_sha256": car.physics_of(tuned.name),
             "score_deg": round(tuned.best.score.objective_deg, 4),
             "trial": tuned.best.number,
         }

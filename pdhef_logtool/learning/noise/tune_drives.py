@@ -15,10 +15,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.drive.reading import MAX_BYTES, too_big
 from pdhef_logtool.drive.reading import Drive as ReadDrive
-from pdhef_logtool.estimators.table import SPECS, Options, spec_of
+from pdhef_logtool.estimators.table import SPECS, Options, former, spec_of
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.noise.search import DriveError, drive_error
 from pdhef_logtool.logs.discovery import LogInput
@@ -43,12 +43,13 @@ class TuneSetup:
     names: tuple[str, ...]
 
 
-def choose_names(names: Sequence[str] | None) -> tuple[str, ...]:
+def choose_names(names: Sequence[str] | None, car: Car) -> tuple[str, ...]:
     """Return the estimators to tune, in the order of the tables.
 
     Parameters
     ----------
-    names : None = every one that can be.
+    names : None = every one that can be, without ``physics`` where the car has a fit of it: its noise was found
+        together with its values.
 
     Raises
     ------
@@ -57,11 +58,14 @@ def choose_names(names: Sequence[str] | None) -> tuple[str, ...]:
     """
     tunable = {s.name: s for s in SPECS if s.tunable}
     if names is None:
-        return tuple(tunable)
+        return tuple(n for n in tunable if n != PHYSICS or car.fitted_physics is None)
     wrong = sorted({n for n in names if n not in tunable or names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
-            expected=f"estimators out of {', '.join(tunable)}", got=", ".join(wrong) or "none", where="--estimators"
+            expected=f"estimators out of {', '.join(tunable)}",
+            got=", ".join(wrong) or "none",
+            where="--estimators",
+            remedy=former(wrong),
         )
     return tuple(n for n in tunable if n in names)
 
