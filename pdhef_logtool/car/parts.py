@@ -112,7 +112,7 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
         ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
-    physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, for filters that have one.
+    physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, in files of older versions.
     score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
     """
 

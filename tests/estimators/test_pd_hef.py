@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,6 +10,8 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from physics_oracle import Oracle, parts
+from reference_car import FRICTION
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
@@ -18,7 +20,7 @@ from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -183,3 +185,35 @@ def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Pat
     estimates = pl.read_parquet(tmp_path / "out/logs/dlc/estimates.parquet")
     trust = estimates.filter((pl.col("estimator") == "pd-hef-fixed-r") & pl.col("valid"))["network_trust"]
     assert trust.unique().to_list() == [1.0]
+
+
+def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
+    """The oracle's car with a force and a moment that its model lacks; told them as a residual, the filter is right."""
+    oracle = Oracle(parts("lag", "roll"))
+
+    @dataclass(frozen=True)
+    class Pushed(Oracle):
+        def derivative(self, x: np.ndarray, steer: float, ax: float, mu: float) -> np.ndarray:
+            return super().derivative(x, steer, ax, mu) + np.array([0.0, 0.8, 0.15, 0, 0, 0, 0, 0])
+
+    made = Pushed(oracle.has).drive(lambda t: 0.02 * np.sin(2.0 * t), 8.0)
+    # A force, so that the accelerometer feels it.
+    signals = replace(made.signals, ay_m_s2=made.signals.ay_m_s2 + 0.8, friction=np.full(len(made.signals), FRICTION))
+    physics = PhysicsFilter(oracle.as_vehicle())
+    rate = np.tile([0.8, 0.15], (len(signals), 1))
+    errors = []
+    for told in (None, rate, 0.5 * rate):
+        track, _ = physics.run(signals, None, told)
+        errors.append(np.sqrt(np.mean((track.vy_m_s - made.vy)[200:] ** 2)))
+    assert errors[1] < 0.05 * errors[0]
+    assert errors[1] < errors[2] < errors[0]
+
+
+def test_what_is_estimated_stands_in_the_track_and_only_that() -> None:
+    signals = _signals()
+    track, _ = hybrid("roll", "bank", "biases").run(signals, None)
+    for name in ESTIMATED_COLUMNS:  # F2 has the force scale, which F1 takes to be 0
+        assert np.isfinite(getattr(track, name)[track.valid]).all(), name
+    static, _ = replace(hybrid(), adaptive=False).run(signals, None)
+    assert [n for n in ESTIMATED_COLUMNS if len(getattr(static, n))] == []
+    assert not {"roll_rad", "force_scale"} & static.columns().keys()

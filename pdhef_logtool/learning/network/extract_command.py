@@ -269,9 +269,9 @@ def _as_in_file(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
     """Raise UsageError where two drives are slices of the same log that overlap: one may train what the other tests."""
-    by_source: dict[str, list[Mapping[str, Any]]] = {}
+    by_source: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
     for entry in entries:
-        by_source.setdefault(entry["source"]["sha256"], []).append(entry)
+        by_source.setdefault((entry["log"], entry["source"]["sha256"]), []).append(entry)
     for same in by_source.values():
         same.sort(key=lambda e: float(e["start_s"]))
         for one, other in pairwise(same):

@@ -6,8 +6,8 @@ From one stamp of the IMU to the next the residual is the increment
 
 with the model at the *true* v_x, v_y and r (at an estimated state the filter's own error would be learnt), and the
 inputs of the same measurement times as the filter takes them. No truth tells the axles' forces and the roll: the model
-runs them along the true motion. Bank and biases are what the filter that runs in parallel has at that time: what they
-take, the network need not. The force scale is 0. The row of v_x is 0 by definition and not stored.
+runs them along the true motion. Bank, biases and force scale are 0: at the filter's estimate of them, which
+changes while it learns, a residual would fit no other filter. The row of v_x is 0 by definition and not stored.
 
 For the paper's network and the baselines the model is the nominal one, by the trapezoidal rule between two true states.
 
@@ -31,7 +31,17 @@ from pdhef_logtool.drive.windows import DriveWindow
 from pdhef_logtool.estimators.filter_shell import U_AX, U_FRICTION, U_STEER, Meanwhile
 from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
-from pdhef_logtool.estimators.physics_model import FRONT, REAR, VX, VY, YAW_RATE, advance, settle_forces, step_count
+from pdhef_logtool.estimators.physics_model import (
+    AX_BIAS,
+    FRONT,
+    REAR,
+    VX,
+    VY,
+    YAW_RATE,
+    advance,
+    settle_forces,
+    step_count,
+)
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
@@ -205,12 +215,9 @@ def physics_increments(
     """
     layout, p, f = physics.parameters
     good = _dynamic(state, p) & np.isfinite(model.x).all(axis=1) & np.isfinite(model.inputs).all(axis=1)
-    states = np.where(good[:, None], model.x, 0.0)
+    states = np.zeros_like(model.x)
     states[:, :3] = np.where(good[:, None], state, 1.0)
-    if layout.roll >= 0:
-        states[:, layout.roll + 1] = 0.0
-    if layout.force_scale >= 0:
-        states[:, layout.force_scale] = 0.0
+    states[:, AX_BIAS] = np.where(good, model.x[:, AX_BIAS], 0.0)
     moved = np.empty((max(len(stamps_ns) - 1, 0), 2))
     _run_model(stamps_ns, states, model.inputs, good, max_step_s, (layout, p, f), run, moved)
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - moved

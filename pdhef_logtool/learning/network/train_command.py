@@ -17,6 +17,7 @@ from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     NOMINAL_MODEL,
@@ -27,11 +28,14 @@ from pdhef_logtool.residual_model.bundle import (
     model_folder,
     open_model,
 )
+from pdhef_logtool.residual_model.features import FEATURES
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"
 #: Shorter runs between two restarts teach nothing.
 MIN_SEQUENCE_STEPS = 50
+#: Utilisation up to which tyres answer to the steering angle in proportion, and driving by which an offset is shrunk.
+CALM_UTILISATION, OFFSET_SHRINK_S = 0.4, 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,7 +140,7 @@ def train_on(
 ) -> TrainResult:
     """Train one network by a recipe, whose target says what it learns; the rest as :func:`run_training`."""
     splits = {
-        name: list(_sequences((d for d in data.drives if d.split == name), recipe.target))
+        name: list(_sequences((d for d in data.drives if d.split == name), recipe.target, odd=recipe.odd))
         for name in ("train", "validation", "test")
     }
 
@@ -192,15 +196,37 @@ def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
             yield slice(a, b)
 
 
-def _sequences(drives: Iterable[DatasetDrive], target: str = RESIDUAL) -> Iterable[FeatureSequence]:
+def steering_offset(rows: DriveArrays) -> FloatArray:
+    """Return the residual rates [2] that an offset of the steering angle makes in a drive: what no network can know.
+
+    The offset is constant over the drive, fitted to calm driving, and shrunk where there is little of it.
+    """
+    column = {name: rows.features[:, i].astype(np.float64) for i, name in enumerate(FEATURES)}
+    calm = (rows.weight > 0.0) & (column["utilisation"] < CALM_UTILISATION)
+    if not calm.any():
+        return np.zeros(2)
+    force = float(column["front_stiffness_per_mass"][calm].mean())
+    turn = force / float((column["inertia_ratio"] * column["cg_to_rear_axle_m"])[calm].mean())
+    by_angle = np.array([force, turn])
+    mean = (rows.targets[calm] / rows.step_s[calm, None]).mean(axis=0)
+    seconds = float(rows.step_s[calm].sum())
+    angle = float(mean @ by_angle / (by_angle @ by_angle)) * seconds / (seconds + OFFSET_SHRINK_S)
+    offset: FloatArray = angle * by_angle
+    return offset
+
+
+def _sequences(
+    drives: Iterable[DatasetDrive], target: str = RESIDUAL, *, odd: bool = False
+) -> Iterable[FeatureSequence]:
     """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
     for drive in drives:
         rows = drive.arrays
+        offset = steering_offset(rows) if odd else np.zeros(2)
         for part in gap_free_runs(rows):
             weight = np.asarray(rows.weight[part], dtype=np.float64)
             features = np.asarray(rows.features[part], dtype=np.float64)
             if target == RESIDUAL:
-                values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None]
+                values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset
             else:
                 values = np.asarray(rows.truth_velocity[part, 1:2], dtype=np.float64)
                 weight = weight * np.isfinite(values[:, 0])
