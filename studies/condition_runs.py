@@ -24,8 +24,8 @@ import pyarrow.parquet as pq
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import digest
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.estimators.table import Options, make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.files import PendingFile
@@ -182,11 +182,11 @@ def _estimators(setup: Setup, available: frozenset[str], use_speed: bool) -> tup
 
 
 @cache
-def _grid_base(setup: Setup, use_speed: bool) -> HybridUkf | None:
-    if setup.loaded.network is None:
+def _grid_base(setup: Setup, use_speed: bool) -> AdaptivePhysics | None:
+    if setup.loaded.residual_network is None:
         return None
     base = make_estimator(fixed_grid.BASE, setup.loaded, Options(use_speed))
-    return base if isinstance(base, HybridUkf) else None
+    return base if isinstance(base, AdaptivePhysics) else None
 
 
 def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:

@@ -31,7 +31,7 @@ INDEPENDENT_ROW = "independent-simulator"
 CALIBRATION_SEED_OFFSET = 1000
 #: What the table's claims are about, the first of these that ran, and what it is held against.
 SUBJECTS = ("pd-hef", fixed_grid.BASE)
-REFERENCES = ("pd-hef-fixed-r", "pd-hef-trust0", "phy-ukf-tuned", "physics", "pd-hef-paper", fixed_grid.BEST)
+REFERENCES = ("physics", "pd-hef-fixed-r", "phy-ukf-tuned", "pd-hef-paper", fixed_grid.BEST)
 BUDGET = ("phy-ukf-tuned", "phy-ukf")
 
 

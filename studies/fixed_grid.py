@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
-from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.evaluation.metrics import ALL, MetricRow
 from pdhef_logtool.records.signals import Signals
 from studies.condition_drives import ConditionDrive, bin_masks, rmse_row
@@ -48,25 +48,21 @@ def is_setting(name: str) -> bool:
     return name.startswith(f"{PREFIX}(")
 
 
-def at(base: HybridUkf, setting: Setting) -> HybridUkf:
+def at(base: AdaptivePhysics, setting: Setting) -> AdaptivePhysics:
     """Return the filter at a point of the grid."""
-    a, b, c, d = base.q_std
-    factor = setting.q_factor
-    return replace(
-        base,
-        trust=setting.trust,
-        q_std=(factor * a, factor * b, factor * c, factor * d),
-        r_std=(setting.ay_factor * base.r_std[0], base.r_std[1]),
-        name=setting.name,
-    )
+    physics = base.physics
+    ay, rate, speed = physics.measurement_std.tolist()
+    q_std = tuple(setting.q_factor * q for q in physics.q_std)
+    changed = replace(physics, q_std=q_std, r_std=(setting.ay_factor * ay, rate, speed), name=setting.name)
+    return replace(base, physics=changed, trust=setting.trust, name=setting.name)
 
 
-def run_grid(base: HybridUkf, signals: Signals, drive: ConditionDrive) -> Iterator[MetricRow]:
+def run_grid(base: AdaptivePhysics, signals: Signals, drive: ConditionDrive) -> Iterator[MetricRow]:
     """Yield the sideslip RMSE and availability of every setting, over everything and in the nonlinear range."""
-    rate, _, _ = base.residual_rate(signals, None)
+    rate = base.inputs(signals, None)[0].rate
     masks = {name: m for name, m in bin_masks(drive).items() if name in (ALL, "nonlinear")}
     for setting in GRID:
-        track, _ = at(base, setting).filter.run(signals, None, setting.trust * rate)
+        track, _ = at(base, setting).physics.run(signals, None, setting.trust * rate)
         error = drive.error(track)
         for segment, mask in masks.items():
             yield from rmse_row(drive.name, setting.name, segment, error[mask])

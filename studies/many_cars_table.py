@@ -47,7 +47,6 @@ VARY = 0.1
 COLUMNS = {
     "phy-ukf-tuned": ("phy-ukf-tuned", "one"),
     "physics": ("physics", "one"),
-    "trust 0": ("pd-hef-trust0", "one"),
     "one car": ("pd-hef-trust1", "one"),
     "many cars": ("pd-hef-trust1", "many"),
 }

@@ -22,7 +22,7 @@ from studies.defaults.train_default import DRIVES, SETS
 from studies.pages import options, table, write
 
 ESTIMATORS = ("zero", "linear-regression", "phy-ukf", "phy-ukf-tuned", "physics", "pure-lstm", "pd-hef-paper",
-              "pd-hef-trust0", "pd-hef-fixed-r", "pd-hef")  # fmt: skip
+              "pd-hef-fixed-r", "pd-hef")  # fmt: skip
 #: Set, split, how the card calls them.
 PARTS = (
     ("one_car", "test", "the car of the vehicle file, test drives"),

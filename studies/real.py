@@ -26,8 +26,8 @@ from scipy.signal import butter, sosfilt
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.hybrid import HybridUkf
 from pdhef_logtool.estimators.table import SPECS, runnable
 from pdhef_logtool.evaluation.bootstrap import (
     Interval,
@@ -283,7 +283,7 @@ def with_evidence(case: Case, car: Car, network: ModelBundle) -> Car:
 def half_trust(ready: Sequence[Estimator]) -> list[Estimator]:
     """Return the fixed hybrid filter at half trust, where the fixed one runs."""
     name = "pd-hef-fixed-r"
-    fixed = [e for e in ready if e.name == name and isinstance(e, HybridUkf)]
+    fixed = [e for e in ready if e.name == name and isinstance(e, AdaptivePhysics)]
     return [replace(e, trust=0.5, name=f"{name} at trust 0.5") for e in fixed]
 
 

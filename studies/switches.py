@@ -12,7 +12,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,8 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts
-from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
@@ -57,30 +56,21 @@ LATE_S = 0.04
 Run = Callable[[Estimator, ConditionDrive], StateTrack]
 
 
-@dataclass(frozen=True, slots=True)
-class SwitchedHybrid(AdaptiveHybridUkf):
-    """``pd-hef`` whose two filters have options of :class:`PhysicsUkf` as given; the parallel filter has its own."""
-
-    options: tuple[tuple[str, Any], ...] = ()
-
-    @property
-    def filters(self) -> tuple[PhysicsUkf, PhysicsUkf]:
-        """F1 and F2."""
-        plain = replace(self.hybrid.filter, **dict(self.options))
-        return plain, replace(plain, force_scale=True)
-
-
 def with_option(estimator: Estimator, name: str, value: bool) -> Estimator:
     """Return an estimator with a field of its filter set, ``physics`` with a part where the name is that of one."""
-    if isinstance(estimator, PhysicsFilter) and name in PhysicsParts.model_fields:
-        parts = estimator.vehicle.physics.model_copy(update={name: value})
-        return replace(estimator, vehicle=estimator.vehicle.model_copy(update={"physics": parts}))
-    if isinstance(estimator, AdaptiveHybridUkf) and name not in {f.name for f in fields(estimator)}:
-        own = {f.name: getattr(estimator, f.name) for f in fields(AdaptiveHybridUkf)}
-        return SwitchedHybrid(**own, options=((name, value),))
+    if isinstance(estimator, AdaptivePhysics):
+        return replace(estimator, physics=_with_option(estimator.physics, name, value))
     changed: Any = estimator
     switched: Estimator = replace(changed, **{name: value})
     return switched
+
+
+def _with_option(physics: PhysicsFilter, name: str, value: bool) -> PhysicsFilter:
+    if name in PhysicsParts.model_fields:
+        parts = physics.vehicle.physics.model_copy(update={name: value})
+        return replace(physics, vehicle=physics.vehicle.model_copy(update={"physics": parts}))
+    changed: dict[str, Any] = {name: value}
+    return replace(physics, **changed)
 
 
 def run_plain(estimator: Estimator, drive: ConditionDrive) -> StateTrack:

@@ -36,6 +36,7 @@ from pdhef_logtool.records.errors import UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     NO_MODEL,
+    PHYSICS_MODEL,
     SHIPPED,
     SHIPPED_FOLDERS,
     ModelBundle,
@@ -142,11 +143,7 @@ class Car:
         found = _intervals_of(folder, name, intervals)
         car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=found)
         stale = list(car.notes)
-        foreign = [n for n, one in car.noise.items() if bundle and one.network_sha256 not in (None, bundle.sha256)]
-        if foreign:
-            car = replace(car, noise={n: one for n, one in car.noise.items() if n not in foreign})
-            stale.append(_stale(f"noise of {', '.join(foreign)}", "it belongs to another network", "pdhef tune"))
-        elif other := car._other_than_tried:
+        if other := car._other_than_tried:
             stale.append(f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef trust makes it anew")
         own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
         if own and found is not None and found.physics_sha256 != car.physics_sha256:
@@ -178,6 +175,16 @@ class Car:
         return noise_sha256(self.noise)
 
     @property
+    def residual_network(self) -> ModelBundle | None:
+        """The network, if it says what ``physics`` lacks; that of the paper says what ``phy-ukf`` lacks."""
+        return self.network if self.network is not None and self.network.model == PHYSICS_MODEL else None
+
+    @property
+    def tried_with(self) -> tuple[str, str]:
+        """Digests of the physics and of the noise that ``pd-hef`` runs with: what evidence for its network is about."""
+        return self.physics_of(PHYSICS), noise_sha256({n: one for n, one in self.noise.items() if n == PHYSICS})
+
+    @property
     def allowed_trust(self) -> AllowedTrust:
         """How far ``pd-hef`` may follow the network on this car, and why (METHOD §14).
 
@@ -203,9 +210,10 @@ class Car:
     def _other_than_tried(self) -> str:
         """What of the car is another than the network was tried with; empty if nothing is."""
         found = self.trust
-        if found is not None and found.physics_sha256 not in (None, self.physics_sha256):
+        physics, noise = self.tried_with
+        if found is not None and found.physics_sha256 not in (None, physics):
             return "other physics"
-        return "other noise" if found is not None and found.noise_sha256 not in (None, self.noise_sha256) else ""
+        return "other noise" if found is not None and found.noise_sha256 not in (None, noise) else ""
 
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
@@ -233,7 +241,7 @@ class Car:
         if physics is not None:
             told = {k: None for k in FittedValues.model_fields if k in other}
             physics = physics.model_copy(update={"values": physics.values.model_copy(update=told)})
-        if trust is not None and trust.physics_sha256 == self.physics_sha256:
+        if trust is not None and trust.physics_sha256 == self.tried_with[0]:
             trust = trust.model_copy(update={"physics_sha256": None})
         own = self.own.model_copy(update=other)
         return replace(self, vehicle=vehicle, own=own, trust=trust, fitted_physics=physics)

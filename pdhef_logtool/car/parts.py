@@ -21,9 +21,15 @@ Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 #: The filter on physics that has parts of its own.
 PHYSICS = "physics"
 #: Filters whose noise a car may hold, by the name of the estimator that it belongs to.
-NOISY_FILTERS = ("phy-ukf-tuned", PHYSICS, "pd-hef", "pd-hef-smoothed")
-#: Filters of older versions by name, and what stands for them now. A file may hold noise of theirs; it is not used.
-FORMER_FILTERS = {"physics-plus": PHYSICS}
+NOISY_FILTERS = ("phy-ukf-tuned", PHYSICS)
+#: Filters of older versions by name, and what stands for them or for their noise now. A file may hold noise of theirs;
+#: it is not used.
+FORMER_FILTERS = {
+    "physics-plus": PHYSICS,
+    "pd-hef-trust0": PHYSICS,
+    "pd-hef": "physics with a network",
+    "pd-hef-smoothed": "physics with a network",
+}
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
@@ -106,7 +112,7 @@ class FilterNoise(Record):
     q_std : per square root of second, of v_x, v_y and yaw rate, and of the a_x bias if it is not left out; for
         ``physics`` also of the two axle forces. Empty: the filter's own.
     r_std : by measurement; what is left out is the filter's own.
-    physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, for filters that have one.
+    physics_sha256 : of the physics that it belongs to. network_sha256 : of the network, in files of older versions.
     score_deg : what it scored in ``pdhef tune``, lower is better; None where nothing was compared. trial : its number.
     """
 

@@ -62,6 +62,7 @@ def extract(
     split: Annotated[str | None, Option(help="train, validation or test for all drives of this command.")] = None,
     seed: Annotated[int, Option(help="Seed of the split by drive.")] = 0,
     vary: Annotated[float, Option(help="Make friction and car wrong by this spread for a part of the drives.")] = 0.0,
+    model: Annotated[str, Option(help="Whose residuals: physics, or phy-ukf for --paper and --baselines.")] = "physics",
     jobs: options.Jobs = 1,
     resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings are as they were.")] = False,
     as_json: options.JsonFlag = False,
@@ -70,7 +71,7 @@ def extract(
     from pdhef_logtool.learning.network.extract_command import ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as write_residuals
 
-    settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed, vary=vary)
+    settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed, vary=vary, model=model)
     with console.progress() as bar:
         result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_extraction, as_json)

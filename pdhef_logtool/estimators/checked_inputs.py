@@ -1,7 +1,7 @@
 """What filters that heed sensor faults start from: checked signals, and the network's residual made of them.
 
 The detector looks at the window, the parallel filter runs on what it leaves, and the network sees that filter's
-prediction in place of a bad sample. No noise of the filters that take the result changes it.
+prediction in place of a bad sample. Without a network there is no parallel filter and no residual.
 """
 
 from __future__ import annotations
@@ -11,21 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.estimators.hybrid import HybridUkf
-from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
+from pdhef_logtool.estimators.parallel_physics import run_features
 from pdhef_logtool.estimators.physics import FilterCarry
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray, Signals
-from pdhef_logtool.residual_model.service import NetworkCarry
+from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 from pdhef_logtool.watches.sensor_faults import FaultCarry, SensorFaults, find_faults
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InputCarry:
-    """What the detector, the parallel filter and the network take from window to window."""
+    """What the detector, the parallel filter and the network take from window to window; None: there is none."""
 
-    faults: FaultCarry
-    physics: FilterCarry
-    network: NetworkCarry
+    faults: FaultCarry | None
+    physics: FilterCarry | None = None
+    network: NetworkCarry | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,25 +52,42 @@ class CheckedInputs:
         return CheckedInputs(SensorFaults(**cut), self.rate[first:end])
 
 
-def check_inputs(hybrid: HybridUkf, signals: Signals, carry: InputCarry | None) -> tuple[CheckedInputs, InputCarry]:
+def check_inputs(
+    physics: PhysicsFilter, network: NetworkService | None, signals: Signals, carry: InputCarry | None
+) -> tuple[CheckedInputs, InputCarry]:
     """Look for faults in one window, and run parallel filter and network on what they leave.
 
     Joined windows give the same bits as one call over the whole log.
     """
-    faults, fault_carry = find_faults(signals, hybrid.vehicle, carry.faults if carry else None)
-    features, steps, physics = run_features(
-        parallel_filter(hybrid.vehicle, use_speed=hybrid.use_speed, slip_gate=hybrid.slip_gate),
-        faults.filtered,
+    read_with = physics.read_with or physics.vehicle
+    faults, fault_carry = find_faults(signals, read_with, carry.faults if carry else None)
+    rate, carried = residual_rate(physics, network, faults.filtered, carry, faults)
+    return CheckedInputs(faults, rate), InputCarry(fault_carry, carried.physics, carried.network)
+
+
+def residual_rate(
+    physics: PhysicsFilter,
+    network: NetworkService | None,
+    signals: Signals,
+    carry: InputCarry | None,
+    faults: SensorFaults | None = None,
+) -> tuple[FloatArray, InputCarry]:
+    """Return the network's residual rate [N, 2] in m/s² and rad/s², 0 without a network; trust is not yet applied."""
+    if network is None:
+        return np.zeros((len(signals), 2)), InputCarry(None)
+    features, steps, after = run_features(
+        physics,
+        signals,
         carry.physics if carry else None,
-        seen=faults.network,
-        extra_r=faults.extra_r,
+        seen=None if faults is None else faults.network,
+        extra_r=None if faults is None else faults.extra_r,
     )
     starts = ~np.isfinite(steps.prior[:, 0])
-    rate, network = hybrid.network.run(features, starts, carry.network if carry else None)
-    return CheckedInputs(faults, rate), InputCarry(fault_carry, physics, network)
+    rate, said = network.run(features, starts, carry.network if carry else None)
+    return rate, InputCarry(None, after, said)
 
 
-def r_scale(extra_r: FloatArray, r_std: tuple[float, float]) -> FloatArray:
-    """Return the larger factor by which the detector raised R of a_y or yaw rate, [N], at a filter's ``r_std``."""
-    factor: FloatArray = 1.0 + (extra_r / np.square(r_std)).max(axis=1, initial=0.0)
+def r_scale(extra_r: FloatArray, r_std: FloatArray) -> FloatArray:
+    """Return the larger factor by which the detector raised R of a_y or yaw rate, [N], at a filter's 1-sigmas [≥2]."""
+    factor: FloatArray = 1.0 + (extra_r / np.square(r_std[:2])).max(axis=1, initial=0.0)
     return factor

@@ -16,8 +16,9 @@ targets are made the same way.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -561,11 +562,16 @@ def carry_on(
 
 
 def released_track(
-    name: str, stamps_ns: IntArray, steps: PosteriorSteps, predict: Callable[[Due, Predicted], None]
+    name: str,
+    stamps_ns: IntArray,
+    steps: PosteriorSteps,
+    predict: Callable[[Due, Predicted], None],
+    named: Mapping[str, int] = MappingProxyType({}),
 ) -> tuple[StateTrack, Release]:
     """Predict to each scored stamp the newest step that had arrived by then.
 
-    ``predict`` writes what becomes of the steps in the time ahead, with their inputs held.
+    ``predict`` writes what becomes of the steps in the time ahead, with their inputs held. ``named`` are the entries of
+    the state that have a column of the track.
     """
     released, horizon_s, usable = predictable(steps.stamps_ns, steps.ready_ns, steps.valid, stamps_ns)
     at, count, n = released.at, len(stamps_ns), steps.x.shape[1]
@@ -588,6 +594,7 @@ def released_track(
         friction=np.where(usable, steps.inputs[at, U_FRICTION], np.nan),
         valid=usable,
         diverged=usable & steps.diverged[at],
+        **{column: np.where(usable, x[:, i], np.nan) for column, i in named.items()},
     )
     return track, released
 

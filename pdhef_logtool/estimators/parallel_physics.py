@@ -1,8 +1,13 @@
-"""The pure physics filter that runs beside the network and gives it its features (METHOD §5)."""
+"""The pure physics filter that runs beside the network and gives it its features (METHOD §5).
+
+Which one a network was trained with stands in its bundle: ``physics``, or ``phy-ukf`` for the paper's network and the
+baselines beside it, which are frozen.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,20 +15,38 @@ from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.filter_shell import U_FRICTION, U_SPEED, U_STEER, VX, PosteriorSteps, rolls_forward
 from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.physics_model import FRONT, REAR, Layout, PhysicsParameters, sensed_ay
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL
 from pdhef_logtool.residual_model.features import make_features
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+
+#: Entries of the features that the states of ``physics`` beyond the motion, and its parameters, give.
+_BODY, _PARAMETERS = 4, 6
 
 
 @njit(cache=True)
-def _predicted_ay(x, inputs, p, out):  # type: ignore[no-untyped-def]
+def _nominal_ay(x, inputs, p, out):  # type: ignore[no-untyped-def]
     for k in range(x.shape[0]):
         out[k] = math.nan
         if math.isfinite(x[k, 0]):
             out[k] = measured_lateral_acceleration(
                 x[k, 0], x[k, 1], x[k, 2], inputs[k, U_STEER], inputs[k, U_FRICTION], p
             )
+
+
+@njit(cache=True)
+def _physics_ay(x, inputs, layout, p, f, out):  # type: ignore[no-untyped-def]
+    row = np.empty(x.shape[1])
+    for k in range(x.shape[0]):
+        out[k] = math.nan
+        if math.isfinite(x[k, 0]):
+            out[k] = sensed_ay(x[k], inputs[k, U_STEER], layout, p, f, row)
 
 
 def car_features(vehicle: VehicleParameters, friction: FloatArray) -> FloatArray:
@@ -43,12 +66,24 @@ def car_features(vehicle: VehicleParameters, friction: FloatArray) -> FloatArray
 
 
 def parallel_filter(vehicle: VehicleParameters, *, use_speed: bool = True, slip_gate: bool = True) -> PhysicsUkf:
-    """Return the filter whose steps the features are made of: ``phy-ukf`` as it is frozen."""
+    """Return the filter whose steps the features of the paper's network and of the baselines are made of.
+
+    That is ``phy-ukf`` as it is frozen.
+    """
     return PhysicsUkf(vehicle, use_speed=use_speed, slip_gate=slip_gate, name="parallel")
 
 
+def filter_of(car: Car, model: str, *, use_speed: bool = True) -> PhysicsUkf | PhysicsFilter:
+    """Return the parallel filter of networks for a model, one of :data:`~.bundle.MODELS`."""
+    return (
+        of_car(car, use_speed=use_speed)
+        if model == PHYSICS_MODEL
+        else parallel_filter(car.vehicle, use_speed=use_speed)
+    )
+
+
 def run_features(
-    physics: PhysicsUkf,
+    physics: PhysicsUkf | PhysicsFilter,
     signals: Signals,
     carry: FilterCarry | None,
     *,
@@ -64,17 +99,33 @@ def run_features(
 
     Returns
     -------
-    features : [K, 17], NaN where the filter has no state, or one that goes backwards against the speed sensor.
+    features : [K, 28], NaN where the filter has no state, or one that goes backwards against the speed sensor.
     steps, carry : of the filter.
     """
     steps, after = physics.filter_steps(signals, carry, extra_r=extra_r)
-    usable = without_impossible(signals if seen is None else seen)
-    predicted = np.empty(len(signals))
-    friction = steps.inputs[:, U_FRICTION]
-    _predicted_ay(steps.x, steps.inputs, model_parameters(physics.vehicle), predicted)
+    seen = signals if seen is None else seen
+    friction, predicted = steps.inputs[:, U_FRICTION], np.empty(len(signals))
+    body, parameters = np.zeros((len(signals), _BODY)), np.zeros((len(signals), _PARAMETERS))
+    if isinstance(physics, PhysicsFilter):
+        seen = physics.corrected(seen)
+        layout, p, f = physics.parameters
+        _physics_ay(steps.x, steps.inputs, layout, p, f, predicted)
+        if layout.roll >= 0:
+            body[:, :2] = steps.x[:, layout.roll : layout.roll + 2]
+        body[:, 2:] = steps.x[:, [FRONT, REAR]]
+        parameters[:] = _part_parameters(layout, f)
+    else:
+        _nominal_ay(steps.x, steps.inputs, model_parameters(physics.vehicle), predicted)
+    usable = without_impossible(seen)
     features = make_features(
         steps.inputs[:, U_STEER], usable.ay_m_s2, usable.yaw_rate_rad_s, steps.x, steps.prior, predicted,
-        friction, usable.ax_m_s2, car_features(physics.vehicle, friction),
+        friction, usable.ax_m_s2, body, np.concatenate([car_features(physics.vehicle, friction), parameters], axis=1),
     )  # fmt: skip
     features[~(steps.valid & rolls_forward(steps.x[:, VX], steps.inputs[:, U_SPEED]))] = np.nan
     return features, steps, after
+
+
+def _part_parameters(layout: Layout, f: PhysicsParameters) -> list[float]:
+    """Return the last features: the parameters of the parts that the filter has, 0 for those that it has not."""
+    of_roll = [f.roll_frequency_rad_s, f.roll_damping, f.swing_m] if layout.roll >= 0 else [0.0, 0.0, 0.0]
+    return [f.relaxation_length_m, f.load_sensitivity, f.roll_gradient, *of_roll]

@@ -1,63 +1,50 @@
-"""``pd-hef`` and ``pd-hef-smoothed``: which algorithm they are on a car, by the trust that its evidence allows.
+"""``pd-hef`` and its presets: ``physics`` of the car plus trust times what the network says that it lacks.
 
-Without evidence a hybrid filter at trust 0 would be a single-track filter with noise that was chosen for a network; the
-strongest filter on physics stands in its place (:mod:`~.cautious`).
+The trust is what the car's evidence allows; without a network or evidence it is 0, and ``pd-hef`` is ``physics``.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
-from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
-from pdhef_logtool.estimators.hybrid import FILTER
-from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
-from pdhef_logtool.estimators.smoothed import SmoothedHybrid, smoothed_hybrid
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.physics_ukf import of_car
+from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.table import Options
 
-
-def build(name: str, car: Car, options: Options) -> Estimator:
-    """Return the adaptive hybrid filter, or the strongest filter on physics behind its detector where trust is 0."""
-    del name
-    trust, notes = _trust(car, options)
-    if trust == 0.0:
-        physics = strongest_physics(car, use_speed=options.use_speed)
-        said = f"without trust in its network it is {physics.name}, with faulty samples of a_y and gyro left out"
-        return CautiousPhysics(physics, notes=(*notes, said))
-    noise = car.noise.get(FILTER)
-    network = options.service(car)
-    return adaptive_hybrid_ukf(car.vehicle, network, noise, trust=trust, use_speed=options.use_speed, notes=notes)
+#: Presets at trust 1, whatever the car allows; the second is without the adaptive mechanism.
+FULL_TRUST, FIXED = "pd-hef-trust1", "pd-hef-fixed-r"
 
 
-def build_smoothed(name: str, car: Car, options: Options) -> SmoothedHybrid:
-    """Return the hybrid filter smoothed; where trust is 0 and ``phy-ukf-tuned`` is best, that one smoothed.
-
-    Where ``physics`` is best, the hybrid filter at trust 0 is smoothed.
-    """
-    trust, notes = _trust(car, options)
-    network, use_speed = options.service(car), options.use_speed
-    if trust > 0.0 or strongest_physics(car).name != TUNED:
-        noise = car.noise.get(name, car.noise.get(FILTER))
-        return smoothed_hybrid(car.vehicle, network, noise, trust=trust, use_speed=use_speed, notes=notes)
-    forward = strongest_physics(car)
-    assert forward.r_std is not None  # it has every measurement
-    ay_std, yaw_rate_std, speed_std = forward.r_std
-    noise = FilterNoise(q_std=forward.q_std, r_std={"ay_m_s2": ay_std, "yaw_rate_rad_s": yaw_rate_std})
-    sensors = car.vehicle.sensors.model_copy(update={"speed_std_m_s": speed_std})
-    own = car.vehicle.model_copy(update={"sensors": sensors})
-    said = f"without trust in its network it is {TUNED}, smoothed"
-    smoothed = smoothed_hybrid(own, network, noise, trust=0.0, use_speed=use_speed, notes=(*notes, said))
-    return replace(smoothed, bias_states=False)  # as the filter whose noise it has
+def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
+    """Return ``physics`` of a car with its network, at the trust that options, name or evidence say."""
+    trust, notes = _trust(name, car, options)
+    return AdaptivePhysics(
+        of_car(car, use_speed=options.use_speed),
+        options.service(car) if trust > 0.0 else None,
+        trust,
+        adaptive=name != FIXED,
+        name=name,
+        notes=notes,
+    )
 
 
-def _trust(car: Car, options: Options) -> tuple[float, tuple[str, ...]]:
+def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
+    """Return the same smoothed; ``name`` is that of the result."""
+    filtered = build(name, car, options)
+    return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *filtered.notes))
+
+
+def _trust(name: str, car: Car, options: Options) -> tuple[float, tuple[str, ...]]:
+    if car.residual_network is None:
+        why = "the car has no network" if car.network is None else "the network is one for phy-ukf, as the paper has it"
+        return 0.0, (f"network trust 0: {why}",)
     if options.trust is not None:
         return options.trust, ()
+    if name in (FULL_TRUST, FIXED):
+        return 1.0, ()
     allowed = car.allowed_trust
     return allowed.cap, (allowed.note,)

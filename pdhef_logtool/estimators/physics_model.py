@@ -62,6 +62,19 @@ class Layout(NamedTuple):
     steer_bias: int
     sensor_bias: int  # of a_y, and of the yaw rate behind it; the last entries, for only the sensors feel them
 
+    @property
+    def named(self) -> dict[str, int]:
+        """Where the states stand that a track has a column for, by its name; those that the car has."""
+        places = {
+            "roll_rad": self.roll,
+            "bank_rad": self.bank,
+            "force_scale": self.force_scale,
+            "steer_bias_rad": self.steer_bias,
+            "ay_bias_m_s2": self.sensor_bias,
+            "yaw_rate_bias_rad_s": self.sensor_bias + 1 if self.sensor_bias >= 0 else -1,
+        }
+        return {name: at for name, at in places.items() if at >= 0}
+
 
 class PhysicsParameters(NamedTuple):
     """What the compiled model needs beside :class:`~pdhef_logtool.car.nominal_model.ModelParameters`."""

@@ -5,6 +5,9 @@ states, what the sensors read is linear in the state but for a lever arm's r²: 
 for a linear function is what the sigma points give. Points that differ in the sensors' biases alone move with their
 centre. With ``jacobian`` the time update takes derivatives too, by differences of the model, and is an extended filter.
 
+A residual rate of v̇_y and ṙ enters as in ``phy-ukf``: half before and half after the model's step, and in the
+predicted a_y, times the force scale where that is a state. Zeros change no bit.
+
 Inputs, gate, standstill, restart, wheel speed and delay are those of ``phy-ukf``.
 """
 
@@ -16,9 +19,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters
+from pdhef_logtool.car.nominal_model import ModelParameters, dynamic_share, model_parameters
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise
-from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, corrected_anew
 from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators.physics import (
     BIAS_WALK_STD,
@@ -37,6 +40,7 @@ from pdhef_logtool.estimators.physics_model import (
     FRONT,
     REAR,
     VX,
+    VY,
     YAW_RATE,
     Layout,
     PhysicsParameters,
@@ -56,7 +60,6 @@ from pdhef_logtool.watches.speed_slip import believable
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
-    from pdhef_logtool.estimators.table import Options
 
 #: Process noise, 1-sigma per square root of second, of [v_x, v_y, r, b_ax, f_f, f_r] where the car has none of its own,
 #: and where identification looks for it. By innovation likelihood over simulated drives, as that of ``phy-ukf``, with
@@ -129,15 +132,41 @@ def _cross(before, deviation, out):  # type: ignore[no-untyped-def]
             out[a, b] = weight * total
 
 
+@_compiled
+def _force(x, layout):  # type: ignore[no-untyped-def]
+    """Return the factor on forces and residual in state x [n]."""
+    return max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
+
+
+@_compiled
+def _push(points, count, half, layout):  # type: ignore[no-untyped-def]
+    """Add half of the residual's increments of v_y and r to points that move, times their force scale."""
+    half_vy, half_rate = half
+    for j in range(count):
+        force = max(0.1, 1.0 + points[layout.force_scale, j]) if layout.force_scale >= 0 else 1.0
+        points[VY, j] += force * half_vy
+        points[YAW_RATE, j] += force * half_rate
+
+
 # positional: to hand structures of arrays on at every step would cost as much as the step.
 @_compiled
-def _predict(x, P, over, dt, noise, layout, p, f, work):  # type: ignore[no-untyped-def]
-    """Move state and covariance by ``dt`` s in place; the deviations of the sigma points are left in ``work``."""
+def _predict(x, P, over, rate, dt, noise, layout, p, f, work):  # type: ignore[no-untyped-def]
+    """Move state and covariance by ``dt`` s in place; the deviations of the sigma points are left in ``work``.
+
+    ``rate`` is the residual of v̇_y and ṙ; it counts where the model is dynamic.
+    """
     q_std, scale = noise
     points, deviation, L = work
     count = _draw(x, P, scale, layout, L, points)
     n = step_count(x[VX], dt, over.friction, layout, p, f)
+    given = rate[0] != 0.0 or rate[1] != 0.0
+    share = 0.5 * dynamic_share(x[VX], p) * dt
+    half = (share * rate[0], share * rate[1])
+    if given:
+        _push(points, count, half, layout)
     advance(points, count, over, dt, n, layout, p, f)
+    if given:
+        _push(points, count, half, layout)
     for j in range(x.shape[0]):
         if layout.sensor_bias < 0 or j < layout.sensor_bias:
             for i in range(count, points.shape[1]):
@@ -150,10 +179,18 @@ def _predict(x, P, over, dt, noise, layout, p, f, work):  # type: ignore[no-unty
 
 # positional: as _predict.
 @_compiled
-def _measure(x, P, steer, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [n, 3]."""
+def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [n, 3].
+
+    ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
+    """
     n = x.shape[0]
     z_hat[shell.Z_AY] = sensed_ay(x, steer, layout, p, f, row)
+    if rate_vy != 0.0:
+        felt = (1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient) * dynamic_share(x[VX], p) * rate_vy
+        z_hat[shell.Z_AY] += _force(x, layout) * felt
+        if layout.force_scale >= 0:
+            row[layout.force_scale] = felt
     z_hat[shell.Z_YAW_RATE] = x[YAW_RATE]
     z_hat[shell.Z_SPEED] = x[VX]
     biased = layout.sensor_bias >= 0
@@ -201,16 +238,17 @@ def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[n
                 settle_forces(x, now.steer, now.ax, now.friction, layout, p, f)
         else:
             over = shell.meanwhile(now, memory)
+            rate = (memory[shell.M_RATE_VY], memory[shell.M_RATE_R])
             if linked:
                 _draw(x, P, scale, layout, L, before)
-            _predict(x, P, over, now.dt, noise, layout, p, f, work)
+            _predict(x, P, over, rate, now.dt, noise, layout, p, f, work)
             alive = shell.all_finite(x, P)
             if linked:
                 _cross(before, deviation, out_cross[k])
                 out_predicted_P[k] = P
             out_prior[k] = x
             if alive:
-                _measure(x, P, now.steer, layout, p, f, row, z_hat, S, Pxz)
+                _measure(x, P, now.steer, rate[0], layout, p, f, row, z_hat, S, Pxz)
                 shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
                 verdict = shell.gate(now, memory, nu, S, at_gate, given, use)
                 for i in range(shell.MEASUREMENTS):
@@ -222,7 +260,7 @@ def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[n
                     P *= shell.GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
-                    _measure(x, P, now.steer, layout, p, f, row, z_hat, S, Pxz)
+                    _measure(x, P, now.steer, rate[0], layout, p, f, row, z_hat, S, Pxz)
                     shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
                     shell.open_gate(use, memory)
                 nis, dof, likelihood = kalman_update(x, P, nu, S, Pxz, use)
@@ -248,7 +286,7 @@ def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[n
 def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignore[no-untyped-def]
     """Predict the steps that are due with their inputs held; writes state, covariance and planar a_y."""
     step, horizon_s = due
-    held_x, held_P, inputs, _ = held
+    held_x, held_P, inputs, residual_rate = held
     out_x, out_P, out_ay = predicted
     q_std, _, _, _, _, _, scale, _ = tuning
     n = held_x.shape[1]
@@ -264,14 +302,17 @@ def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignor
         x[:] = held_x[k]
         P[:, :] = held_P[k]
         over = shell.held_inputs(inputs, k)
+        rate = (residual_rate[k, 0], residual_rate[k, 1])
         if horizon_s[m] > 0.0:
-            _predict(x, P, over, horizon_s[m], (q_std, scale), layout, p, f, (points, deviation, L))
+            _predict(x, P, over, rate, horizon_s[m], (q_std, scale), layout, p, f, (points, deviation, L))
             if not shell.all_finite(x, P):
                 x[:] = math.nan
                 P[:, :] = math.nan
         out_x[m] = x
         out_P[m] = P
         out_ay[m] = planar_ay(x, over.steer, p)
+        if rate[0] != 0.0:
+            out_ay[m] += _force(x, layout) * dynamic_share(x[VX], p) * rate[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,7 +352,8 @@ class PhysicsFilter:
         return layout_of(self.vehicle)
 
     @property
-    def _parameters(self) -> tuple[Layout, ModelParameters, PhysicsParameters]:
+    def parameters(self) -> tuple[Layout, ModelParameters, PhysicsParameters]:
+        """What the compiled model takes."""
         return self.layout, model_parameters(self.vehicle), physics_parameters(self.vehicle)
 
     @property
@@ -344,41 +386,65 @@ class PhysicsFilter:
             standstill=self.standstill,
         )
 
+    def corrected(self, signals: Signals) -> Signals:
+        """Return signals as this filter's vehicle corrects them, where they were read with another one."""
+        return signals if self.read_with is None else corrected_anew(signals, self.read_with, self.vehicle)
+
     def filter_steps(
-        self, signals: Signals, carry: FilterCarry | None, extra_r: FloatArray | None = None
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry]:
         """Run the filter on measurement time only; the steps and the carry with no pending steps in it.
 
+        ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
-        steps, after, _ = self._steps(signals, carry, extra_r, linked=False)
+        steps, after, _ = self._steps(signals, carry, residual_rate, extra_r, linked=False)
         return steps, after
 
     def linked_steps(
-        self, signals: Signals, carry: FilterCarry | None, extra_r: FloatArray | None = None
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
         """Return what :meth:`filter_steps` does, bit for bit, and what ties the steps together."""
-        return self._steps(signals, carry, extra_r, linked=True)
+        return self._steps(signals, carry, residual_rate, extra_r, linked=True)
 
     def _steps(
-        self, signals: Signals, carry: FilterCarry | None, extra_r: FloatArray | None, *, linked: bool
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None,
+        extra_r: FloatArray | None,
+        *,
+        linked: bool,
     ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
-        if self.read_with is not None:
-            signals = corrected_anew(signals, self.read_with, self.vehicle)
+        signals = self.corrected(signals)
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
-        window, tuning = shell.make_window(signals, carry, extra_r=extra_r), self._tuning
+        window, tuning = shell.make_window(signals, carry, residual_rate, extra_r), self._tuning
         count, n = len(signals), self.layout.size
         belief, out = shell.resume(carry, n), shell.no_posterior(count, n)
         tied = count if linked else 0
         links = LinkColumns(np.full(tied, LINK_NONE), np.zeros((tied, n, n)), np.zeros((tied, n, n)))
-        _filter(window, tuning, *self._parameters, belief, out, links)
+        _filter(window, tuning, *self.parameters, belief, out, links)
         steps = shell.PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
         return steps, shell.carry_on(belief, steps, carry, slip), StepLinks(*links)
 
-    def run(self, signals: Signals, carry: FilterCarry | None) -> tuple[StateTrack, FilterCarry]:
+    def run(
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
+    ) -> tuple[StateTrack, FilterCarry]:
         """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
-        steps, after = self.filter_steps(signals, carry)
+        steps, after = self.filter_steps(signals, carry, residual_rate, extra_r)
         return self.outputs(signals, carry, steps, after)
 
     def outputs(
@@ -390,9 +456,9 @@ class PhysicsFilter:
         held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
 
         def predict(due: shell.Due, predicted: shell.Predicted) -> None:
-            _predict_outputs(due, held, self._tuning, *self._parameters, predicted)
+            _predict_outputs(due, held, self._tuning, *self.parameters, predicted)
 
-        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict)
+        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict, self.layout.named)
         return track, replace(after, steps=steps.since(released.needed))
 
 
@@ -408,12 +474,6 @@ def physics_filter(
         r_std=noise.measurement_std(vehicle.sensors),
         use_speed=use_speed,
     )
-
-
-def build(name: str, car: Car, options: Options) -> PhysicsFilter:
-    """Return ``physics`` of a car."""
-    del name
-    return of_car(car, use_speed=options.use_speed)
 
 
 def of_car(car: Car, *, use_speed: bool = True) -> PhysicsFilter:

@@ -1,6 +1,7 @@
-"""``pd-hef-smoothed``: Rauch-Tung-Striebel smoothing over the hybrid filter (METHOD §12, §14). Not causal.
+"""``pd-hef-smoothed``: Rauch-Tung-Striebel smoothing over ``pd-hef`` (METHOD §12, §14). Not causal.
 
-Forward runs the hybrid unscented filter on checked signals, as the F1 of ``pd-hef`` does (:mod:`~.checked_inputs`);
+Forward runs F1 of ``pd-hef``, the car's physics filter with its residual, on checked signals
+(:mod:`~.checked_inputs`);
 backward, from the last step that is seen,
 
     G_k = C_{k,k+1} P_{k+1|k}⁻¹
@@ -11,8 +12,7 @@ with C from the sigma points of the step before Q is added and they are drawn an
 is a known input of the step, so that it stands in x_{k+1|k} and needs no term of its own.
 
 - A start (first step, gap, failure) ends the recursion: nothing behind it tells of what lies before it.
-- A standstill overwrites v_x, v_y and r with zero. That is no measurement, so none of it goes back; only the biases,
-  which it does not touch, tie the step to the one before.
+- A standstill overwrites the motion with zero. That is no measurement, so none of it goes back.
 - Where the gate opened, the inflated covariance counts as that of the prediction: process noise of that step.
 - The detector is causal: what comes later does not make it find a fault sooner.
 
@@ -26,25 +26,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, r_scale
 from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
-from pdhef_logtool.estimators.hybrid import HybridUkf, hybrid_ukf
-from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, PhysicsUkf, StepLinks
+from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, StepLinks
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.residual_model.service import NetworkService
 
-#: Name under which a car holds this estimator's noise; without it that of the filter is used.
-NAME = "pd-hef-smoothed"
-#: Used where the car has neither: v_y's noise is 3/4 of the filter's. On 30 simulated validation drives the geometric
-#: mean of the sideslip RMSE is 0.0260° with 97 % in the 95 % band: 0.0274° at the filter's noise, 0.0253° but narrower
-#: bands at half of it; without bias states 0.0307° at the filter's noise; the filter itself has 0.0309°.
-SMOOTHED_Q_STD = (0.089, 0.045, 0.03, 0.021)
 #: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
 #: smoother that sees all of a drive of 300 s this changed v_y by less than 5e-5 m/s (60 s: 5e-4 m/s).
 BLOCK_S = 120.0
@@ -182,19 +174,17 @@ class SmoothedCarry:
 
 
 @dataclass(frozen=True, slots=True)
-class SmoothedHybrid:
-    """The hybrid filter, smoothed.
+class SmoothedPhysics:
+    """The car's physics filter with trust times the residual, smoothed.
 
     Parameters
     ----------
-    hybrid : the filter that runs forward, with its trust and noise.
-    bias_states : whether the forward filter estimates the biases of a_y, yaw rate and steering angle.
+    filtered : what is smoothed: its inputs, and its F1 runs forward.
     block_s : a step sees at least this much ahead, in s, and at most twice as much.
     notes : what the report says of it.
     """
 
-    hybrid: HybridUkf
-    bias_states: bool = True
+    filtered: AdaptivePhysics
     block_s: float = BLOCK_S
     name: str = "pd-hef-smoothed"
     causal: bool = False
@@ -206,9 +196,9 @@ class SmoothedHybrid:
         return 2.0 * self.block_s
 
     @property
-    def filter(self) -> PhysicsUkf:
+    def filter(self) -> PhysicsFilter:
         """The filter that runs forward."""
-        return replace(self.hybrid.filter, bias_states=self.bias_states, name=self.name)
+        return replace(self.filtered.physics, name=self.name)
 
     def run(
         self,
@@ -223,8 +213,8 @@ class SmoothedHybrid:
         ----------
         ahead : what follows the window, at least ``look_ahead_s`` of it or all that there is; the next window begins
             with it. Without it the log ends here for all that the smoother knows.
-        known : what :func:`~.checked_inputs.check_inputs` returns for a whole log that is given as one window; it is
-            then not called.
+        known : what :meth:`~.AdaptivePhysics.inputs` returns for a whole log that is given as one window; it is then
+            not called.
         """
         given = signals if ahead is None else join_signals([signals, ahead])
         parts = []
@@ -238,7 +228,7 @@ class SmoothedHybrid:
             fresh = given.rows(taken, seen)
             inputs = None if carry is None else carry.inputs
             if known is None:
-                checked, inputs = check_inputs(self.hybrid, fresh, inputs)
+                checked, inputs = self.filtered.inputs(fresh, inputs)
             else:
                 checked = known.cut(taken, seen)
             steps, forward = self._filtered(checked, None if carry is None else carry.forward)
@@ -256,7 +246,7 @@ class SmoothedHybrid:
         """Run the filter forward over steps that it has not taken yet."""
         faults = checked.faults
         steps, after, links = self.filter.linked_steps(
-            faults.filtered, carry, self.hybrid.trust * checked.rate, faults.extra_r
+            faults.filtered, carry, self.filtered.trust * checked.rate, faults.extra_r
         )
         return ForwardSteps(steps, links, faults.extra_r, faults.reason), after
 
@@ -269,25 +259,9 @@ class SmoothedHybrid:
         track, _ = self.filter.outputs(signals, None, here, after)
         return replace(
             track,
-            network_trust=np.where(track.valid, self.hybrid.trust, np.nan),
-            r_scale=np.where(track.valid, r_scale(steps.extra_r[:count], self.hybrid.r_std), 1.0),
+            network_trust=np.where(track.valid, self.filtered.trust, np.nan),
+            r_scale=np.where(track.valid, r_scale(steps.extra_r[:count], self.filter.measurement_std), 1.0),
             nis=np.full(count, np.nan),  # a smoothed state has no innovation
             nis_dof=np.zeros(count),
             reason=steps.reason[:count],
         )
-
-
-def smoothed_hybrid(
-    vehicle: VehicleParameters,
-    network: NetworkService,
-    noise: FilterNoise | None = None,
-    *,
-    trust: float = 1.0,
-    use_speed: bool = True,
-    notes: tuple[str, ...] = (),
-) -> SmoothedHybrid:
-    """Return ``pd-hef-smoothed`` with a noise; what its ``q_std`` leaves out is :data:`SMOOTHED_Q_STD`."""
-    noise = noise or FilterNoise()
-    noise = noise.model_copy(update={"q_std": (*noise.q_std, *SMOOTHED_Q_STD[len(noise.q_std) :])})
-    hybrid = hybrid_ukf(vehicle, network, noise, trust=trust, use_speed=use_speed, name=NAME)
-    return SmoothedHybrid(hybrid, notes=(NOT_CAUSAL, *notes))

@@ -14,6 +14,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FORMER_FILTERS
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 from pdhef_logtool.residual_model.service import NetworkService
 
 _ESP = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
@@ -52,10 +53,9 @@ class Spec:
     colour : 0xRRGGBB in every plot, tellable apart with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
     causal : whether an estimate at t uses only what had arrived by t.
     default : whether it runs where none are named.
-    network : which part of a network bundle it needs; empty: none.
+    network : which part of a network bundle it needs; empty: none; ``optional``: it runs without as well.
     needs_noise : whether it cannot run without noise of its own in the car.
-    tunable : whether ``pdhef tune`` searches its noise: always, or where it is named; ``tuned_as`` : the estimator that
-        the search runs, where that is another (the same filter without what its noise does not change).
+    tunable : whether ``pdhef tune`` searches its noise.
     """
 
     name: str
@@ -65,20 +65,26 @@ class Spec:
     colour: int
     causal: bool = True
     default: bool = True
-    network: Literal["", "residual", "pure_lstm", "linear_regression"] = ""
+    network: Literal["", "optional", "residual", "paper", "pure_lstm", "linear_regression"] = ""
     needs_noise: bool = False
-    tunable: Literal["", "always", "on request"] = ""
-    tuned_as: str = ""
+    tunable: bool = False
 
     def missing(self, car: Car) -> str:
         """Return why a car does not let it run, empty if it does."""
         if self.needs_noise and self.name not in car.noise:
             return f"the car has no noise for {self.name}; pdhef identify finds it"
-        if not self.network:
+        if self.network in ("", "optional"):
             return ""
         if car.network is None:
             return "no network; --network names one, pdhef train writes one"
-        if self.network != "residual" and getattr(car.network, self.network) is None:
+        if self.network == "residual":
+            return (
+                "" if car.residual_network is not None else "the network is one for phy-ukf; pdhef train makes another"
+            )
+        if self.network == "paper":
+            has = car.network.paper_network is not None or car.network.model == NOMINAL_MODEL
+            return "" if has else "no network as the paper has it; pdhef train --paper makes one"
+        if getattr(car.network, self.network) is None:
             return "the network has no such baseline; pdhef train --baselines writes it"
         return ""
 
@@ -127,41 +133,35 @@ SPECS: tuple[Spec, ...] = (
     ),
     Spec(
         "physics", "the strongest filter on physics alone, with the parts that driving of the car gave evidence for",
-        "physics_ukf:build", _ESP, 0x44AA99, tunable="always",
+        "adaptive_physics:build", _ESP, 0x44AA99, tunable=True,
     ),
     Spec(
         "phy-ukf-tuned", "the same with the noise of an identified car, corrected for body roll",
-        "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable="always",
+        "physics_tuned:build", _ESP, 0x56B4E9, needs_noise=True, tunable=True,
     ),
     Spec(
         "pure-lstm", "a network that says v_y itself, from the same inputs, no filter (needs a network with baselines)",
         "direct_network:build", _ESP, 0xAA4499, network="pure_lstm",
     ),
     Spec(
-        "pd-hef", "hybrid filter that finds faulty sensors and scales wrong forces (needs a network)",
-        "pd_hef:build", _ESP, 0xD55E00, network="residual", tunable="always", tuned_as="pd-hef-fixed-r",
+        "pd-hef", "physics plus what its network says that it lacks, as far as the car's evidence lets it",
+        "pd_hef:build", _ESP, 0xD55E00, network="optional",
     ),
     Spec(
-        "pd-hef-fixed-r",
-        "hybrid filter: nominal model plus the network's residual, trust 1, fixed noise (needs a network)",
-        "hybrid:build", _ESP, 0x117733, network="residual",
+        "pd-hef-fixed-r", "the same at trust 1 without the adaptive mechanism (needs a network)",
+        "pd_hef:build", _ESP, 0x117733, network="residual",
     ),
     Spec(
-        "pd-hef-smoothed",
-        "the hybrid filter smoothed with what came later: not causal, ranked apart (needs a network)",
-        "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="residual", tunable="on request",
+        "pd-hef-smoothed", "pd-hef smoothed with what came later: not causal, ranked apart",
+        "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="optional",
     ),
     Spec(
-        "pd-hef-trust0", "the hybrid filter with its network switched off (needs a network)",
-        "hybrid:build", _ESP, 0x999933, network="residual",
+        "pd-hef-trust1", "pd-hef at trust 1, whatever the car allows (needs a network)",
+        "pd_hef:build", _ESP, 0x882255, default=False, network="residual",
     ),
     Spec(
-        "pd-hef-trust1", "the hybrid filter at trust 1, whatever the car allows (needs a network)",
-        "hybrid:build", _ESP, 0x882255, default=False, network="residual",
-    ),
-    Spec(
-        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs a network)",
-        "hybrid_paper:build", _ESP, 0xCC6677, network="residual",
+        "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs its network)",
+        "hybrid_paper:build", _ESP, 0xCC6677, network="paper",
     ),
 )  # fmt: skip
 

@@ -32,9 +32,17 @@ TRACK_COLUMNS = (
     "diverged",
     "mixture_weight",
     "reason",
+    "roll_rad",
+    "bank_rad",
+    "force_scale",
+    "steer_bias_rad",
+    "ay_bias_m_s2",
+    "yaw_rate_bias_rad_s",
 )
+#: What a filter may estimate beside the motion.
+ESTIMATED_COLUMNS = TRACK_COLUMNS[-6:]
 #: Those that a source may not have at all.
-OPTIONAL_COLUMNS = ("mixture_weight", "reason")
+OPTIONAL_COLUMNS = ("mixture_weight", "reason", *ESTIMATED_COLUMNS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +55,8 @@ class StateTrack:
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
     ``mixture_weight`` (of an adaptive estimator's second filter) and ``reason`` (bits of
     :mod:`pdhef_logtool.records.reasons`, why samples were not used as usual) are [N], or of length 0 where the source
-    has none.
+    has none; so are roll and bank, the share by which all lateral forces are larger, and the biases by which sensors
+    read too much.
     """
 
     name: str
@@ -71,6 +80,12 @@ class StateTrack:
     diverged: BoolArray
     mixture_weight: FloatArray = field(default_factory=lambda: np.empty(0))
     reason: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    roll_rad: FloatArray = field(default_factory=lambda: np.empty(0))
+    bank_rad: FloatArray = field(default_factory=lambda: np.empty(0))
+    force_scale: FloatArray = field(default_factory=lambda: np.empty(0))
+    steer_bias_rad: FloatArray = field(default_factory=lambda: np.empty(0))
+    ay_bias_m_s2: FloatArray = field(default_factory=lambda: np.empty(0))
+    yaw_rate_bias_rad_s: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         """Return the number of stamps."""

@@ -14,11 +14,11 @@ from pdhef_logtool.records.documents import read_json
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 
 FORMAT = "pdhef.residual-model"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 WEIGHTS_FILE = "weights.safetensors"
 DOCUMENT_FILE = "model.json"
 #: Baselines that were trained on the same dataset stand beside the network, where there are any.
@@ -34,7 +34,12 @@ SHIPPED_FOLDERS = {
     MANY_CARS: Path(__file__).parents[1] / "models" / "many-cars",
 }
 
-#: What a network may predict, and how many numbers that is: rates of v_y and r that f_nom lacks, or v_y itself.
+#: Filters that features are made by and whose model a residual is of: the strongest one, and that of the paper, which
+#: the paper's network and the baselines have.
+PHYSICS_MODEL, NOMINAL_MODEL = "physics", "phy-ukf"
+MODELS = (PHYSICS_MODEL, NOMINAL_MODEL)
+
+#: What a network may predict, and how many numbers that is: rates of v_y and r that the model lacks, or v_y itself.
 RESIDUAL = "residual_rates"
 LATERAL_VELOCITY = "lateral_velocity"
 OUTPUT_COUNT = {RESIDUAL: 2, LATERAL_VELOCITY: 1}
@@ -60,6 +65,9 @@ class ModelBundle:
     weights : by name, float32, as PyTorch names them.
     provenance : training data hash, seeds, metrics and what else the model card says; JSON-able.
     target : what it predicts, one of :data:`OUTPUT_COUNT`.
+    model : the filter that its features come from and that its residual is of, one of :data:`MODELS`.
+    physics_sha256 : digest of the physics of the car, or the cars, that it was trained on.
+    odd : mirrored left and right it is asked too, and half of the difference counts, so that it is exactly odd.
     pure_lstm, linear_regression, paper_network : the baselines beside it, None where there are none.
     """
 
@@ -72,6 +80,9 @@ class ModelBundle:
     weights: dict[str, np.ndarray[Any, np.dtype[np.float32]]]
     provenance: dict[str, Any] = field(default_factory=dict)
     target: str = RESIDUAL
+    model: str = PHYSICS_MODEL
+    physics_sha256: str = ""
+    odd: bool = False
     pure_lstm: ModelBundle | None = None
     linear_regression: LinearModel | None = None
     paper_network: ModelBundle | None = None
@@ -89,8 +100,13 @@ class ModelBundle:
         """Where the bundle's features stand in the full feature array."""
         return [FEATURES.index(name) for name in self.feature_names]
 
+    @property
+    def signs(self) -> FloatArray:
+        """Signs of the bundle's features where left and right are mirrored, [k]."""
+        return np.array([-1.0 if name in ODD_FEATURES else 1.0 for name in self.feature_names])
+
     def normalise(self, features: FloatArray) -> FloatArray:
-        """Return the chosen features [N, k] of the full array [N, 17], normalised and limited to ±8."""
+        """Return the chosen features [N, k] of the full array [N, 28], normalised and limited to ±8."""
         n = self.normalisation
         scaled = (features[:, self.columns] - np.array(n.feature_mean)) / np.array(n.feature_std)
         limited: FloatArray = np.clip(scaled, -8.0, 8.0)
@@ -102,6 +118,9 @@ class ModelBundle:
             **other,
             "format": FORMAT,
             "version": FORMAT_VERSION,
+            "model": self.model,
+            "physics_sha256": self.physics_sha256,
+            "odd": self.odd,
             "features": list(self.feature_names),
             "architecture": {"hidden": self.hidden, "layers": self.layers, "head": list(self.head)},
             "period_s": float(self.period_s),
@@ -188,7 +207,12 @@ def load_network(folder: Path, target: str) -> ModelBundle:
         raise ModelError(expected=expected, got=str(error), where=where) from None
     if document.get("format") != FORMAT or document.get("version") != FORMAT_VERSION:
         got = f"{document.get('format')} {document.get('version')}"
-        raise ModelError(expected=f"{FORMAT} {FORMAT_VERSION}", got=got, where=where, remedy="train it anew")
+        raise ModelError(
+            expected=f"{FORMAT} {FORMAT_VERSION}, which says whose physics a network completes",
+            got=got,
+            where=where,
+            remedy=f"pdhef extract LOG... -o DATASET and pdhef train DATASET -o {folder.name} make it anew",
+        )
     if (learnt := document.get("target", RESIDUAL)) != target:
         raise ModelError(expected=f"a network for {target}", got=f"one for {learnt}", where=where)
     try:
@@ -207,12 +231,17 @@ def load_network(folder: Path, target: str) -> ModelBundle:
             weights=weights,
             provenance=document.get("provenance", {}),
             target=target,
+            model=str(document["model"]),
+            physics_sha256=str(document["physics_sha256"]),
+            odd=bool(document["odd"]),
         )
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise ModelError(expected="the entries of model.json", got=f"{error!r}", where=where) from None
     unknown = [f for f in bundle.feature_names if f not in FEATURES]
     if unknown:
         raise ModelError(expected=f"features out of {', '.join(FEATURES)}", got=", ".join(unknown), where=where)
+    if bundle.model not in MODELS:
+        raise ModelError(expected=f"a network for {' or '.join(MODELS)}", got=bundle.model, where=where)
     if document.get("sha256") != bundle.sha256:
         raise ModelError(expected="weights that belong to model.json", got="another hash", where=where)
     return bundle

@@ -1,6 +1,6 @@
-"""The network's inputs, one piece of code for training and service (METHOD §5).
+"""The network's inputs, one piece of code for training and service (METHOD §5, §16).
 
-The pure physics filter runs in parallel and gives the reference for ε_phy: Δr = r_m − r̂⁻ and Δβ = β̂⁺ − β̂⁻, prior and
+A filter on physics runs in parallel and gives the reference for ε_phy: Δr = r_m − r̂⁻ and Δβ = β̂⁺ − β̂⁻, prior and
 posterior of that filter. Nothing here depends on what the hybrid filter does, and nothing on truth.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray
 
-#: Name and order of the features. The paper's six come first; a network for one car uses all but the last seven,
+#: Name and order of the features. The paper's six come first; a network for one car uses all but the last thirteen,
 #: which tell cars apart.
 FEATURES = (
     "vx_m_s",  # posterior of the physics filter
@@ -21,8 +21,13 @@ FEATURES = (
     "delta_sideslip_rad",
     "physics_vy_m_s",
     "physics_yaw_rate_rad_s",
-    "friction",  # as the nominal model is told it
+    "friction",  # as the model is told it
     "ax_m_s2",  # measured; 0 where missing
+    "utilisation",  # |a_y| / (μ g)
+    "roll_rad",  # of the physics filter; 0 where the car has no such state, as the next three
+    "roll_rate_rad_s",
+    "front_force_per_mass",  # of the axle, m/s²
+    "rear_force_per_mass",
     "cg_to_front_axle_m",
     "cg_to_rear_axle_m",
     "inertia_ratio",  # I_z / (m l_f l_r)
@@ -30,11 +35,37 @@ FEATURES = (
     "rear_stiffness_per_mass",
     "front_peak_per_mass",  # m/s², at friction 1
     "rear_peak_per_mass",
+    "relaxation_length_m",  # this and what follows are 0 where the physics filter has no such part
+    "load_sensitivity",
+    "roll_gradient_rad_per_m_s2",
+    "roll_frequency_rad_s",
+    "roll_damping",
+    "cg_over_roll_axis_m",
 )
 PAPER_FEATURES = FEATURES[:6]
-ONE_CAR_FEATURES = FEATURES[:10]
+#: Those of networks that were trained on what the nominal model misses.
+NOMINAL_FEATURES = FEATURES[:10]
+ONE_CAR_FEATURES = FEATURES[:15]
+#: Features that change sign where left and right are mirrored.
+ODD_FEATURES = frozenset(
+    {
+        "ay_m_s2",
+        "steer_rad",
+        "yaw_rate_rad_s",
+        "delta_yaw_rate_rad_s",
+        "delta_sideslip_rad",
+        "physics_vy_m_s",
+        "physics_yaw_rate_rad_s",
+        "roll_rad",
+        "roll_rate_rad_s",
+        "front_force_per_mass",
+        "rear_force_per_mass",
+    }
+)
 
-# Entries of the filter's state, as in estimators.physics.
+#: As in car.vehicle, which stands above this.
+_GRAVITY_M_S2 = 9.80665
+# Entries of the filter's state, as in estimators.filter_shell.
 _VX, _VY, _YAW_RATE = 0, 1, 2
 
 
@@ -48,9 +79,10 @@ def make_features(
     predicted_ay_m_s2: FloatArray,
     friction: FloatArray,
     ax_m_s2: FloatArray,
+    body: FloatArray,
     car: FloatArray,
 ) -> FloatArray:
-    """Return the features [K, 17] at each step; always finite where the filter's state is.
+    """Return the features [K, 28] at each step; always finite where the filter's state is.
 
     A missing measurement is replaced by what the physics filter predicts for it, so that a dropped channel looks to
     the network like one that agrees with physics.
@@ -59,18 +91,20 @@ def make_features(
     ----------
     steer_rad : [K], held where missing. ay_m_s2, yaw_rate_rad_s : [K], NaN where missing.
     posterior, prior : states of the physics filter, [K, ≥3] over v_x, v_y, r; the prior is NaN where it starts.
-    predicted_ay_m_s2 : [K], the nominal model's a_y at the posterior.
-    friction : [K]. ax_m_s2 : [K], NaN where missing. car : [K, 7], the last seven features.
+    predicted_ay_m_s2 : [K], the filter's a_y at the posterior.
+    friction : [K]. ax_m_s2 : [K], NaN where missing.
+    body : [K, 4], roll, roll rate and the axles' forces. car : [K, 13], the last features.
     """
     prior = np.where(np.isfinite(prior), prior, posterior)
     vx = posterior[:, _VX]
     rate = np.where(np.isfinite(yaw_rate_rad_s), yaw_rate_rad_s, prior[:, _YAW_RATE])
+    ay = np.where(np.isfinite(ay_m_s2), ay_m_s2, predicted_ay_m_s2)
     beta_after = np.arctan2(posterior[:, _VY], np.maximum(vx, 0.1))
     beta_before = np.arctan2(prior[:, _VY], np.maximum(prior[:, _VX], 0.1))
     columns = np.stack(
         [
             vx,
-            np.where(np.isfinite(ay_m_s2), ay_m_s2, predicted_ay_m_s2),
+            ay,
             steer_rad,
             rate,
             rate - prior[:, _YAW_RATE],
@@ -79,7 +113,8 @@ def make_features(
             posterior[:, _YAW_RATE],
             friction,
             np.where(np.isfinite(ax_m_s2), ax_m_s2, 0.0),
+            np.abs(ay) / (friction * _GRAVITY_M_S2),
         ],
         axis=1,
     )
-    return np.concatenate([columns, car], axis=1)
+    return np.concatenate([columns, body, car], axis=1)

@@ -61,7 +61,7 @@ class NetworkService:
 
         Parameters
         ----------
-        features : [N, 17] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
+        features : [N, 28] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
         starts : [N], where a sequence begins anew.
         """
         if carry is None:
@@ -85,6 +85,8 @@ class NetworkService:
     def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
         import torch
 
+        # Normalised, a mirrored feature has the other sign, for the means of those that change theirs are 0.
+        sides = [np.ones(len(self.bundle.feature_names)), self.bundle.signs][: 2 if self.bundle.odd else 1]
         before = carry.pending.shape[0]
         rows = np.concatenate([carry.pending, scaled])
         whole = rows.shape[0] // BLOCK_STEPS * BLOCK_STEPS
@@ -95,11 +97,13 @@ class NetworkService:
         try:
             with torch.inference_mode():
                 for at in range(0, rows.shape[0], BLOCK_STEPS):
-                    block = np.zeros((1, BLOCK_STEPS, rows.shape[1]), dtype=np.float32)
                     part = rows[at : at + BLOCK_STEPS]
-                    block[0, : part.shape[0]] = part
+                    block = np.zeros((len(sides), BLOCK_STEPS, rows.shape[1]), dtype=np.float32)
+                    for side, sign in enumerate(sides):
+                        block[side, : part.shape[0]] = sign * part
                     result, after = self._network(torch.from_numpy(block), state)
-                    outputs.append(result[0, : part.shape[0]].numpy().astype(np.float64))
+                    said = result[:, : part.shape[0]].numpy().astype(np.float64)
+                    outputs.append(0.5 * (said[0] - said[1]) if self.bundle.odd else said[0])
                     if at < whole:
                         state = after
         finally:

@@ -226,8 +226,7 @@ def _track_from_table(name: str, table: pa.Table) -> StateTrack:
     floats = {c: numbers(c) for c in TRACK_COLUMNS if c not in ("stamp_ns", *_FLAGS, *_STD_COLUMNS, *OPTIONAL_COLUMNS)}
     optional = {c: table[c] for c in OPTIONAL_COLUMNS if c in table.column_names}
     known: dict[str, Any] = {c: v for c, v in optional.items() if v.null_count < table.num_rows}
-    if "mixture_weight" in known:
-        known["mixture_weight"] = numbers("mixture_weight")
+    known |= {c: numbers(c) for c in known if c != "reason"}
     if "reason" in known:
         known["reason"] = np.asarray(pc.fill_null(known["reason"], 0).to_numpy(), dtype=np.int64)
     flags = {c: np.asarray(table[c].to_numpy(), dtype=np.bool_) for c in _FLAGS if c in table.column_names}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.evaluation.metrics import lag_s
 from pdhef_logtool.learning.network.residuals import join_rows, residual_windows
 from pdhef_logtool.learning.network.train_command import HISTORY_FILE
@@ -77,9 +78,10 @@ class ResidualFit:
 def residual_fit(drive: ReadDrive, car: Car) -> ResidualFit:
     """Compare the residual of a drive with the network's output, features as in service."""
     whole = drive.whole
-    rows = join_rows(residual_windows(whole.windows(), whole.plan.vehicle, period_s=whole.plan.alignment.grid_period_s))
-    starts = np.concatenate([[True], np.diff(rows.segment) != 0])
     assert car.network is not None
+    parallel, period_s = filter_of(car, car.network.model), whole.plan.alignment.grid_period_s
+    rows = join_rows(residual_windows(whole.windows(), parallel, period_s=period_s))
+    starts = np.concatenate([[True], np.diff(rows.segment) != 0])
     output, _ = NetworkService(car.network).run(rows.features, starts, None)
     use = rows.weight > 0.0
     time_s = (rows.stamps_ns[use] - rows.stamps_ns[0]) * 1e-9

@@ -14,7 +14,6 @@ SCHEMES: dict[str, str] = {
     "physics": "lagged axle forces, load transfer, roll-corrected a_y",
     "pure-lstm": "network alone, same inputs",
     "pd-hef-paper": "the paper's filter and adaptation, to the letter",
-    "pd-hef-trust0": "our hybrid filter with its network switched off",
     "pd-hef-fixed-r": "our hybrid filter, full trust, fixed R",
     "pd-hef": "our hybrid filter with its adaptive mechanism",
 }

@@ -67,7 +67,7 @@ def test_another_network_needs_evidence_of_its_own() -> None:
 
 def test_other_physics_or_noise_need_evidence_of_their_own() -> None:
     car = _car()
-    found = {"physics_sha256": car.physics_sha256, "noise_sha256": car.noise_sha256}
+    found = dict(zip(("physics_sha256", "noise_sha256"), car.tried_with, strict=True))
     tried = _car(trust_cap=1.0, evidence=EVIDENCE, network_sha256=_bundle().sha256, **found)
     assert tried.allowed_trust.cap == 1.0
     fit = Fit(physics_sha256=car.physics_sha256, values=FittedValues(friction=0.5))
@@ -76,7 +76,8 @@ def test_other_physics_or_noise_need_evidence_of_their_own() -> None:
         other = _car(trust_cap=1.0, evidence=EVIDENCE, **{**found, f"{what}_sha256": "0" * 64})
         assert other.allowed_trust.cap == 0.0
         assert f"other {what}; pdhef trust" in other.allowed_trust.reason
-    assert tried.with_noise("pd-hef", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 0.0
+    assert tried.with_noise("physics", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 0.0
+    assert tried.with_noise("phy-ukf-tuned", FilterNoise(q_std=(1.0, 1.0, 1.0))).allowed_trust.cap == 1.0
     heavier = tried.vehicle.model_copy(update={"mass_kg": 1500.0})
     assert tried.with_vehicle(heavier).allowed_trust.cap == 1.0  # a car made wrong on purpose is trusted as before
 

@@ -44,7 +44,7 @@ from pdhef_logtool.car.parts import (
 )
 from pdhef_logtool.car.store import Change, check_output, update_car, write_change
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
-from pdhef_logtool.estimators.cautious import strongest_physics
+from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records import outputs
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
@@ -113,8 +113,8 @@ def add_trust(folder: Path, network: str = "default") -> Trust:
         network_sha256=car.network.sha256,
         trust_cap=0.5,
         evidence="a gain on one drive",
-        physics_sha256=car.physics_sha256,
-        noise_sha256=car.noise_sha256,
+        physics_sha256=car.tried_with[0],
+        noise_sha256=car.tried_with[1],
     )
     write_part(folder / NETWORK_FILE, trust)
     return trust
@@ -229,7 +229,7 @@ def test_what_was_found_through_physics_is_its_own(folder: Path, tmp_path: Path)
     assert car.physics_vehicle == FOUND.values.applied_to(car.own)
     assert (car.physics_vehicle.friction, car.vehicle.friction) == (car.own.friction, 0.6)
     assert car.physics_vehicle.physics.names == ("lag", "roll")
-    assert make_estimator("physics", car).vehicle == car.physics_vehicle
+    assert of_car(car).vehicle == car.physics_vehicle
     assert make_estimator(TUNED, car).vehicle == car.vehicle
     flat = write_change(car, car, tmp_path / "flat.toml", noise_change(NEW))
     again = load(flat)
@@ -343,19 +343,10 @@ def test_other_noise_takes_the_trust_but_nothing_else(folder: Path) -> None:
     assert "other noise" in car.allowed_trust.reason
 
 
-def test_noise_of_a_filter_with_another_network_is_left_out(folder: Path) -> None:
-    network = load(folder, "many-cars").network
-    assert network is not None
-    noise = add_noise(folder, "pd-hef", network_sha256=network.sha256)
-    assert dict(load(folder, "many-cars").noise) == {"pd-hef": noise}
-    assert load(folder, "many-cars").notes == ()
-    other = load(folder, "default")
-    assert dict(other.noise) == {}
-    assert other.notes == ("noise of pd-hef is not used: it belongs to another network; pdhef tune makes it anew",)
-    assert dict(load(folder, "none").noise) == {"pd-hef": noise}  # no filter that could take it
+def test_evidence_about_another_network_makes_nothing_stale(folder: Path) -> None:
     add_noise(folder)
     add_trust(folder, "many-cars")
-    assert load(folder, "default").notes == ()  # noise of physics alone, and evidence about another network
+    assert load(folder, "default").notes == ()
     assert "the car's evidence is about network" in load(folder, "default").allowed_trust.reason
 
 
@@ -446,11 +437,8 @@ def test_scores_and_drives_of_older_files_are_understood(tmp_path: Path) -> None
     path.write_text(PERSONS + FLAT)
     car = load(path)
     assert {n: (one.score_deg, one.trial) for n, one in car.noise.items()} == {OURS: (0.1092, 63), TUNED: (0.1378, 7)}
-    assert strongest_physics(car).name == OURS
     assert [(d.name, d.start_s, d.end_s) for d in car.learnt_on] == [("other", 1.0, 2.0), ("lap", 0.0, 80.5)]
     assert car.allowed_trust.cap == 0.25
-    path.write_text(PERSONS + FLAT.replace("0.1092", "0.2092"))
-    assert strongest_physics(load(path)).name == TUNED
 
 
 @pytest.mark.parametrize(

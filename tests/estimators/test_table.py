@@ -22,10 +22,10 @@ from pdhef_logtool.car.parts import (
     Trust,
 )
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import LookingAhead, run_window
-from pdhef_logtool.estimators.cautious import CautiousPhysics
-from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, PhysicsFilter
+from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
 from pdhef_logtool.estimators.table import (
     SPECS,
     Options,
@@ -38,7 +38,14 @@ from pdhef_logtool.estimators.table import (
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, RESIDUAL, ModelBundle, Normalisation
+from pdhef_logtool.residual_model.bundle import (
+    LATERAL_VELOCITY,
+    NOMINAL_MODEL,
+    PHYSICS_MODEL,
+    RESIDUAL,
+    ModelBundle,
+    Normalisation,
+)
 from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -59,7 +66,8 @@ def make_network(target: str = RESIDUAL, names: tuple[str, ...] = ONE_CAR_FEATUR
     network = ResidualNetwork(Architecture(len(names), 8, 1, (4,), outputs=outputs))
     weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
     normalisation = Normalisation((0.0,) * len(names), (5.0,) * len(names), (1.0,) * outputs)
-    return ModelBundle(names, 8, 1, (4,), 0.01, normalisation, weights, target=target)
+    model = PHYSICS_MODEL if target == RESIDUAL and names != PAPER_FEATURES else NOMINAL_MODEL
+    return ModelBundle(names, 8, 1, (4,), 0.01, normalisation, weights, target=target, model=model)
 
 
 def make_model(seed: int = 1) -> ModelBundle:
@@ -108,7 +116,6 @@ def test_a_line_builds_what_it_says(spec: Any) -> None:
     assert spec_of(spec.name) is spec
     assert (spec.name in default_names(CAR)) == spec.default
     assert spec.needs <= frozenset(ALIGNED_SIGNALS)
-    assert spec.tuned_as in ("", *(s.name for s in SPECS))
 
 
 @every_spec
@@ -145,7 +152,7 @@ def test_only_what_is_causal_sees_nothing_of_what_comes(spec: Any, signals: Sign
 def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
     everything = frozenset(ALIGNED_SIGNALS)
     estimators, skipped = runnable((spec.name,), Car.of(VEHICLE), everything)
-    lacks = bool(spec.network) or spec.needs_noise
+    lacks = spec.network not in ("", "optional") or spec.needs_noise
     assert ([e.name for e in estimators], [s.name for s in skipped]) == (
         ([], [spec.name]) if lacks else ([spec.name], [])
     )
@@ -159,8 +166,9 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
 def test_physics_runs_on_any_car_and_without_a_fit_it_has_no_part() -> None:
     bare = Car.of(VEHICLE)
     assert "physics" in default_names(bare)
-    estimator = make_estimator("physics", bare)
-    assert isinstance(estimator, PhysicsFilter)
+    adaptive = make_estimator("physics", bare)
+    assert isinstance(adaptive, AdaptivePhysics)
+    estimator = adaptive.physics
     assert (estimator.vehicle, estimator.q_std, estimator.r_std) == (VEHICLE, PHYSICS_Q_STD, None)
     assert estimator.vehicle.physics.names == ()
 
@@ -169,8 +177,9 @@ def test_tuned_noise_keeps_the_axle_forces_noise_of_the_fit() -> None:
     fitted = FittedPhysics(
         values=FittedValues(roll_damping=0.5), noise=FilterNoise(q_std=(0.1, 0.2, 0.3, 0.4, 0.5, 0.6))
     )
-    estimator = make_estimator("physics", replace(CAR, fitted_physics=fitted))
-    assert isinstance(estimator, PhysicsFilter)
+    adaptive = make_estimator("physics", replace(CAR, fitted_physics=fitted))
+    assert isinstance(adaptive, AdaptivePhysics)
+    estimator = adaptive.physics
     assert estimator.q_std == (*NOISE.q_std, 0.4, 0.5, 0.6)
     assert estimator.vehicle.roll_damping == 0.5
 
@@ -200,7 +209,8 @@ def test_names_stand_for_different_algorithms() -> None:
     structures: dict[str, list[str]] = {}
     for spec in SPECS:
         structures.setdefault(ran(spec.name).structure, []).append(spec.name)
-    assert [n for n in structures.values() if len(n) > 1] == [["pd-hef-fixed-r", "pd-hef-trust1"]]
+    # CAR allows all of the trust.
+    assert [n for n in structures.values() if len(n) > 1] == [["pd-hef", "pd-hef-trust1"]]
 
 
 @every_spec
@@ -225,13 +235,14 @@ def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
 
 @pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics", "pd-hef", "pd-hef-smoothed"])
 def test_other_noise_is_another_basis_of_the_same_structure(name: str) -> None:
-    was = ran(name, CAR.with_noise(name, NOISE))
+    of = name if name == "phy-ukf-tuned" else "physics"
+    was = ran(name, CAR.with_noise(of, NOISE))
     for change in ({"q_std": (0.1, 0.2, 0.2)}, {"r_std": {"ay_m_s2": 1.0}}):
-        is_now = ran(name, CAR.with_noise(name, NOISE.model_copy(update=change)))
+        is_now = ran(name, CAR.with_noise(of, NOISE.model_copy(update=change)))
         assert is_now.noise != was.noise
         assert is_now.sha256 != was.sha256
         assert is_now.structure == was.structure
-    told = ran(name, CAR.with_noise(name, NOISE.model_copy(update={"score_deg": 0.1, "trial": 3})))
+    told = ran(name, CAR.with_noise(of, NOISE.model_copy(update={"score_deg": 0.1, "trial": 3})))
     assert told == was
 
 
@@ -243,7 +254,7 @@ def test_trust_and_speed_sensor_are_told() -> None:
     assert full.sha256 != esp.sha256
 
 
-# --- pd-hef is two algorithms ----------------------------------------------------------------------------------------
+# --- pd-hef without trust is physics ---------------------------------------------------------------------------------
 
 BARE = replace(CAR, trust=None, noise={})
 
@@ -265,12 +276,13 @@ def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[fl
 
 def test_evidence_decides_what_pd_hef_is() -> None:
     trusted, cautious = make_estimator("pd-hef", CAR), make_estimator("pd-hef", BARE)
-    assert isinstance(cautious, CautiousPhysics) and not isinstance(trusted, CautiousPhysics)
     assert trusted.name == cautious.name == "pd-hef"
-    assert resolve(trusted).algorithm != resolve(cautious).algorithm
     assert resolve(trusted).structure != resolve(cautious).structure
-    # With noise that was found for it, the filter that stands in is another one.
-    assert ran("pd-hef", replace(BARE, noise=CAR.noise)).structure != resolve(cautious).structure
+    assert resolve(cautious) == ran("physics", BARE)
+    without = replace(CAR, network=None)
+    assert ran("pd-hef", without) == ran("physics", without)
+    papers = replace(CAR, network=MODEL.paper_network)
+    assert ran("pd-hef", papers) == ran("physics", papers)
 
 
 def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> None:
@@ -284,16 +296,10 @@ def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> No
         assert notes == ("intervals calibrated on car for friction and vehicle as told",)
 
 
-def test_without_its_own_it_has_those_of_the_filter_that_it_is(signals: Signals) -> None:
-    of_filter, own = ran("physics", BARE), ran("pd-hef", BARE)
-    assert with_intervals(BARE, intervals_for(of_filter), signals)[0] == pytest.approx(2.0)
-    assert with_intervals(CAR, intervals_for(of_filter), signals)[0] == 1.0
-    both = intervals_for(of_filter).entries + intervals_for(own, factor=3.0).entries
-    assert with_intervals(BARE, intervals_for().model_copy(update={"entries": both}), signals)[0] == pytest.approx(3.0)
-    # The filter of a car with noise of its own is another; so are its intervals.
-    tuned = replace(BARE, noise=CAR.noise)
-    assert with_intervals(tuned, intervals_for(of_filter), signals)[0] == 1.0
-    assert with_intervals(tuned, intervals_for(ran("phy-ukf-tuned", tuned)), signals)[0] == pytest.approx(2.0)
+def test_without_trust_it_has_the_intervals_of_physics(signals: Signals) -> None:
+    of_physics = ran("physics", BARE)
+    assert with_intervals(BARE, intervals_for(of_physics), signals)[0] == pytest.approx(2.0)
+    assert with_intervals(CAR, intervals_for(of_physics), signals)[0] == 1.0
 
 
 def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signals: Signals) -> None:

@@ -498,7 +498,7 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     (folder / "manifest.json").write_text(json.dumps({"drives": [{"file": "b.mcap", "split": "train"}]}))
     told: list[tuple[str, float]] = []
     warned: list[str] = []
-    settings = TuneSettings(config=SALOON, trials=6, seed=1)
+    settings = TuneSettings(config=SALOON, trials=6, seed=1, names=("phy-ukf-tuned", "physics"))
     result = tune_command.tune(
         arguments, tmp_path / "car", settings, jobs=5, progress=lambda *x: told.append(x), warn=warned.append
     )
@@ -508,10 +508,9 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     )
     assert told[-1] == ("trial 6 of 6", pytest.approx(1.0))
     ((setup, jobs),) = FakeBenches.made
-    assert jobs == 3 and setup.names == ("phy-ukf-tuned", "pd-hef")
-    assert warned[0].startswith("drives of split train: a network is better there")
-    assert warned[1] == "c is left out: no true sideslip"
-    assert list(result.notes) == warned[2:]
+    assert jobs == 3 and setup.names == ("physics", "phy-ukf-tuned")
+    assert warned[0] == "c is left out: no true sideslip"
+    assert list(result.notes) == warned[1:]
     car = Car.load(tmp_path / "car")
     document = json.loads((tmp_path / "car/noise.record.json").read_text())
     for one in result.tuned:
@@ -519,7 +518,6 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
         noise = car.noise[one.name]
         assert (noise.trial, noise.score_deg) == (best.number, round(best.score.objective_deg, 4))
         assert noise.q_std[1:] + tuple(noise.r_std.values()) == best.values
-        assert noise.network_sha256 == (car.network.sha256 if one.name == "pd-hef" and car.network else None)
         entry = document["estimators"][one.name]
         assert entry["best_trial"] == best.number and len(entry["trials"]) == 6
         rmse = 0.1 + abs(math.log(best.values[0] / 0.3))
@@ -540,12 +538,8 @@ def test_tune_tells_its_progress_and_writes_what_it_found(tmp_path: Path, monkey
     np.testing.assert_allclose(lines[1].get_ydata(), np.minimum.accumulate(values))
     assert lines[2].get_ydata()[0] == pytest.approx(result.tuned[0].before.objective_deg)
     assert lines[-1].get_xdata()[0] == 3.5  # between the third trial, the last that explores, and the fourth
-    shown = result.to_dict()["estimators"]["pd-hef"]
+    shown = result.to_dict()["estimators"]["phy-ukf-tuned"]
     assert (shown["trials"], shown["best_trial"]) == (6, result.tuned[1].best.number)
-    warned.clear()
-    physics = replace(settings, names=("physics",))
-    tune_command.tune(arguments[:2], tmp_path / "physics", physics, warn=warned.append)
-    assert not [w for w in warned if "split train" in w]
     with pytest.raises(EstimatorError, match="tune"):
         tune_command.tune(arguments[2:], tmp_path / "other", settings)
     for wrong in ({"trials": 3}, {"jobs": 0}):
@@ -565,28 +559,22 @@ def test_only_a_search_that_ends_badly_is_noted() -> None:
 
 def test_what_a_person_wrote_is_no_search_s() -> None:
     searched = FilterNoise(q_std=(0.1, 0.1, 0.1), trial=3, score_deg=0.5)
-    car = Car.of(VEHICLE, noise={"pd-hef": searched, "physics": FilterNoise(q_std=(0.2, 0.2, 0.2))})
-    assert tune_command._kept(car) == {"pd-hef": searched.model_copy(update={"score_deg": None})}
+    car = Car.of(VEHICLE, noise={"phy-ukf-tuned": searched, "physics": FilterNoise(q_std=(0.2, 0.2, 0.2))})
+    assert tune_command._kept(car) == {"phy-ukf-tuned": searched.model_copy(update={"score_deg": None})}
 
 
 def test_names_are_those_of_the_tables_in_their_order() -> None:
     car = Car.load("saloon")
-    bare = replace(car, network=None)
-    assert choose_names(None, car, with_network=True) == ("phy-ukf-tuned", "pd-hef")
-    assert choose_names(None, car, with_network=False) == ("phy-ukf-tuned",)
-    assert choose_names(None, bare, with_network=True) == ("phy-ukf-tuned",)
+    assert choose_names(None, car) == ("phy-ukf-tuned",)
     # Where no fit of it holds the noise of physics, it is tuned as all are.
-    unfitted = replace(car, fitted_physics=None)
-    assert choose_names(None, unfitted, with_network=True) == ("physics", "phy-ukf-tuned", "pd-hef")
-    assert choose_names(("pd-hef", "physics"), car, with_network=False) == ("physics", "pd-hef")
-    for wrong in ((), ("zero",), ("pd-hef", "pd-hef")):
+    assert choose_names(None, replace(car, fitted_physics=None)) == ("physics", "phy-ukf-tuned")
+    assert choose_names(("phy-ukf-tuned", "physics"), car) == ("physics", "phy-ukf-tuned")
+    for wrong in ((), ("zero",), ("pd-hef",), ("physics", "physics")):
         with pytest.raises(UsageError, match="--estimators"):
-            choose_names(wrong, car, with_network=True)
-    with pytest.raises(UsageError, match="pd-hef"):
-        choose_names(("pd-hef",), bare, with_network=True)
+            choose_names(wrong, car)
 
 
-def test_a_bench_keeps_drives_by_number_and_scores_filters_at_full_trust(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.MonkeyPatch) -> None:
     car = Car.of(VEHICLE)
     setup = TuneSetup(replace(SALOON, sensors="esp"), car, None, ("phy-ukf-tuned", "physics"))
     asked: list[Any] = []
@@ -613,9 +601,7 @@ def test_a_bench_keeps_drives_by_number_and_scores_filters_at_full_trust(monkeyp
     own = spec_of("phy-ukf-tuned").make(car.with_noise("phy-ukf-tuned", noise), Options(use_speed=False))
     assert WHOLE.truth is not None
     assert found == {"phy-ukf-tuned": {3: drive_error(own.run(WHOLE.signals, None)[0], WHOLE.truth, 3.0)}}
-    monkeypatch.setattr(tune_drives, "RememberingNetwork", lambda network: network)
-    hybrid = DriveBench(TuneSetup(SALOON, Car.load("saloon"), None, ("pd-hef",)))
-    assert hybrid._options.trust == 1.0 and hybrid._options.use_speed
+    assert DriveBench(TuneSetup(SALOON, car, None, ("physics",)))._options.use_speed
 
 
 class FakeBench:

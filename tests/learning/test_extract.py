@@ -117,7 +117,9 @@ def _extract(
     monkeypatch.setattr(reading, "open_log", lambda *_: log)
     monkeypatch.setattr(reading, "hash_log", lambda _: "0" * 64)
     config = RunConfig(car=tmp_path / "v.toml", mapping=tmp_path / "m.toml", window_s=settings.pop("window_s", 7.0))
-    return extract([str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **settings))
+    return extract(
+        [str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **{"model": "phy-ukf", **settings})
+    )
 
 
 def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
@@ -264,7 +266,7 @@ def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None
         broken.load()
     document = json.loads((copy / MANIFEST).read_text())
     (copy / MANIFEST).write_text(json.dumps({**document, "version": 99}))
-    with pytest.raises(OutputError, match="extract it again"):
+    with pytest.raises(OutputError, match="makes it anew"):
         read_dataset(copy)
     (copy / MANIFEST).unlink()
     with pytest.raises(OutputError, match="--resume"):
@@ -351,6 +353,41 @@ def test_wrong_settings_are_told_before_any_log_is_read(tmp_path: Path, wrong: d
     with pytest.raises(UsageError):
         extract([str(tmp_path / "none.mcap")], tmp_path / "out", ExtractSettings(RunConfig(), **wrong))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) -> None:
+    out, log = tmp_path / "out", str(sample_logs_dir / "road.mcap")
+    first = ExtractSettings(RunConfig(end=8.0), split="train")
+    second = ExtractSettings(RunConfig(start=10.0, end=14.0), split="validation")
+    extract([log], out, first)
+    both = extract([log], out, second).manifest
+    jsonschema.validate(both, SCHEMA)
+    assert [(d["name"], d["split"]) for d in both["drives"]] == [
+        ("road.0-8.0", "train"),
+        ("road.10.0-14.0", "validation"),
+    ]
+    assert [d.name for d in read_dataset(out).drives if len(d.arrays.stamps_ns)] == ["road.0-8.0", "road.10.0-14.0"]
+    again = extract([log], out, second).manifest
+    assert again["sha256"] == both["sha256"], "what is extracted again takes its own place"
+    other = extract([str(sample_logs_dir / "dlc.mcap")], out, ExtractSettings(RunConfig(), split="train")).manifest
+    assert [d["name"] for d in other["drives"]] == ["dlc", "road.0-8.0", "road.10.0-14.0"]
+    with pytest.raises(UsageError, match="do not overlap"):
+        extract([log], out, ExtractSettings(RunConfig(start=7.0, end=9.0), split="test"))
+    with pytest.raises(UsageError, match="for phy-ukf"):
+        extract([log], out, replace(first, model="phy-ukf"))
+    assert read_dataset(out).sha256 == other["sha256"], "a call that is refused leaves what was there"
+
+
+def test_a_dataset_of_an_older_version_is_refused_in_one_line(tmp_path: Path) -> None:
+    out = tmp_path / "old"
+    out.mkdir()
+    (out / MANIFEST).write_text(json.dumps({"format": "pdhef.residual-dataset", "version": 2, "features": ["x"]}))
+    with pytest.raises(OutputError, match="pdhef extract") as refused:
+        read_dataset(out)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(UsageError, match="version 2"):
+        extract([str(Path("sample_logs/dlc.mcap"))], out, ExtractSettings(RunConfig()))
 
 
 def test_another_manifest_is_not_overwritten(sample_logs_dir: Path, tmp_path: Path) -> None:

@@ -7,11 +7,17 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import reference_car
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from physics_oracle import Oracle, parts
+from reference_car import Drive
 from residual_car import CAR, FRICTION, START_NS, Motion, Wave, drive, pick, truth_of, window
 
 from pdhef_logtool.drive.windows import DriveWindow
+from pdhef_logtool.estimators.parallel_physics import parallel_filter
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.learning.network.dataset import DriveArrays
 from pdhef_logtool.learning.network.residuals import (
     ResidualRows,
     difference_noise,
@@ -19,6 +25,7 @@ from pdhef_logtool.learning.network.residuals import (
     residual_windows,
     smooth_increments,
 )
+from pdhef_logtool.learning.network.train_command import steering_offset
 
 LATERAL, YAW = Wave(0.5, 0.7), Wave(0.3, 1.1)
 
@@ -44,7 +51,7 @@ def noisy(motion: Motion) -> DriveWindow:
 
 def rows_of(*windows: DriveWindow, half_window: int = 0, **changes: float) -> ResidualRows:
     car = CAR.model_copy(update=changes)
-    return join_rows(residual_windows(windows, car, period_s=0.01, half_window=half_window))
+    return join_rows(residual_windows(windows, parallel_filter(car), period_s=0.01, half_window=half_window))
 
 
 def rates(rows: ResidualRows) -> np.ndarray:
@@ -230,3 +237,67 @@ def test_staircase_truth_is_noise() -> None:
     t = np.arange(2000) * 0.01
     held = np.sin(2 * np.pi * 0.5 * t)[np.arange(2000) // 5 * 5]
     assert difference_noise(START_NS + np.arange(2000) * 10_000_000, held) > 1.0
+
+
+# --- what physics lacks ----------------------------------------------------------------------------------------------
+
+
+def oracle_window(oracle: Oracle, made: Drive, **signals: np.ndarray) -> DriveWindow:
+    state = np.stack([made.vx, made.vy, made.r], axis=1)
+    whole = replace(made.signals, friction=np.full(len(made.signals), reference_car.FRICTION), **signals)
+    return DriveWindow(whole, truth_of(whole.stamps_ns, state), 1.0)
+
+
+@pytest.mark.parametrize("names", [("lag",), ("lag", "roll", "load_transfer")], ids="+".join)
+def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_comes_out(names: tuple[str, ...]) -> None:
+    """The oracle's car, driven by its own equations; told 10 % less grip the model lacks force in proportion to a_y."""
+    oracle = Oracle(parts(*names))
+    made = oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 6.0)
+    physics = PhysicsFilter(oracle.as_vehicle())
+    right = rates(join_rows(residual_windows([oracle_window(oracle, made)], physics, period_s=0.01)))
+    late = slice(100, -1)
+    assert np.abs(right[late]).max() < 0.02
+    slippery = np.full(len(made.signals), 0.9 * reference_car.FRICTION)
+    window_ = oracle_window(oracle, made)
+    told = replace(window_, signals=replace(window_.signals, friction=slippery))
+    lacks = rates(join_rows(residual_windows([told], physics, period_s=0.01)))[late, 0]
+    slope = float(made.ay[late] @ lacks / (made.ay[late] @ made.ay[late]))
+    assert 0.04 < slope < 0.15
+
+
+def test_windows_change_no_bit_of_what_physics_lacks() -> None:
+    oracle = Oracle(parts("lag", "roll", "biases"))
+    whole = oracle_window(oracle, oracle.drive(lambda t: 0.03 * np.sin(3.0 * t), 3.0))
+    physics = PhysicsFilter(oracle.as_vehicle())
+    n = len(whole.signals)
+    once = join_rows(residual_windows([whole], physics, period_s=0.01, half_window=3))
+    edges = (0, 1, 2, 77, 78, 200, n)
+    cuts = [pick(whole, slice(a, b)) for a, b in pairwise(edges)]
+    joined = join_rows(residual_windows(cuts, physics, period_s=0.01, half_window=3))
+    for f in fields(ResidualRows):
+        np.testing.assert_array_equal(getattr(joined, f.name), getattr(once, f.name), err_msg=f.name)
+
+
+def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
+    """What is taken off before training is what the offset makes, and nothing of a residual that comes and goes."""
+    oracle = Oracle(parts("lag"))
+    made = oracle.drive(lambda t: 0.02 * np.sin(3.0 * t), 12.0)
+    off = made.signals.steer_rad + 0.002
+    rows = join_rows(
+        residual_windows(
+            [oracle_window(oracle, made, steer_rad=off)], PhysicsFilter(oracle.as_vehicle()), period_s=0.01
+        )
+    )
+    use = rows.weight > 0
+    arrays = DriveArrays(
+        rows.stamps_ns[use],
+        rows.features[use].astype(np.float32),
+        rows.targets[use].astype(np.float32),
+        rows.step_s[use],
+        rows.weight[use].astype(np.float32),
+        rows.segment[use],
+        rows.truth_velocity[use].astype(np.float32),
+    )
+    mean = (arrays.targets / arrays.step_s[:, None]).mean(axis=0)
+    assert np.abs(mean).min() > 0.05
+    assert np.abs(mean - steering_offset(arrays)).max() < 0.2 * np.abs(mean).max()

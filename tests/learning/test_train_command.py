@@ -56,7 +56,7 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     assert bundle.provenance["dataset_sha256"]
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=tmp_path / "model", annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
-    assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef-trust0"}
+    assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef"}
     again = run_training(joined, tmp_path / "again", epochs=2)
     assert again.bundle.sha256 == bundle.sha256
     assert again.bundle.provenance["fine_tuned_on"] is None

@@ -21,8 +21,8 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.options import ReadOptions
-from pdhef_logtool.estimators.adaptive_hybrid import adaptive_hybrid_ukf
-from pdhef_logtool.estimators.cautious import CautiousPhysics, strongest_physics
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import LearnSettings, choose_drives, load_drive
@@ -270,8 +270,7 @@ def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, mon
     blocks = errors_by_trust(car, drive, use_speed=True)
     assert len(passes) == 1
     for row, share in zip(blocks.squares, TRUSTS, strict=True):
-        hybrid = adaptive_hybrid_ukf(vehicle, NetworkService(bundle), trust=share)
-        estimator = hybrid if share > 0.0 else CautiousPhysics(strongest_physics(car))
+        estimator = AdaptivePhysics(of_car(car), NetworkService(bundle), share)
         track = estimator.run(signals, None)[0]
         error = signal_error(track, truth, "sideslip_rad", vehicle.low_speed_blend_m_s)
         assert row.sum() == pytest.approx(np.nansum(error**2), rel=1e-12)

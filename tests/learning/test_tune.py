@@ -18,9 +18,6 @@ import pytest
 import torch
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.hybrid import hybrid_ukf
-from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.evaluation.metrics import score_track
 from pdhef_logtool.learning.drives import choose_drives
 from pdhef_logtool.learning.noise import tune_drives
@@ -42,12 +39,10 @@ from pdhef_logtool.learning.noise.search import (
 from pdhef_logtool.learning.noise.tune_command import REFUSED, TuneSettings, tune
 from pdhef_logtool.learning.noise.tune_drives import choose_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, UsageError
-from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.residual_model.service import NetworkService, RememberingNetwork
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.pipeline import run_logs
 
@@ -193,41 +188,6 @@ def _bundle() -> ModelBundle:
     return ModelBundle(FEATURES, 8, 1, (4,), 0.01, Normalisation((0.0,) * n, (10.0,) * n, (1.0, 1.0)), weights)
 
 
-def test_the_network_runs_once_and_the_hybrid_filter_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    count = 700
-    rng = np.random.default_rng(0)
-    stamps = 10**18 + np.arange(count, dtype=np.int64) * 10_000_000
-    signals = Signals(
-        stamps_ns=stamps,
-        ready_ns=stamps + 10_000_000,
-        steer_rad=0.02 * np.sin(np.arange(count) / 60),
-        ax_m_s2=rng.normal(0, 0.1, count),
-        ay_m_s2=2.0 * np.sin(np.arange(count) / 60) + rng.normal(0, 0.1, count),
-        yaw_rate_rad_s=0.08 * np.sin(np.arange(count) / 60) + rng.normal(0, 0.004, count),
-        speed_m_s=25.0 + rng.normal(0, 0.05, count),
-        friction=np.full(count, np.nan),
-        wheel_speed_m_s=np.full((count, 4), np.nan),
-        available=frozenset(ALIGNED_SIGNALS),
-    )
-    vehicle, network = default_vehicle(), RememberingNetwork(_bundle())
-    spec = spec_of(spec_of("pd-hef").tuned_as)
-    passes = []
-    run = NetworkService.run
-    monkeypatch.setattr(NetworkService, "run", lambda *a: passes.append(1) or run(*a))
-    tracks = []
-    for values in ((0.5, 0.05, 0.5, 0.01), (0.05, 0.5, 2.0, 0.001)):
-        noise = filter_tuning(values)
-        car = Car.of(vehicle, network=_bundle()).with_noise("pd-hef", noise)
-        tracks.append(spec.make(car, Options(trust=1.0, network=network)).run(signals, None)[0])
-    assert len(passes) == 1
-    for values, track in zip(((0.5, 0.05, 0.5, 0.01), (0.05, 0.5, 2.0, 0.001)), tracks, strict=True):
-        whole = hybrid_ukf(vehicle, NetworkService(_bundle()), filter_tuning(values)).run(signals, None)[0]
-        assert np.array_equal(track.sideslip_rad, whole.sideslip_rad, equal_nan=True)
-    without = hybrid_ukf(vehicle, NetworkService(_bundle()), filter_tuning(values), trust=0.0).run(signals, None)[0]
-    assert not np.array_equal(track.sideslip_rad, without.sideslip_rad, equal_nan=True)
-    assert not np.array_equal(tracks[-1].sideslip_rad, tracks[0].sideslip_rad, equal_nan=True)
-
-
 # ---- the command ----
 
 
@@ -271,62 +231,27 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
     assert part["search"]["trials"] == record["search"]["trials"] == 4
     assert (tmp_path / "mycar/noise.png").read_bytes().startswith(b"\x89PNG")
 
-    names = choose_names(None, Car.of(before.vehicle, network=_bundle()), with_network=True)
-    assert {"phy-ukf-tuned", "pd-hef"} <= set(names)
+    names = choose_names(None, before)
+    assert set(names) == {"phy-ukf-tuned", "physics"}
     assert set(record["estimators"]) == set(names)
     explored = {n: [t["values"] for t in e["trials"] if t["stage"] == "sobol"] for n, e in record["estimators"].items()}
-    assert all(len(record["estimators"][n]["trials"]) == 4 and explored[n] == explored["pd-hef"] for n in names)
+    assert all(len(record["estimators"][n]["trials"]) == 4 and explored[n] == explored["physics"] for n in names)
     for name in names:
         best = record["estimators"][name]["trials"][record["estimators"][name]["best_trial"]]
         assert best["objective_deg"] == min(t["objective_deg"] for t in record["estimators"][name]["trials"])
         told = {"score_deg": round(best["objective_deg"], 4), "trial": best["trial"]}
         told |= {"physics_sha256": after.physics_sha256}
-        told |= {"network_sha256": _bundle().sha256} if name == "pd-hef" else {}
         assert after.noise[name] == filter_tuning(tuple(best["values"].values())).model_copy(update=told)
         errors = record["estimators"][name]["rmse_deg"]
         assert best["objective_deg"] == pytest.approx(
             math.sqrt(math.hypot(errors["dlc"], 0.05) * math.hypot(errors["step"], 0.05)), rel=1e-9
         )
 
-    runnable = {"phy-ukf-tuned": "phy-ukf-tuned", "physics": "physics", "pd-hef": "pd-hef-fixed-r"}
-    shown = tuple(runnable[n] for n in names)
-    config = RunConfig(car=tmp_path / "mycar", network=tmp_path / "model", estimators=shown, annotate="none")
+    config = RunConfig(car=tmp_path / "mycar", network=tmp_path / "model", estimators=names, annotate="none")
     rows = run_logs([str(drives / "dlc.mcap")], tmp_path / "out", config).results[0].rows
     rmse = {r.estimator: r.value for r in rows if (r.signal, r.segment, r.metric) == ("sideslip_rad", "all", "rmse")}
     for name in names:
-        assert math.degrees(rmse[runnable[name]]) == pytest.approx(
-            record["estimators"][name]["rmse_deg"]["dlc"], rel=1e-12
-        )
-
-
-def test_the_smoother_is_tuned_only_when_it_is_named_and_by_its_own_error(
-    sample_logs_dir: Path, drives: Path, tmp_path: Path
-) -> None:
-    plain = Car.load(sample_logs_dir / "vehicle.toml", network="none")
-    assert "pd-hef-smoothed" not in choose_names(None, replace(plain, network=_bundle()), with_network=True)
-    with pytest.raises(UsageError, match="a network"):
-        choose_names(("pd-hef-smoothed",), plain, with_network=True)
-    _bundle().save(tmp_path / "model")
-    names = ("pd-hef", "pd-hef-smoothed")
-    # The network is trusted by hand, at 1: for any network.
-    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=tmp_path / "model")
-    assert Car.load(config.car, network=config.network).allowed_trust.cap == 1.0
-    settings = TuneSettings(config=config, names=names, trials=4, split="validation")
-    tune([str(drives)], tmp_path / "car.toml", settings)
-    record = json.loads((tmp_path / "car.noise.record.json").read_text())["estimators"]
-    explored = {n: [t["values"] for t in record[n]["trials"] if t["stage"] == "sobol"] for n in names}
-    assert explored["pd-hef"] == explored["pd-hef-smoothed"]
-    assert [len(record[n]["trials"]) for n in names] == [4, 4]
-    tuned = Car.load(tmp_path / "car.toml").noise
-    best = record["pd-hef-smoothed"]["trials"][record["pd-hef-smoothed"]["best_trial"]]
-    found = filter_tuning(tuple(best["values"].values()))
-    assert (tuned["pd-hef-smoothed"].q_std, tuned["pd-hef-smoothed"].r_std) == (found.q_std, found.r_std)
-
-    config = replace(config, car=tmp_path / "car.toml", estimators=("pd-hef-smoothed",), annotate="none")
-    rows = run_logs([str(drives / "dlc.mcap")], tmp_path / "out", config).results[0].rows
-    (rmse,) = [r.value for r in rows if (r.signal, r.segment, r.metric) == ("sideslip_rad", "all", "rmse")]
-    assert math.degrees(rmse) == pytest.approx(record["pd-hef-smoothed"]["rmse_deg"]["dlc"], rel=1e-12)
-    assert record["pd-hef-smoothed"]["rmse_deg"] != record["pd-hef"]["rmse_deg"]
+        assert math.degrees(rmse[name]) == pytest.approx(record["estimators"][name]["rmse_deg"]["dlc"], rel=1e-12)
 
 
 def test_processes_change_nothing_and_the_command_prints_json(

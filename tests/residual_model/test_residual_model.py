@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -42,12 +43,41 @@ def test_features_by_hand() -> None:
     posterior = np.array([[20.0, 0.4, 0.1, 0.0]])
     prior = np.array([[19.0, 0.2, 0.08, 0.0]])
     measured = (np.array([0.02]), np.array([1.5]), np.array([0.11]))
-    car = np.arange(1.0, 8.0)[None]
-    features = make_features(*measured, posterior, prior, np.array([1.4]), np.array([0.8]), np.array([-0.5]), car)
+    body, car = np.arange(1.0, 5.0)[None], np.arange(1.0, 14.0)[None]
+    given = (np.array([1.4]), np.array([0.8]), np.array([-0.5]), body, car)
+    features = make_features(*measured, posterior, prior, *given)
     beta = np.arctan2(0.4, 20.0) - np.arctan2(0.2, 19.0)
-    np.testing.assert_allclose(
-        features, [[20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, *car[0]]], rtol=1e-12
-    )
+    used = 1.5 / (0.8 * 9.80665)
+    expected = [20.0, 1.5, 0.02, 0.11, 0.03, beta, 0.4, 0.1, 0.8, -0.5, used, *body[0], *car[0]]
+    np.testing.assert_allclose(features, [expected], rtol=1e-12)
+    assert len(FEATURES) == len(expected)
+
+
+def test_an_odd_network_is_odd_to_the_last_digits() -> None:
+    plain = make_bundle()
+    centred = replace(plain.normalisation, feature_mean=(0.0,) * len(FEATURES))
+    bundle = replace(plain, odd=True, normalisation=centred)
+    rng = np.random.default_rng(5)
+    features = rng.normal(size=(300, len(FEATURES)))
+    starts = np.zeros(300, dtype=np.bool_)
+    out, _ = NetworkService(bundle).run(features, starts, None)
+    mirrored, _ = NetworkService(bundle).run(features * bundle.signs, starts, None)
+    np.testing.assert_allclose(mirrored, -out, atol=1e-6)
+    other, _ = NetworkService(replace(bundle, odd=False)).run(features, starts, None)
+    assert np.abs(other - out).max() > 1e-4
+    first, carry = NetworkService(bundle).run(features[:77], starts[:77], None)
+    second, _ = NetworkService(bundle).run(features[77:], starts[77:], carry)
+    np.testing.assert_array_equal(np.concatenate([first, second]), out)
+
+
+def test_a_bundle_of_an_older_version_says_how_to_make_it_anew(tmp_path: Path) -> None:
+    make_bundle().save(tmp_path)
+    document = json.loads((tmp_path / DOCUMENT_FILE).read_text())
+    del document["model"], document["physics_sha256"], document["odd"]
+    (tmp_path / DOCUMENT_FILE).write_text(json.dumps({**document, "version": 1}))
+    with pytest.raises(ModelError, match=r"pdhef extract .* pdhef train") as refused:
+        load_bundle(tmp_path)
+    assert "\n" not in str(refused.value)
 
 
 def test_missing_measurements_look_like_agreement_with_physics() -> None:
@@ -55,7 +85,16 @@ def test_missing_measurements_look_like_agreement_with_physics() -> None:
     prior = np.full((1, 4), np.nan)
     nan = np.array([np.nan])
     features = make_features(
-        np.array([0.02]), nan, nan, posterior, prior, np.array([1.4]), np.array([0.8]), nan, np.zeros((1, 7))
+        np.array([0.02]),
+        nan,
+        nan,
+        posterior,
+        prior,
+        np.array([1.4]),
+        np.array([0.8]),
+        nan,
+        np.zeros((1, 4)),
+        np.zeros((1, 13)),
     )
     np.testing.assert_array_equal(features[:, :10], [[20.0, 1.4, 0.02, 0.1, 0.0, 0.0, 0.4, 0.1, 0.8, 0.0]])
 

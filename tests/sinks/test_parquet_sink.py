@@ -12,7 +12,7 @@ from numpy.testing import assert_array_equal
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.tracks import concatenate, make_track
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, concatenate, make_track
 from pdhef_logtool.sinks.parquet import EstimatesSink, list_estimators, read_metrics, read_track, write_metrics
 
 ESTIMATE_COLUMNS = {
@@ -38,9 +38,15 @@ ESTIMATE_COLUMNS = {
     "diverged": pl.Boolean,
     "mixture_weight": pl.Float64,
     "reason": pl.Int32,
+    "roll_rad": pl.Float64,
+    "bank_rad": pl.Float64,
+    "force_scale": pl.Float64,
+    "steer_bias_rad": pl.Float64,
+    "ay_bias_m_s2": pl.Float64,
+    "yaw_rate_bias_rad_s": pl.Float64,
 }
 #: Those that none of these tracks has.
-OPTIONAL = {"mixture_weight", "reason"}
+OPTIONAL = {"mixture_weight", "reason", *ESTIMATED_COLUMNS}
 UNITS = {
     "stamp_ns": "ns",
     "estimator": "",
@@ -64,6 +70,12 @@ UNITS = {
     "diverged": "",
     "mixture_weight": "1",
     "reason": "",
+    "roll_rad": "rad",
+    "bank_rad": "rad",
+    "force_scale": "1",
+    "steer_bias_rad": "rad",
+    "ay_bias_m_s2": "m/s^2",
+    "yaw_rate_bias_rad_s": "rad/s",
 }
 METRIC_COLUMNS = {
     "log": pl.String,

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.adaptive_hybrid import AdaptiveHybridUkf
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.physics import PhysicsUkf
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from studies import switches
@@ -70,17 +71,16 @@ def test_steering_that_counts_when_it_arrives_is_old_and_nothing_waits_for_it(dr
     np.testing.assert_array_equal(seen[0].ready_ns, drive.signals.stamps_ns)
 
 
-def test_options_reach_both_filters_of_the_hybrid() -> None:
-    hybrid = AdaptiveHybridUkf(VEHICLE, None)  # type: ignore[arg-type]
-    switched = switches.with_option(hybrid, "bias_states", value=True)
-    assert isinstance(switched, AdaptiveHybridUkf)
-    assert [f.bias_states for f in switched.filters] == [True, True]
-    assert [f.force_scale for f in switched.filters] == [False, True]
-    assert [f.bias_states for f in hybrid.filters] == [False, False]
-    ungated = switches.with_option(hybrid, "slip_gate", value=False)
-    assert isinstance(ungated, AdaptiveHybridUkf)
-    assert not ungated.hybrid.slip_gate
-    assert not any(f.slip_gate for f in ungated.filters)
+def test_options_reach_both_filters_of_the_mixture() -> None:
+    plain = AdaptivePhysics(PhysicsFilter(VEHICLE))
+    for name in ("biases", "slip_gate"):
+        switched = switches.with_option(plain, name, value=name == "biases")
+        assert isinstance(switched, AdaptivePhysics)
+        assert switched.scaled is not None
+        for one in (switched.physics, switched.scaled):
+            assert one.vehicle.physics.biases == (name == "biases")
+            assert one.slip_gate == (name == "biases")
+    assert not plain.physics.vehicle.physics.biases
 
 
 def test_both_sides_are_scored_where_both_say_something(drive: ConditionDrive) -> None:

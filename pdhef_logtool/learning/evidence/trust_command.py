@@ -125,8 +125,10 @@ def trust(
     """
     config = settings.config
     car = open_car(config, output, warn)
-    if car.network is None:
-        raise UsageError(expected="a network", got="none", where="--network", remedy="give a folder of pdhef train")
+    if car.residual_network is None:
+        got = "none" if car.network is None else f"one for {car.network.model}"
+        raise UsageError(expected="a network", got=got, where="--network", remedy="give a folder of pdhef train")
+    assert car.network is not None
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     check_file_output(inputs, config, output)
     mapping = open_mapping(config)
@@ -167,8 +169,8 @@ def trust(
         network_sha256=car.network.sha256,
         trust_cap=decision.cap,
         evidence=evidence(decision, len(drives), car.network.sha256),
-        physics_sha256=car.physics_sha256,
-        noise_sha256=car.noise_sha256,
+        physics_sha256=car.tried_with[0],
+        noise_sha256=car.tried_with[1],
         drives=tuple(d.learnt_on for d in drives),
     )
     rmse_deg = tuple(_rmse_deg(b) for b in scored)

@@ -14,14 +14,25 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.learning.network.dataset import Dataset, read_dataset
-from pdhef_logtool.learning.network.train_command import TrainResult, gap_free_runs, make_recipe, train_on
+from pdhef_logtool.learning.network.dataset import Dataset
+from pdhef_logtool.learning.network.train_command import (
+    TrainResult,
+    dataset_for,
+    gap_free_runs,
+    make_recipe,
+    train_on,
+)
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.records.signals import FloatArray
-from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, LINEAR_REGRESSION_FILE, PURE_LSTM_FOLDER
-from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.bundle import (
+    LATERAL_VELOCITY,
+    LINEAR_REGRESSION_FILE,
+    NOMINAL_MODEL,
+    PURE_LSTM_FOLDER,
+)
+from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
 
@@ -82,7 +93,9 @@ def run_baselines(
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
-    data = read_dataset(dataset)
+    if not paper:
+        recipe = replace(recipe, feature_names=NOMINAL_FEATURES, odd=False)
+    data = dataset_for(dataset, NOMINAL_MODEL)
     file = output / LINEAR_REGRESSION_FILE
     with OutputFolder(output):
         regression = fit_dataset(data, recipe.feature_names)

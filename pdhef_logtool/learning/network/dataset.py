@@ -2,7 +2,8 @@
 
 Features, targets and weights are stored as float32: a relative error of 6e-8, which no network sees. Each file carries
 its own entry of the manifest in its footer, so that what an interrupted command had finished can be kept. Files in the
-folder that the manifest does not name are no part of the dataset.
+folder that the manifest does not name are no part of the dataset. Calls add up: the manifest keeps what earlier ones
+wrote, and what is extracted anew takes its place, by log and slice.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from pdhef_logtool.car.parts import digest
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
@@ -30,7 +32,7 @@ from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.sinks.schema import arrow_schema
 
 FORMAT = "pdhef.residual-dataset"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 MANIFEST = "manifest.json"
 DRIVES = "drives"
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
@@ -97,9 +99,9 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     return entry if isinstance(entry, dict) else None
 
 
-def drive_file(folder: Path, log: str) -> Path:
-    """Return where the drive of a log stands in a dataset."""
-    return folder / DRIVES / f"{log}.parquet"
+def drive_file(folder: Path, name: str) -> Path:
+    """Return where a drive stands in a dataset, by the name of its log and slice."""
+    return folder / DRIVES / f"{name}.parquet"
 
 
 def write_manifest(
@@ -109,18 +111,19 @@ def write_manifest(
     *,
     settings: Mapping[str, Any],
     seed: int,
-    vehicles: Sequence[tuple[str, VehicleParameters]],
+    vehicles: Mapping[str, Mapping[str, Any]],
 ) -> dict[str, Any]:
     """Write manifest.json over the drives' files that are there, and return it; raises OutputError.
 
     Parameters
     ----------
     entries : one a drive, as in its file. failed : log, file and reason of the logs that gave none.
-    vehicles : by sha256, those that the drives name.
+    settings, seed : of the call that wrote last. vehicles : by the digest of their physics; those that no drive names
+        are left out.
     """
     drives = []
-    for entry in sorted(entries, key=lambda e: str(e["log"])):
-        path = drive_file(folder, entry["log"])
+    for entry in sorted(entries, key=lambda e: str(e["name"])):
+        path = drive_file(folder, entry["name"])
         drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": _sha256(path)})
     splits: dict[str, dict[str, int]] = {name: {"drives": 0, "rows": 0, "usable_rows": 0} for name in SPLITS}
     for d in drives:
@@ -128,19 +131,18 @@ def write_manifest(
         total["drives"] += 1
         total["rows"] += d["rows"]
         total["usable_rows"] += d["usable_rows"]
-    content = json.dumps([[d["log"], d["file_sha256"]] for d in drives]).encode()
+    content = json.dumps([[d["name"], d["file_sha256"]] for d in drives]).encode()
     document = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
+        "model": settings["model"],
         "sha256": hashlib.sha256(content).hexdigest(),
         "features": list(FEATURES),
         "targets": [{"name": name, "unit": unit} for name, unit in TARGETS],
         "period_s": float(np.median([d["period_s"] for d in drives])) if drives else None,
         "settings": dict(settings),
         "seed": seed,
-        "vehicles": [
-            {"name": v.name, "sha256": sha256, "parameters": v.model_dump(mode="json")} for sha256, v in vehicles
-        ],
+        "vehicles": [vehicles[sha256] for sha256 in sorted({d["vehicle_sha256"] for d in drives})],
         "splits": splits,
         "drives": drives,
         "failed": list(failed),
@@ -148,6 +150,11 @@ def write_manifest(
     }
     write_json(folder / MANIFEST, document)
     return document
+
+
+def vehicle_entry(sha256: str, vehicle: VehicleParameters) -> dict[str, Any]:
+    """Return what the manifest says of a vehicle."""
+    return {"name": vehicle.name, "sha256": sha256, "parameters": vehicle.model_dump(mode="json")}
 
 
 def _sha256(path: Path) -> str:
@@ -169,7 +176,7 @@ class DriveArrays:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : float32 [N, 17], finite.
+    stamps_ns : int64 [N]. features : float32 [N, 28], finite.
     targets : float32 [N, 2], increments to the next stamp in m/s and rad/s; 0 where ``weight`` is 0.
     step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
     weight : float32 [N]. segment : int64 [N]; recurrent state starts anew where it changes.
@@ -245,10 +252,12 @@ class DatasetDrive:
 class Dataset:
     """A residual dataset: what its manifest says, and its drives, none of which is read before it is asked for.
 
-    ``features`` names the columns of :attr:`DriveArrays.features` in order; ``sha256`` identifies the content.
+    ``features`` names the columns of :attr:`DriveArrays.features` in order; ``sha256`` identifies the content;
+    ``model`` is the filter that features come from and residuals are of (:data:`~.bundle.MODELS`).
     """
 
     folder: Path
+    model: str
     features: tuple[str, ...]
     period_s: float
     sha256: str
@@ -256,12 +265,18 @@ class Dataset:
     manifest: Mapping[str, Any]
 
     @property
+    def physics_sha256(self) -> str:
+        """Digest of the physics that residuals were taken against: that of the vehicle, or of all of them."""
+        found = [str(v["sha256"]) for v in self.manifest["vehicles"]]
+        return found[0] if len(found) == 1 else digest(found)
+
+    @property
     def vehicle_name(self) -> str:
-        """Names of the vehicles whose nominal models the residuals were taken against."""
+        """Names of the vehicles whose models the residuals were taken against."""
         return ", ".join(sorted({str(v["name"]) for v in self.manifest["vehicles"]}))
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
-        """Return the vehicle whose nominal model a drive's residuals were taken against."""
+        """Return the vehicle whose model a drive's residuals were taken against."""
         wanted = drive.entry["vehicle_sha256"]
         parameters = next(v["parameters"] for v in self.manifest["vehicles"] if v["sha256"] == wanted)
         return VehicleParameters.model_validate(parameters)
@@ -284,16 +299,17 @@ def read_dataset(folder: Path) -> Dataset:
                 expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
                 got=f"{kind[0]} {kind[1]} with {', '.join(document['features'])}",
                 where=str(path),
-                remedy="extract it again with this version",
+                remedy="pdhef extract LOG... -o DATASET makes it anew, in another folder",
             )
         return Dataset(
             folder=folder,
+            model=str(document["model"]),
             features=tuple(document["features"]),
             period_s=float(document["period_s"]),
             sha256=str(document["sha256"]),
             drives=tuple(
                 DatasetDrive(
-                    name=d["log"],
+                    name=d["name"],
                     split=d["split"],
                     path=folder / d["file"],
                     rows=int(d["rows"]),

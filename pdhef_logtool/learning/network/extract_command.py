@@ -10,6 +10,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from functools import cache
+from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,13 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.car.parts import physics_sha256
+from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.reading import Tell, friction_of, no_samples, read_drive
 from pdhef_logtool.drive.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
+from pdhef_logtool.estimators.parallel_physics import filter_of
 from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -40,6 +44,7 @@ from pdhef_logtool.learning.network.dataset import (
     DriveWriter,
     drive_file,
     read_entry,
+    vehicle_entry,
     write_manifest,
 )
 from pdhef_logtool.learning.network.residuals import (
@@ -59,7 +64,7 @@ from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
 from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.signals import Loss
-from pdhef_logtool.residual_model.bundle import NO_MODEL
+from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
 
@@ -82,6 +87,7 @@ class ExtractSettings:
     split : for all drives; None = what a set's manifest says of a drive, else 70/15/15 by a hash of its content.
     seed : of that hash, and of the variation.
     vary : spread by which friction and vehicle are made wrong for a part of the drives (``variation.vary``).
+    model : whose residuals, one of :data:`~.bundle.MODELS`.
     """
 
     config: RunConfig
@@ -89,6 +95,15 @@ class ExtractSettings:
     split: str | None = None
     seed: int = 0
     vary: float = 0.0
+    model: str = PHYSICS_MODEL
+
+    def name_of(self, log: str) -> str:
+        """Return what the slice of a log is called in the dataset."""
+        start, end = self.config.start, self.config.end
+        if start is None and end is None:
+            return log
+        # Times of day have colons, which no file name has everywhere.
+        return f"{log}.{start or 0}-{'' if end is None else end}".replace(":", "")
 
     def smoothing_half_s(self) -> float | None:
         """Return the half window that was asked for, 0 for none, None for ``auto``; raises UsageError."""
@@ -117,6 +132,7 @@ class ExtractSettings:
             **({} if config["friction"] == "auto" else {"friction": config["friction"]}),
             "truth_smoothing": self.truth_smoothing,
             "split": self.split,
+            "model": self.model,
             **({"vary": self.vary, "vary_seed": self.seed} if self.vary else {}),
         }
 
@@ -171,6 +187,18 @@ class _Job:
     listed_split: str | None
     resume: bool
 
+    @property
+    def name(self) -> str:
+        """What the drive is called in the dataset."""
+        return self.settings.name_of(self.log_input.stem)
+
+    @property
+    def physics(self) -> tuple[str, VehicleParameters]:
+        """The vehicle whose model residuals are of, and its digest."""
+        car = self.car
+        vehicle = car.physics_vehicle if self.settings.model == PHYSICS_MODEL else car.vehicle
+        return physics_sha256(vehicle), vehicle
+
 
 def extract(
     arguments: Sequence[str],
@@ -203,28 +231,57 @@ def extract(
     inputs = find_logs(arguments)
     mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
-    _check_output(output)
-    files = [output / MANIFEST, *(drive_file(output, i.stem) for i in inputs)]
+    before = _earlier(output, settings)
+    names = {settings.name_of(i.stem) for i in inputs}
+    files = [output / MANIFEST, *(drive_file(output, name) for name in sorted(names))]
     check_no_input([*(i.path for i in inputs), *settings.config.files, *(j.car.source for j in work)], files)
-    with OutputFolder(output, (DRIVES,)):
-        with writing(output):
-            # Until the new manifest stands, what the old one says of the files here is no longer true.
-            (output / MANIFEST).unlink(missing_ok=True)
-        results = _extract_all(work, jobs, progress, warn)
-        used = {r.entry["vehicle_sha256"] for r in results if r.entry is not None}
-        vehicles = {job.car.physics_sha256: job.car.vehicle for job in work}
-        manifest = write_manifest(
-            output,
-            [r.entry for r in results if r.entry is not None],
-            [{"log": r.name, "file": r.file, "reason": r.left_out} for r in (x.record for x in results) if r.left_out],
-            settings=settings.to_dict(),
-            seed=settings.seed,
-            vehicles=sorted((sha, v) for sha, v in vehicles.items() if sha in used),
+    kept = [_as_in_file(d) for d in before.get("drives", []) if d["name"] not in names]
+    vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
+
+    def write(results: Sequence[DriveResult]) -> dict[str, Any]:
+        entries = [r.entry for r in results if r.entry is not None]
+        _check_apart([*kept, *entries])
+        left_out = [r.record for r in results if r.record.left_out]
+        failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
+        return write_manifest(
+            output, [*kept, *entries], failed, settings=settings.to_dict(), seed=settings.seed, vehicles=vehicles
         )
-    if settings.split is None and len(used) and not all(manifest["splits"][s]["drives"] for s in SPLITS):
+
+    with OutputFolder(output, (DRIVES,)):
+        # Until the new manifest stands, what the old one says of the files that change is no longer true.
+        if kept:
+            write([])
+        else:
+            with writing(output):
+                (output / MANIFEST).unlink(missing_ok=True)
+        results = _extract_all(work, jobs, progress, warn)
+        vehicles |= {sha: vehicle_entry(sha, v) for sha, v in (job.physics for job in work)}
+        manifest = write(results)
+    if settings.split is None and manifest["drives"] and not all(manifest["splits"][s]["drives"] for s in SPLITS):
         empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
         warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)
+
+
+def _as_in_file(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in entry.items() if k not in ("file", "file_sha256")}
+
+
+def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
+    """Raise UsageError where two drives are slices of the same log that overlap: one may train what the other tests."""
+    by_source: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for entry in entries:
+        by_source.setdefault((entry["log"], entry["source"]["sha256"]), []).append(entry)
+    for same in by_source.values():
+        same.sort(key=lambda e: float(e["start_s"]))
+        for one, other in pairwise(same):
+            if one["split"] != other["split"] and other["start_s"] < one["end_s"]:
+                raise UsageError(
+                    expected="slices of a log that do not overlap across splits",
+                    got=f"{one['name']} ({one['split']}) and {other['name']} ({other['split']})",
+                    where="extract",
+                    remedy="choose other slices with --start and --end, or another folder with -o",
+                )
 
 
 def _extract_all(work: Sequence[_Job], jobs: int, progress: Progress, warn: Tell) -> tuple[DriveResult, ...]:
@@ -236,13 +293,21 @@ def _extract_all(work: Sequence[_Job], jobs: int, progress: Progress, warn: Tell
     return tuple(by_log[job.log_input.stem] for job in work)
 
 
-def _check_output(output: Path) -> None:
+def _earlier(output: Path, settings: ExtractSettings) -> dict[str, Any]:
+    """Return the manifest of the dataset that this call adds to; nothing for a new one.
+
+    Raises
+    ------
+    UsageError
+        The folder holds another manifest, or a dataset that this one cannot add to.
+    """
     path = output / MANIFEST
+    remedy = "choose another folder with -o"
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         ours = isinstance(document, dict) and document.get("format") == FORMAT
     except FileNotFoundError:
-        return
+        return {}
     except (OSError, ValueError, RecursionError):
         ours = False
     if not ours:
@@ -250,8 +315,18 @@ def _check_output(output: Path) -> None:
             expected="a new folder, or that of a residual dataset",
             got=f"a folder with another {MANIFEST}",
             where=str(output),
-            remedy="choose another folder with -o",
+            remedy=remedy,
         )
+    wanted = (FORMAT_VERSION, settings.model)
+    if (found := (document.get("version"), document.get("model"))) != wanted:
+        raise UsageError(
+            expected=f"a dataset of version {wanted[0]} for {wanted[1]}",
+            got=f"version {found[0]} for {found[1] or NOMINAL_MODEL}",
+            where=str(output),
+            remedy=remedy,
+        )
+    whole: dict[str, Any] = document
+    return whole
 
 
 def _check_counts(jobs: int, settings: ExtractSettings) -> None:
@@ -263,6 +338,8 @@ def _check_counts(jobs: int, settings: ExtractSettings) -> None:
         raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.vary), where="--vary")
     if settings.split is not None and settings.split not in SPLITS:
         raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
+    if settings.model not in MODELS:
+        raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--model")
 
 
 def _plan_jobs(
@@ -335,7 +412,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     source = hash_log(job.log_input.path)
     split, split_from = choose_split(source, settings.seed, chosen=settings.split, listed=job.listed_split)
     fingerprint = _fingerprint(job, split)
-    target = drive_file(job.output, stem)
+    target = drive_file(job.output, job.name)
     if job.resume:
         entry = read_entry(target)
         if (
@@ -350,7 +427,9 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
         drive.plan = plan = _strict_truth(drive.plan)
         _check_plan(plan, job)
         smoothing = _choose_smoothing(plan, settings)
-        told = vary(job.car.vehicle, settings.vary, f"{settings.seed}:{source}")
+        physics = filter_of(job.car, settings.model, use_speed=drive.options.use_speed)
+        told = vary(physics.vehicle, settings.vary, f"{settings.seed}:{source}")
+        physics = replace(physics, vehicle=told.vehicle)
         drive.friction = friction_of(plan, told.vehicle, drive.options, told.friction_factor)
 
         def windows() -> Iterator[Any]:
@@ -363,10 +442,9 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             counts = _Counts()
             for rows in residual_windows(
                 windows(),
-                told.vehicle,
+                physics,
                 period_s=plan.alignment.grid_period_s,
                 half_window=round(smoothing.half_s / plan.alignment.grid_period_s),
-                use_speed=drive.options.use_speed,
             ):
                 counts.add(rows)
                 writer.append(rows)
@@ -374,11 +452,13 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 raise no_samples(job.log_input.path)
             friction = drive.friction
             entry = {
+                "name": job.name,
                 "log": stem,
+                **counts.span(drive.log.start_ns),
                 "source": {"file": name, "sha256": source},
                 "split": split,
                 "split_from": split_from,
-                "vehicle_sha256": job.car.physics_sha256,
+                "vehicle_sha256": job.physics[0],
                 "settings_sha256": fingerprint,
                 "period_s": plan.alignment.grid_period_s,
                 **counts.to_dict(),
@@ -521,6 +601,11 @@ class _Counts:
         first = int(rows.stamps_ns[0]) if self._span is None else self._span[0]
         self._span = (first, int(rows.stamps_ns[-1]))
 
+    def span(self, log_start_ns: int) -> dict[str, float]:
+        """Return first and last stamp in seconds from the log's start."""
+        first, last = self._span or (log_start_ns, log_start_ns)
+        return {"start_s": (first - log_start_ns) * 1e-9, "end_s": (last - log_start_ns) * 1e-9}
+
     def to_dict(self) -> dict[str, Any]:
         first, last = self._span or (0, 0)
         rms = np.sqrt(self._squares / self.usable) if self.usable else np.full(2, math.nan)
@@ -540,7 +625,7 @@ def _fingerprint(job: _Job, split: str) -> str:
         "format": FORMAT_VERSION,
         "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
-        "vehicle": job.car.physics_sha256,
+        "vehicle": [job.physics[0], job.car.noise_sha256],
         "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
         "versions": tool_versions(),
     }

@@ -1,7 +1,8 @@
 """Training of the residual network: stateful truncated back-propagation through time, resumable at every epoch.
 
 Sequences run in order through chunks of ``chunk_steps``; the LSTM state is carried from chunk to chunk and detached
-(METHOD §5). The loss is the weighted mean square of the normalised residual rates. Every epoch is a pure function of
+(METHOD §5). The loss is the weighted mean square of the normalised residual rates; a piece counts by the inverse of its
+own mean square, so that calm driving is not drowned by the limit. Every epoch is a pure function of
 the state before it, the seed and its number, so that an interrupted training goes on as if nothing had happened.
 """
 
@@ -22,7 +23,7 @@ from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
+from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork, State
 
 CHECKPOINT = "checkpoint.safetensors"
@@ -31,13 +32,15 @@ CHECKPOINT = "checkpoint.safetensors"
 #: Longer sequences are cut into pieces for training; validation runs over them whole.
 PIECE_STEPS = 1500
 GRADIENT_CLIP = 1.0
+#: Mean square of normalised targets that is added before a piece is weighted by its inverse.
+WEIGHT_FLOOR = 0.1
 #: What a recipe and the bundle made by it have in common.
-_SHAPE = ("feature_names", "hidden", "layers", "head")
+_SHAPE = ("feature_names", "hidden", "layers", "head", "odd")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureSequence:
-    """One gap-free run of one drive: features [N, 17], target [N, m], weight [N].
+    """One gap-free run of one drive: features [N, 28], target [N, m], weight [N].
 
     The target is residual rates in m/s² and rad/s² (m = 2), or v_y in m/s (m = 1).
     """
@@ -70,6 +73,7 @@ class Recipe:
     seed: int = 0
     period_s: float = 0.01
     target: str = RESIDUAL
+    odd: bool = True  # mirrored pieces are drawn as often, and the network is made exactly odd
 
 
 PAPER_RECIPE = Recipe(
@@ -80,6 +84,7 @@ PAPER_RECIPE = Recipe(
     batch=64,
     learning_rate=1e-3,
     schedule="exponential",
+    odd=False,
 )
 
 
@@ -97,17 +102,25 @@ class Epoch:
 Progress = Callable[[Epoch, int], None]
 
 
-def normalisation_of(sequences: Sequence[FeatureSequence], names: tuple[str, ...]) -> Normalisation:
-    """Return mean and standard deviation of features and targets over the training sequences, by weight."""
+def normalisation_of(
+    sequences: Sequence[FeatureSequence], names: tuple[str, ...], *, odd: bool = False
+) -> Normalisation:
+    """Return mean and standard deviation of features and targets over the training sequences, by weight.
+
+    With ``odd`` those that change sign where left and right are mirrored are taken to have a mean of 0.
+    """
     columns = [FEATURES.index(n) for n in names]
     features = np.concatenate([s.features[s.weight > 0][:, columns] for s in sequences])
     target = np.concatenate([s.target[s.weight > 0] for s in sequences])
     if features.shape[0] == 0:
         raise ModelError(expected="training sequences with usable samples", got="none", where="train")
-    std = np.maximum(features.std(axis=0), 1e-6)
+    mean = features.mean(axis=0)
+    if odd:
+        mean[[n in ODD_FEATURES for n in names]] = 0.0
+    std = np.maximum(np.sqrt(np.mean((features - mean) ** 2, axis=0)), 1e-6)
     spread = np.maximum(np.sqrt(np.mean(target**2, axis=0)), 1e-6)
     return Normalisation(
-        tuple(float(x) for x in features.mean(axis=0)),
+        tuple(float(x) for x in mean),
         tuple(float(x) for x in std),
         tuple(float(x) for x in spread),
     )
@@ -144,11 +157,14 @@ def train(
         )
     if init is not None:
         recipe = replace(recipe, **{name: getattr(init, name) for name in (*_SHAPE, "target")})
-    normalisation = init.normalisation if init is not None else normalisation_of(training, recipe.feature_names)
+    normalisation = (
+        init.normalisation if init is not None else normalisation_of(training, recipe.feature_names, odd=recipe.odd)
+    )
     network = _new_network(recipe, init).to(device)
     optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
+    signs = _signs(recipe)
     train_pieces = _pieces(training, recipe, normalisation)
-    validation_pieces = [_scaled(s, recipe, normalisation) for s in validation]
+    validation_pieces = [_balanced(_scaled(s, recipe, normalisation)) for s in validation]
     identity = _identity(recipe, normalisation, training, validation, init)
     history, best, best_loss = _resume(work, identity, network, optimiser, device)
     batches = max(1, math.ceil(len(train_pieces) / recipe.batch))
@@ -166,8 +182,10 @@ def train(
             for group in optimiser.param_groups:
                 group["lr"] = rate
             chosen = [train_pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
+            if recipe.odd:
+                chosen = [_mirrored(p, signs) if torch.rand(()) < 0.5 else p for p in chosen]
             losses.append(_train_batch(network, optimiser, chosen, recipe.chunk_steps, device))
-        loss = _validate(network, validation_pieces, device)
+        loss = _validate(network, validation_pieces, device, signs if recipe.odd else None)
         history.append(Epoch(epoch + 1, float(np.mean(losses)), loss, rate, time.perf_counter() - began))
         if loss < best_loss:
             best, best_loss = _weights(network), loss
@@ -200,6 +218,14 @@ class _Piece:
     weight: torch.Tensor
 
 
+def _signs(recipe: Recipe) -> torch.Tensor:
+    return torch.tensor([-1.0 if name in ODD_FEATURES else 1.0 for name in recipe.feature_names])
+
+
+def _mirrored(piece: _Piece, signs: torch.Tensor) -> _Piece:
+    return _Piece(piece.features * signs, -piece.target, piece.weight)
+
+
 def _scaled(s: FeatureSequence, recipe: Recipe, n: Normalisation) -> _Piece:
     scratch = ModelBundle(recipe.feature_names, recipe.hidden, recipe.layers, recipe.head, recipe.period_s, n, {})
     return _Piece(
@@ -216,8 +242,15 @@ def _pieces(sequences: Sequence[FeatureSequence], recipe: Recipe, n: Normalisati
         for at in range(0, whole.features.shape[0], PIECE_STEPS):
             part = slice(at, at + PIECE_STEPS)
             if float(whole.weight[part].sum()) > 0.0:
-                out.append(_Piece(whole.features[part], whole.target[part], whole.weight[part]))
+                out.append(_balanced(_Piece(whole.features[part], whole.target[part], whole.weight[part])))
     return out
+
+
+def _balanced(piece: _Piece) -> _Piece:
+    """Return a piece whose weights are over the mean square of its target."""
+    square = (piece.target**2).mean(dim=1)
+    mean = float((square * piece.weight).sum() / piece.weight.sum())
+    return _Piece(piece.features, piece.target, piece.weight / (mean + WEIGHT_FLOOR))
 
 
 def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
@@ -257,13 +290,16 @@ def _train_batch(
     return float(np.mean(losses)) if losses else 0.0
 
 
-def _validate(network: ResidualNetwork, pieces: Sequence[_Piece], device: str) -> float:
+def _validate(network: ResidualNetwork, pieces: Sequence[_Piece], device: str, signs: torch.Tensor | None) -> float:
+    """Return the loss as service has it; with ``signs`` the network is made odd."""
     network.eval()
     total, weight = 0.0, 0.0
     with torch.inference_mode():
         for p in pieces:
-            output, _ = network(p.features[None].to(device), None)
-            square = ((output[0].cpu() - p.target) ** 2).mean(dim=1)
+            sides = p.features[None] if signs is None else torch.stack([p.features, p.features * signs])
+            output, _ = network(sides.to(device), None)
+            said = output[0] if signs is None else 0.5 * (output[0] - output[1])
+            square = ((said.cpu() - p.target) ** 2).mean(dim=1)
             total += float((square * p.weight).sum())
             weight += float(p.weight.sum())
     return total / weight if weight else math.inf

@@ -1,12 +1,15 @@
-"""What the nominal model misses, step by step, from a drive with truth (METHOD §4, Eq 8-10, 18).
+"""What the model of ``physics`` misses, step by step, from a drive with truth (METHOD §4, §16, Eq 8-10, 18).
 
 From one stamp of the IMU to the next the residual is the increment
 
-    Δx_net[k] = (x_true(t_k+1) − x_true(t_k)) − ∫ f_nom(x_true, u) dτ
+    Δx_net[k] = (x_true(t_k+1) − x_true(t_k)) − (step of the model from x_true(t_k) − x_true(t_k))
 
-with f_nom at the *true* state (at an estimated one the filter's own error would be learnt), the trapezoidal rule
-between the two true states, and the inputs of the same measurement times: steering and friction as the filters use
-them. The row of v_x is 0 by definition and not stored.
+with the model at the *true* v_x, v_y and r (at an estimated state the filter's own error would be learnt), and the
+inputs of the same measurement times as the filter takes them. No truth tells the axles' forces and the roll: the model
+runs them along the true motion. Bank, biases and force scale are 0: at the filter's estimate of them, which
+changes while it learns, a residual would fit no other filter. The row of v_x is 0 by definition and not stored.
+
+For the paper's network and the baselines the model is the nominal one, by the trapezoidal rule between two true states.
 
 A recorded truth is noisy, and differences over one step are mostly that noise. Then the *residual* is smoothed, not the
 truth: increments are added up to a curve, a cubic is fitted by least squares to the ± half window about each step over
@@ -24,13 +27,25 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from pdhef_logtool.car.nominal_model import ModelParameters, model_parameters, state_derivative
-from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.windows import DriveWindow
-from pdhef_logtool.estimators.filter_shell import U_FRICTION
-from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import FilterCarry
+from pdhef_logtool.estimators.filter_shell import U_AX, U_FRICTION, U_STEER, Meanwhile
+from pdhef_logtool.estimators.parallel_physics import run_features
+from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.physics_model import (
+    AX_BIAS,
+    FRONT,
+    REAR,
+    VX,
+    VY,
+    YAW_RATE,
+    advance,
+    settle_forces,
+    step_count,
+)
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
+from pdhef_logtool.records.release import StepColumns
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: A step of more than this many periods is a gap: no increment is taken across it.
@@ -57,7 +72,7 @@ class ResidualRows:
 
     Attributes
     ----------
-    stamps_ns : int64 [N]. features : [N, 17] at the stamp, NaN where the parallel filter has no state.
+    stamps_ns : int64 [N]. features : [N, 28] at the stamp, NaN where the parallel filter has no state.
     targets : [N, 2], increments of v_y in m/s and of r in rad/s from this stamp to the next; NaN where unknown.
     step_s : [N], time to the next stamp; NaN at the last row.
     weight : [N], 1 where target and features can be used and the next row carries on from this one, else 0.
@@ -82,6 +97,17 @@ def join_rows(parts: Iterable[ResidualRows]) -> ResidualRows:
     """Join consecutive rows of one drive."""
     parts = list(parts)
     return ResidualRows(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(ResidualRows)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelSteps(StepColumns):
+    """What a model is asked with: states of the parallel filter [N, n] and inputs [N, 5] of its steps.
+
+    The steering of ``inputs`` is NaN where it was not measured: the filter's guess of it must not become a residual.
+    """
+
+    x: FloatArray
+    inputs: FloatArray
 
 
 @njit(cache=True)
@@ -117,9 +143,7 @@ def residual_increments(
     n = int(stamps_ns.shape[0])
     if n < 2:
         return np.empty((0, 2))
-    sliding = np.abs(np.arctan2(state[:, 1], state[:, 0])) > MAX_SIDESLIP_RAD
-    good = np.isfinite(state).all(axis=1) & np.isfinite(steer_rad) & np.isfinite(friction)
-    good &= (state[:, 0] >= parameters.blend_high_m_s) & ~sliding
+    good = _dynamic(state, parameters) & np.isfinite(steer_rad) & np.isfinite(friction)
     rates = np.empty((n, 2))
     usable = (np.where(good[:, None], state, 1.0), np.where(good, steer_rad, 0.0), np.where(good, friction, 1.0))
     _nominal_rates(*usable, parameters, rates)
@@ -127,6 +151,84 @@ def residual_increments(
     increments: FloatArray = np.diff(state[:, 1:3], axis=0) - 0.5 * step_s[:, None] * (rates[:-1] + rates[1:])
     increments[~(good[:-1] & good[1:] & (step_s <= max_step_s))] = np.nan
     return increments
+
+
+#: What the model's run along the truth keeps from step to step: whether it runs, forces, roll and roll rate.
+_RUN = 5
+
+
+@njit(cache=True)
+def _run_model(stamps_ns, states, inputs, good, max_step_s, model, run, out):  # type: ignore[no-untyped-def]
+    """Write what the model moves v_y and r by [N − 1, 2] from each true state; NaN where that is not known."""
+    layout, p, f = model
+    points = np.zeros((states.shape[1], 2 * states.shape[1] + 1))
+    for k in range(states.shape[0] - 1):
+        out[k, 0] = math.nan
+        out[k, 1] = math.nan
+        dt = (stamps_ns[k + 1] - stamps_ns[k]) * 1e-9
+        if not (good[k] and good[k + 1] and dt <= max_step_s):
+            run[0] = 0.0
+            continue
+        x = states[k].copy()
+        over = Meanwhile(
+            0.5 * (inputs[k, U_STEER] + inputs[k + 1, U_STEER]),
+            0.5 * (inputs[k, U_AX] + inputs[k + 1, U_AX]),
+            True,
+            0.5 * (inputs[k, U_FRICTION] + inputs[k + 1, U_FRICTION]),
+        )
+        if run[0] == 0.0:
+            settle_forces(x, over.steer, over.ax, over.friction, layout, p, f)
+        else:
+            x[FRONT], x[REAR] = run[1], run[2]
+            if layout.roll >= 0:
+                x[layout.roll], x[layout.roll + 1] = run[3], run[4]
+        points[:, 0] = x
+        advance(points, 1, over, dt, step_count(x[VX], dt, over.friction, layout, p, f), layout, p, f)
+        out[k, 0] = points[VY, 0] - x[VY]
+        out[k, 1] = points[YAW_RATE, 0] - x[YAW_RATE]
+        run[0], run[1], run[2] = 1.0, points[FRONT, 0], points[REAR, 0]
+        if layout.roll >= 0:
+            run[3], run[4] = points[layout.roll, 0], points[layout.roll + 1, 0]
+
+
+# positional: as of residual_increments, and what a run keeps.
+def physics_increments(
+    stamps_ns: IntArray,
+    state: FloatArray,
+    model: ModelSteps,
+    physics: PhysicsFilter,
+    run: FloatArray,
+    *,
+    max_step_s: float,
+) -> FloatArray:
+    """Return what truth moves by and the model of ``physics`` does not, from each stamp to the next, [N − 1, 2].
+
+    Parameters
+    ----------
+    stamps_ns : int64 [N]. state : true [v_x, v_y, r], [N, 3]; NaN where it must not be used.
+    model : of the parallel filter. run : [5], what the model's run keeps, moved in place; zeros at its start.
+    max_step_s : longer steps are gaps.
+
+    Returns
+    -------
+    Increments of v_y in m/s and r in rad/s; NaN as of :func:`residual_increments`.
+    """
+    layout, p, f = physics.parameters
+    good = _dynamic(state, p) & np.isfinite(model.x).all(axis=1) & np.isfinite(model.inputs).all(axis=1)
+    states = np.zeros_like(model.x)
+    states[:, :3] = np.where(good[:, None], state, 1.0)
+    states[:, AX_BIAS] = np.where(good, model.x[:, AX_BIAS], 0.0)
+    moved = np.empty((max(len(stamps_ns) - 1, 0), 2))
+    _run_model(stamps_ns, states, model.inputs, good, max_step_s, (layout, p, f), run, moved)
+    increments: FloatArray = np.diff(state[:, 1:3], axis=0) - moved
+    return increments
+
+
+def _dynamic(state: FloatArray, parameters: ModelParameters) -> BoolArray:
+    """Return where the true state [N, 3] is known, the model is the dynamic one, and the car drives forward."""
+    known = np.isfinite(state).all(axis=1)
+    forward = np.abs(np.arctan2(state[:, 1], state[:, 0])) <= MAX_SIDESLIP_RAD
+    return np.asarray(known & forward & (state[:, 0] >= parameters.blend_high_m_s), dtype=np.bool_)
 
 
 def smooth_increments(stamps_ns: IntArray, increments: FloatArray, half_window: int) -> FloatArray:
@@ -183,57 +285,45 @@ def difference_noise(stamps_ns: IntArray, values: FloatArray) -> float:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Steps:
+class _Steps(StepColumns):
     """What the targets are computed from, with the features, on the IMU's stamps."""
 
     stamps_ns: IntArray
     state: FloatArray
-    steer_rad: FloatArray
-    friction: FloatArray
+    model: ModelSteps
     features: FloatArray
     segment: IntArray
-
-    def since(self, index: int) -> _Steps:
-        return _Steps(*(getattr(self, f.name)[index:] for f in fields(_Steps)))
-
-    def joined(self, other: _Steps) -> _Steps:
-        return _Steps(*(np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(_Steps)))
 
 
 def residual_windows(
     windows: Iterable[DriveWindow],
-    vehicle: VehicleParameters,
+    physics: PhysicsFilter | PhysicsUkf,
     *,
     period_s: float,
     half_window: int = 0,
-    use_speed: bool = True,
 ) -> Iterator[ResidualRows]:
     """Turn the windows of a drive into residual rows; how the drive is cut into windows changes no bit of them.
 
     Parameters
     ----------
     windows : signals and truth at the same stamps, biases of the vehicle file taken off; without truth no targets.
+    physics : the parallel filter as it shall run in service; its model is what the residual is of.
     period_s : of the IMU. half_window : steps on each side that a target is smoothed over.
-    use_speed : as the parallel filter shall run in service.
 
     Yields
     ------
     The rows of all stamps; a window's last rows come with the next one, since their targets look ahead. Memory is
     bounded by one window.
     """
-    physics = parallel_filter(vehicle, use_speed=use_speed)
-    parameters = model_parameters(vehicle)
     carry: FilterCarry | None = None
     waiting: _Steps | None = None
+    increments, run = np.empty((0, 2)), np.zeros(_RUN)
     emitted = 0  # rows at the head of ``waiting`` that are there for smoothing only
     running, segment = False, -1
     max_step_s = GAP_PERIODS * period_s
 
     def emit(steps: _Steps, first: int, end: int) -> ResidualRows:
         n = len(steps.stamps_ns)
-        increments = residual_increments(
-            steps.stamps_ns, steps.state, steps.steer_rad, steps.friction, parameters, max_step_s=max_step_s
-        )
         targets, step_s = np.full((n, 2), np.nan), np.full(n, np.nan)
         targets[: n - 1] = smooth_increments(steps.stamps_ns, increments, half_window)
         step_s[: n - 1] = np.diff(steps.stamps_ns) * 1e-9
@@ -260,23 +350,36 @@ def residual_windows(
         fresh: BoolArray = known & ~(np.concatenate([[running], known[:-1]]) & np.isfinite(filtered.prior[:, 0]))
         numbers = segment + np.cumsum(fresh)
         running, segment = bool(known[-1]), int(numbers[-1])
+        inputs = filtered.inputs.copy()
+        inputs[~np.isfinite(without_impossible(window.signals).steer_rad), U_STEER] = np.nan
         new = _Steps(
             stamps_ns=window.signals.stamps_ns,
             state=_true_state(window),
-            # As measured: where it is missing, the filter's guess of it must not become a residual.
-            steer_rad=without_impossible(window.signals).steer_rad,
-            friction=filtered.inputs[:, U_FRICTION],
+            model=ModelSteps(filtered.x, inputs),
             features=features,
             segment=np.maximum(numbers, 0),
         )
+        chain = new if waiting is None else waiting.since(len(waiting.stamps_ns) - 1).joined(new)
+        increments = np.concatenate([increments, _increments(chain, physics, run, max_step_s)])
         waiting = new if waiting is None else waiting.joined(new)
         decided = len(waiting.stamps_ns) - 1 - half_window
         if decided > emitted:
             yield emit(waiting, emitted, decided)
             keep = max(0, decided - half_window)
-            waiting, emitted = waiting.since(keep), decided - keep
+            waiting, emitted, increments = waiting.since(keep), decided - keep, increments[keep:]
     if waiting is not None and emitted < len(waiting.stamps_ns):
         yield emit(waiting, emitted, len(waiting.stamps_ns))
+
+
+def _increments(steps: _Steps, physics: PhysicsFilter | PhysicsUkf, run: FloatArray, max_step_s: float) -> FloatArray:
+    """Return what the parallel filter's model misses from each step to the next, [N − 1, 2]."""
+    stamps_ns, state, model = steps.stamps_ns, steps.state, steps.model
+    if isinstance(physics, PhysicsFilter):
+        return physics_increments(stamps_ns, state, model, physics, run, max_step_s=max_step_s)
+    parameters, inputs = model_parameters(physics.vehicle), model.inputs
+    return residual_increments(
+        stamps_ns, state, inputs[:, U_STEER], inputs[:, U_FRICTION], parameters, max_step_s=max_step_s
+    )
 
 
 def _complete(values: FloatArray) -> BoolArray:

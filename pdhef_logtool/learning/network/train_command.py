@@ -14,22 +14,28 @@ import numpy as np
 from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.learning.plots import new_figure, png_bytes
-from pdhef_logtool.records.errors import ModelError, UsageError
+from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
+    NOMINAL_MODEL,
+    PHYSICS_MODEL,
     RESIDUAL,
     WEIGHTS_FILE,
     ModelBundle,
     model_folder,
     open_model,
 )
+from pdhef_logtool.residual_model.features import FEATURES
 
 HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"
 #: Shorter runs between two restarts teach nothing.
 MIN_SEQUENCE_STEPS = 50
+#: Utilisation up to which tyres answer to the steering angle in proportion, and driving by which an offset is shrunk.
+CALM_UTILISATION, OFFSET_SHRINK_S = 0.4, 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,12 +88,33 @@ def run_training(
         The dataset has no usable drives, or another training's checkpoint is in the way.
     """
     recipe = make_recipe(paper=paper, seed=seed, epochs=epochs, device=device)
-    data = read_dataset(dataset)
+    data = dataset_for(dataset, NOMINAL_MODEL if paper else PHYSICS_MODEL)
     bundle = None if init is None else open_model(init)
+    if bundle is not None and bundle.model != data.model:
+        raise ModelError(expected=f"a network for {data.model}", got=f"one for {bundle.model}", where=str(init))
     start = None if init is None else model_folder(init)
     check_no_input([start], [output / name for name in (DOCUMENT_FILE, WEIGHTS_FILE)])
     with OutputFolder(output):
         return train_on(data, output, recipe, init=bundle, device=device, progress=progress)
+
+
+def dataset_for(folder: Path, model: str) -> Dataset:
+    """Open a dataset whose residuals are those of a model.
+
+    Raises
+    ------
+    OutputError
+        It is none, or one of another model.
+    """
+    data = read_dataset(folder)
+    if data.model != model:
+        raise OutputError(
+            expected=f"residuals of {model}",
+            got=f"those of {data.model}",
+            where=str(folder),
+            remedy=f"pdhef extract LOG... -o DATASET --model {model} writes them, into another folder",
+        )
+    return data
 
 
 def make_recipe(*, paper: bool, seed: int, epochs: int | None, device: str) -> Recipe:
@@ -113,7 +140,7 @@ def train_on(
 ) -> TrainResult:
     """Train one network by a recipe, whose target says what it learns; the rest as :func:`run_training`."""
     splits = {
-        name: list(_sequences((d for d in data.drives if d.split == name), recipe.target))
+        name: list(_sequences((d for d in data.drives if d.split == name), recipe.target, odd=recipe.odd))
         for name in ("train", "validation", "test")
     }
 
@@ -136,7 +163,7 @@ def train_on(
         "test_loss": test_loss,
         "training_hours": round(sum(len(s.weight) for s in splits["train"]) * recipe.period_s / 3600.0, 3),
     }
-    bundle = replace(bundle, provenance=provenance)
+    bundle = replace(bundle, provenance=provenance, model=data.model, physics_sha256=data.physics_sha256)
     write_bytes(output / HISTORY_FILE, _history_table(history))
     write_bytes(output / PLOT_FILE, _plot_history(history))
     bundle.save(output)
@@ -169,15 +196,37 @@ def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
             yield slice(a, b)
 
 
-def _sequences(drives: Iterable[DatasetDrive], target: str = RESIDUAL) -> Iterable[FeatureSequence]:
+def steering_offset(rows: DriveArrays) -> FloatArray:
+    """Return the residual rates [2] that an offset of the steering angle makes in a drive: what no network can know.
+
+    The offset is constant over the drive, fitted to calm driving, and shrunk where there is little of it.
+    """
+    column = {name: rows.features[:, i].astype(np.float64) for i, name in enumerate(FEATURES)}
+    calm = (rows.weight > 0.0) & (column["utilisation"] < CALM_UTILISATION)
+    if not calm.any():
+        return np.zeros(2)
+    force = float(column["front_stiffness_per_mass"][calm].mean())
+    turn = force / float((column["inertia_ratio"] * column["cg_to_rear_axle_m"])[calm].mean())
+    by_angle = np.array([force, turn])
+    mean = (rows.targets[calm] / rows.step_s[calm, None]).mean(axis=0)
+    seconds = float(rows.step_s[calm].sum())
+    angle = float(mean @ by_angle / (by_angle @ by_angle)) * seconds / (seconds + OFFSET_SHRINK_S)
+    offset: FloatArray = angle * by_angle
+    return offset
+
+
+def _sequences(
+    drives: Iterable[DatasetDrive], target: str = RESIDUAL, *, odd: bool = False
+) -> Iterable[FeatureSequence]:
     """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
     for drive in drives:
         rows = drive.arrays
+        offset = steering_offset(rows) if odd else np.zeros(2)
         for part in gap_free_runs(rows):
             weight = np.asarray(rows.weight[part], dtype=np.float64)
             features = np.asarray(rows.features[part], dtype=np.float64)
             if target == RESIDUAL:
-                values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None]
+                values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset
             else:
                 values = np.asarray(rows.truth_velocity[part, 1:2], dtype=np.float64)
                 weight = weight * np.isfinite(values[:, 0])

@@ -15,7 +15,6 @@ from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import FilterNoise, Noise
 from pdhef_logtool.car.store import Change, write_change
 from pdhef_logtool.drive.reading import Tell
-from pdhef_logtool.estimators.table import spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     LearnResult,
@@ -153,14 +152,9 @@ def tune(
     if jobs < 1:
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     car = open_car(config, output, warn)
-    names = choose_names(settings.names, car, with_network=config.network is not None or car.trust is not None)
-    has_network = any(spec_of(n).network for n in names)
+    names = choose_names(settings.names, car)
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
     check_file_output(inputs, config, output)
-    if has_network and "train" in splits.values():
-        warn(
-            "drives of split train: a network is better there than in service, and its filter's noise is tuned to that"
-        )
     setup = TuneSetup(config, car, open_mapping(config), names)
     with Benches(setup, min(jobs, len(inputs))) as benches:
         done = 0
@@ -212,11 +206,9 @@ def tune(
 
 def _noise(tuned: Tuned, car: Car) -> FilterNoise:
     """Return the noise of the best trial with what it belongs to."""
-    network = car.network if spec_of(tuned.name).network else None
     return filter_tuning(tuned.best.values).model_copy(
         update={
             "physics_sha256": car.physics_of(tuned.name),
-            "network_sha256": None if network is None else network.sha256,
             "score_deg": round(tuned.best.score.objective_deg, 4),
             "trial": tuned.best.number,
         }

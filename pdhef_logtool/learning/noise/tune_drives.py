@@ -1,6 +1,6 @@
 """Drives that noise is tuned on, kept in memory by the processes that score them.
 
-What does not depend on a filter's noise (reading, alignment, truth, the network's pass) is done once a drive.
+What does not depend on a filter's noise (reading, alignment, truth) is done once a drive.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.residual_model.service import RememberingNetwork
 from pdhef_logtool.runs.config import RunConfig
 
 #: A drive with fewer scored stamps says nothing of its own.
@@ -44,24 +43,22 @@ class TuneSetup:
     names: tuple[str, ...]
 
 
-def choose_names(names: Sequence[str] | None, car: Car, *, with_network: bool) -> tuple[str, ...]:
+def choose_names(names: Sequence[str] | None, car: Car) -> tuple[str, ...]:
     """Return the estimators to tune, in the order of the tables.
 
     Parameters
     ----------
-    names : None = every one that is always tuned and that the car suits, without ``physics`` where the car has a fit of
-        it: its noise was found together with its values. with_network : among them those with one.
+    names : None = every one that can be, without ``physics`` where the car has a fit of it: its noise was found
+        together with its values.
 
     Raises
     ------
     UsageError
-        A name is unknown or given twice, or its network is missing.
+        A name is unknown or given twice.
     """
     tunable = {s.name: s for s in SPECS if s.tunable}
     if names is None:
-        usual = (s for s in tunable.values() if s.tunable == "always" and (with_network or not s.network))
-        fitted = () if car.fitted_physics is None else (PHYSICS,)
-        return tuple(s.name for s in usual if s.name not in fitted and not (s.network and car.network is None))
+        return tuple(n for n in tunable if n != PHYSICS or car.fitted_physics is None)
     wrong = sorted({n for n in names if n not in tunable or names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
@@ -70,8 +67,6 @@ def choose_names(names: Sequence[str] | None, car: Car, *, with_network: bool) -
             where="--estimators",
             remedy=former(wrong),
         )
-    if car.network is None and (without := [n for n in names if tunable[n].network]):
-        raise UsageError(expected="a network", got="none", where=", ".join(without), remedy="give --network")
     return tuple(n for n in tunable if n in names)
 
 
@@ -87,9 +82,7 @@ class DriveBench:
     def __init__(self, setup: TuneSetup) -> None:
         self._setup = setup
         self._drives: dict[int, _Drive] = {}
-        network = None if setup.car.network is None else RememberingNetwork(setup.car.network)
-        # Noise is chosen at full trust; what a car allows comes later, by evidence.
-        self._options = Options(setup.config.sensors == "full", trust=1.0, network=network)
+        self._options = Options(setup.config.sensors == "full")
 
     def load(self, index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord:
         """Read a drive, run what its filters' noise does not change, and keep it under ``index``.
@@ -124,8 +117,7 @@ class DriveBench:
         slow = self._setup.car.vehicle.low_speed_blend_m_s
         errors: dict[str, dict[int, DriveError]] = {}
         for name, noise in tunings.items():
-            spec = spec_of(spec_of(name).tuned_as or name)
-            estimator = spec.make(self._setup.car.with_noise(name, noise), self._options)
+            estimator = spec_of(name).make(self._setup.car.with_noise(name, noise), self._options)
             errors[name] = {
                 index: drive_error(estimator.run(drive.signals, None)[0], drive.truth, slow)
                 for index, drive in self._drives.items()

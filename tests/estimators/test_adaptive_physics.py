@@ -15,13 +15,9 @@ from reference_car import cut, drive, slalom, tanh_tyre, with_noise
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.adaptive_hybrid import (
-    SIDESLIP_TO_RAD,
-    AdaptiveHybridUkf,
-    adaptive_hybrid_ukf,
-    mix,
-)
-from pdhef_logtool.estimators.hybrid import HybridUkf
+from pdhef_logtool.estimators.adaptive_physics import SIDESLIP_TO_RAD, AdaptivePhysics, mix
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
@@ -54,12 +50,16 @@ NETWORK = NetworkService(_bundle())
 SILENT = NetworkService(_bundle((0.0, 0.0)))
 
 
-def adaptive(network: NetworkService = SILENT, **options) -> AdaptiveHybridUkf:
-    return replace(adaptive_hybrid_ukf(VEHICLE, network), **options)
+#: As a car that was identified: a static single track with noise that it was found with.
+PHYSICS = PhysicsFilter(VEHICLE, q_std=(0.089, 0.06, 0.03, 0.021, 0.4, 0.4), r_std=(0.3, 0.003, 0.08))
 
 
-def fixed(network: NetworkService = SILENT, **options) -> HybridUkf:
-    return HybridUkf(VEHICLE, network, **options)
+def adaptive(network: NetworkService = SILENT, **options) -> AdaptivePhysics:
+    return AdaptivePhysics(PHYSICS, network, **{"trust": 1.0, **options})
+
+
+def fixed(network: NetworkService = SILENT, **options) -> AdaptivePhysics:
+    return adaptive(network, adaptive=False, name="pd-hef-fixed-r", **options)
 
 
 def times(signals: Signals) -> np.ndarray:
@@ -144,8 +144,8 @@ def test_a_burst_raises_r_for_its_time_and_costs_less(made):
 def test_a_slow_model_error_leaves_r_alone(weak):
     track, _ = adaptive().run(noisy(weak), None)
     assert (track.r_scale == 1.0).mean() > 0.99
-    innovation = adaptive().hybrid.filter.filter_steps(noisy(weak), None)[0].innovation[:, 0]
-    assert np.sqrt(np.nanmean(innovation**2)) > 3 * VEHICLE.sensors.ay_std_m_s2, "there was an error to be misread"
+    innovation = PHYSICS.filter_steps(noisy(weak), None)[0].innovation[:, 0]
+    assert np.sqrt(np.nanmean(innovation**2)) > 2 * VEHICLE.sensors.ay_std_m_s2, "there was an error to be misread"
 
 
 @pytest.mark.parametrize("how", ["stuck", "dead"])
@@ -165,7 +165,7 @@ def test_a_gyro_that_fails_does_not_take_the_filter_with_it(made, how):
 # --- top layer -------------------------------------------------------------------------------------------------------
 
 
-def weights(estimator: AdaptiveHybridUkf, signals: Signals) -> np.ndarray:
+def weights(estimator: AdaptivePhysics, signals: Signals) -> np.ndarray:
     return np.nan_to_num(estimator.run(signals, None)[0].mixture_weight)
 
 
@@ -197,7 +197,7 @@ def test_at_a_very_large_sideslip_it_has_no_weight(weak):
     estimator = adaptive()
     made = drive(lambda t: 0.3 * min(1.0, max(0.0, t - 2.0)), 6.0, speed=25.0, mu=0.3)
     signals = noisy(made)
-    steps, _ = estimator.hybrid.filter.filter_steps(signals, None)
+    steps, _ = PHYSICS.filter_steps(signals, None)
     large = np.abs(np.arctan2(steps.x[:, 1], steps.x[:, 0])) > SIDESLIP_TO_RAD
     track, _ = estimator.run(signals, None)
     first, _ = fixed().run(signals, None)
@@ -244,10 +244,14 @@ def test_trust_scales_the_network_in_both_filters(made):
 
 
 def test_its_noise_comes_from_the_car():
-    tuned = Car.of(VEHICLE, network=SILENT.bundle, noise={"pd-hef": FilterNoise(r_std={"ay_m_s2": 2.0})})
-    estimator = make_estimator("pd-hef", tuned, Options(trust=1.0))
-    assert isinstance(estimator, AdaptiveHybridUkf)
-    assert estimator.r_std[0] == 2.0
+    tuned = Car.of(VEHICLE, network=SILENT.bundle, noise={"physics": FilterNoise(r_std={"ay_m_s2": 2.0})})
+    found = [
+        make_estimator(n, tuned, Options(trust=t)) for n, t in (("physics", None), ("pd-hef", 0.0), ("pd-hef", 1.0))
+    ]
+    for estimator in found:
+        assert isinstance(estimator, AdaptivePhysics)
+        assert estimator.physics.measurement_std[0] == 2.0
+    assert resolve(found[0]) == resolve(found[1]) != resolve(found[2])
 
 
 # --- windows, causality, symmetry ------------------------------------------------------------------------------------

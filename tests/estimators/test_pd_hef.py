@@ -1,8 +1,8 @@
-"""The hybrid filter: it is the physics filter plus exactly the residual, and a right residual makes it right."""
+"""pd-hef: it is ``physics`` plus exactly the residual, and a right residual makes it right."""
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,16 +10,17 @@ import numpy as np
 import polars as pl
 import pytest
 import torch
+from physics_oracle import Oracle, parts
+from reference_car import FRICTION
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf
-from pdhef_logtool.estimators.physics import PhysicsUkf
+from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -74,37 +75,45 @@ def _same(a: StateTrack, b: StateTrack) -> bool:
     return all(np.array_equal(getattr(a, c), getattr(b, c), equal_nan=True) for c in COMPARED)
 
 
-def test_without_trust_it_is_the_physics_filter_with_its_noise() -> None:
-    hybrid = HybridUkf(VEHICLE, NetworkService(_bundle()), trust=0.0)
-    plain = PhysicsUkf(
-        VEHICLE, q_std=hybrid.q_std, r_std=(*hybrid.r_std, VEHICLE.sensors.speed_std_m_s), roll_correction=True
-    )
+def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) -> AdaptivePhysics:
+    vehicle = VEHICLE.model_copy(update={"physics": PhysicsParts(**dict.fromkeys(parts, True))})
+    return AdaptivePhysics(PhysicsFilter(vehicle), NetworkService(network or _bundle()), trust)
+
+
+@pytest.mark.parametrize("parts", [(), ("lag", "roll", "biases", "bank"), tuple(PhysicsParts.model_fields)])
+def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...]) -> None:
     signals = _signals()
-    assert _same(hybrid.run(signals, None)[0], plain.run(signals, None)[0])
-    trusted = replace(hybrid, trust=1.0)
-    assert not _same(trusted.run(signals, None)[0], plain.run(signals, None)[0])
+    trusted = hybrid(*parts)
+    physics, _ = AdaptivePhysics(trusted.physics, name="physics").run(signals, None)
+    for change in ({"trust": 0.0}, {"network": NetworkService(_bundle((0.0, 0.0)))}):
+        track, _ = replace(trusted, **change).run(signals, None)
+        for f in fields(StateTrack):
+            if f.name not in ("name", "network_trust"):
+                np.testing.assert_array_equal(getattr(track, f.name), getattr(physics, f.name), err_msg=f.name)
+    assert not _same(trusted.run(signals, None)[0], physics)
+    assert (trusted.scaled is None) == ("force_scale" in parts)
 
 
 def test_windows_join_bit_for_bit() -> None:
-    hybrid = HybridUkf(VEHICLE, NetworkService(_bundle()))
+    estimator = hybrid("lag", "roll", "biases", "bank")
     signals = _signals()
-    whole, _ = hybrid.run(signals, None)
+    whole, _ = estimator.run(signals, None)
     carry = None
     parts = []
     for a, b in pairwise((0, 3, 250, 257, 600, 800)):
-        part, carry = hybrid.run(_cut(signals, a, b), carry)
+        part, carry = estimator.run(_cut(signals, a, b), carry)
         parts.append(part)
     assert _same(concatenate(parts), whole)
 
 
 def test_nothing_that_arrives_later_changes_an_output() -> None:
-    hybrid = HybridUkf(VEHICLE, NetworkService(_bundle()))
+    estimator = hybrid("lag", "roll")
     signals = _signals()
     later = {"ay_m_s2": signals.ay_m_s2.copy(), "steer_rad": signals.steer_rad.copy()}
     for column in later.values():
         column[500:] += 0.1
-    before, _ = hybrid.run(signals, None)
-    after, _ = hybrid.run(replace(signals, **later), None)
+    before, _ = estimator.run(signals, None)
+    after, _ = estimator.run(replace(signals, **later), None)
     seen = signals.stamps_ns < signals.ready_ns[500]
     assert np.array_equal(before.vy_m_s[seen], after.vy_m_s[seen], equal_nan=True)
     assert not np.array_equal(before.vy_m_s, after.vy_m_s, equal_nan=True)
@@ -132,18 +141,18 @@ def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None
     )  # fmt: skip
     error = {}
     for trust in (0.0, 0.5, 1.0):
-        track, _ = HybridUkf(VEHICLE, NetworkService(_bundle((force, 0.0))), trust=trust).run(signals, None)
+        track, _ = hybrid(network=_bundle((force, 0.0)), trust=trust).run(signals, None)
         error[trust] = float(np.abs(track.vy_m_s - truth[:, 0])[500:].mean())
         if trust == 1.0:
             assert track.ay_m_s2[500:] == pytest.approx(ay[500:], abs=0.003)
-    assert error[1.0] < 0.02 * error[0.0]
+    assert error[1.0] < 0.05 * error[0.0]
     assert error[1.0] < error[0.5] < error[0.0]
 
 
 def test_below_the_dynamic_range_the_residual_counts_for_nothing() -> None:
     slow = replace(_signals(speed=1.0), ay_m_s2=np.zeros(800))
-    a, _ = HybridUkf(VEHICLE, NetworkService(_bundle((2.0, 1.0)))).run(slow, None)
-    b, _ = HybridUkf(VEHICLE, NetworkService(_bundle((2.0, 1.0))), trust=0.0).run(slow, None)
+    a, _ = hybrid(network=_bundle((2.0, 1.0))).run(slow, None)
+    b, _ = hybrid(trust=0.0).run(slow, None)
     assert _same(a, b)
 
 
@@ -154,7 +163,7 @@ def test_a_dead_accelerometer_and_gaps_stay_finite() -> None:
     stamps = signals.stamps_ns.copy()
     stamps[600:] += 3_000_000_000
     faulty = replace(signals, ay_m_s2=ay, stamps_ns=stamps, ready_ns=stamps + 10_000_000)
-    track, _ = HybridUkf(VEHICLE, NetworkService(_bundle())).run(faulty, None)
+    track, _ = hybrid().run(faulty, None)
     assert np.isfinite(track.vy_m_s[track.valid]).all()
     assert track.valid[150:400].all()
 
@@ -178,13 +187,33 @@ def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Pat
     assert trust.unique().to_list() == [1.0]
 
 
-def test_the_noise_is_the_cars_where_it_has_some() -> None:
-    car = Car.of(VEHICLE, network=_bundle())
-    plain = make_estimator("pd-hef-fixed-r", car)
-    assert isinstance(plain, HybridUkf)
-    assert (plain.q_std, plain.r_std) == (HYBRID_Q_STD, HYBRID_R_STD)
-    noise = FilterNoise(q_std=(0.1, 0.2, 0.04), r_std={"ay_m_s2": 0.7})
-    tuned = make_estimator("pd-hef-fixed-r", car.with_noise("pd-hef", noise))
-    assert isinstance(tuned, HybridUkf)
-    assert tuned.q_std == (0.1, 0.2, 0.04, *HYBRID_Q_STD[3:])
-    assert tuned.r_std == (0.7, HYBRID_R_STD[1])
+def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
+    """The oracle's car with a force and a moment that its model lacks; told them as a residual, the filter is right."""
+    oracle = Oracle(parts("lag", "roll"))
+
+    @dataclass(frozen=True)
+    class Pushed(Oracle):
+        def derivative(self, x: np.ndarray, steer: float, ax: float, mu: float) -> np.ndarray:
+            return super().derivative(x, steer, ax, mu) + np.array([0.0, 0.8, 0.15, 0, 0, 0, 0, 0])
+
+    made = Pushed(oracle.has).drive(lambda t: 0.02 * np.sin(2.0 * t), 8.0)
+    # A force, so that the accelerometer feels it.
+    signals = replace(made.signals, ay_m_s2=made.signals.ay_m_s2 + 0.8, friction=np.full(len(made.signals), FRICTION))
+    physics = PhysicsFilter(oracle.as_vehicle())
+    rate = np.tile([0.8, 0.15], (len(signals), 1))
+    errors = []
+    for told in (None, rate, 0.5 * rate):
+        track, _ = physics.run(signals, None, told)
+        errors.append(np.sqrt(np.mean((track.vy_m_s - made.vy)[200:] ** 2)))
+    assert errors[1] < 0.05 * errors[0]
+    assert errors[1] < errors[2] < errors[0]
+
+
+def test_what_is_estimated_stands_in_the_track_and_only_that() -> None:
+    signals = _signals()
+    track, _ = hybrid("roll", "bank", "biases").run(signals, None)
+    for name in ESTIMATED_COLUMNS:  # F2 has the force scale, which F1 takes to be 0
+        assert np.isfinite(getattr(track, name)[track.valid]).all(), name
+    static, _ = replace(hybrid(), adaptive=False).run(signals, None)
+    assert [n for n in ESTIMATED_COLUMNS if len(getattr(static, n))] == []
+    assert not {"roll_rad", "force_scale"} & static.columns().keys()

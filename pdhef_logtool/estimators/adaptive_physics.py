@@ -1,9 +1,13 @@
-"""``pd-hef``: the hybrid filter with an adaptive mechanism that does not read model error as noise (METHOD §7, §15).
+"""``physics`` and ``pd-hef``: the physics filter with trust times a network's residual, and an adaptive mechanism.
+
+There is one set of noise, that of the car's physics: trust scales the residual only, and ``physics`` is trust 0 without
+a network. The mechanism (METHOD §7, §15) does not read model error as noise.
 
 Bottom layer: :mod:`~.sensor_faults` looks at a_y and yaw rate alone. What it finds goes into every filter here, the
 parallel one too, and keeps bad samples from the network.
 
-Top layer: two filters on one pass of the network. F1 is the hybrid filter; F2 has a state that scales all forces. White
+Top layer: two filters on one pass of the network. F1 is the car's filter; F2 has a state that scales all forces. Where
+the car's parts have that state there is F1 alone. White
 noise does not repeat itself, a model error does, and in proportion to the force. So the mean product of innovations of
 a_y three steps apart is what a filter's model misses. F2 gets weight as its own product stays below that of F1, beyond
 chance: a force scale that does not explain a_y is the wrong cure, for another car or a spin, and is not taken. More is
@@ -15,22 +19,25 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pdhef_logtool.car.parts import FilterNoise
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.checked_inputs import InputCarry, check_inputs, r_scale
+from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, check_inputs, r_scale, residual_rate
 from pdhef_logtool.estimators.filter_shell import VX, VY, YAW_RATE, Z_AY, PosteriorSteps, sideslip_std
-from pdhef_logtool.estimators.hybrid import HYBRID_Q_STD, HYBRID_R_STD, HybridUkf, hybrid_ukf
-from pdhef_logtool.estimators.physics import FilterCarry, PhysicsUkf
+from pdhef_logtool.estimators.physics import FilterCarry
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.reasons import BURST_AY
 from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
-from pdhef_logtool.watches.sensor_faults import AY, SensorFaults
+from pdhef_logtool.watches.sensor_faults import AY, SensorFaults, no_faults
+
+if TYPE_CHECKING:
+    from pdhef_logtool.car.car import Car
+    from pdhef_logtool.estimators.table import Options
 
 # The constants below were chosen on simulated condition drives (``pdhef simulate conditions --drives 8 --seed 1``) and
 # checked on others (``--drives 12 --seed 5``): in no row more than 4 % above the fixed filter, in those with a wrong
@@ -49,6 +56,8 @@ FREEDOM = 1.3
 #: Evidence up to which F2 has no weight, and from which on it has all, at a certain sideslip, over the usual noise
 #: variance of a_y: a car that shakes has more innovation that repeats itself, and no wrong force.
 EVIDENCE_LOW, EVIDENCE_HIGH = 0.35, 2.1
+#: The usual noise of a_y is at least this share of the filter's: identified noise holds the model's usual error.
+IDENTIFIED_SHARE = 0.4
 #: 1-sigma of F1's sideslip at which twice that evidence is asked for.
 UNCERTAIN_RAD = math.radians(0.1)
 #: Sideslip between which F2 loses its weight.
@@ -73,11 +82,11 @@ class MixtureSteps(StepColumns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdaptiveCarry:
-    """What the inputs, the filters and the mixture take from window to window."""
+    """What the inputs, the filters and the mixture take from window to window; ``scaled`` is None without F2."""
 
     inputs: InputCarry
     plain: FilterCarry
-    scaled: FilterCarry
+    scaled: FilterCarry | None
     memory: FloatArray
     last_stamp_ns: int | None
     waiting: MixtureSteps
@@ -167,84 +176,93 @@ def mix(weight: FloatArray, first: StateTrack, second: StateTrack) -> StateTrack
         friction=np.where(first.valid, first.friction, second.friction),
         valid=first.valid | second.valid,
         diverged=np.where(mostly, second.diverged, first.diverged),
+        **_mixed_columns(w, first, second),
     )
 
 
+def _mixed_columns(w: FloatArray, first: StateTrack, second: StateTrack) -> dict[str, Any]:
+    """Return what the second track estimates beside the motion, mixed; a force scale that the first has not is 0."""
+    mixed = {}
+    for name in ESTIMATED_COLUMNS:
+        b: FloatArray = getattr(second, name)
+        if len(b) == len(second):
+            a = getattr(first, name) if len(getattr(first, name)) == len(first) else np.zeros(len(b))
+            a = np.where(first.valid, a, np.nan)
+            mixed[name] = np.where(w <= 0.0, a, np.where(w >= 1.0, b, a + w * (b - a)))
+    return mixed
+
+
 @dataclass(frozen=True, slots=True)
-class AdaptiveHybridUkf:
-    """Hybrid filter with fault detection and a mixture over a force scale.
+class AdaptivePhysics:
+    """The filter of this file as an estimator.
 
     Parameters
     ----------
-    trust : share of the network's residual that both filters take, in [0, 1]; the cap of METHOD §14 goes here.
-    q_std, r_std, slip_gate : as for :class:`~.hybrid.HybridUkf`.
+    physics : the car's filter with its parts and noise, which is F1.
+    network : what its model lacks, None without; trust : share of that which both filters take, in [0, 1].
+    adaptive : False leaves the mechanism out: no detector, and F1 alone.
     evidence_low, evidence_high : between which F2 gains its weight, over the noise variance of a_y.
     notes : what the report says of it, such as the reason for its trust.
     """
 
-    vehicle: VehicleParameters
-    network: NetworkService
-    trust: float = 1.0
-    q_std: tuple[float, float, float, float] = HYBRID_Q_STD
-    r_std: tuple[float, float] = HYBRID_R_STD
+    physics: PhysicsFilter
+    network: NetworkService | None = None
+    trust: float = 0.0
+    adaptive: bool = True
     evidence_low: float = EVIDENCE_LOW
     evidence_high: float = EVIDENCE_HIGH
-    use_speed: bool = True
-    slip_gate: bool = True
     name: str = "pd-hef"
     causal: bool = True
     notes: tuple[str, ...] = ()
 
     @property
-    def hybrid(self) -> HybridUkf:
-        """The fixed filter that F1 is when nothing is wrong."""
-        return HybridUkf(
-            self.vehicle,
-            self.network,
-            self.trust,
-            self.q_std,
-            self.r_std,
-            use_speed=self.use_speed,
-            slip_gate=self.slip_gate,
-            name=self.name,
-        )
+    def scaled(self) -> PhysicsFilter | None:
+        """F2; None where there is no mixture."""
+        vehicle = self.physics.vehicle
+        if not self.adaptive or vehicle.physics.force_scale:
+            return None
+        parts = vehicle.physics.model_copy(update={"force_scale": True})
+        read_with = self.physics.read_with or vehicle
+        return replace(self.physics, vehicle=vehicle.model_copy(update={"physics": parts}), read_with=read_with)
 
-    @property
-    def filters(self) -> tuple[PhysicsUkf, PhysicsUkf]:
-        """F1 and F2."""
-        plain = self.hybrid.filter
-        return plain, replace(plain, force_scale=True)
+    def inputs(self, signals: Signals, carry: InputCarry | None) -> tuple[CheckedInputs, InputCarry]:
+        """Return what the filters take: checked signals with the residual at trust 1; and the carry."""
+        if self.adaptive:
+            return check_inputs(self.physics, self.network, signals, carry)
+        rate, after = residual_rate(self.physics, self.network, signals, carry)
+        return CheckedInputs(no_faults(signals), rate), after
 
     def run(self, signals: Signals, carry: AdaptiveCarry | None) -> tuple[StateTrack, AdaptiveCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         c = carry
-        checked, inputs = check_inputs(self.hybrid, signals, c.inputs if c else None)
-        faults = checked.faults
-        given, extra = faults.filtered, faults.extra_r
-        rate = self.trust * checked.rate
-        plain, scaled = self.filters
-        plain_steps, plain_after = plain.filter_steps(given, c.plain if c else None, rate, extra)
-        scaled_steps, scaled_after = scaled.filter_steps(given, c.scaled if c else None, rate, extra)
-        weight, memory = self._mixture(plain_steps, scaled_steps, faults, c)
-        # Only what the mixture takes is predicted to the stamps.
-        plain_steps = replace(plain_steps, valid=plain_steps.valid & ((weight < 1.0) | ~scaled_steps.valid))
-        scaled_steps = replace(scaled_steps, valid=scaled_steps.valid & ((weight > 0.0) | ~plain_steps.valid))
-        first, plain_carry = plain.outputs(given, c.plain if c else None, plain_steps, plain_after)
-        second, scaled_carry = scaled.outputs(given, c.scaled if c else None, scaled_steps, scaled_after)
+        checked, inputs = self.inputs(signals, c.inputs if c else None)
+        faults, rate = checked.faults, self.trust * checked.rate
+        plain, plain_after = self.physics.filter_steps(faults.filtered, c.plain if c else None, rate, faults.extra_r)
+        weight, memory, second, scaled_carry = np.zeros(len(signals)), np.zeros(MEMORY), None, None
+        if (twin := self.scaled) is not None:
+            before = c.scaled if c else None
+            scaled, scaled_after = twin.filter_steps(faults.filtered, before, rate, faults.extra_r)
+            weight, memory = self._mixture(plain, scaled, faults, c)
+            # Only what the mixture takes is predicted to the stamps.
+            scaled = replace(scaled, valid=scaled.valid & ((weight > 0.0) | ~plain.valid))
+            plain = replace(plain, valid=plain.valid & ((weight < 1.0) | ~scaled.valid))
+            second, scaled_carry = twin.outputs(signals, before, scaled, scaled_after)
+        track, plain_carry = self.physics.outputs(signals, c.plain if c else None, plain, plain_after)
 
-        steps = MixtureSteps(signals.ready_ns, weight, r_scale(extra, self.r_std), faults.reason)
+        r_std = self.physics.measurement_std
+        steps = MixtureSteps(signals.ready_ns, weight, r_scale(faults.extra_r, r_std), faults.reason)
         if c is not None:
             steps = c.waiting.joined(steps)
         released = release(steps.ready_ns, signals.stamps_ns)
         at = released.at
-        track = mix(steps.weight[at], first, second)
-        track = replace(
-            track,
-            network_trust=np.where(track.valid, self.trust, np.nan),
-            r_scale=np.where(track.valid, steps.r_scale[at], 1.0),
-            mixture_weight=np.where(track.valid, steps.weight[at], np.nan),
-            reason=np.where(released.arrived, steps.reason[at], 0),
-        )
+        if second is not None:
+            track = mix(steps.weight[at], track, second)
+        told: dict[str, Any] = {"network_trust": np.where(track.valid, self.trust, np.nan)}
+        if self.adaptive:
+            told["r_scale"] = np.where(track.valid, steps.r_scale[at], 1.0)
+            told["mixture_weight"] = np.where(track.valid, steps.weight[at], np.nan)
+            told["reason"] = np.where(released.arrived, steps.reason[at], 0)
+        track = replace(track, name=self.name, **told)
         last = last_stamp_ns(signals.stamps_ns, c.last_stamp_ns if c else None)
         return track, AdaptiveCarry(inputs, plain_carry, scaled_carry, memory, last, steps.since(released.needed))
 
@@ -258,24 +276,16 @@ class AdaptiveHybridUkf:
         innovations = np.stack([plain.innovation[:, Z_AY], scaled.innovation[:, Z_AY]], axis=1)
         starts: BoolArray = ~np.isfinite(plain.prior[:, VX])
         skip = faults.reason & BURST_AY > 0
+        usual = np.maximum(faults.usual_std[:, AY], IDENTIFIED_SHARE * self.physics.measurement_std[Z_AY])
         out = np.empty(count)
         given = (
-            dt, innovations, starts, skip, faults.filtered.ay_m_s2, faults.noise_std[:, AY], faults.usual_std[:, AY],
+            dt, innovations, starts, skip, faults.filtered.ay_m_s2, faults.noise_std[:, AY], usual,
             plain.x[:, VX], plain.x[:, VY], plain.P[:, VY, VY], plain.x[:, YAW_RATE],
         )  # fmt: skip
         _weights(given, self.evidence_low, self.evidence_high, memory, out)
         return out, memory
 
 
-def adaptive_hybrid_ukf(
-    vehicle: VehicleParameters,
-    network: NetworkService,
-    noise: FilterNoise | None = None,
-    *,
-    trust: float = 1.0,
-    use_speed: bool = True,
-    notes: tuple[str, ...] = (),
-) -> AdaptiveHybridUkf:
-    """Return ``pd-hef`` with a noise; what that leaves out is that of the hybrid filter."""
-    fixed = hybrid_ukf(vehicle, network, noise, trust=trust, use_speed=use_speed)
-    return AdaptiveHybridUkf(vehicle, network, trust, fixed.q_std, fixed.r_std, use_speed=use_speed, notes=notes)
+def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
+    """Return ``physics`` of a car."""
+    return AdaptivePhysics(of_car(car, use_speed=options.use_speed), name=name)
