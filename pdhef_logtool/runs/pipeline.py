@@ -32,6 +32,7 @@ from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signa
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.scoring import evaluate, in_time
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.report import (
@@ -53,6 +54,7 @@ from pdhef_logtool.watches.intervals import TrackCalibrator
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
+    from pdhef_logtool.self_calibration.calibration import SelfCalibration
 
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
@@ -157,6 +159,7 @@ def run_logs(
         warn(note)
     check_places(inputs, output, config, mapping, junit)
     results: list[LogResult] = []
+    pool = calibrate_pool(inputs, car, mapping, config) if config.calibrate == "pool" else None
     with OutputFolder(output, (LOGS,)) as outputs:
         for number, log_input in enumerate(inputs):
 
@@ -164,7 +167,7 @@ def run_logs(
                 progress(text, (number + share) / len(inputs))
 
             try:
-                result = run_log(log_input, outputs, config, car, mapping, progress=of_all, warn=warn)
+                result = run_log(log_input, outputs, config, car, mapping, pool=pool, progress=of_all, warn=warn)
             except Exception as error:  # one bad log never stops the others, whatever is wrong with it
                 if len(inputs) == 1:
                     raise
@@ -223,10 +226,15 @@ def run_log(
     car: Car,
     mapping: Mapping | None,
     *,
+    pool: SelfCalibration | None = None,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> LogResult:
     """Run one log and replace its folder ``logs/<stem>`` of the outputs.
+
+    Parameters
+    ----------
+    pool : what all logs of the run together say of the car; None: the log says it, if it is asked.
 
     Raises
     ------
@@ -235,6 +243,8 @@ def run_log(
     """
     progress(log_input.stem, 0.0)
     with read_drive(log_input, car, mapping, config.read_options, tell=warn) as drive:
+        calibration = pool if pool is not None else calibrate_drive(drive, config)
+        car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
         algorithms = {e.name: resolve(e) for e in ready}
         intervals = calibrator(car, ready)
@@ -263,7 +273,8 @@ def run_log(
             ]
             left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in skipped]
             facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
-            report = build_report(replace(facts, friction=friction_facts(drive.friction)))
+            found_out = None if calibration is None else calibration.to_dict()
+            report = build_report(replace(facts, friction=friction_facts(drive.friction), calibration=found_out))
             from pdhef_logtool.sinks.parquet import write_metrics
 
             for sink in sinks:
