@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import Drive, read_drive
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
 from pdhef_logtool.logs.discovery import LogInput
@@ -15,6 +16,7 @@ from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.consistency import LogSensors
     from pdhef_logtool.self_calibration.calibration import SelfCalibration
     from pdhef_logtool.self_calibration.driving import Driving
 
@@ -69,6 +71,26 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     note = "not causal: its car was calibrated on the whole log, without truth"
     found = WithoutTruth(calibration.vehicle, told_friction=_told(drive), note=note)
     return replace(drive.car, self_calibrated=found)
+
+
+def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> LogSensors:
+    """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file says.
+
+    What is refused for its tyres is no worse for its sensors.
+    """
+    from pdhef_logtool.evaluation.consistency import LogSensors
+
+    if calibration is None or not calibration.parameters:
+        gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
+        return LogSensors(ay_gain=gain, lever_m=vehicle.imu_position_m[0])
+    found = {p.name: p.value for p in calibration.parameters}
+    return LogSensors(
+        ay_bias_m_s2=found["a_y bias"] - vehicle.sensors.ay_bias_m_s2,
+        yaw_rate_bias_rad_s=found["yaw rate bias"] - vehicle.sensors.yaw_rate_bias_rad_s,
+        ay_gain=found["roll gain"],
+        lever_m=found["lever of a_y"],
+        superelevation=found["superelevation"],
+    )
 
 
 def _asked(config: RunConfig, car: Car) -> bool:

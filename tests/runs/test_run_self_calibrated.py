@@ -128,3 +128,24 @@ def test_a_pool_takes_what_its_logs_say_together(sample_logs_dir: Path, wrong_ca
     assert pool.logs == 2
     assert pool.seconds > 15.0
     assert not pool.refused
+
+
+def test_a_default_estimate_that_contradicts_the_sensors_is_replaced_and_the_run_says_so(
+    sample_logs_dir: Path, wrong_car: Path, tmp_path: Path
+) -> None:
+    """A car whose rear axle is nearly gone, in a log too short to calibrate it."""
+    if Car.load().network is None:
+        pytest.skip("no network is shipped, without which there is no pd-hef")
+    worse = tmp_path / "vehicle.toml"
+    worse.write_text(wrong_car.read_text().replace("B = 5.6", "B = 20.0").replace("B = 10.627", "B = 4.0"))
+    names = ("zero", "phy-ukf", "pd-hef")
+    log, found = sample_logs_dir / "sweep.mcap", {}
+    for calibrate in ("off", "log"):
+        report = run(log, worse, tmp_path / calibrate, calibrate=calibrate, estimators=names, end=None)
+        jsonschema.validate(report, load_schema("report.schema.json"))
+        assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
+        found[calibrate] = {e["name"]: e for e in report["estimators"]}["pd-hef"]
+    assert found["off"]["causal"] and not found["log"]["causal"]
+    assert any("stands in its place" in note for note in found["log"]["notes"])
+    assert rmse(tmp_path / "log", "pd-hef") <= 1.2 * min(rmse(tmp_path / "log", n) for n in ("zero", "phy-ukf"))
+    assert rmse(tmp_path / "log", "pd-hef") < 0.5 * rmse(tmp_path / "off", "pd-hef")
