@@ -232,8 +232,9 @@ class Car:
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
         vehicle = fit.values.applied_to(self.own)
-        if vehicle != self.own and not vehicle.name.endswith("(identified)"):
-            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
+        how = "(calibrated without truth)" if fit.without_truth else "(identified)"
+        if vehicle != self.own and not vehicle.name.endswith(how):
+            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} {how}"})
         here = physics_sha256(vehicle)
         noise = {n: one for n, one in self.noise.items() if one.physics_sha256 in (None, here)} | fit.filter
         if fit.physics is not None:

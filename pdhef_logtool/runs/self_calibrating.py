@@ -20,12 +20,12 @@ if TYPE_CHECKING:
     from pdhef_logtool.self_calibration.calibration import SelfCalibration
     from pdhef_logtool.self_calibration.driving import Driving
 
-_NEEDS = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
+_NEEDS = ("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 
 def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
     """Return what a drive says of its car; None where nobody asks or the log lacks a sensor for it."""
-    if config.calibrate == "off" or not _asked(config, drive.car) or not drive.available >= _NEEDS:
+    if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
         return None
     from pdhef_logtool.self_calibration.calibration import self_calibrate
 
@@ -44,11 +44,16 @@ def calibrate_pool(
     for log_input in inputs:
         try:
             with read_drive(log_input, car, mapping, config.read_options) as drive:
-                if drive.available >= _NEEDS:
+                if not lacking(drive):
                     found.append(read_driving(drive))
         except PdhefError:
             continue  # the run itself says what is wrong with it
     return self_calibrate(found, car.vehicle)
+
+
+def lacking(drive: Drive) -> list[str]:
+    """Return the signals without which a drive calibrates nothing, those that it lacks."""
+    return [name for name in _NEEDS if name not in drive.available]
 
 
 def read_driving(drive: Drive) -> Driving:
