@@ -69,6 +69,19 @@ class AllowedTrust:
         return f"network trust {self.cap:g}: {self.reason}"
 
 
+@dataclass(frozen=True, slots=True)
+class WithoutTruth:
+    """The vehicle as driving without truth calibrated it, for the log that it is about.
+
+    ``told_friction`` : whether the signals' friction is one that the calibration knew too; an estimate, made with the
+    file as it stands, is none. ``note`` : what a reader of the report must know.
+    """
+
+    vehicle: VehicleParameters
+    told_friction: bool
+    note: str
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Car:
     """A vehicle with what was learnt of it.
@@ -82,6 +95,7 @@ class Car:
     network, network_name, network_folder : the residual network, None without; trust : what was found of it.
     intervals : calibrated 95 % intervals, None without.
     learnt_on : drives that ``vehicle`` was identified on.
+    self_calibrated : the vehicle as the log that is run calibrated it, None without; for the estimators that take it.
     source : folder or file, None for the default car. notes : what is stale, and why.
     """
 
@@ -95,6 +109,7 @@ class Car:
     intervals: Intervals | None = None
     learnt_on: tuple[LearntOn, ...] = ()
     fitted_physics: FittedPhysics | None = None
+    self_calibrated: WithoutTruth | None = None
     source: Path | None = None
     notes: tuple[str, ...] = ()
 
@@ -215,12 +230,30 @@ class Car:
             return "other physics"
         return "other noise" if found is not None and found.noise_sha256 not in (None, noise) else ""
 
+    @property
+    def has_evidence(self) -> bool:
+        """Whether driving has shown this vehicle to be right: it was fitted, or its network was tried with it."""
+        fitted = bool(self.learnt_on) or self.fitted_physics is not None
+        trust = self.trust
+        tried = trust is not None and trust.has_evidence and trust.physics_sha256 in (None, self.physics_sha256)
+        return fitted or tried
+
+    @property
+    def calibrated_car(self) -> Car:
+        """The car with the vehicle that the log calibrated, for its estimators; itself without a calibration."""
+        found = self.self_calibrated
+        if found is None:
+            return self
+        car = replace(self.with_vehicle(found.vehicle), self_calibrated=None)
+        return car if PHYSICS in car.noise else car.with_noise(PHYSICS, FilterNoise())
+
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""
         vehicle = fit.values.applied_to(self.own)
         found = replace(self, vehicle=vehicle, fitted_physics=fit.physics)
-        if vehicle != self.own and not vehicle.name.endswith("(identified)"):
-            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} (identified)"})
+        how = "(calibrated without truth)" if fit.without_truth else "(identified)"
+        if vehicle != self.own and not vehicle.name.endswith(how):
+            vehicle = vehicle.model_copy(update={"name": f"{vehicle.name} {how}"})
         noise = {n: one for n, one in self.noise.items() if found.owns_noise(n, one)} | fit.filter
         if fit.physics is not None:
             noise[PHYSICS] = fit.physics.noise

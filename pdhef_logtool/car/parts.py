@@ -13,7 +13,16 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from pdhef_logtool.car.vehicle import NonNegative, PhysicsParts, Positive, Record, Sensors, Tyres, VehicleParameters
+from pdhef_logtool.car.vehicle import (
+    NonNegative,
+    PhysicsParts,
+    Position,
+    Positive,
+    Record,
+    Sensors,
+    Tyres,
+    VehicleParameters,
+)
 from pdhef_logtool.records.documents import one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
@@ -81,6 +90,7 @@ class FittedValues(Record):
     roll_frequency_rad_s: Positive | None = None
     roll_damping: Positive | None = None
     cg_over_roll_axis_m: NonNegative | None = None
+    imu_position_m: Position | None = None
     physics: PhysicsParts | None = None
 
     @classmethod
@@ -174,7 +184,8 @@ class Fit(Record):
     """``fit.toml``, written by ``pdhef identify``: the car's physics as the drives show it.
 
     The noise in ``filter`` was found together with the values and belongs to them (METHOD §14). ``physics`` are those
-    of the filter of that name, whose model has other parts: each filter's are found through itself.
+    of the filter of that name, whose model has other parts: each filter's are found through itself. ``without_truth``:
+    the drives had none; they calibrated the car on their sensors alone (METHOD §17).
     """
 
     format: Literal["pdhef-fit"] = "pdhef-fit"
@@ -183,6 +194,7 @@ class Fit(Record):
     values: FittedValues = FittedValues()
     filter: FilterTables = Field(default_factory=dict)
     physics: FittedPhysics | None = None
+    without_truth: bool = False
     drives: Annotated[tuple[LearntOn, ...], Field(strict=False)] = ()
     scores: dict[str, dict[str, float]] = Field(default_factory=dict)
     notes: Annotated[tuple[str, ...], Field(strict=False)] = ()

@@ -21,6 +21,7 @@ commands = typer.Typer()
     commands,
     "pdhef identify drives/ --car guess.toml -o mycar",
     "pdhef identify drive.mcap --car guess.toml -o mycar --end 150 --holdout 0",
+    "pdhef identify logs/ --car guess.toml -o mycar --without-truth",
     car="Where the fit starts (mass, geometry, sensor noise, priors)",
 )
 def identify(
@@ -31,9 +32,18 @@ def identify(
     parts: Annotated[
         str, Option(help="Of the model of physics: auto (by held-out driving), static, or names with commas.")
     ] = "auto",
+    without_truth: Annotated[
+        bool, Option("--without-truth", help="From the sensors of several logs alone: no truth is looked at.")
+    ] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Fit a car's tyres, steering and biases to its drives. Roll gradient and filter noise are fitted too."""
+    if without_truth:
+        from pdhef_logtool.learning.car.without_truth_command import identify_without_truth
+
+        with console.progress() as bar:
+            found = identify_without_truth(logs, output, config, progress=bar, warn=console.warn)
+        console.finish(found, learning_tables.render_without_truth, as_json)
     from pdhef_logtool.learning.car.identify_command import identify as fit
     from pdhef_logtool.learning.car.physics_fit import physics_parts
 

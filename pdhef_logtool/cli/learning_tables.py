@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pdhef_logtool.learning.car.identify_command import IdentifyResult
+    from pdhef_logtool.learning.car.without_truth_command import WithoutTruthResult
     from pdhef_logtool.learning.evidence.calibrate_command import CalibrateResult
     from pdhef_logtool.learning.evidence.trust_command import TrustResult
     from pdhef_logtool.learning.network.baselines import BaselinesResult
@@ -37,6 +38,17 @@ def render_identification(result: IdentifyResult, console: Console) -> None:
     console.print(scores)
     for note in found.notes:
         console.print(f"  {note}")
+    console.print(f"car in {result.car}", soft_wrap=True)
+
+
+def render_without_truth(result: WithoutTruthResult, console: Console) -> None:
+    """Print what a pool of logs says of its car without truth, and how well it is known."""
+    parameters = table("parameter", ">value", ">± 1 sd", ">prior", ">± 1 sd", "unit")
+    for p in result.calibration.parameters:
+        spread = [f"{100.0 * s:.0f} %" if p.log else f"{s:.2g}" for s in (p.sd, p.prior_sd)]
+        parameters.add_row(p.name, f"{p.value:.5g}", spread[0], f"{p.prior:.4g}", spread[1], p.unit)
+    console.print(parameters)
+    console.print(f"  {result.calibration.text}")
     console.print(f"car in {result.car}", soft_wrap=True)
 
 

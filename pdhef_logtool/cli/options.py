@@ -53,6 +53,9 @@ _OPTIONS: dict[str, Any] = {
     "config_file": Annotated[_File, Option("--config", help="pdhef.toml; flags win over it.")],
     "network": Annotated[_File, Option(help="Instead of the car's: a folder, default, many-cars, or none.")],
     "intervals": Annotated[_File, Option(help="Instead of the car's: a file of calibrate, unsure (wide), or none.")],
+    "calibrate": Annotated[
+        _Text, Option(help="A car without evidence, without truth: each log for itself, the pool of all, or off.")
+    ],
     "vehicle": Annotated[_File, Option("--vehicle", "-v", hidden=True)],
     "model": Annotated[_File, Option(hidden=True)],
     "calibration": Annotated[_File, Option(hidden=True)],

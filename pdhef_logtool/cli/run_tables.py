@@ -32,6 +32,8 @@ _COLUMNS: tuple[tuple[str, str, str, float, int], ...] = (
     ("a_y\nRMSE m/s²", "ay_m_s2", "rmse", 1.0, 3),
     ("1 s lateral\nRMSE m", "lateral_1s_m", "rmse", 1.0, 3),
 )
+#: Where there is no truth.
+_WITHOUT_TRUTH = (("v_y\nd2 m/s", "vy_m_s", "d2", 1.0, 3),)
 _SEGMENTS = ("linear", "nonlinear")
 _LEAVE_FIRST = ("v_x\nRMSE m/s", "\nmax °", "1 s lateral\nRMSE m", "v_y\nRMSE m/s", "\np95 °", "a_y\nRMSE m/s²")
 #: Width of the columns that always stand: name, two segments, NIS.
@@ -111,7 +113,8 @@ def _notes(report: Mapping[str, Any]) -> dict[str, list[str]]:
 def _table(report: Mapping[str, Any], width: int) -> Table:
     values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
     present = {(m["signal"], m["metric"]) for m in report["metrics"] if m["segment"] == "all"}
-    shown = [c for c in _COLUMNS if (c[1], c[2]) in present]
+    asked = _COLUMNS if report["truth"]["available"] else _WITHOUT_TRUTH
+    shown = [c for c in asked if (c[1], c[2]) in present]
     # On a narrow terminal the columns that matter least go, rather than all of them being squeezed.
     for head in _LEAVE_FIRST:
         if _width(shown) > width:

@@ -13,7 +13,7 @@ from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.service import NetworkService
 
 #: Fields of an estimator that are no option: what it is called and told of it, and what its signals come back from.
-_TOLD = {"name", "causal", "notes", "read_with"}
+_TOLD = {"name", "causal", "notes", "read_with", "calibration", "reason"}
 _NOISE = {"q_std", "r_std"}
 
 

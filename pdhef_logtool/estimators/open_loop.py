@@ -103,5 +103,5 @@ class OpenLoop:
 
 def build(name: str, car: Car, options: Options) -> OpenLoop:
     """Return ``open-loop`` of a car."""
-    del name, options
-    return OpenLoop(car.vehicle)
+    del options
+    return OpenLoop(car.vehicle, name=name)

@@ -13,6 +13,7 @@ from typing import Literal
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FORMER_FILTERS
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 from pdhef_logtool.residual_model.service import NetworkService
@@ -71,6 +72,10 @@ class Spec:
 
     def missing(self, car: Car) -> str:
         """Return why a car does not let it run, empty if it does."""
+        if self.name == OPEN_LOOP and car.self_calibrated is None:
+            return "the log has not calibrated its car"
+        if self.name in SELF_CALIBRATED:
+            car = car.calibrated_car
         if self.needs_noise and self.name not in car.noise:
             return f"the car has no noise for {self.name}; pdhef identify finds it"
         if self.network in ("", "optional"):
@@ -100,8 +105,11 @@ class Spec:
             raise UsageError(expected="a car that has what it needs", got=reason, where=self.name)
         module, _, function = self.build.partition(":")
         module = module if "." in module else f"{__package__}.{module}"
-        estimator: Estimator = getattr(import_module(module), function)(self.name, car, options)
-        return estimator
+        build = getattr(import_module(module), function)
+        if car.self_calibrated is None or self.name not in {OPEN_LOOP, *SELF_CALIBRATED}:
+            estimator: Estimator = build(self.name, car, options)
+            return estimator
+        return SelfCalibrated(build(self.name, car.calibrated_car, options), car.self_calibrated, car.vehicle)
 
 
 #: In the order of the tables.
@@ -121,6 +129,10 @@ SPECS: tuple[Spec, ...] = (
     Spec(
         "open-loop", "nominal single-track model from steering and speed alone", "open_loop:build",
         frozenset({"steer_rad", "speed_m_s"}), 0xE69F00,
+    ),
+    Spec(
+        OPEN_LOOP, "the same on the car as its log calibrated it, without truth: not causal",
+        "open_loop:build", frozenset({"steer_rad", "speed_m_s"}), 0x661100, causal=False,
     ),
     Spec(
         "linear-regression",

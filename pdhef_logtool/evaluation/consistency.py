@@ -8,6 +8,10 @@ metric                    estimator     definition
 ``nis_autocorrelation``   each          autocorrelation of NIS / dof from one stamp to the next, signal ``state``; 0 for
                                         white innovations, beyond ± 2/√n they are not white
 ``disagreement_rms``      ``a~b``       rms of the difference of two estimates' sideslip, both above the low-speed blend
+``d2``                    each          signal ``vy_m_s``: rms of the change of the estimated v_y over 2 s minus the
+                                        integral of a_y − v_x r, above the low-speed blend; a_y without bias, roll gain,
+                                        lever arm and bank as the log has them (:class:`LogSensors`); large with a
+                                        wrong model; ``kinematic`` integrates the same: its d2 says nothing
 ``residual_rms``,         ``sensors``   signal ``ay_m_s2``: a_y − v_x r, smoothed to 1 Hz, above the low-speed blend. It
 ``residual_bias``                       holds v̇_y (zero mean), roll and bank (g sin φ), sensor bias and speed error.
                                         signal ``vx_m_s``: change of speed over a second minus the integral of a_x. It
@@ -18,6 +22,7 @@ metric                    estimator     definition
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -40,8 +45,26 @@ from pdhef_logtool.records.tracks import StateTrack
 SENSORS = "sensors"
 SMOOTHING_HZ = 1.0
 SPEED_SPAN_S = 1.0
+D2_SPAN_S = 2.0
 #: Speed is carried over missing stamps for this long; a_x is integrated over no longer step.
 MAX_STEP_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class LogSensors:
+    """What a log's own sensors were found to have, against the vehicle that its signals were read with.
+
+    Attributes
+    ----------
+    ay_bias_m_s2, yaw_rate_bias_rad_s : what they read too much. ay_gain : of body roll. lever_m : of a_y ahead of the
+        centre of gravity. superelevation : share of v_x r that the road's bank carries.
+    """
+
+    ay_bias_m_s2: float = 0.0
+    yaw_rate_bias_rad_s: float = 0.0
+    ay_gain: float = 1.0
+    lever_m: float = 0.0
+    superelevation: float = 0.0
 
 
 def innovation_rows(track: StateTrack, masks: Mapping[str, BoolArray], *, log: str) -> list[MetricRow]:
@@ -105,6 +128,49 @@ def disagreement_rows(
             rms = float(np.sqrt(squares / n))
             rows.append(MetricRow(log, name, "sideslip_rad", segment, "disagreement_rms", rms, "rad", n))
     return rows
+
+
+def d2_rows(
+    track: StateTrack,
+    signals: Signals,
+    masks: Mapping[str, BoolArray],
+    *,
+    log: str,
+    low_speed_m_s: float,
+    sensors: LogSensors,
+) -> list[MetricRow]:
+    """Return ``d2`` of one estimator at the same stamps as the signals [N], a row a segment; none where v_y is not."""
+    masks = packed(masks, len(track))
+    sums = SegmentSums()
+    for first, a, b, end in blocks_with_halo(signals, D2_SPAN_S + MAX_STEP_S, 1):
+        part, estimate, core = signals.rows(first, end), track.rows(first, end), slice(a - first, b - first)
+        residual = _lateral_change_residual(part, estimate, low_speed_m_s, sensors)[core]
+        sums.add(masks.rows(a, b), residual, residual**2)
+    return [
+        MetricRow(log, track.name, "vy_m_s", segment, "d2", float(np.sqrt(squares / n)), "m/s", n)
+        for segment, (n, (_, squares)) in sums.totals().items()
+    ]
+
+
+def _lateral_change_residual(
+    signals: Signals, track: StateTrack, low_speed_m_s: float, sensors: LogSensors
+) -> FloatArray:
+    """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN where it cannot be told."""
+    t = signals.stamps_ns
+    speed = _carried_speed(signals)
+    rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
+    turn = (1.0 - sensors.superelevation) * speed * rate
+    rising = (signals.ay_m_s2 - sensors.ay_bias_m_s2) / sensors.ay_gain - turn
+    vy = np.where(track.valid & (speed > low_speed_m_s), track.vy_m_s, np.nan)
+    vy = vy + sensors.lever_m / sensors.ay_gain * rate  # the lever's share of ∫ a_y
+    gained, breaks, steps = np.zeros(len(t)), np.zeros(len(t)), np.diff(t) * 1e-9
+    broken = ~np.isfinite(rising[1:] + rising[:-1]) | (steps > MAX_STEP_S)
+    gained[1:] = np.cumsum(np.where(broken, 0.0, 0.5 * (rising[1:] + rising[:-1]) * steps))
+    breaks[1:] = np.cumsum(broken)
+    earlier = np.searchsorted(t, t - round(D2_SPAN_S * 1e9), side="right") - 1
+    i = np.maximum(earlier, 0)
+    whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((D2_SPAN_S + MAX_STEP_S) * 1e9))
+    return np.where(whole, vy - vy[i] - (gained - gained[i]), np.nan)
 
 
 def sensor_rows(signals: Signals, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float) -> list[MetricRow]:

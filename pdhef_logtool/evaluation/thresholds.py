@@ -36,6 +36,7 @@ _OTHER_UNITS = {
     "nis": "1",
     "nis_dof": "1",
     "nis_autocorrelation": "1",
+    "d2": "m/s",
     "diverged": "1",
     "not_independent": "1",
 }

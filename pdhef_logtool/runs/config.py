@@ -64,6 +64,7 @@ class RunConfig:
     intervals : instead of the car's: a file of ``pdhef calibrate``, ``none`` (intervals as they are), ``unsure`` (wide
         ones, for a car that may have changed since its file was made).
     thresholds : limits that the figures are held against; None = no gate.
+    calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.
     """
 
     estimators: Names | None = None
@@ -80,6 +81,7 @@ class RunConfig:
     thresholds: Path | None = None
     network: Path | None = None
     intervals: Path | None = None
+    calibrate: Literal["off", "log", "pool"] = "log"
 
     @property
     def read_options(self) -> ReadOptions:

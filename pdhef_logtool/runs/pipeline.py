@@ -14,6 +14,7 @@ from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
+from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, find_logs
 from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
@@ -31,7 +32,9 @@ from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_in
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.guard import GUARDED, Distrust, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.report import (
@@ -53,6 +56,7 @@ from pdhef_logtool.watches.intervals import TrackCalibrator
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
+    from pdhef_logtool.self_calibration.calibration import SelfCalibration
 
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
@@ -157,6 +161,7 @@ def run_logs(
         warn(note)
     check_places(inputs, output, config, mapping, junit)
     results: list[LogResult] = []
+    pool = calibrate_pool(inputs, car, mapping, config) if config.calibrate == "pool" else None
     with OutputFolder(output, (LOGS,)) as outputs:
         for number, log_input in enumerate(inputs):
 
@@ -164,7 +169,7 @@ def run_logs(
                 progress(text, (number + share) / len(inputs))
 
             try:
-                result = run_log(log_input, outputs, config, car, mapping, progress=of_all, warn=warn)
+                result = run_log(log_input, outputs, config, car, mapping, pool=pool, progress=of_all, warn=warn)
             except Exception as error:  # one bad log never stops the others, whatever is wrong with it
                 if len(inputs) == 1:
                     raise
@@ -223,10 +228,15 @@ def run_log(
     car: Car,
     mapping: Mapping | None,
     *,
+    pool: SelfCalibration | None = None,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> LogResult:
     """Run one log and replace its folder ``logs/<stem>`` of the outputs.
+
+    Parameters
+    ----------
+    pool : what all logs of the run together say of the car; None: the log says it, if it is asked.
 
     Raises
     ------
@@ -235,45 +245,95 @@ def run_log(
     """
     progress(log_input.stem, 0.0)
     with read_drive(log_input, car, mapping, config.read_options, tell=warn) as drive:
+        calibration = pool if pool is not None else calibrate_drive(drive, config)
+        car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
-        algorithms = {e.name: resolve(e) for e in ready}
-        intervals = calibrator(car, ready)
-        with outputs.begin(log_place(drive.name)) as change, _open_sinks(change, drive, config, car) as sinks:
-            with TrackStore(change.scratch / "tracks") as store:
-                signals = _estimate(drive, ready, intervals, sinks, store, progress)
-                found = evaluate(drive, [e.name for e in ready], store.read, signals)
-                if drive.friction.bank is not None:
-                    observable = friction_events(drive.friction, signals)
-                    found = replace(found, events=sorted([*found.events, *observable], key=in_time))
-            rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
-            events = found.events
-            if not found.moves:
-                drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
-            silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
-            losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent])
-            ran = [
-                EstimatorFacts(
-                    e.name,
-                    causal=e.causal,
-                    notes=(*notes_of(e), *intervals.notes(e.name)),
-                    reasons=found.reasons[e.name],
-                    algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
-                )
-                for e, a in zip(ready, algorithms.values(), strict=True)
-            ]
-            left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in skipped]
-            facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
-            report = build_report(replace(facts, friction=friction_facts(drive.friction)))
-            from pdhef_logtool.sinks.parquet import write_metrics
+        job = _Job(drive, car, calibration, ready, skipped)
+        try:
+            # What driving with truth showed of a car is worth more than d2, and its estimate stays causal.
+            unproven = config.calibrate != "off" and not drive.car.has_evidence
+            result = _run_estimators(job, outputs, config, progress, falls_back=unproven)
+        except _FallBackError as found:
+            job = replace(job, ready=_with_stand_in(ready, found.distrust))
+            result = _run_estimators(job, outputs, config, progress, falls_back=False)
+    progress(result.outcome.log, 1.0)
+    return result
 
-            for sink in sinks:
-                sink.finish(report, events)
-            write_metrics(change.file("metrics.parquet"), rows)
-            write_json(change.file("report.json"), report)
-        outcome = outcome_of(drive, losses)
-        if len(found.silent) == len(ready):
-            outcome = replace(outcome, failed=_ALL_SILENT)
-    progress(drive.name, 1.0)
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Job:
+    """A drive with the car, as its log calibrated it where it did, and the estimators that run on it."""
+
+    drive: Drive
+    car: Car
+    calibration: SelfCalibration | None
+    ready: Sequence[Estimator]
+    skipped: Sequence[Skipped]
+
+
+class _FallBackError(Exception):
+    """The default estimate is much worse than a simple one: nothing of the run stays."""
+
+    def __init__(self, distrust: Distrust) -> None:
+        super().__init__(distrust.text)
+        self.distrust = distrust
+
+
+def _with_stand_in(ready: Sequence[Estimator], found: Distrust) -> list[Estimator]:
+    """Return the estimators with the best of the simple ones under the name of the guarded one."""
+    best = next(e for e in ready if e.name == found.best)
+    reason = f"not causal: {found.text}; {found.best} stands in its place"
+    return [StandIn(best, e.name, reason) if e.name == GUARDED else e for e in ready]
+
+
+def _run_estimators(
+    job: _Job, outputs: OutputFolder, config: RunConfig, progress: Progress, *, falls_back: bool
+) -> LogResult:
+    """Estimate, score and write one drive; raises _FallBackError, before anything stays, where it is asked to."""
+    drive, car, ready = job.drive, job.car, job.ready
+    algorithms = {e.name: resolve(e) for e in ready}
+    intervals = calibrator(car, ready)
+    with outputs.begin(log_place(drive.name)) as change, _open_sinks(change, drive, config, car) as sinks:
+        with TrackStore(change.scratch / "tracks") as store:
+            signals = _estimate(drive, ready, intervals, sinks, store, progress)
+            sensors = log_sensors(drive.car.vehicle, job.calibration)
+            found = evaluate(drive, [e.name for e in ready], store.read, signals, sensors)
+            if drive.friction.bank is not None:
+                observable = friction_events(drive.friction, signals)
+                found = replace(found, events=sorted([*found.events, *observable], key=in_time))
+        if against := distrust(found.rows):
+            drive.tell(f"WARNING: {against.text}")
+            if falls_back:
+                raise _FallBackError(against)
+        rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
+        events = found.events
+        if not found.moves:
+            drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
+        silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
+        losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent])
+        ran = [
+            EstimatorFacts(
+                e.name,
+                causal=e.causal,
+                notes=(*notes_of(e), *intervals.notes(e.name)),
+                reasons=found.reasons[e.name],
+                algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
+            )
+            for e, a in zip(ready, algorithms.values(), strict=True)
+        ]
+        left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
+        facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
+        calibration = None if job.calibration is None else job.calibration.to_dict()
+        report = build_report(replace(facts, friction=friction_facts(drive.friction), calibration=calibration))
+        from pdhef_logtool.sinks.parquet import write_metrics
+
+        for sink in sinks:
+            sink.finish(report, events)
+        write_metrics(change.file("metrics.parquet"), rows)
+        write_json(change.file("report.json"), report)
+    outcome = outcome_of(drive, losses)
+    if len(found.silent) == len(ready):
+        outcome = replace(outcome, failed=_ALL_SILENT)
     return LogResult(outcome, change.target, report, tuple(rows))
 
 

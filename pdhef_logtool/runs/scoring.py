@@ -11,9 +11,11 @@ from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.records.signals import BoolArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.self_calibrating import log_sensors
 from pdhef_logtool.sinks.base import TRUTH, Event
 
 if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.consistency import LogSensors
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.reasons import ReasonFacts
 
@@ -37,16 +39,20 @@ class Evaluation:
 
 
 def evaluate(
-    drive: Drive, names: Sequence[str], read: Callable[[str], StateTrack | None], signals: Signals
+    drive: Drive,
+    names: Sequence[str],
+    read: Callable[[str], StateTrack | None],
+    signals: Signals,
+    sensors: LogSensors | None = None,
 ) -> Evaluation:
     """Score the tracks of a drive, block by block where they are on disk.
 
     Parameters
     ----------
     names : of the estimators. read : returns the track of a name, ``truth`` too; None if there is none.
-    signals : what the estimators saw.
+    signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file says.
     """
-    from pdhef_logtool.evaluation.consistency import disagreement_rows, sensor_rows, whiteness_rows
+    from pdhef_logtool.evaluation.consistency import d2_rows, disagreement_rows, sensor_rows, whiteness_rows
     from pdhef_logtool.evaluation.metrics import score_track, state_rows
     from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
@@ -56,6 +62,7 @@ def evaluate(
     moving = moving_mask(signals, truth, vehicle)
     silent = []
     slow = vehicle.low_speed_blend_m_s
+    sensors = log_sensors(vehicle, None) if sensors is None else sensors
     rows: list[MetricRow] = []
     reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
     events = segment_events(signals, masks)
@@ -69,6 +76,7 @@ def evaluate(
         else:
             rows += state_rows(track, masks, log=stem)
         rows += whiteness_rows(track, masks, log=stem)
+        rows += d2_rows(track, signals, masks, log=stem, low_speed_m_s=slow, sensors=sensors)
         reasons[name] = summarise_reasons(track)
         events += diverged_events(track)
     if truth is None:

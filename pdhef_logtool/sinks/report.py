@@ -112,6 +112,7 @@ class FrictionFacts:
 class ReportFacts:
     """Everything that report.json says about one log.
 
+    ``calibration``: what the drive said of its car without truth, None where it was not asked.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     """
 
@@ -123,6 +124,7 @@ class ReportFacts:
     estimators: Sequence[EstimatorFacts]
     truth: TruthFacts
     friction: FrictionFacts | None = None
+    calibration: Mapping[str, Any] | None = None
     metrics: Sequence[MetricRow] = ()
     segments: Sequence[Event] = ()
     losses: Sequence[Loss] = ()
@@ -195,6 +197,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "not_independent": sorted(facts.truth.not_independent),
         },
         "friction": facts.friction,
+        "self_calibration": facts.calibration,
         "metrics": [{name: getattr(m, name) for name in _METRIC_COLUMNS} for m in facts.metrics],
         "segments": list(facts.segments),
         "losses": list(facts.losses),

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics
+from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.pass_through import PassThrough
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
@@ -40,7 +41,6 @@ from pdhef_logtool.learning.car.axle_forces import (
 )
 from pdhef_logtool.learning.car.fit_data import FitDrive, signals_of
 from pdhef_logtool.learning.car.physics_fit import PhysicsFit, find_physics
-from pdhef_logtool.learning.car.prior import Prior
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 

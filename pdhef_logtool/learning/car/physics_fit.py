@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
+from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.learning.car.axle_forces import (
@@ -35,7 +36,6 @@ from pdhef_logtool.learning.car.axle_forces import (
     usable_stamps,
 )
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
-from pdhef_logtool.learning.car.prior import Prior
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
 

@@ -1,0 +1,41 @@
+"""Another estimator under the name of one that cannot be relied on: what a run falls back to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+
+
+@dataclass(frozen=True, slots=True)
+class StandIn:
+    """An estimator under another name; ``reason`` is why. It was chosen on the whole log: not causal."""
+
+    estimator: Estimator
+    name: str
+    reason: str
+    causal: bool = False
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the report says of it."""
+        return (*notes_of(self.estimator), self.reason)
+
+    @property
+    def look_ahead_s(self) -> float:
+        """What the estimator must see of what follows a window."""
+        return look_ahead_of(self.estimator)
+
+    @property
+    def calibrated_as(self) -> Estimator:
+        """Whose calibrated intervals hold for it."""
+        of_estimator: Estimator = getattr(self.estimator, "calibrated_as", self.estimator)
+        return of_estimator
+
+    def run(self, signals: Signals, carry: Any | None, ahead: Signals | None = None) -> tuple[StateTrack, Any]:
+        """Process one window (see :class:`~.base.Estimator`)."""
+        track, carry = run_window(self.estimator, signals, carry, ahead)
+        return replace(track, name=self.name), carry

@@ -1,0 +1,108 @@
+"""The first pass over a log, in which it calibrates its car without truth (METHOD §17), and what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.runs.config import RunConfig
+
+if TYPE_CHECKING:
+    from pdhef_logtool.evaluation.consistency import LogSensors
+    from pdhef_logtool.self_calibration.calibration import SelfCalibration
+    from pdhef_logtool.self_calibration.driving import Driving
+
+_NEEDS = ("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+
+
+def calibrate_drive(drive: Drive, config: RunConfig) -> SelfCalibration | None:
+    """Return what a drive says of its car; None where nobody asks or the log lacks a sensor for it."""
+    if config.calibrate == "off" or not _asked(config, drive.car) or lacking(drive):
+        return None
+    from pdhef_logtool.self_calibration.calibration import self_calibrate
+
+    return self_calibrate([read_driving(drive)], drive.car.vehicle)
+
+
+def calibrate_pool(
+    inputs: Sequence[LogInput], car: Car, mapping: Mapping | None, config: RunConfig
+) -> SelfCalibration | None:
+    """Return what all logs of a run together say of its car; None where nobody asks. A log that fails is left out."""
+    if not _asked(config, car):
+        return None
+    from pdhef_logtool.self_calibration.calibration import self_calibrate
+
+    found = []
+    for log_input in inputs:
+        try:
+            with read_drive(log_input, car, mapping, config.read_options) as drive:
+                if not lacking(drive):
+                    found.append(read_driving(drive))
+        except PdhefError:
+            continue  # the run itself says what is wrong with it
+    return self_calibrate(found, car.vehicle)
+
+
+def lacking(drive: Drive) -> list[str]:
+    """Return the signals without which a drive calibrates nothing, those that it lacks."""
+    return [name for name in _NEEDS if name not in drive.available]
+
+
+def read_driving(drive: Drive) -> Driving:
+    """Return the driving of a drive that can be calibrated on; its truth is not looked at."""
+    from pdhef_logtool.self_calibration.driving import DrivingReader
+
+    reader = DrivingReader(drive.car.vehicle)
+    for window in drive.windows(fill_friction=_told(drive)):
+        reader.add(window.signals)
+    return reader.finish()
+
+
+def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
+    """Return the car of a drive with what was found, unless it was refused; says what was found."""
+    if calibration is None:
+        return drive.car
+    drive.tell(calibration.text)
+    if calibration.refused:
+        return drive.car
+    note = "not causal: its car was calibrated on the whole log, without truth"
+    found = WithoutTruth(calibration.vehicle, told_friction=_told(drive), note=note)
+    return replace(drive.car, self_calibrated=found)
+
+
+def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None) -> LogSensors:
+    """Return what the sensors of a log have that was read with a vehicle: as calibrated on it, else as its file says.
+
+    What is refused for its tyres is no worse for its sensors.
+    """
+    from pdhef_logtool.evaluation.consistency import LogSensors
+
+    if calibration is None or not calibration.parameters:
+        gain = 1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2
+        return LogSensors(ay_gain=gain, lever_m=vehicle.imu_position_m[0])
+    found = {p.name: p.value for p in calibration.parameters}
+    return LogSensors(
+        ay_bias_m_s2=found["a_y bias"] - vehicle.sensors.ay_bias_m_s2,
+        yaw_rate_bias_rad_s=found["yaw rate bias"] - vehicle.sensors.yaw_rate_bias_rad_s,
+        ay_gain=found["roll gain"],
+        lever_m=found["lever of a_y"],
+        superelevation=found["superelevation"],
+    )
+
+
+def _asked(config: RunConfig, car: Car) -> bool:
+    names = config.estimators
+    return not car.has_evidence and (names is None or bool({OPEN_LOOP, *SELF_CALIBRATED} & set(names)))
+
+
+def _told(drive: Drive) -> bool:
+    """Whether the friction of a drive is told, and no estimate with the file as it stands."""
+    return drive.friction.bank is None

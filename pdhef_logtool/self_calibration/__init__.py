@@ -1,0 +1,1 @@
+"""A car that calibrates itself on a log without truth (METHOD §17)."""

@@ -1,0 +1,107 @@
+"""d2: what an estimate of v_y lets open against the sensors, without truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.evaluation import blocks
+from pdhef_logtool.evaluation.consistency import LogSensors, d2_rows
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack, make_track
+from pdhef_logtool.runs.guard import FACTOR, distrust
+
+T = np.arange(0, 60, 0.01)
+STAMPS = 1_700_000_000_000_000_000 + np.round(T * 1e9).astype(np.int64)
+EVERYTHING = {"all": np.ones(T.size, bool)}
+SPEED, RATE, VY = 20.0 + 0.0 * T, 0.1 * np.sin(0.5 * T), 0.4 * np.sin(0.8 * T)
+VY_RATE, YAW_ACCELERATION = 0.32 * np.cos(0.8 * T), 0.05 * np.cos(0.5 * T)
+SENSORS = LogSensors(ay_bias_m_s2=0.2, yaw_rate_bias_rad_s=0.003, ay_gain=1.08, lever_m=0.7, superelevation=0.25)
+
+
+def signals(sensors: LogSensors) -> Signals:
+    """Return what such sensors read of the motion above."""
+    felt = VY_RATE + (1.0 - sensors.superelevation) * SPEED * RATE
+    ay = sensors.ay_gain * felt + sensors.lever_m * YAW_ACCELERATION + sensors.ay_bias_m_s2
+    return Signals(
+        stamps_ns=STAMPS,
+        ready_ns=STAMPS,
+        steer_rad=np.zeros(T.size),
+        ax_m_s2=np.zeros(T.size),
+        ay_m_s2=ay,
+        yaw_rate_rad_s=RATE + sensors.yaw_rate_bias_rad_s,
+        speed_m_s=np.where(np.arange(T.size) % 5 == 0, SPEED, np.nan),
+        friction=np.full(T.size, np.nan),
+        wheel_speed_m_s=np.full((T.size, 4), np.nan),
+    )
+
+
+def track(vy: np.ndarray) -> StateTrack:
+    return make_track("e", STAMPS, vx_m_s=SPEED, vy_m_s=vy, valid=np.ones(T.size, bool))
+
+
+def d2(of: Signals, vy: np.ndarray, sensors: LogSensors) -> MetricRow:
+    (row,) = d2_rows(track(vy), of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
+    return row
+
+
+def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_known() -> None:
+    row = d2(signals(SENSORS), VY, SENSORS)
+    assert (row.signal, row.metric, row.unit, row.segment) == ("vy_m_s", "d2", "m/s", "all")
+    assert row.value < 2e-3
+    assert row.n == T.size - 200 - 4  # two seconds before the first, and no speed behind the last sample
+
+
+@pytest.mark.parametrize("entry", ["ay_bias_m_s2", "yaw_rate_bias_rad_s", "ay_gain", "lever_m", "superelevation"])
+def test_each_entry_of_the_sensors_counts(entry: str) -> None:
+    plain = getattr(LogSensors(), entry)
+    assert d2(signals(SENSORS), VY, replace(SENSORS, **{entry: plain})).value > 0.01
+
+
+def test_it_is_the_change_of_the_error_over_two_seconds() -> None:
+    error = 0.3 * np.sin(0.4 * T)
+    change = error[200:] - error[:-200]
+    found = d2(signals(SENSORS), VY + error, SENSORS).value
+    assert found == pytest.approx(float(np.sqrt(np.mean(change**2))), rel=0.01)
+    assert d2(signals(SENSORS), VY + 5.0, SENSORS).value < 2e-3  # a constant is not seen
+
+
+def test_gaps_and_invalid_stamps_are_left_out() -> None:
+    s = signals(SENSORS)
+    ay = s.ay_m_s2.copy()
+    ay[3000:3010] = np.nan
+    row = d2(replace(s, ay_m_s2=ay), VY, SENSORS)
+    assert row.value < 2e-3
+    assert row.n < T.size - 300
+    nothing = d2_rows(track(np.full(T.size, np.nan)), s, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=SENSORS)
+    assert nothing == []
+    assert d2_rows(track(VY), s, EVERYTHING, log="drive", low_speed_m_s=30.0, sensors=SENSORS) == []
+
+
+def test_blocks_change_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = d2(signals(SENSORS), VY + 0.1 * T, SENSORS)
+    monkeypatch.setattr(blocks, "BLOCK_ROWS", 333)
+    parts = d2(signals(SENSORS), VY + 0.1 * T, SENSORS)
+    assert parts.n == whole.n
+    assert parts.value == pytest.approx(whole.value, rel=1e-9)
+
+
+def rows(**values: float) -> list[MetricRow]:
+    return [MetricRow("drive", k.replace("_", "-"), "vy_m_s", "all", "d2", v, "m/s", 100) for k, v in values.items()]
+
+
+def test_the_guard_speaks_where_the_default_estimate_is_much_worse_than_a_simple_one() -> None:
+    assert distrust(rows(zero=1.0, pd_hef=FACTOR * 0.99)) is None
+    found = distrust(rows(zero=1.0, phy_ukf=0.5, pd_hef=FACTOR))
+    assert found is not None
+    assert found.best == "phy-ukf"
+    assert "pd-hef contradicts the sensors" in found.text
+
+
+def test_the_guard_is_silent_without_something_to_compare_with() -> None:
+    assert distrust(rows(pd_hef=3.0)) is None
+    assert distrust(rows(kinematic=0.01, pd_hef=3.0)) is None  # it integrates what d2 compares with
+    assert distrust(rows(zero=1.0)) is None

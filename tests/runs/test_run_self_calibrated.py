@@ -1,0 +1,151 @@
+"""A run whose car calibrates itself: who takes it, what is said of it, and that no truth is read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import numpy as np
+import polars as pl
+import pytest
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Tell, read_drive
+from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, read_driving
+from pdhef_logtool.sinks.schema import load_schema
+
+pytestmark = pytest.mark.slow
+
+#: Of the road: so much carries a calibration.
+END = "110"
+NAMES = ("zero", "open-loop", "open-loop-calibrated", "phy-ukf", "physics")
+
+
+@pytest.fixture(scope="module")
+def wrong_car(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a bare vehicle file of the sample logs' car whose front axle is half as stiff."""
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    head, _, rest = text.partition("[network]")
+    path = tmp_path_factory.mktemp("car") / "vehicle.toml"
+    path.write_text(head + rest[rest.index("[sensors]") :].replace("B = 11.146", "B = 5.6"))
+    return path
+
+
+def run(log: Path, car: Path, out: Path, **changes: Any) -> dict[str, Any]:
+    values: dict[str, Any] = {"car": car, "annotate": "none", "estimators": NAMES, "end": END, **changes}
+    run_logs([str(log)], out, RunConfig(**values))
+    return json.loads((out / "logs" / log.stem / "report.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def calibrated(sample_logs_dir: Path, wrong_car: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("log")
+    run(sample_logs_dir / "road.mcap", wrong_car, out)
+    return out
+
+
+def rmse(out: Path, estimator: str) -> float:
+    chosen = {"estimator": estimator, "signal": "sideslip_rad", "metric": "rmse", "segment": "all"}
+    return float(pl.read_parquet(out / "metrics.parquet").filter(**chosen)["value"].item())
+
+
+def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the_file(calibrated: Path) -> None:
+    report = json.loads((calibrated / "logs/road/report.json").read_text())
+    jsonschema.validate(report, load_schema("report.schema.json"))
+    told = {e["name"]: e for e in report["estimators"]}
+    for name in ("physics", "open-loop-calibrated"):
+        assert not told[name]["causal"]
+        assert any("whole log" in note for note in told[name]["notes"])
+    assert all(told[name]["causal"] for name in ("zero", "open-loop", "phy-ukf"))
+    assert told["phy-ukf"]["algorithm"]["physics_sha256"] == report["vehicle"]["sha256"]
+    assert told["physics"]["algorithm"]["physics_sha256"] != report["vehicle"]["sha256"]
+    assert report["self_calibration"]["understeer"]["contradicts"]
+    assert any("calibrated without truth" in w and "contradicts" in w for w in report["warnings"])
+
+
+def test_a_wrong_file_is_mended(calibrated: Path) -> None:
+    assert rmse(calibrated, "physics") < 0.6 * rmse(calibrated, "phy-ukf")
+
+
+def test_off_is_the_file_as_it_stands_and_causal(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+    report = run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, calibrate="off", end="30", estimators=NAMES[:2])
+    assert report["self_calibration"] is None
+    assert all(e["causal"] for e in report["estimators"])
+
+
+def test_windows_change_no_number(sample_logs_dir: Path, wrong_car: Path, calibrated: Path, tmp_path: Path) -> None:
+    run(sample_logs_dir / "road.mcap", wrong_car, tmp_path, window_s=7.0)
+    a, b = (pl.read_parquet(out / "logs/road/estimates.parquet") for out in (calibrated, tmp_path))
+    assert a.sort("estimator", "stamp_ns").equals(b.sort("estimator", "stamp_ns"))
+
+
+def test_no_truth_is_read(sample_logs_dir: Path, wrong_car: Path) -> None:
+    """The same log with its truth made unreadable gives the same bits."""
+    config, car = RunConfig(), Car.load(wrong_car)
+    with read_drive(sample_logs_dir / "road.mcap", car, options=ReadOptions(end=END)) as drive:
+        found = read_driving(drive)
+        with_truth = calibrate_drive(drive, config)
+
+    def without(_log: DriveLog, mapping: Mapping, _tell: Tell) -> Mapping:
+        return replace(mapping, truth={})
+
+    with read_drive(sample_logs_dir / "road.mcap", car, options=ReadOptions(end=END), adjust=without) as drive:
+        assert drive.plan.truth is None
+        np.testing.assert_array_equal(read_driving(drive).columns, found.columns)
+        alone = calibrate_drive(drive, config)
+    assert with_truth is not None and alone is not None
+    assert alone.to_dict() == with_truth.to_dict()
+
+
+def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_car: Path, tmp_path: Path) -> None:
+    report = run(sample_logs_dir / "sweep.mcap", wrong_car, tmp_path)
+    assert "are needed" in report["self_calibration"]["refused"]
+    told = {e["name"]: e for e in report["estimators"]}
+    assert told["open-loop-calibrated"]["outcome"] == "skipped"
+    assert any("the file stays as it stands" in w for w in report["warnings"])
+
+
+def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:
+    with read_drive(sample_logs_dir / "road.mcap", Car.load(sample_logs_dir / "vehicle.toml")) as drive:
+        assert drive.car.has_evidence
+        assert calibrate_drive(drive, RunConfig()) is None
+
+
+def test_a_pool_takes_what_its_logs_say_together(sample_logs_dir: Path, wrong_car: Path) -> None:
+    logs = find_logs([str(sample_logs_dir / f"{name}.mcap") for name in ("sweep", "dlc")])
+    config = RunConfig(calibrate="pool")
+    pool = calibrate_pool(logs, Car.load(wrong_car), None, config)
+    assert pool is not None
+    assert pool.logs == 2
+    assert pool.seconds > 15.0
+    assert not pool.refused
+
+
+def test_a_default_estimate_that_contradicts_the_sensors_is_replaced_and_the_run_says_so(
+    sample_logs_dir: Path, wrong_car: Path, tmp_path: Path
+) -> None:
+    """A car whose rear axle is nearly gone, in a log too short to calibrate it."""
+    if Car.load().network is None:
+        pytest.skip("no network is shipped, without which there is no pd-hef")
+    worse = tmp_path / "vehicle.toml"
+    worse.write_text(wrong_car.read_text().replace("B = 5.6", "B = 20.0").replace("B = 10.627", "B = 4.0"))
+    names = ("zero", "phy-ukf", "pd-hef")
+    log, found = sample_logs_dir / "sweep.mcap", {}
+    for calibrate in ("off", "log"):
+        report = run(log, worse, tmp_path / calibrate, calibrate=calibrate, estimators=names, end=None)
+        jsonschema.validate(report, load_schema("report.schema.json"))
+        assert any(w.startswith("WARNING: pd-hef contradicts the sensors") for w in report["warnings"])
+        found[calibrate] = {e["name"]: e for e in report["estimators"]}["pd-hef"]
+    assert found["off"]["causal"] and not found["log"]["causal"]
+    assert any("stands in its place" in note for note in found["log"]["notes"])
+    assert rmse(tmp_path / "log", "pd-hef") <= 1.2 * min(rmse(tmp_path / "log", n) for n in ("zero", "phy-ukf"))
+    assert rmse(tmp_path / "log", "pd-hef") < 0.5 * rmse(tmp_path / "off", "pd-hef")
