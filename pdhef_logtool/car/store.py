@@ -80,10 +80,11 @@ def vehicle_file(car: Car) -> bytes:
     return (car.source / VEHICLE_FILE if car.source.is_dir() else car.source).read_bytes()
 
 
-def update_car(source: Car, output: Path, change: Change) -> Path:
+def update_car(source: Car, output: Path, change: Change, *, base: Path | None = None) -> Path:
     """Write a change into the car's folder ``output``; return the path of the part.
 
-    A new folder holds the source's vehicle.toml and parts as well. ``output`` may be the source itself.
+    A new folder holds the source's vehicle.toml and parts as well. ``output`` may be the source itself. ``base``: a
+    car's folder that takes the place of all that stands in ``output``, with the change in it.
 
     Raises
     ------
@@ -97,7 +98,7 @@ def update_car(source: Car, output: Path, change: Change) -> Path:
     lock = FolderLock(output)
     lock.acquire(wait_s=LONGEST_WAIT_S)
     try:
-        base = output if (output / VEHICLE_FILE).is_file() else source.source
+        base = base or (output if (output / VEHICLE_FILE).is_file() else source.source)
         with writing(output), FolderTransaction(output, keep=False) as transaction:
             fresh = transaction.file(".")
             if base is not None and base.is_dir():

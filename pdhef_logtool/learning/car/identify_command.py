@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from pdhef_logtool.learning.drives import (
     open_mapping,
     tell_drive,
 )
-from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.discovery import Logs, find_logs
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
@@ -84,7 +84,7 @@ class IdentifyResult(LearnResult):
 
 
 def identify(
-    arguments: Sequence[str],
+    arguments: Logs,
     output: Path,
     config: RunConfig,
     *,

@@ -1,0 +1,120 @@
+"""Which driving teaches what: parts of drives that do not mix, with a gap wherever two of them meet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pdhef_logtool.learning.car.fit_data import GUARD_S
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.signals import FloatArray
+
+#: What fits parameters and noise (and chooses the model's parts, by folds of its own), what stops the network's
+#: training, what says after each step whether it stays, and what is scored once.
+FIT, NETWORK, CHECK, LAST = "fit", "network", "check", "last"
+PARTS = (FIT, NETWORK, CHECK, LAST)
+#: Shares of what is not held out, without and with a part for the network.
+SHARES = {FIT: 0.75, CHECK: 0.25}
+SHARES_WITH_NETWORK = {FIT: 0.55, NETWORK: 0.20, CHECK: 0.25}
+#: Usable driving from which on the network has a part of its own; below, all of it goes to the fit.
+LEAST_FOR_NETWORK_S = 240.0
+#: One drive is cut into rounds of about this much usable driving, each with all parts but the last.
+ROUND_S = 240.0
+#: From so many drives on each belongs to one part whole; fewer are cut by time.
+WHOLE_DRIVES = 8
+#: Between two parts of one drive, half of it on either side of the cut.
+GAP_S = GUARD_S
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveTimes:
+    """When a drive can be learnt from: [n] seconds from the log's start, ascending, one a step of ``period_s``."""
+
+    log: LogInput
+    usable_s: FloatArray
+    period_s: float
+
+    @property
+    def seconds(self) -> float:
+        """How much of it can be learnt from."""
+        return float(self.usable_s.size) * self.period_s
+
+
+def shares_of(usable_s: float, holdout: float) -> dict[str, float]:
+    """Return the share of each part in so much usable driving; their sum is 1."""
+    shares = SHARES if usable_s < LEAST_FOR_NETWORK_S else SHARES_WITH_NETWORK
+    return {**{part: (1.0 - holdout) * share for part, share in shares.items()}, LAST: holdout}
+
+
+def split_drives(drives: Sequence[DriveTimes], holdout: float) -> dict[str, tuple[LogInput, ...]]:
+    """Return the slices of each part: whole drives where there are many, else all drives are cut by time.
+
+    Parameters
+    ----------
+    holdout : share of the last part: the end of each drive that is cut, or whole drives.
+    """
+    shares = shares_of(sum(d.seconds for d in drives), holdout)
+    if len(drives) >= WHOLE_DRIVES:
+        return deal_drives(drives, shares)
+    found: dict[str, list[LogInput]] = {part: [] for part in PARTS}
+    for drive in drives:
+        for part, span in cut_times(drive, shares):
+            found[part].append(part_of_log(drive.log, span))
+    return {part: tuple(slices) for part, slices in found.items()}
+
+
+def deal_drives(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> dict[str, tuple[LogInput, ...]]:
+    """Return whole drives by part: each in its turn goes to the part that lacks most of its share."""
+    found: dict[str, list[LogInput]] = {part: [] for part in PARTS}
+    total = sum(d.seconds for d in drives)
+    lacks = {part: share * total for part, share in shares.items() if share > 0.0}
+    for drive in drives:
+        part = max(lacks, key=lambda p: lacks[p])
+        lacks[part] -= drive.seconds
+        found[part].append(part_of_log(drive.log, (float(drive.usable_s[0]), float(drive.usable_s[-1]))))
+    return {part: tuple(logs) for part, logs in found.items()}
+
+
+def cut_times(drive: DriveTimes, shares: Mapping[str, float]) -> list[tuple[str, tuple[float, float]]]:
+    """Return (part, (start, end) in s) of one drive in order of time; shares are those of its usable driving.
+
+    All parts but the last come in rounds, so that each has something of all of the drive; the last is its end.
+    """
+    learnt = {part: share for part, share in shares.items() if part != LAST and share > 0.0}
+    rounds = max(1, round(sum(learnt.values()) * drive.seconds / ROUND_S))
+    pieces = [(part, share / rounds) for _ in range(rounds) for part, share in learnt.items()]
+    if shares.get(LAST, 0.0) > 0.0:
+        pieces.append((LAST, shares[LAST]))
+    ends = np.concatenate([[0.0], np.cumsum([share for _, share in pieces])])
+    at = np.round(ends / ends[-1] * (drive.usable_s.size - 1)).astype(np.int64)
+    spans = []
+    for number, ((part, _), (a, b)) in enumerate(zip(pieces, pairwise(at), strict=True)):
+        start = float(drive.usable_s[a]) + (0.0 if number == 0 else 0.5 * GAP_S)
+        end = float(drive.usable_s[b]) - (0.0 if number == len(pieces) - 1 else 0.5 * GAP_S)
+        if end > start:
+            spans.append((part, (start, end)))
+    return spans
+
+
+def part_of_log(log: LogInput, span_s: tuple[float, float]) -> LogInput:
+    """Return a slice of a log, under a name of its own."""
+    start_s, end_s = (round(s, 3) for s in span_s)
+    return LogInput(log.path, f"{log.stem}_{start_s:g}-{end_s:g}s", (start_s, end_s))
+
+
+def halves(slices: Iterable[LogInput]) -> tuple[LogInput, ...]:
+    """Return the first half of each slice: what half of the driving would have taught."""
+    kept = []
+    for one in slices:
+        assert one.span_s is not None
+        start_s, end_s = one.span_s
+        kept.append(part_of_log(one, (start_s, 0.5 * (start_s + end_s))))
+    return tuple(kept)
+
+
+def seconds_of(slices: Iterable[LogInput]) -> float:
+    """Return how long slices are together."""
+    return sum(one.span_s[1] - one.span_s[0] for one in slices if one.span_s is not None)
