@@ -228,7 +228,7 @@ def learn(
     logs: options.TruthLogs,
     output: Annotated[Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write.")],
     config: RunConfig,
-    holdout: Annotated[float, Option(help="Share of the driving that is only scored, once, at the end.")] = 0.2,
+    holdout: Annotated[float, Option(help="Share of the driving that is only scored, once, at the end.")] = 0.15,
     trials: Annotated[int, Option(help="Of the search for the noise of physics.")] = 64,
     seed: Annotated[int, Option(help="Of the search, of bootstraps and of vehicles that are made wrong.")] = 0,
     split: options.Split = None,

@@ -560,6 +560,7 @@ FOUND = Identification(
     FilterNoise(q_std=(0.1, 0.2, 0.3)),
     PHYSICS,
     PARAMETERS,
+    (),
     (PartScore("fit", 60.0, 3.0, 2.0, 1.0, 0.5), PartScore("held out", 20.0, 3.5, 2.5, 1.5, 0.75)),
     AxleSamples(*(np.linspace(-1.0, 1.0, 12_000) * k for k in (0.1, 5000.0, 0.05, 4000.0))),
     ("a note",),

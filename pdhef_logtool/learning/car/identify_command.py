@@ -54,18 +54,8 @@ class IdentifyResult(LearnResult):
         found = self.identification
         return {
             **super(IdentifyResult, self).to_dict(),
-            "parameters": [
-                {
-                    "name": p.name,
-                    "unit": p.unit,
-                    "value": p.value,
-                    "low95": p.low,
-                    "high95": p.high,
-                    "prior": p.prior,
-                    "excited": p.excited,
-                }
-                for p in found.parameters
-            ],
+            "parameters": [_parameter(p) for p in found.parameters],
+            "physics_parameters": [_parameter(p) for p in found.physics_parameters],
             "understeer_deg_per_g": understeer_deg_per_g(found.vehicle),
             "sideslip_rmse_deg": [
                 {
@@ -81,6 +71,11 @@ class IdentifyResult(LearnResult):
             "physics": found.physics.model_dump(mode="json", exclude_none=True),
             "notes": list(found.notes),
         }
+
+
+def _parameter(p: Identified) -> dict[str, Any]:
+    figures = {"value": p.value, "low95": p.low, "high95": p.high, "prior": p.prior}
+    return {"name": p.name, "unit": p.unit, **figures, "excited": p.excited}
 
 
 def identify(

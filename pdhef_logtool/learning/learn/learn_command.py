@@ -69,6 +69,8 @@ WORK, RECORD_FILE, PAGE_FILE, PLOT_FILE = "learn", "learn.record.json", "learn.m
 STEP_FILE, CAR = "step.json", "car"
 #: What may come of a step.
 KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
+#: Steps that do not stay where they change nothing: simpler is better.
+MUST_GAIN = ("noise", "training")
 #: Usable driving below which nothing is left to fit, to check and to score.
 LEAST_S = 40.0
 #: A candidate that gives an estimate at fewer of the stamps counts as worse.
@@ -85,7 +87,7 @@ YARDSTICK = f"{HYBRID}, learnt"
 class CourseSettings(LearnSettings):
     """With the share ``holdout`` that is scored once, at the end, and the ``trials`` of the search for noise."""
 
-    holdout: float = 0.2
+    holdout: float = 0.15
     trials: int = 64
 
 
@@ -95,7 +97,8 @@ class StepResult:
 
     Attributes
     ----------
-    status : ``kept``; ``undone``, with the held-out error worse; or ``not done``. text : what it found, or why not.
+    status : ``kept``; ``undone``, with the held-out error worse, or no better where it must be; or ``not done``.
+    text : what it found, or why not.
     before, after : [estimator that stands for the car, its RMSE on the check part in degrees], None if not done.
     figures : of the step itself.
     """
@@ -172,7 +175,7 @@ def learn(
     mapping = open_mapping(config)
     records, times = _read(inputs, splits, given, mapping, settings, progress, warn)
     parts = split_drives(times, settings.holdout)
-    lesson = Lesson(config, mapping, parts, settings.seed, settings.trials)
+    lesson = Lesson(config, mapping, parts, tuple(times), settings.seed, settings.trials)
     if not (output / VEHICLE_FILE).is_file():
         write_bytes(output / VEHICLE_FILE, vehicle_file(given))
     work = output / WORK
@@ -186,7 +189,7 @@ def learn(
         ends = _cached(course, len(STEPS) + 1, "end", kept, lambda _: _end(course, start, car, figures))
     document = {
         **record_head(FORMAT, FORMAT_VERSION, settings, Car.load(start, network=NO_MODEL)),
-        "parts": {p: [{"log": s.stem, "span_s": list(s.span_s or ())} for s in parts[p]] for p in PARTS},
+        "parts": {p: {"usable_s": round(lesson.seconds(p), 2), "slices": [s.stem for s in parts[p]]} for p in PARTS},
         "steps": [asdict(s) for s in steps],
         **ends,
         **drives_document(records),
@@ -360,10 +363,11 @@ def _step(course: _Course, name: str, before: Path, folder: Path) -> dict[str, A
         return {"status": NOT_DONE, "text": str(error), "before": None, "after": None, "figures": {}}
     progress("scoring what it is worth", 1.0)
     old, new = (_held_out(lesson, car) for car in (before, folder / CAR))
-    (was, now), worse = _compare(old, new)
-    _tidy(folder, keep_car=not worse)
+    (was, now), gains = _compare(old, new)
+    stays = gains if gains is not None else name not in MUST_GAIN
+    _tidy(folder, keep_car=stays)
     return {
-        "status": UNDONE if worse else KEPT,
+        "status": KEPT if stays else UNDONE,
         "text": taught.text,
         "before": [old.name, was],
         "after": [new.name, now],
@@ -393,12 +397,12 @@ def _held_out(lesson: Lesson, car_folder: Path) -> Errors:
     return scored.errors[name]
 
 
-def _compare(old: Errors, new: Errors) -> tuple[tuple[float, float], bool]:
-    """Return the RMSE of both in degrees where both are known, and whether the new one is worse."""
+def _compare(old: Errors, new: Errors) -> tuple[tuple[float, float], bool | None]:
+    """Return the RMSE of both in degrees where both are known, and whether the new one is better; None: it is alike."""
     both = np.isfinite(old.error) & np.isfinite(new.error)
     was, now = (float(np.degrees(np.sqrt(np.mean(e.error[both] ** 2)))) if both.any() else np.nan for e in (old, new))
     lacks = new.scored < LEAST_AVAILABILITY * old.scored
-    return (round(was, 6), round(now, 6)), lacks or not now <= was
+    return (round(was, 6), round(now, 6)), None if was == now and not lacks else now < was and not lacks
 
 
 # ---- the end ----
@@ -420,18 +424,20 @@ def _end(course: _Course, start: Path, car: Path, figures: dict[str, dict[str, A
 
 def table_of(lesson: Lesson, start: Path, learnt: Path, part: str) -> list[dict[str, Any]]:
     """Return a line an estimator on a part of the drives, with the car as it was given and as it was learnt."""
-    lines: list[Errors] = []
-    skipped: list[dict[str, Any]] = []
+    names_in_order, lines = list[str](), list[Errors]()
+    skipped: dict[str, dict[str, Any]] = {}
     for label, folder, names in (("as given", start, BEFORE), ("learnt", learnt, AFTER)):
         car = Car.load(folder)
         scored = score_slices(car, names, lesson.parts[part], lesson.mapping, lesson.config_for(folder).read_options)
         for name in names:
             shown = name if name in _OF_NO_CAR else f"{name}, {label}"
+            names_in_order.append(shown)
             if name in scored.errors:
                 lines.append(replace(scored.errors[name], name=shown))
             elif name in scored.skipped:
-                skipped.append({"name": shown, "skipped": scored.skipped[name]})
-    return [*map(_line, compare(lines, YARDSTICK)), *skipped]
+                skipped[shown] = {"name": shown, "skipped": scored.skipped[name]}
+    found = skipped | {one.name: _line(one) for one in compare(lines, YARDSTICK)}
+    return [found[name] for name in names_in_order if name in found]
 
 
 def _line(one: Compared) -> dict[str, Any]:

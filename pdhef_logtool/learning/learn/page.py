@@ -36,16 +36,14 @@ def page_markdown(document: Mapping[str, Any]) -> str:
 def _parts(document: Mapping[str, Any]) -> list[str]:
     told = {
         "fit": "sensors, parameters and noise; parts of the model, by folds of its own",
-        "network": "stops the training of the network",
+        "network": "trains the network; without it the part fit does",
         "check": "says whether a step stays; trust; intervals",
         "last": "scored once, at the end",
     }
     rows = []
-    for name, slices in document["parts"].items():
-        seconds = sum(s["span_s"][1] - s["span_s"][0] for s in slices)
-        spans = ", ".join(s["log"] for s in slices)
-        rows.append([name, f"{seconds:.0f}", told[name], spans or "–"])
-    return ["## Parts", "", *_table(("part", "seconds", "for", "slices"), rows)]
+    for name, part in document["parts"].items():
+        rows.append([name, f"{part['usable_s']:.0f}", told[name], ", ".join(part["slices"]) or "–"])
+    return ["## Parts", "", *_table(("part", "usable seconds", "for", "slices"), rows)]
 
 
 def _scores(lines: Iterable[Mapping[str, Any]]) -> list[str]:

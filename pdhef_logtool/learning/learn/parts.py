@@ -12,15 +12,16 @@ from pdhef_logtool.learning.car.fit_data import GUARD_S
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.signals import FloatArray
 
-#: What fits parameters and noise (and chooses the model's parts, by folds of its own), what stops the network's
-#: training, what says after each step whether it stays, and what is scored once.
+#: What fits parameters and noise (and chooses the model's parts, by folds of its own), what trains the network, what
+#: says after each step whether it stays, and what is scored once.
 FIT, NETWORK, CHECK, LAST = "fit", "network", "check", "last"
 PARTS = (FIT, NETWORK, CHECK, LAST)
 #: Shares of what is not held out, without and with a part for the network.
-SHARES = {FIT: 0.75, CHECK: 0.25}
-SHARES_WITH_NETWORK = {FIT: 0.55, NETWORK: 0.20, CHECK: 0.25}
-#: Usable driving from which on the network has a part of its own; below, all of it goes to the fit.
-LEAST_FOR_NETWORK_S = 240.0
+SHARES = {FIT: 0.82, CHECK: 0.18}
+SHARES_WITH_NETWORK = {FIT: 0.50, NETWORK: 0.32, CHECK: 0.18}
+#: Usable driving from which on the network has a part of its own, that physics was not fitted to, and still leaves
+#: the fit enough to choose the model's parts; with less it learns from the fit part.
+OWN_NETWORK_PART_S = 600.0
 #: One drive is cut into rounds of about this much usable driving, each with all parts but the last.
 ROUND_S = 240.0
 #: From so many drives on each belongs to one part whole; fewer are cut by time.
@@ -45,7 +46,7 @@ class DriveTimes:
 
 def shares_of(usable_s: float, holdout: float) -> dict[str, float]:
     """Return the share of each part in so much usable driving; their sum is 1."""
-    shares = SHARES if usable_s < LEAST_FOR_NETWORK_S else SHARES_WITH_NETWORK
+    shares = SHARES if usable_s < OWN_NETWORK_PART_S else SHARES_WITH_NETWORK
     return {**{part: (1.0 - holdout) * share for part, share in shares.items()}, LAST: holdout}
 
 
@@ -100,21 +101,43 @@ def cut_times(drive: DriveTimes, shares: Mapping[str, float]) -> list[tuple[str,
 
 
 def part_of_log(log: LogInput, span_s: tuple[float, float]) -> LogInput:
-    """Return a slice of a log, under a name of its own."""
+    """Return a slice of a log, or of a slice of it, under a name of its own."""
     start_s, end_s = (round(s, 3) for s in span_s)
-    return LogInput(log.path, f"{log.stem}_{start_s:g}-{end_s:g}s", (start_s, end_s))
+    stem = log.stem if log.span_s is None else log.stem.rpartition("_")[0]
+    return LogInput(log.path, f"{stem}_{start_s:g}-{end_s:g}s", (start_s, end_s))
 
 
-def halves(slices: Iterable[LogInput]) -> tuple[LogInput, ...]:
-    """Return the first half of each slice: what half of the driving would have taught."""
-    kept = []
+def usable_in(times: Iterable[DriveTimes], slices: Iterable[LogInput]) -> list[DriveTimes]:
+    """Return when each slice can be learnt from."""
+    by_path = {t.log.path: t for t in times}
+    found = []
     for one in slices:
         assert one.span_s is not None
-        start_s, end_s = one.span_s
-        kept.append(part_of_log(one, (start_s, 0.5 * (start_s + end_s))))
-    return tuple(kept)
+        whole = by_path[one.path]
+        inside = (whole.usable_s >= one.span_s[0]) & (whole.usable_s <= one.span_s[1])
+        found.append(DriveTimes(one, whole.usable_s[inside], whole.period_s))
+    return found
 
 
-def seconds_of(slices: Iterable[LogInput]) -> float:
-    """Return how long slices are together."""
-    return sum(one.span_s[1] - one.span_s[0] for one in slices if one.span_s is not None)
+def divided(drives: Iterable[DriveTimes], share: float) -> tuple[tuple[LogInput, ...], tuple[LogInput, ...]]:
+    """Return the first ``share`` of the usable driving of each slice, and the rest, with a gap between."""
+    first, rest = list[LogInput](), list[LogInput]()
+    for drive in (d for d in drives if d.usable_s.size > 1):
+        assert drive.log.span_s is not None
+        start_s, end_s = drive.log.span_s
+        cut_s = float(drive.usable_s[round(share * (drive.usable_s.size - 1))])
+        for found, span in ((first, (start_s, cut_s - 0.5 * GAP_S)), (rest, (cut_s + 0.5 * GAP_S, end_s))):
+            if span[1] > span[0]:
+                found.append(part_of_log(drive.log, span))
+    return tuple(first), tuple(rest)
+
+
+def pieces_of(drives: Iterable[DriveTimes], piece_s: float) -> tuple[LogInput, ...]:
+    """Return slices cut into pieces with at least ``piece_s`` of usable driving; shorter ones are left out."""
+    pieces = []
+    for drive in drives:
+        count = int(drive.seconds // piece_s)
+        if count:
+            at = np.round(np.linspace(0, drive.usable_s.size - 1, count + 1)).astype(np.int64)
+            pieces += [part_of_log(drive.log, (float(a), float(b))) for a, b in pairwise(drive.usable_s[at])]
+    return tuple(pieces)
