@@ -24,6 +24,7 @@ from pdhef_logtool.evaluation.comparison import Errors
 from pdhef_logtool.learning.car import identify, physics_fit
 from pdhef_logtool.learning.learn import learn_command, steps
 from pdhef_logtool.learning.learn.learn_command import CourseSettings, _compare, learn
+from pdhef_logtool.learning.learn.page import draw_page, page_markdown
 from pdhef_logtool.learning.learn.parts import (
     CHECK,
     FIT,
@@ -121,7 +122,7 @@ def test_a_slice_is_divided_with_a_gap_and_cut_into_pieces_of_usable_driving() -
     assert [s.stem for s in (*first, *rest)] == ["a_0-172.45s", "a_177.45-200s"]
     pieces = pieces_of([whole], 30.0)
     assert len(pieces) == 3 and all(b.span_s[0] == a.span_s[1] for a, b in pairwise(pieces) if a.span_s and b.span_s)
-    assert pieces_of([whole], 101.0) == ()
+    assert [s.span_s for s in pieces_of([whole], 101.0)] == [(0.0, 199.95)]
 
 
 # ---- what stays ----
@@ -140,6 +141,38 @@ def test_what_is_worse_or_says_less_does_not_stay() -> None:
     assert _compare(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10))[1] is True
     assert _compare(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8))[1] is False
     assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
+
+
+def test_the_page_holds_any_name_and_what_was_not_known() -> None:
+    line = {"name": "pd-hef-smoothed, learnt", "causal": False, "share": 1.0, "covered": None}
+    document = {
+        "car_name": "a|b\x1b",
+        "versions": {"tool": "1"},
+        "parts": {"fit": {"usable_s": 30.4, "slices": ["x|y_0-30s"]}, "last": {"usable_s": 0.0, "slices": []}},
+        "steps": [
+            {"name": "one", "status": "undone", "text": "why", "before": ["a", 0.5], "after": ["b", 0.75]},
+            {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None},
+        ],
+        "check": [
+            {**line, "rmse_deg": [0.1, None, None], "against_hybrid_deg": [-0.02, -0.03, 0.01]},
+            {"name": "physics, as given", "skipped": "no noise"},
+        ],
+        "last": [],
+        "more": ["more | driving"],
+    }
+    page = page_markdown(document)
+    for text in (
+        "# What was learnt of a\\|b\\x1b",
+        "x\\|y_0-30s |",
+        "| one | undone | a: 0.500 | b: 0.750 | why |",
+        "| two | not done | – | – | why not |",
+        "Nothing was held out.",
+        "| pd-hef-smoothed, learnt (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",
+        "| physics, as given | – (no noise) |",
+        "- more \\| driving",
+    ):
+        assert text in page, text
+    assert draw_page(document).startswith(b"\x89PNG") and draw_page(document) == draw_page(document)
 
 
 # ---- the command, with steps that are quick ----

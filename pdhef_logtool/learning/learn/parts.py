@@ -133,11 +133,10 @@ def divided(drives: Iterable[DriveTimes], share: float) -> tuple[tuple[LogInput,
 
 
 def pieces_of(drives: Iterable[DriveTimes], piece_s: float) -> tuple[LogInput, ...]:
-    """Return slices cut into pieces with at least ``piece_s`` of usable driving; shorter ones are left out."""
+    """Return slices cut into pieces with at least ``piece_s`` of usable driving; a shorter one is a piece by itself."""
     pieces = []
-    for drive in drives:
-        count = int(drive.seconds // piece_s)
-        if count:
-            at = np.round(np.linspace(0, drive.usable_s.size - 1, count + 1)).astype(np.int64)
-            pieces += [part_of_log(drive.log, (float(a), float(b))) for a, b in pairwise(drive.usable_s[at])]
+    for drive in (d for d in drives if d.usable_s.size > 1):
+        count = max(1, int(drive.seconds // piece_s))
+        at = np.round(np.linspace(0, drive.usable_s.size - 1, count + 1)).astype(np.int64)
+        pieces += [part_of_log(drive.log, (float(a), float(b))) for a, b in pairwise(drive.usable_s[at])]
     return tuple(pieces)

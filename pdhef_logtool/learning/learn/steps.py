@@ -171,7 +171,7 @@ def learn_intervals(lesson: Lesson, before: Path, output: Path, progress: Progre
     pieces = pieces_of(lesson.usable(CHECK), INTERVAL_PIECE_S)
     if len(pieces) < MIN_DRIVES:
         raise EstimatorError(
-            expected=f"{MIN_DRIVES} pieces of {INTERVAL_PIECE_S:g} s in the check part",
+            expected=f"{MIN_DRIVES} drives, or pieces of {INTERVAL_PIECE_S:g} s, in the check part",
             got=str(len(pieces)),
             where="intervals",
         )
@@ -181,7 +181,7 @@ def learn_intervals(lesson: Lesson, before: Path, output: Path, progress: Progre
     )
     names = ", ".join(e.estimator for e in result.intervals.entries)
     coverage = {e.estimator: list(e.coverage) for e in result.intervals.entries}
-    return Taught(f"{names}, on {len(pieces)} pieces of {INTERVAL_PIECE_S:g} s", {"coverage": coverage})
+    return Taught(f"{names}, on {len(pieces)} pieces of the check part", {"coverage": coverage})
 
 
 #: In the order in which they are done; each begins with the car that the ones before have left.
@@ -225,7 +225,7 @@ def learning_curve(lesson: Lesson, folder: Path, progress: Progress) -> dict[str
         "half_s": sum(d.seconds for d in usable_in(lesson.times, half_slices)),
         "half_deg": rms_deg(found.vehicle, found.noise),
         "whole_s": lesson.seconds(FIT),
-        "whole_deg": rms_deg(car.physics_vehicle, car.noise[PHYSICS]),
+        "whole_deg": rms_deg(car.physics_vehicle, car.fitted_physics.noise),
     }
 
 
@@ -260,8 +260,8 @@ def what_more_would_pay(
         )
     if len(pieces_of(lesson.usable(CHECK), INTERVAL_PIECE_S)) < MIN_DRIVES:
         told.append(
-            f"the 95 % intervals are the filters' own: calibrating takes {MIN_DRIVES} pieces of {INTERVAL_PIECE_S:g} s "
-            f"in the check part, which has {check_s:.0f} s"
+            f"the 95 % intervals are the filters' own: calibrating takes {MIN_DRIVES} drives, or pieces of "
+            f"{INTERVAL_PIECE_S:g} s, in the check part, which has {check_s:.0f} s"
         )
     if curve is not None:
         gain = 1.0 - curve["whole_deg"] / curve["half_deg"]
