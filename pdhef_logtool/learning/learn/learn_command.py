@@ -41,7 +41,7 @@ from pdhef_logtool.learning.drives import (
     tell_drive,
 )
 from pdhef_logtool.learning.learn.page import draw_page, page_markdown
-from pdhef_logtool.learning.learn.parts import CHECK, LAST, PARTS, DriveTimes, split_drives
+from pdhef_logtool.learning.learn.parts import CHECK, FIT, LAST, PARTS, DriveTimes, split_drives
 from pdhef_logtool.learning.learn.score import score_slices
 from pdhef_logtool.learning.learn.steps import (
     BASELINE,
@@ -72,7 +72,7 @@ KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
 #: Steps that do not stay where they change nothing: simpler is better.
 MUST_GAIN = ("noise", "training")
 #: Usable driving below which nothing is left to fit, to check and to score.
-LEAST_S = 40.0
+LEAST_S = 50.0
 #: A candidate that gives an estimate at fewer of the stamps counts as worse.
 LEAST_AVAILABILITY = 0.9
 #: Lines of the tables: the estimator, and whether it has what was learnt or the vehicle file as it was given.
@@ -175,6 +175,10 @@ def learn(
     mapping = open_mapping(config)
     records, times = _read(inputs, splits, given, mapping, settings, progress, warn)
     parts = split_drives(times, settings.holdout)
+    if not parts[FIT] or not parts[CHECK]:
+        raise EstimatorError(
+            expected="driving to fit and to check", got="too little of one", where="learn", remedy="give longer drives"
+        )
     lesson = Lesson(config, mapping, parts, tuple(times), settings.seed, settings.trials)
     if not (output / VEHICLE_FILE).is_file():
         write_bytes(output / VEHICLE_FILE, vehicle_file(given))
@@ -201,7 +205,7 @@ def learn(
         PLOT_FILE: draw_page(document),
     }
     change = Change("learn", RECORD_FILE, files, {WORK: work}, settings.to_dict(), taught)
-    update_car(given, output, change, base=car)
+    update_car(given, output, change, parts_from=car)
     progress("done", 1.0)
     return CourseResult(
         car=output,

@@ -24,6 +24,10 @@ SHARES_WITH_NETWORK = {FIT: 0.50, NETWORK: 0.32, CHECK: 0.18}
 OWN_NETWORK_PART_S = 600.0
 #: One drive is cut into rounds of about this much usable driving, each with all parts but the last.
 ROUND_S = 240.0
+#: What check and last have at least of usable driving, where there is little; a gap comes off it.
+LEAST_PART_S = 10.0 + GUARD_S
+#: Drives shorter than this are not cut each for itself.
+LEAST_CUT_S = 100.0
 #: From so many drives on each belongs to one part whole; fewer are cut by time.
 WHOLE_DRIVES = 8
 #: Between two parts of one drive, half of it on either side of the cut.
@@ -46,8 +50,12 @@ class DriveTimes:
 
 def shares_of(usable_s: float, holdout: float) -> dict[str, float]:
     """Return the share of each part in so much usable driving; their sum is 1."""
+    least = LEAST_PART_S / max(usable_s, 1e-9)
+    last = min(max(holdout, least), 0.5) if holdout > 0.0 else 0.0
     shares = SHARES if usable_s < OWN_NETWORK_PART_S else SHARES_WITH_NETWORK
-    return {**{part: (1.0 - holdout) * share for part, share in shares.items()}, LAST: holdout}
+    shares = {part: (1.0 - last) * share for part, share in shares.items()}
+    lacks = min(max(0.0, least - shares[CHECK]), shares[FIT])
+    return {**shares, FIT: shares[FIT] - lacks, CHECK: shares[CHECK] + lacks, LAST: last}
 
 
 def split_drives(drives: Sequence[DriveTimes], holdout: float) -> dict[str, tuple[LogInput, ...]]:
@@ -58,18 +66,19 @@ def split_drives(drives: Sequence[DriveTimes], holdout: float) -> dict[str, tupl
     holdout : share of the last part: the end of each drive that is cut, or whole drives.
     """
     shares = shares_of(sum(d.seconds for d in drives), holdout)
+    found: dict[str, tuple[LogInput, ...]] = dict.fromkeys(PARTS, ())
     if len(drives) >= WHOLE_DRIVES:
-        return deal_drives(drives, shares)
-    found: dict[str, list[LogInput]] = {part: [] for part in PARTS}
-    for drive in drives:
-        for part, span in cut_times(drive, shares):
-            found[part].append(part_of_log(drive.log, span))
-    return {part: tuple(slices) for part, slices in found.items()}
+        return found | deal_drives(drives, shares)
+    # Short ones are cut as if they were one: each would give nothing to some parts.
+    together = min(d.seconds for d in drives) < LEAST_CUT_S
+    for part, piece in (x for one in ([drives] if together else [[d] for d in drives]) for x in cut_times(one, shares)):
+        found[part] += (piece,)
+    return found
 
 
 def deal_drives(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> dict[str, tuple[LogInput, ...]]:
     """Return whole drives by part: each in its turn goes to the part that lacks most of its share."""
-    found: dict[str, list[LogInput]] = {part: [] for part in PARTS}
+    found: dict[str, list[LogInput]] = {part: [] for part in shares}
     total = sum(d.seconds for d in drives)
     lacks = {part: share * total for part, share in shares.items() if share > 0.0}
     for drive in drives:
@@ -79,25 +88,34 @@ def deal_drives(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> di
     return {part: tuple(logs) for part, logs in found.items()}
 
 
-def cut_times(drive: DriveTimes, shares: Mapping[str, float]) -> list[tuple[str, tuple[float, float]]]:
-    """Return (part, (start, end) in s) of one drive in order of time; shares are those of its usable driving.
+def cut_times(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> list[tuple[str, LogInput]]:
+    """Return the slices of drives, one behind the other, by part in order of time; shares are of usable driving.
 
-    All parts but the last come in rounds, so that each has something of all of the drive; the last is its end.
+    All parts but the last come in rounds, so that each has something of all of it; the last is the end.
     """
+    total = sum(d.seconds for d in drives)
     learnt = {part: share for part, share in shares.items() if part != LAST and share > 0.0}
-    rounds = max(1, round(sum(learnt.values()) * drive.seconds / ROUND_S))
+    rounds = max(1, round(sum(learnt.values()) * total / ROUND_S))
     pieces = [(part, share / rounds) for _ in range(rounds) for part, share in learnt.items()]
-    if shares.get(LAST, 0.0) > 0.0:
-        pieces.append((LAST, shares[LAST]))
+    pieces += [(LAST, shares[LAST])] if shares.get(LAST, 0.0) > 0.0 else []
     ends = np.concatenate([[0.0], np.cumsum([share for _, share in pieces])])
-    at = np.round(ends / ends[-1] * (drive.usable_s.size - 1)).astype(np.int64)
-    spans = []
-    for number, ((part, _), (a, b)) in enumerate(zip(pieces, pairwise(at), strict=True)):
-        start = float(drive.usable_s[a]) + (0.0 if number == 0 else 0.5 * GAP_S)
-        end = float(drive.usable_s[b]) - (0.0 if number == len(pieces) - 1 else 0.5 * GAP_S)
-        if end > start:
-            spans.append((part, (start, end)))
-    return spans
+    slices = []
+    for (part, _), (a, b) in zip(pieces, pairwise(total * ends / ends[-1]), strict=True):
+        before = 0.0
+        for drive in drives:
+            if (piece := _between(drive, float(a) - before, float(b) - before)) is not None:
+                slices.append((part, piece))
+            before += drive.seconds
+    return slices
+
+
+def _between(drive: DriveTimes, a: float, b: float) -> LogInput | None:
+    """Return the slice from ``a`` to ``b`` seconds of a drive's usable driving, less half a gap at a cut."""
+    last = drive.usable_s.size - 1
+    first, end = (min(max(round(x / drive.period_s), 0), last) for x in (a, b))
+    start_s = float(drive.usable_s[first]) + (0.5 * GAP_S if first > 0 else 0.0)
+    end_s = float(drive.usable_s[end]) - (0.5 * GAP_S if end < last else 0.0)
+    return part_of_log(drive.log, (start_s, end_s)) if end_s - start_s > drive.period_s else None
 
 
 def part_of_log(log: LogInput, span_s: tuple[float, float]) -> LogInput:
@@ -119,17 +137,14 @@ def usable_in(times: Iterable[DriveTimes], slices: Iterable[LogInput]) -> list[D
     return found
 
 
-def divided(drives: Iterable[DriveTimes], share: float) -> tuple[tuple[LogInput, ...], tuple[LogInput, ...]]:
-    """Return the first ``share`` of the usable driving of each slice, and the rest, with a gap between."""
-    first, rest = list[LogInput](), list[LogInput]()
-    for drive in (d for d in drives if d.usable_s.size > 1):
-        assert drive.log.span_s is not None
-        start_s, end_s = drive.log.span_s
-        cut_s = float(drive.usable_s[round(share * (drive.usable_s.size - 1))])
-        for found, span in ((first, (start_s, cut_s - 0.5 * GAP_S)), (rest, (cut_s + 0.5 * GAP_S, end_s))):
-            if span[1] > span[0]:
-                found.append(part_of_log(drive.log, span))
-    return tuple(first), tuple(rest)
+def divided(drives: Sequence[DriveTimes], share: float) -> tuple[tuple[LogInput, ...], tuple[LogInput, ...]]:
+    """Return the first ``share`` of the usable driving of each slice, and the rest; whole slices of many."""
+    drives = [d for d in drives if d.usable_s.size > 1]
+    if len(drives) >= WHOLE_DRIVES:
+        first, rest = deal_drives(drives, {"first": share, "rest": 1.0 - share}).values()
+        return first, rest
+    halves = [(_between(d, 0.0, share * d.seconds), _between(d, share * d.seconds, d.seconds)) for d in drives]
+    return tuple(a for a, _ in halves if a is not None), tuple(b for _, b in halves if b is not None)
 
 
 def pieces_of(drives: Iterable[DriveTimes], piece_s: float) -> tuple[LogInput, ...]:

@@ -154,6 +154,8 @@ def train_network(lesson: Lesson, before: Path, output: Path, progress: Progress
         )
     config, work = lesson.config_for(before), output.parent / "training"
     learns, stops = divided(lesson.usable(part), TRAIN_SHARE)
+    if not stops:
+        raise EstimatorError(expected="driving to stop it", got="none", where="training of the network")
     parts = {"train": (learns, config), "validation": (stops, config)}
     train_on_parts(parts, work, network, progress=progress)
     return _trusted(lesson, before, output, work / "model", progress)
