@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -152,6 +153,14 @@ def test_what_is_worse_or_says_less_does_not_stay() -> None:
     assert _compare(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10))[1] is True
     assert _compare(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8))[1] is False
     assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "sure"), [(10, 8, True), (10, 7, False), (7, 7, True), (7, 6, False), (3, 4, True), (0, 0, True)]
+)
+def test_a_gain_is_not_worth_intervals_that_mean_nothing(was: int, now: int, sure: bool) -> None:
+    old, new = (replace(_errors(*[1.0] * 10), inside=np.arange(10) < n) for n in (was, now))
+    assert learn_command._still_sure(old, new) is sure
 
 
 def test_the_page_holds_any_name_and_what_was_not_known() -> None:

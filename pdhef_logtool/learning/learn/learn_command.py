@@ -69,8 +69,9 @@ WORK, RECORD_FILE, PAGE_FILE, PLOT_FILE = "learn", "learn.record.json", "learn.m
 STEP_FILE, CAR = "step.json", "car"
 #: What may come of a step.
 KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
-#: Steps that do not stay where they change nothing: simpler is better.
-MUST_GAIN = ("noise", "training")
+#: Steps that do not stay where they change nothing, or where the 95 % intervals then hold less than a share of the errors
+#: and less than before: simpler is better, and a gain in error is not worth an interval that means nothing.
+MUST_GAIN, LEAST_COVERED = ("noise", "training"), 0.8
 #: Usable driving below which nothing is left to fit, to check and to score.
 LEAST_S = 50.0
 #: A candidate that gives an estimate at fewer of the stamps counts as worse.
@@ -368,7 +369,7 @@ def _step(course: _Course, name: str, before: Path, folder: Path) -> dict[str, A
     progress("scoring what it is worth", 1.0)
     old, new = (_held_out(lesson, car) for car in (before, folder / CAR))
     (was, now), gains = _compare(old, new)
-    stays = gains if gains is not None else name not in MUST_GAIN
+    stays = gains is not False if name not in MUST_GAIN else gains is True and _still_sure(old, new)
     _tidy(folder, keep_car=stays)
     return {
         "status": KEPT if stays else UNDONE,
@@ -407,6 +408,12 @@ def _compare(old: Errors, new: Errors) -> tuple[tuple[float, float], bool | None
     was, now = (float(np.degrees(np.sqrt(np.mean(e.error[both] ** 2)))) if both.any() else np.nan for e in (old, new))
     lacks = new.scored < LEAST_AVAILABILITY * old.scored
     return (round(was, 6), round(now, 6)), None if was == now and not lacks else now < was and not lacks
+
+
+def _still_sure(old: Errors, new: Errors) -> bool:
+    """Return whether the 95 % intervals of the new one hold most of its errors, or as many as those of the old one."""
+    was, now = (float(np.mean(e.inside[np.isfinite(e.error)])) if e.inside is not None else 0.0 for e in (old, new))
+    return now >= min(was, LEAST_COVERED)
 
 
 # ---- the end ----
