@@ -69,8 +69,8 @@ WORK, RECORD_FILE, PAGE_FILE, PLOT_FILE = "learn", "learn.record.json", "learn.m
 STEP_FILE, CAR = "step.json", "car"
 #: What may come of a step.
 KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
-#: Steps that do not stay where they change nothing, or where the 95 % intervals then hold less than a share of the errors
-#: and less than before: simpler is better, and a gain in error is not worth an interval that means nothing.
+#: Steps that do not stay where they change nothing, or where the 95 % intervals then hold less than a share of the
+#: errors and less than before: simpler is better, and a gain is not worth an interval that means nothing.
 MUST_GAIN, LEAST_COVERED = ("noise", "training"), 0.8
 #: Usable driving below which nothing is left to fit, to check and to score.
 LEAST_S = 50.0
@@ -369,11 +369,12 @@ def _step(course: _Course, name: str, before: Path, folder: Path) -> dict[str, A
     progress("scoring what it is worth", 1.0)
     old, new = (_held_out(lesson, car) for car in (before, folder / CAR))
     (was, now), gains = _compare(old, new)
-    stays = gains is not False if name not in MUST_GAIN else gains is True and _still_sure(old, new)
+    unsure = name in MUST_GAIN and not _still_sure(old, new)
+    stays = not unsure and (gains is True if name in MUST_GAIN else gains is not False)
     _tidy(folder, keep_car=stays)
     return {
         "status": KEPT if stays else UNDONE,
-        "text": taught.text,
+        "text": taught.text + ("; its 95 % intervals hold too few of the errors" if unsure else ""),
         "before": [old.name, was],
         "after": [new.name, now],
         "figures": taught.figures,
