@@ -36,7 +36,7 @@ from pdhef_logtool.learning.network.fine_tune import train_on_parts
 from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.records.errors import EstimatorError
+from pdhef_logtool.records.errors import EstimatorError, ModelError
 from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, ModelBundle, open_model
 from pdhef_logtool.runs.config import RunConfig
 
@@ -94,8 +94,15 @@ class Lesson:
         return Path(MANY_CARS) if self.config.network is None else self.config.network
 
     def bundle(self) -> ModelBundle | None:
-        """Return that network, None without."""
-        return None if str(self.network) == NO_MODEL else open_model(self.network)
+        """Return that network, None without; raises ModelError where one that is asked for cannot be read."""
+        if str(self.network) == NO_MODEL:
+            return None
+        try:
+            return open_model(self.network)
+        except ModelError:
+            if self.config.network is None:
+                return None  # a source tree without shipped networks still learns what needs none
+            raise
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +143,7 @@ def learn_noise(lesson: Lesson, before: Path, output: Path, progress: Progress) 
 def try_network(lesson: Lesson, before: Path, output: Path, progress: Progress) -> Taught:
     """Find how far the network to begin with may be followed, on the check part."""
     if lesson.bundle() is None:
-        raise EstimatorError(expected="a network", got="--network none", where="network")
+        raise EstimatorError(expected="a network", got="none", where="network")
     return _trusted(lesson, before, output, lesson.network, progress)
 
 
@@ -144,7 +151,7 @@ def train_network(lesson: Lesson, before: Path, output: Path, progress: Progress
     """Go on training that network, stopped by driving that it has not seen, and find how far it may be followed."""
     network, part = lesson.bundle(), NETWORK if lesson.parts[NETWORK] else FIT
     if network is None:
-        raise EstimatorError(expected="a network", got="--network none", where="training of the network")
+        raise EstimatorError(expected="a network", got="none", where="training of the network")
     seconds = lesson.seconds(part)
     if seconds < LEAST_TRAINING_S:
         raise EstimatorError(
