@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings as CalibrateSettings
     from pdhef_logtool.learning.evidence.calibrate_command import calibrate as calibrate
     from pdhef_logtool.learning.evidence.trust_command import trust as trust
+    from pdhef_logtool.learning.learn.learn_command import CourseSettings as CourseSettings
+    from pdhef_logtool.learning.learn.learn_command import learn as learn
     from pdhef_logtool.learning.network.extract_command import ExtractSettings as ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as extract
     from pdhef_logtool.learning.network.train_command import run_training as train  # noqa: F401
@@ -44,6 +46,8 @@ _HOMES = {
     "CalibrateSettings": "learning.evidence.calibrate_command",
     "calibrate": "learning.evidence.calibrate_command",
     "trust": "learning.evidence.trust_command",
+    "CourseSettings": "learning.learn.learn_command",
+    "learn": "learning.learn.learn_command",
     "ExtractSettings": "learning.network.extract_command",
     "extract": "learning.network.extract_command",
     "train": "learning.network.train_command:run_training",

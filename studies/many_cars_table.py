@@ -24,6 +24,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.car.identify_command import identify
 from pdhef_logtool.learning.network.dataset import read_dataset
+from pdhef_logtool.learning.network.fine_tune import train_on_parts
 from pdhef_logtool.learning.network.fit import Recipe
 from pdhef_logtool.learning.network.train_command import train_on
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, ModelBundle, load_bundle
@@ -32,7 +33,6 @@ from pdhef_logtool.runs.config import RunConfig
 from studies import many_cars
 from studies.condition_drives import drives_of, independent_runs, read_drive, root_mean_square, sideslip_error
 from studies.defaults.train_default import MAPPING, pdhef
-from studies.fine_tuning import train_on_parts
 from studies.pages import DOCS, INDEPENDENT, ROOT, options, table, write
 from studies.table_maths import median_ratio, pooled_rmse
 
@@ -117,7 +117,9 @@ def fine_tuned(network: ModelBundle, work: Path) -> dict[str, Errors]:
         config = RunConfig(car=vehicle_file, mapping=mapping)
         logs = [TUNED_SET / e["file"] for e in entries]
         parts = {"train": logs[: FIT_DRIVES - STOP_DRIVES], "validation": logs[FIT_DRIVES - STOP_DRIVES : FIT_DRIVES]}
-        own = train_on_parts({s: (logs, config) for s, logs in parts.items()}, work / str(car), network)
+        own = train_on_parts(
+            {s: ([str(log) for log in of], config) for s, of in parts.items()}, work / str(car), network
+        )
         drawn = with_shipped_noise(load_vehicle(vehicle_file))
         columns = {
             "phy-ukf-tuned": ("phy-ukf-tuned", network),

@@ -12,7 +12,6 @@ so and ends with 0, and the page holds figures only.
 
 from __future__ import annotations
 
-import math
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -29,29 +28,25 @@ from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import SPECS, runnable
-from pdhef_logtool.evaluation.bootstrap import (
-    Interval,
-    block_bootstrap_difference,
-    block_bootstrap_interval,
-    block_sums,
-)
+from pdhef_logtool.evaluation.bootstrap import block_sums
+from pdhef_logtool.evaluation.comparison import Errors, compare, shown_interval
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive
 from pdhef_logtool.learning.car.identify_command import identify
 from pdhef_logtool.learning.evidence.trust import decide_cap
 from pdhef_logtool.learning.evidence.trust_command import errors_by_trust
+from pdhef_logtool.learning.network.fine_tune import train_on_parts
 from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import load_mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.release import released_steps
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import NO_MODEL, ModelBundle
 from pdhef_logtool.runs.config import RunConfig
 from studies.condition_drives import SIDESLIP
-from studies.fine_tuning import train_on_parts
-from studies.pages import DOCS, DRIVES, ROOT, number, options, table, write
+from studies.pages import DOCS, DRIVES, ROOT, options, table, write
 
 REFERENCE = ROOT / "tests" / "reference"
 #: Share of the fit part that the network learns from; the rest, behind a guard, stops its training.
@@ -164,15 +159,6 @@ CASES = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Result:
-    """One line of a table: sideslip errors [N] in rad at the stamps of the scored part, NaN where not scored."""
-
-    name: str
-    error: FloatArray
-    stamps_ns: IntArray
-
-
 def files(case: Case) -> tuple[Path, Path]:
     """Return the mapping file and the catalogue's vehicle file of a case."""
     return REFERENCE / "mappings" / f"{case.mapping}.toml", REFERENCE / "vehicles" / f"{case.vehicle}.toml"
@@ -185,10 +171,10 @@ def read_part(part: Part, mapping_file: Path, car: Car) -> WholeDrive:
         return drive.whole()
 
 
-def run_case(case: Case, network: Path, trials: int) -> tuple[list[Result], str]:
+def run_case(case: Case, network: Path, trials: int) -> tuple[list[Errors], str]:
     """Fit what is to be fitted; return the errors of everything on the scored part, and why something is missing."""
     mapping_file, catalogue_file = files(case)
-    results: list[Result] = []
+    results: list[Errors] = []
 
     def add(label: str, car: Car, names: Sequence[str]) -> None:
         part = read_part(case.score, mapping_file, car)
@@ -203,7 +189,7 @@ def run_case(case: Case, network: Path, trials: int) -> tuple[list[Result], str]
             shown = e.name if e.causal else f"{e.name} (not causal)"
             if e.name in ("pd-hef", "pd-hef-smoothed"):
                 shown += f" at trust {car.allowed_trust.cap:g}"
-            results.append(Result(f"{shown}, {label}" if label else shown, error, part.truth.stamps_ns))
+            results.append(Errors(f"{shown}, {label}" if label else shown, error, part.truth.stamps_ns))
 
     catalogue = Car.load(catalogue_file, network=network)
     free = ("zero", "kinematic")
@@ -247,7 +233,7 @@ def run_case(case: Case, network: Path, trials: int) -> tuple[list[Result], str]
     return results, ""
 
 
-def blocks(case: Case, results: Sequence[Result]) -> list[tuple[str, str, int, int, float]]:
+def blocks(case: Case, results: Sequence[Errors]) -> list[tuple[str, str, int, int, float]]:
     """Return case, estimator, block, stamps and RMSE in degrees of each block, for comparisons in pairs."""
     rows = []
     for r in results:
@@ -291,7 +277,7 @@ def train(case: Case, config: RunConfig, folder: Path, init: ModelBundle | None)
     """Train a network on the first share of the fit part, stopped by the rest of it; ``init`` is its start."""
     say(f"{case.name}: training {folder.name}")
     slices = {
-        split: ([DRIVES / part.log], replace(config, start=part.config.start, end=part.config.end))
+        split: ([str(DRIVES / part.log)], replace(config, start=part.config.start, end=part.config.end))
         for split, part in split_fit(case).items()
     }
     return train_on_parts(slices, folder, init)
@@ -314,7 +300,7 @@ def regression_features(drive: FitDrive, *, low_pass: bool) -> FloatArray:
     return np.column_stack([x, np.ones(len(x))])
 
 
-def regressions(case: Case, part: Part, mapping_file: Path, car: Car) -> list[Result]:
+def regressions(case: Case, part: Part, mapping_file: Path, car: Car) -> list[Errors]:
     """Fit a linear regression of the sideslip on seven features, raw and low-passed, and score it."""
     loaded = [
         load_fit_drive(LogInput(DRIVES / p.log, p.log), car, load_mapping(mapping_file), p.config.read_options)[1]
@@ -331,32 +317,19 @@ def regressions(case: Case, part: Part, mapping_file: Path, car: Car) -> list[Re
         speed = np.hypot(score.truth.vx_m_s, score.truth.vy_m_s)
         error = np.where(speed > case.min_speed_m_s, error, np.nan)
         label = "linear regression, 7 features" + (", 2 Hz" if low_pass else "")
-        results.append(Result(label, error, score.truth.stamps_ns))
+        results.append(Errors(label, error, score.truth.stamps_ns))
     return results
 
 
-def case_table(results: Sequence[Result]) -> str:
+def case_table(results: Sequence[Errors]) -> str:
     """Return a case's table: RMSE with its interval, how much was scored, and the difference to the yardstick."""
     names = [r.name for r in results]
-    yard = next((results[names.index(n)] for n in YARDSTICKS if n in names), None)
+    yard = next((n for n in YARDSTICKS if n in names), None)
     body = []
-    for r in results:
-        if not np.isfinite(r.error).any():
-            continue
-        at = block_bootstrap_interval(r.error, r.stamps_ns)
-        versus = "–"
-        if yard is not None and yard.name != r.name and np.array_equal(yard.stamps_ns, r.stamps_ns):
-            versus = _interval(block_bootstrap_difference(r.error, yard.error, r.stamps_ns), "+")
-        scored = max(int(np.isfinite(x.error).sum()) for x in results)
-        body.append([r.name, _interval(at, ""), f"{100 * np.isfinite(r.error).sum() / scored:.0f} %", versus])
-    against = "–" if yard is None else yard.name
-    return table(["estimator", "sideslip RMSE, deg", "of the stamps", f"minus that of {against}, deg"], body)
-
-
-def _interval(found: Interval, sign: str) -> str:
-    value, low, high = (math.degrees(x) for x in (found.value, found.low, found.high))
-    shown = f"{value:{sign}.3f}" if math.isfinite(value) else "–"
-    return f"{shown} [{number(low)}, {number(high)}]" if math.isfinite(low) else shown
+    for line in compare(results, yard):
+        versus = "–" if line.difference is None else shown_interval(line.difference, "+")
+        body.append([line.name, shown_interval(line.rmse), f"{100 * line.share:.0f} %", versus])
+    return table(["estimator", "sideslip RMSE, deg", "of the stamps", f"minus that of {yard or '–'}, deg"], body)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""``pdhef identify``, ``extract``, ``train``, ``tune``, ``trust`` and ``calibrate``: what is learnt from drives."""
+"""``pdhef identify``, ``extract``, ``train``, ``tune``, ``trust``, ``calibrate``, ``learn``: what drives teach."""
 
 from __future__ import annotations
 
@@ -221,3 +221,39 @@ def calibrate(
     with console.progress() as bar:
         result = fit_intervals(logs, output, settings, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_calibration, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef learn drives/ --car guess.toml -o mycar",
+    "pdhef learn drive.mcap --car guess.toml -o mycar --end 150 --holdout 0",
+    notes="The drives are cut in parts that do not mix. Physics, noise, network with its trust, and intervals are "
+    "learnt one after the other; a step that makes the error on held-out driving worse is undone. The end of a drive "
+    "(or some drives of many) is scored once, against all baselines: learn.md in the car's folder (docs/learn.md). The "
+    "same command again goes on where it was interrupted.",
+    shared="sensors friction network",
+    car="Where it starts (mass, geometry, sensor noise, priors)",
+)
+def learn(
+    *,
+    logs: options.TruthLogs,
+    output: Annotated[Path, Option("--output", "-o", metavar="CAR", help="Folder of the car to write.")],
+    config: RunConfig,
+    holdout: Annotated[float, Option(help="Share of the driving that is only scored, once, at the end.")] = 0.15,
+    trials: Annotated[int, Option(help="Of the search for the noise of physics.")] = 64,
+    seed: Annotated[int, Option(help="Of the search, of bootstraps and of vehicles that are made wrong.")] = 0,
+    split: options.Split = None,
+    any_split: options.AnySplit = False,
+    fresh: Annotated[bool, Option("--fresh", help="Forget what an earlier call with this output has found.")] = False,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Teach a car all that drives with truth can. One command from a vehicle file to a proven car."""
+    from pdhef_logtool.learning.learn.learn_command import CourseSettings
+    from pdhef_logtool.learning.learn.learn_command import learn as teach
+
+    settings = CourseSettings(
+        config=config, holdout=holdout, trials=trials, seed=seed, split=split, any_split=any_split
+    )
+    with console.progress() as bar:
+        result = teach(logs, output, settings, fresh=fresh, progress=bar, warn=console.warn, say=console.say)
+    console.finish(result, learning_tables.render_course, as_json)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.car.without_truth_command import WithoutTruthResult
     from pdhef_logtool.learning.evidence.calibrate_command import CalibrateResult
     from pdhef_logtool.learning.evidence.trust_command import TrustResult
+    from pdhef_logtool.learning.learn.learn_command import CourseResult
     from pdhef_logtool.learning.network.baselines import BaselinesResult
     from pdhef_logtool.learning.network.extract_command import ExtractResult
     from pdhef_logtool.learning.network.train_command import TrainResult
@@ -146,3 +147,27 @@ def render_calibration(result: CalibrateResult, console: Console) -> None:
     console.print("95 % intervals of sideslip, each drive judged by a fit without it; width over 3.92 x RMSE")
     console.print(intervals)
     console.print(f"{len(result.intervals.drives)} drives; intervals in {result.file}", soft_wrap=True)
+
+
+def render_course(result: CourseResult, console: Console) -> None:
+    """Print what each step came to, the part that was scored once, and what more driving would pay."""
+    steps = table("step", "came to", ">held out °\nbefore", ">\nafter", "by")
+    for s in result.steps:
+        before, after = ("-" if x is None else f"{x[1]:.3f}" for x in (s.before, s.after))
+        steps.add_row(s.name, s.status, before, after, "" if s.after is None else s.after[0])
+    console.print(steps)
+    console.print()
+    scores = table("estimator", ">RMSE °", ">95 % interval", ">inside 95 %")
+    for line in result.last:
+        if "skipped" in line:
+            scores.add_row(line["name"], "-", "-", "-")
+            continue
+        value, low, high = line["rmse_deg"]
+        interval = "-" if low is None else f"{low:.3f} to {high:.3f}"
+        scores.add_row(line["name"], cell(value, digits=3), interval, cell(line["covered"], 100.0, 0))
+    if result.last:
+        console.print("sideslip RMSE on the last part, scored once")
+        console.print(scores)
+    for text in result.more:
+        console.print(f"  {text}")
+    console.print(f"car in {result.car}, what each decision rests on in learn.md there", soft_wrap=True)

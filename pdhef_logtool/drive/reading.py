@@ -205,7 +205,7 @@ def read_drive(
 
     Parameters
     ----------
-    log : a file or folder; a :class:`LogInput` brings the name that the drive has beside others.
+    log : a file or folder; a :class:`LogInput` brings the name that the drive has beside others, and may bring a slice.
     mapping : None recognises types.
     tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
     adjust : changes the mapping in effect.
@@ -224,6 +224,9 @@ def read_drive(
     ([951], ())
     """
     log_input = log if isinstance(log, LogInput) else one_log(str(log))
+    if log_input.span_s is not None:
+        start_s, end_s = log_input.span_s
+        options = replace(options, start=f"{start_s:.9f}", end=f"{end_s:.9f}")
     notes: list[str] = []
 
     def told(text: str) -> None:

@@ -32,14 +32,20 @@ class LogInput:
     """A log and its ``stem``: unique in a run, fit for a folder name on any system, equal to ``log`` in the tables.
 
     The stem is the log's name; where that is none for a folder, or another log's too, hash digits end it.
+    ``span_s``: only this slice of it, in seconds from its start; it goes before a slice that holds for all logs.
     """
 
     path: Path
     stem: str
+    span_s: tuple[float, float] | None = None
 
 
-def find_logs(arguments: Sequence[str]) -> list[LogInput]:
-    """Expand files, folders and glob patterns to logs in a stable order; each log once.
+#: Logs as people name them, or as a command has found and cut them.
+Logs = Sequence[str] | Sequence[LogInput]
+
+
+def find_logs(arguments: Logs) -> list[LogInput]:
+    """Expand files, folders and glob patterns to logs in a stable order; each log once. What was found stays as it is.
 
     A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders are
     searched for logs by suffix; a rosbag2 folder counts as one log.
@@ -49,7 +55,9 @@ def find_logs(arguments: Sequence[str]) -> list[LogInput]:
     UsageError : An argument stands for no log at all.
     """
     found: dict[str, Path] = {}
-    for argument in arguments:
+    if already := [a for a in arguments if isinstance(a, LogInput)]:
+        return already
+    for argument in map(str, arguments):
         paths = list(_expand(argument))
         if not paths:
             raise UsageError(

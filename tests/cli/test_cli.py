@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
     *("inspect", "estimators", "run", "metrics", "view", "simulate", "simulate suite", "simulate conditions"),
-    *("identify", "extract", "train", "tune", "trust", "calibrate"),
+    *("identify", "extract", "train", "tune", "trust", "calibrate", "learn"),
 )
 
 

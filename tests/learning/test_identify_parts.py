@@ -58,7 +58,11 @@ PHYSICS = FittedPhysics(
         TriedParts(parts=("roll",), held_out_deg=(0.1, 0.2), taken=True),
     ),
 )
-FITTED: Any = object()
+FITTED: Any = SimpleNamespace(
+    priors=(Prior("roll frequency", "rad/s", 9.0, 0.5), Prior("q v_y", "m/s", 1.0, 0.5, tuning=True)),
+    theta=np.array([1.0, 0.0]),
+    std=np.array([0.9, 0.9]),
+)
 NO_SAMPLES = AxleSamples(*(np.empty(0) for _ in range(4)))
 
 
@@ -466,6 +470,9 @@ def test_what_is_not_excited_goes_back_to_its_prior_and_the_rest_is_fitted_again
         ("scoring", 0.95),
     ]  # fmt: skip
     assert found.physics is PHYSICS
+    frequency, noise = found.physics_parameters
+    assert (frequency.value, frequency.low) == (pytest.approx(9.5), pytest.approx(9.5 - 1.96 * 0.45))
+    assert (frequency.excited, noise.excited) == (False, True)  # noise is the filter's: no prior to go back to
     assert found.notes[-1] == "physics has roll, by driving that its fits had not seen"
     given = PHYSICS.model_copy(update={"values": FittedValues(physics=STATIC), "tried": ()})
     assert identify._told(given) == "physics has none of its parts, as asked for, or for want of driving"
@@ -560,6 +567,7 @@ FOUND = Identification(
     FilterNoise(q_std=(0.1, 0.2, 0.3)),
     PHYSICS,
     PARAMETERS,
+    (),
     (PartScore("fit", 60.0, 3.0, 2.0, 1.0, 0.5), PartScore("held out", 20.0, 3.5, 2.5, 1.5, 0.75)),
     AxleSamples(*(np.linspace(-1.0, 1.0, 12_000) * k for k in (0.1, 5000.0, 0.05, 4000.0))),
     ("a note",),

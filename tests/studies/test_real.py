@@ -20,9 +20,9 @@ def test_without_the_drives_it_says_so_and_ends_with_0(monkeypatch, tmp_path: Pa
 def test_errors_of_constant_size_have_no_spread_and_differ_by_their_difference():
     stamps = np.arange(6000, dtype=np.int64) * 10_000_000
     sign = np.where(np.arange(6000) % 2, 1.0, -1.0)
-    yard = real.Result(real.YARDSTICKS[0], np.radians(0.5) * sign, stamps)
+    yard = real.Errors(real.YARDSTICKS[0], np.radians(0.5) * sign, stamps)
     half = np.where(np.arange(6000) < 3000, math.nan, np.radians(0.3) * sign)
-    lines = real.case_table([yard, real.Result("other", half, stamps)]).splitlines()
+    lines = real.case_table([yard, real.Errors("other", half, stamps)]).splitlines()
     assert lines[2] == f"| {yard.name} | 0.500 [0.500, 0.500] | 100 % | – |"
     assert lines[3] == "| other | 0.300 [0.300, 0.300] | 50 % | -0.200 [-0.200, -0.200] |"
 

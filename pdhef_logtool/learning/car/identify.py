@@ -101,12 +101,16 @@ class PartScore:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Identification:
-    """Everything that identification found: values with the noise of ``phy-ukf-tuned``, and those of ``physics``."""
+    """Everything that identification found: values with the noise of ``phy-ukf-tuned``, and those of ``physics``.
+
+    ``parameters`` are those of the former, ``physics_parameters`` those of the latter.
+    """
 
     vehicle: VehicleParameters
     noise: FilterNoise
     physics: FittedPhysics
     parameters: tuple[Identified, ...]
+    physics_parameters: tuple[Identified, ...]
     scores: tuple[PartScore, ...]
     samples: AxleSamples
     notes: tuple[str, ...]
@@ -174,7 +178,16 @@ def fit_car(
     scores = [_score("fit", fit, start, vehicle, noise, found)]
     if held_out:
         scores.append(_score("held out", held_out, start, vehicle, noise, found))
-    parameters = tuple(
+    parameters = _identified(priors, theta, std, active)
+    of_physics = _identified(found.priors, found.theta, found.std, found.std < NOT_EXCITED)
+    notes = (*_notes(parameters, fit, usable_s), _told(physics))
+    return Identification(vehicle, noise, physics, parameters, of_physics, tuple(scores), samples, notes)
+
+
+def _identified(
+    priors: Sequence[Prior], theta: FloatArray, std: FloatArray, excited: BoolArray
+) -> tuple[Identified, ...]:
+    return tuple(
         Identified(
             name=p.name,
             unit=p.unit,
@@ -182,13 +195,11 @@ def fit_car(
             low=p.value(float(t - 1.96 * s)),
             high=p.value(float(t + 1.96 * s)),
             prior=p.mean,
-            excited=bool(a),
+            excited=bool(a) or p.tuning,
             tuning=p.tuning,
         )
-        for p, t, s, a in zip(priors, theta, std, active, strict=True)
+        for p, t, s, a in zip(priors, theta, std, excited, strict=True)
     )
-    notes = (*_notes(parameters, fit, usable_s), _told(physics))
-    return Identification(vehicle, noise, physics, parameters, tuple(scores), samples, notes)
 
 
 def make_priors(

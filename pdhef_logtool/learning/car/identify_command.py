@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from pdhef_logtool.learning.drives import (
     open_mapping,
     tell_drive,
 )
-from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.discovery import Logs, find_logs
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
@@ -54,18 +54,8 @@ class IdentifyResult(LearnResult):
         found = self.identification
         return {
             **super(IdentifyResult, self).to_dict(),
-            "parameters": [
-                {
-                    "name": p.name,
-                    "unit": p.unit,
-                    "value": p.value,
-                    "low95": p.low,
-                    "high95": p.high,
-                    "prior": p.prior,
-                    "excited": p.excited,
-                }
-                for p in found.parameters
-            ],
+            "parameters": [_parameter(p) for p in found.parameters],
+            "physics_parameters": [_parameter(p) for p in found.physics_parameters],
             "understeer_deg_per_g": understeer_deg_per_g(found.vehicle),
             "sideslip_rmse_deg": [
                 {
@@ -83,8 +73,13 @@ class IdentifyResult(LearnResult):
         }
 
 
+def _parameter(p: Identified) -> dict[str, Any]:
+    figures = {"value": p.value, "low95": p.low, "high95": p.high, "prior": p.prior}
+    return {"name": p.name, "unit": p.unit, **figures, "excited": p.excited}
+
+
 def identify(
-    arguments: Sequence[str],
+    arguments: Logs,
     output: Path,
     config: RunConfig,
     *,

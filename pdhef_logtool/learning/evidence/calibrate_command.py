@@ -45,7 +45,7 @@ from pdhef_logtool.learning.evidence.calibrate import (
 from pdhef_logtool.learning.network.extract_command import MAX_VARIATION
 from pdhef_logtool.learning.noise.tune_command import HELD_OUT
 from pdhef_logtool.learning.variation import Variation, vary
-from pdhef_logtool.logs.discovery import LogInput, find_logs
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
@@ -96,7 +96,7 @@ class CalibrateResult(LearnResult):
 
 
 def calibrate(
-    arguments: Sequence[str],
+    arguments: Logs,
     output: Path,
     settings: CalibrateSettings,
     *,

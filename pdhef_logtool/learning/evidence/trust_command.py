@@ -48,7 +48,7 @@ from pdhef_logtool.learning.evidence.trust import (
     join_blocks,
 )
 from pdhef_logtool.learning.noise.tune_drives import MIN_SCORED_STAMPS
-from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.discovery import Logs, find_logs
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
@@ -101,7 +101,7 @@ class TrustResult(LearnResult):
 
 
 def trust(
-    arguments: Sequence[str],
+    arguments: Logs,
     output: Path,
     settings: LearnSettings,
     *,

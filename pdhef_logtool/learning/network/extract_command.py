@@ -56,7 +56,7 @@ from pdhef_logtool.learning.network.residuals import (
     residual_windows,
 )
 from pdhef_logtool.learning.variation import vary
-from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
@@ -201,7 +201,7 @@ class _Job:
 
 
 def extract(
-    arguments: Sequence[str],
+    arguments: Logs,
     output: Path,
     settings: ExtractSettings,
     *,
@@ -626,6 +626,7 @@ def _fingerprint(job: _Job, split: str) -> str:
         "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
         "split": split,
         "vehicle": [job.physics[0], job.car.noise_sha256],
+        **({} if job.log_input.span_s is None else {"span_s": job.log_input.span_s}),
         "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
         "versions": tool_versions(),
     }

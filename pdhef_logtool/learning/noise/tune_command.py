@@ -48,7 +48,7 @@ from pdhef_logtool.learning.noise.search import (
 )
 from pdhef_logtool.learning.noise.tune_drives import Benches, TuneSetup, choose_names
 from pdhef_logtool.learning.plots import new_figure, png_bytes
-from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.discovery import Logs, find_logs
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.sinks.report import json_bytes
 
@@ -123,7 +123,7 @@ class TuneResult(LearnResult):
 
 
 def tune(
-    arguments: Sequence[str],
+    arguments: Logs,
     output: Path,
     settings: TuneSettings,
     *,

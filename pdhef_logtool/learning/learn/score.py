@@ -1,0 +1,87 @@
+"""How well a car's estimators do on slices of drives: errors paired by stamp, and the share inside their intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.estimators.table import Options, runnable
+from pdhef_logtool.evaluation.comparison import Errors, end_to_end
+from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
+from pdhef_logtool.learning.drives import load_drive
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+
+#: What a filter needs from the start of a slice before its error counts.
+SETTLE_S = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scored:
+    """Sideslip errors by estimator, [N] at the same stamps for all of them, and why others did not run."""
+
+    errors: Mapping[str, Errors]
+    skipped: Mapping[str, str]
+
+
+def score_slices(
+    car: Car, names: Sequence[str], slices: Sequence[LogInput], mapping: SignalMapping | None, options: ReadOptions
+) -> Scored:
+    """Run estimators of a car over slices of drives with truth.
+
+    Raises
+    ------
+    PdhefError
+        A log cannot be read.
+    """
+    columns: dict[str, list[tuple[FloatArray, BoolArray]]] = {name: [] for name in names}
+    stamps: list[IntArray] = []
+    skipped: dict[str, str] = {}
+    for one in slices:
+        _, drive = load_drive(one, car, mapping, options)
+        if drive is None or drive.truth is None:
+            continue
+        stamps.append(drive.signals.stamps_ns)
+        tracks, reasons = _tracks(car, names, drive, options)
+        skipped |= reasons
+        for name in names:
+            columns[name].append(_errors(tracks.get(name), drive, car.vehicle.low_speed_blend_m_s))
+    at = end_to_end(stamps)
+    errors = {
+        name: Errors(name, np.concatenate([e for e, _ in parts]), at, np.concatenate([i for _, i in parts]))
+        for name, parts in columns.items()
+        if parts and name not in skipped
+    }
+    return Scored(errors, skipped)
+
+
+def _tracks(
+    car: Car, names: Sequence[str], drive: WholeDrive, options: ReadOptions
+) -> tuple[dict[str, StateTrack], dict[str, str]]:
+    estimators, skipped = runnable(names, car, drive.plan.alignment.available, Options(options.use_speed))
+    found: dict[str, list[StateTrack]] = {e.name: [] for e in estimators}
+    for window in estimate_windows(drive, estimators, drawn=False, intervals=calibrator(car, estimators)):
+        for estimator, track in zip(estimators, window.tracks, strict=True):
+            found[estimator.name].append(track)
+    tracks = {name: parts[0] if len(parts) == 1 else concatenate(parts) for name, parts in found.items()}
+    return tracks, {s.name: s.reason for s in skipped}
+
+
+def _errors(track: StateTrack | None, drive: WholeDrive, slow_m_s: float) -> tuple[FloatArray, BoolArray]:
+    """Return the sideslip errors [N] in rad, NaN where nothing is scored, and which lie inside their interval."""
+    stamps, truth = drive.signals.stamps_ns, drive.truth
+    assert truth is not None
+    if track is None:
+        return np.full(stamps.shape[0], np.nan), np.zeros(stamps.shape[0], dtype=np.bool_)
+    error = signal_error(track, truth, "sideslip_rad", slow_m_s)
+    error = np.where(stamps - stamps[0] < round(SETTLE_S * 1e9), np.nan, error)
+    inside: BoolArray = np.abs(error) <= NORMAL_95 * track.sideslip_std_rad
+    return error, inside

@@ -1,0 +1,367 @@
+"""``pdhef learn``: parts that do not mix, steps that are undone, a rerun that goes on, and a car from one minute."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.car.car import FIT_FILE, Car
+from pdhef_logtool.car.flat import part_toml
+from pdhef_logtool.car.parts import Fit, FittedValues, physics_sha256
+from pdhef_logtool.car.store import Change, update_car
+from pdhef_logtool.car.vehicle import AxleTyre, Tyres
+from pdhef_logtool.evaluation.comparison import Errors
+from pdhef_logtool.learning.car import identify, physics_fit
+from pdhef_logtool.learning.learn import learn_command, steps
+from pdhef_logtool.learning.learn.learn_command import CourseSettings, _compare, learn
+from pdhef_logtool.learning.learn.page import draw_page, page_markdown
+from pdhef_logtool.learning.learn.parts import (
+    CHECK,
+    FIT,
+    GAP_S,
+    LAST,
+    NETWORK,
+    OWN_NETWORK_PART_S,
+    PARTS,
+    WHOLE_DRIVES,
+    DriveTimes,
+    divided,
+    pieces_of,
+    shares_of,
+    split_drives,
+    usable_in,
+)
+from pdhef_logtool.learning.learn.steps import Taught
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.errors import EstimatorError, UsageError
+from pdhef_logtool.runs.config import RunConfig
+
+ROUNDING_S = 2e-3
+
+
+def _times(name: str, stretches: list[tuple[float, float]], period_s: float = 0.05) -> DriveTimes:
+    """Stretches of (pause, driving) in seconds."""
+    at, usable = 0.0, []
+    for pause_s, driving_s in stretches:
+        at += pause_s
+        usable.append(at + np.arange(0.0, driving_s, period_s))
+        at += driving_s
+    return DriveTimes(LogInput(Path(f"{name}.mcap"), name), np.concatenate(usable), period_s)
+
+
+stretches = st.lists(st.tuples(st.floats(0.0, 40.0), st.floats(1.0, 300.0)), min_size=1, max_size=5)
+
+
+# ---- parts ----
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(stretches, min_size=1, max_size=WHOLE_DRIVES - 1), st.floats(0.0, 0.5))
+def test_parts_of_a_drive_never_meet(drives: list[list[tuple[float, float]]], holdout: float) -> None:
+    times = [_times(f"d{i}", s) for i, s in enumerate(drives)]
+    parts = split_drives(times, holdout)
+    assert set(parts) == set(PARTS) and bool(parts[LAST]) <= (holdout > 0.0)
+    for drive in times:
+        mine = [(s.span_s, part) for part in PARTS for s in parts[part] if s.path == drive.log.path and s.span_s]
+        assert [s.stem for p in PARTS for s in parts[p] if s.path == drive.log.path] == [
+            f"{drive.log.stem}_{a:g}-{b:g}s" for (a, b), _ in mine
+        ]
+        mine.sort()
+        for ((_, end), part), ((start, _), other) in pairwise(mine):
+            assert start - end > GAP_S - ROUNDING_S and part != other
+        assert all(b > a for (a, b), _ in mine)
+        assert not any(part == LAST for _, part in mine[:-1])
+        assert not mine or (mine[0][0][0] >= drive.usable_s[0] - ROUNDING_S)
+        assert not mine or mine[-1][0][1] <= drive.usable_s[-1] + ROUNDING_S
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.floats(5.0, 60.0), min_size=WHOLE_DRIVES, max_size=40), st.floats(0.0, 0.5))
+def test_many_drives_are_dealt_whole(lengths: list[float], holdout: float) -> None:
+    times = [_times(f"d{i}", [(1.0, length)]) for i, length in enumerate(lengths)]
+    parts = split_drives(times, holdout)
+    taken = [s.path for part in PARTS for s in parts[part]]
+    assert sorted(taken) == sorted(t.log.path for t in times)
+    total = sum(t.seconds for t in times)
+    for part, share in shares_of(total, holdout).items():
+        got = sum(t.seconds for t in usable_in(times, parts[part]))
+        assert abs(got - share * total) <= max(lengths) + 1.0
+
+
+def test_a_minute_leaves_something_to_check_and_to_score_however_it_comes() -> None:
+    for drives in ([(0.0, 60.0)], [(0.0, 20.0)] * 3, [(0.0, 35.0), (0.0, 25.0)]):
+        times = [_times(f"d{i}", [one]) for i, one in enumerate(drives)]
+        parts = split_drives(times, 0.15)
+        usable = {p: sum(t.seconds for t in usable_in(times, parts[p])) for p in PARTS}
+        assert usable[FIT] > 22.0 and usable[CHECK] > 9.5 and usable[LAST] > 9.5, drives
+
+
+def test_shares_are_of_usable_driving_and_the_network_has_its_own_where_there_is_much() -> None:
+    # Half of the log is a stop.
+    little = _times("a", [(0.0, 50.0), (300.0, 250.0)])
+    parts = split_drives([little], 0.15)
+    usable = {p: sum(t.seconds for t in usable_in([little], parts[p])) for p in PARTS}
+    assert parts[NETWORK] == () and len(parts[FIT]) == 1
+    assert usable[FIT] == pytest.approx(0.85 * 0.82 * 300.0 - GAP_S / 2, abs=0.5)
+    assert usable[CHECK] == pytest.approx(0.85 * 0.18 * 300.0 - GAP_S, abs=0.5)
+    assert usable[LAST] == pytest.approx(0.15 * 300.0 - GAP_S / 2, abs=0.5)
+    much = split_drives([_times("a", [(0.0, OWN_NETWORK_PART_S + 1.0)])], 0.15)
+    assert len(much[FIT]) == len(much[NETWORK]) == len(much[CHECK]) == 2 and len(much[LAST]) == 1
+    for share in (0.0, 0.15, 0.5):
+        assert sum(shares_of(100.0, share).values()) == pytest.approx(1.0)
+        assert sum(shares_of(1000.0, share).values()) == pytest.approx(1.0)
+
+
+def test_a_slice_is_divided_with_a_gap_and_cut_into_pieces_of_usable_driving() -> None:
+    drive = _times("a", [(0.0, 50.0), (100.0, 50.0)])
+    (whole,) = usable_in([drive], [LogInput(drive.log.path, "a_0-200s", (0.0, 200.0))])
+    first, rest = divided([whole], 0.75)
+    assert [s.span_s for s in (*first, *rest)] == [(0.0, 172.5), (177.5, 199.95)]
+    assert [s.stem for s in (*first, *rest)] == ["a_0-172.5s", "a_177.5-199.95s"]
+    many = [_times(f"d{i}", [(0.0, 10.0)]) for i in range(10)]
+    whole_ones = usable_in(many, [LogInput(d.log.path, f"{d.log.stem}_0-10s", (0.0, 10.0)) for d in many])
+    assert [len(x) for x in divided(whole_ones, 0.8)] == [8, 2]
+    pieces = pieces_of([whole], 30.0)
+    assert len(pieces) == 3 and all(b.span_s[0] == a.span_s[1] for a, b in pairwise(pieces) if a.span_s and b.span_s)
+    assert [s.span_s for s in pieces_of([whole], 101.0)] == [(0.0, 199.95)]
+
+
+# ---- what stays ----
+
+
+def _errors(*degrees: float) -> Errors:
+    return Errors("x", np.radians(np.array(degrees)), np.arange(len(degrees)))
+
+
+def test_what_is_worse_or_says_less_does_not_stay() -> None:
+    nan = float("nan")
+    assert _compare(_errors(1.0, 1.0), _errors(0.5, -0.5)) == ((1.0, 0.5), True)
+    assert _compare(_errors(0.5, 0.5), _errors(1.0, nan))[1] is False
+    assert _compare(_errors(1.0, 1.0), _errors(-1.0, 1.0))[1] is None
+    # Where one of them says nothing, neither counts; an estimate that is missing too often is worse.
+    assert _compare(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10))[1] is True
+    assert _compare(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8))[1] is False
+    assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "sure"), [(10, 8, True), (10, 7, False), (7, 7, True), (7, 6, False), (3, 4, True), (0, 0, True)]
+)
+def test_a_gain_is_not_worth_intervals_that_mean_nothing(was: int, now: int, sure: bool) -> None:
+    old, new = (replace(_errors(*[1.0] * 10), inside=np.arange(10) < n) for n in (was, now))
+    assert learn_command._still_sure(old, new) is sure
+
+
+def test_the_page_holds_any_name_and_what_was_not_known() -> None:
+    line = {"name": "pd-hef-smoothed, learnt", "causal": False, "share": 1.0, "covered": None}
+    document = {
+        "car_name": "a|b\x1b",
+        "versions": {"tool": "1"},
+        "parts": {"fit": {"usable_s": 30.4, "slices": ["x|y_0-30s"]}, "last": {"usable_s": 0.0, "slices": []}},
+        "steps": [
+            {"name": "one", "status": "undone", "text": "why", "before": ["a", 0.5], "after": ["b", 0.75]},
+            {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None},
+        ],
+        "check": [
+            {**line, "rmse_deg": [0.1, None, None], "against_hybrid_deg": [-0.02, -0.03, 0.01]},
+            {"name": "physics, as given", "skipped": "no noise"},
+        ],
+        "last": [],
+        "more": ["more | driving"],
+    }
+    page = page_markdown(document)
+    for text in (
+        "# What was learnt of a\\|b\\x1b",
+        "x\\|y_0-30s |",
+        "| one | undone | a: 0.500 | b: 0.750 | why |",
+        "| two | not done | – | – | why not |",
+        "Nothing was held out.",
+        "| pd-hef-smoothed, learnt (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",
+        "| physics, as given | – (no noise) |",
+        "- more \\| driving",
+    ):
+        assert text in page, text
+    assert draw_page(document).startswith(b"\x89PNG") and draw_page(document) == draw_page(document)
+
+
+# ---- the command, with steps that are quick ----
+
+SLICE = RunConfig(start="210", end="275")
+GOOD, BAD = 1.0, 0.5
+
+
+def _tyres(factor: float) -> Callable[..., Taught]:
+    """Return a step that gives the car the tyres that it should have, times a factor on its rear stiffness."""
+
+    def teach(_lesson: steps.Lesson, before: Path, output: Path, _progress: object) -> Taught:
+        car = Car.load(before)
+        tyres = Tyres(
+            front=AxleTyre(cornering_stiffness_n_per_rad=90_000.0),
+            rear=AxleTyre(cornering_stiffness_n_per_rad=factor * 125_000.0),
+        )
+        fit = Fit(physics_sha256=physics_sha256(car.own), values=FittedValues(tyres=tyres))
+        update_car(car, output, Change("step", FIT_FILE, {FIT_FILE: part_toml(fit, "made").encode()}))
+        return Taught(f"factor {factor}", {"factor": factor})
+
+    return teach
+
+
+def _too_little(*_: object) -> Taught:
+    raise EstimatorError(expected="more", got="less", where="little")
+
+
+@pytest.fixture
+def guess(tmp_path: Path, sample_logs_dir: Path) -> Path:
+    """A stranger's file of the saloon: its tyres are far too soft, and it knows of no network."""
+    lines = (sample_logs_dir / "vehicle.toml").read_text(encoding="utf-8").splitlines(keepends=True)
+    lines = [line for line in lines if not line.startswith(("[network]", "trust_cap", "evidence"))]
+    text = "".join(lines).partition("[tyres")[0]
+    stiffness = "cornering_stiffness_n_per_rad = 60000.0\n"
+    path = tmp_path / "guess.toml"
+    path.write_text(f"{text}[tyres.front]\n{stiffness}\n[tyres.rear]\n{stiffness}", encoding="utf-8")
+    return path
+
+
+def _content(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.slow
+def test_steps_that_make_it_worse_are_undone_and_a_rerun_goes_on_to_the_same_bytes(
+    guess: Path, tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+
+    def counted(name: str, teach: Callable[..., Taught]) -> Callable[..., Taught]:
+        def count(*args: Any) -> Taught:
+            done.append(name)
+            return teach(*args)
+
+        return count
+
+    course = {"good": _tyres(GOOD), "little": _too_little, "bad": _tyres(BAD), "again": _tyres(GOOD)}
+    taught = {name: counted(name, teach) for name, teach in course.items()}
+    monkeypatch.setattr(learn_command, "STEPS", taught)
+    monkeypatch.setattr(learn_command, "MUST_GAIN", ("again",))
+    settings = CourseSettings(config=RunConfig(car=guess, start=SLICE.start, end=SLICE.end))
+    logs = [str(sample_logs_dir / "road.mcap")]
+    whole = tmp_path / "whole"
+    result = learn(logs, whole, settings)
+    assert [(s.name, s.status) for s in result.steps] == [
+        ("good", "kept"),
+        ("little", "not done"),
+        ("bad", "undone"),
+        ("again", "undone"),
+    ]
+    good, little, bad, again = result.steps
+    assert good.after is not None and bad.after is not None and again.after is not None
+    assert good.after[1] < good.before[1] and bad.after[1] > bad.before[1] == good.after[1] == again.after[1]
+    assert "expected more, got less" in little.text and result.exit_code == 0
+    assert Car.load(whole).vehicle.tyres.rear.cornering_stiffness_n_per_rad == 125_000.0
+    assert sorted(p.name for p in (whole / "learn" / "3-bad").iterdir()) == ["step.json"]
+    names = [line["name"] for line in result.last]
+    assert names[:4] == ["zero", "kinematic", "open-loop, as given", "phy-ukf, as given"]
+    page = (whole / "learn.md").read_text(encoding="utf-8")
+    assert "| bad | undone |" in page and "scored once" in page
+    json.dumps(result.to_dict())
+
+    # The second is stopped after its first step, goes on, and then has nothing left to do.
+    halted = tmp_path / "halted"
+    monkeypatch.setitem(taught, "little", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        learn(logs, halted, settings)
+    assert Car.load(halted).vehicle == Car.load(guess).vehicle  # a car all the time
+    monkeypatch.setitem(taught, "little", counted("little", _too_little))
+    done.clear()
+    learn(logs, halted, settings)
+    assert done == ["little", "bad", "again"]
+    assert _content(halted) == _content(whole)
+    for folder in (halted, whole):  # what else is there stays; a part that was not learnt here does not
+        (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    (halted / "noise.toml").write_text("stale", encoding="utf-8")
+    done.clear()
+    monkeypatch.setattr(learn_command, "score_slices", lambda *_: pytest.fail("scored more than once"))
+    said: list[str] = []
+    learn(logs, halted, settings, say=said.append)
+    assert not done and all("as found before" in line for line in said) and _content(halted) == _content(whole)
+
+
+@pytest.mark.slow
+def test_other_settings_begin_anew_and_so_does_fresh(
+    guess: Path, tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[int] = []
+    good = _tyres(GOOD)
+
+    def step(*args: Any) -> Taught:
+        done.append(1)
+        return good(*args)
+
+    monkeypatch.setattr(learn_command, "STEPS", {"good": step})
+    monkeypatch.setattr(learn_command, "_end", lambda *_: {"car_name": "x", "check": [], "last": [], "more": []})
+    logs = [str(sample_logs_dir / "road.mcap")]
+    config = RunConfig(car=guess, start=SLICE.start, end=SLICE.end)
+    for count, (holdout, fresh) in enumerate(((0.2, False), (0.3, False), (0.3, True)), start=1):
+        learn(logs, tmp_path / "car", CourseSettings(config=config, holdout=holdout), fresh=fresh)
+        assert len(done) == count
+    shutil.rmtree(tmp_path / "car" / "learn")
+    learn(logs, tmp_path / "car", CourseSettings(config=config, holdout=0.3))
+    assert len(done) == 4
+
+
+@pytest.mark.slow
+def test_a_minute_of_driving_gives_a_car_that_says_what_it_could_not_learn(
+    guess: Path, tmp_path: Path, sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # What is found does not matter here: two steps from one start.
+    quick = partial(physics_fit.fit_physics, starts=physics_fit.STARTS[:1], iterations=2)
+    for module in (physics_fit, steps):
+        monkeypatch.setattr(module, "fit_physics", quick)
+    monkeypatch.setattr(identify, "MAX_ITERATIONS", 2)
+    config = RunConfig(car=guess, start="210", end="270")
+    said: list[str] = []
+    result = learn(
+        [str(sample_logs_dir / "road.mcap")], tmp_path / "car", CourseSettings(config=config), say=said.append
+    )
+    by_name = {s.name: s for s in result.steps}
+    assert list(by_name) == list(steps.STEPS) and by_name["physics"].status == "kept"
+    assert {by_name[n].status for n in ("training", "intervals")} == {"not done"}
+    figures = {line["name"]: line["rmse_deg"][0] for line in result.last if "rmse_deg" in line}
+    assert figures["physics, learnt"] < figures["phy-ukf, as given"]
+    told = "\n".join(result.more)
+    for words in (
+        "none was tried on",
+        "it takes 100 s",
+        "the 95 % intervals are the filters' own",
+        "half of the fit part",
+    ):
+        assert words in told
+    assert len(said) == len(steps.STEPS) + 1 and (tmp_path / "car" / "learn.png").is_file()
+    assert Car.load(tmp_path / "car").fitted_physics is not None
+
+
+def test_too_little_driving_and_wrong_options_are_said(guess: Path, tmp_path: Path, sample_logs_dir: Path) -> None:
+    logs = [str(sample_logs_dir / "dlc.mcap")]
+    settings = CourseSettings(config=RunConfig(car=guess))
+    with pytest.raises(EstimatorError, match="at least 50 s"):
+        learn(logs, tmp_path / "car", settings)
+    assert not (tmp_path / "car").exists()
+    with pytest.raises(UsageError, match="--holdout"):
+        learn(logs, tmp_path / "car", CourseSettings(config=RunConfig(car=guess), holdout=0.6))
+    with pytest.raises(UsageError, match="a car's folder"):
+        learn(logs, tmp_path / "car.toml", settings)
+    with pytest.raises(UsageError, match="would replace the input"):
+        shutil.copytree(sample_logs_dir, tmp_path / "logs", ignore=lambda *_: {"road.mcap", "faults.mcap"})
+        (tmp_path / "logs" / "vehicle.toml").write_bytes(guess.read_bytes())
+        learn([str(tmp_path / "logs" / "dlc.mcap")], tmp_path / "logs", settings)
