@@ -421,7 +421,7 @@ def test_what_cannot_run_is_skipped_with_the_reason():
     assert all("steer_rad" in s.reason and "speed_m_s" not in s.reason for s in skipped)
     assert runnable(NAMES, car_of(), frozenset(ALIGNED_SIGNALS))[1] == []
     skipped = runnable(NAMES, Car.of(VEHICLE), frozenset(ALIGNED_SIGNALS))[1]
-    assert [s.name for s in skipped] == ["physics", "phy-ukf-tuned"]
+    assert [s.name for s in skipped] == ["phy-ukf-tuned"]
     assert all(f"no noise for {s.name}; pdhef identify" in s.reason for s in skipped)
 
 
