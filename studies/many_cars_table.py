@@ -19,6 +19,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.car.identify_command import identify
@@ -77,8 +78,9 @@ def train_networks() -> None:
 
 
 def with_shipped_noise(vehicle: VehicleParameters) -> Car:
-    """Return a car of a vehicle with the filter noise of the shipped one."""
-    return Car.of(vehicle, noise=Car.load("saloon", network="none").noise)
+    """Return a car of a vehicle with the shipped one's filter noise, but that of ``physics``, which has parts there."""
+    noise = Car.load("saloon", network="none").noise
+    return Car.of(vehicle, noise={n: one for n, one in noise.items() if n != PHYSICS})
 
 
 def cars_of(folder: Path, split: str | None) -> Iterator[Case]:
@@ -95,7 +97,9 @@ def independent_cases(work: Path) -> Iterator[Case]:
     guess, found = work / "guess.toml", work / "identified"
     guess.write_text(vehicle_toml(start), encoding="utf-8")
     identify([str(log) for log in fit], found, RunConfig(car=guess), holdout=0.0)
-    car = with_shipped_noise(Car.load(found, network="none").vehicle)
+    identified = Car.load(found, network="none")
+    noise = with_shipped_noise(identified.vehicle).noise
+    car = replace(identified, noise={**noise, PHYSICS: identified.noise[PHYSICS]})
     yield from (Case(log, car, friction) for log, friction in runs if log not in fit)
 
 
@@ -197,7 +201,8 @@ Written by `python -m studies.many_cars_table`; networks by `make train-default`
 The network for many cars knows mass, geometry, stiffness and peak force of the vehicle file as inputs. It learns from
 {many_cars.CARS} simulated saloons and SUVs with {many_cars.DRIVES_PER_CAR} drives of {many_cars.DRIVE_S:g} s each, all
 with vehicle files and sensors of their own; {VARY:g} is the spread by which files and friction are made wrong on top.
-Friction is told. Filter noise of all estimators is the shipped car's.
+Friction is told. Filter noise of all estimators is the shipped car's, but that of `physics`: it has no part on a car of
+which nothing was found, and what `pdhef identify` finds through it on the independent simulator's.
 
 {chr(10).join(parts)}"""
 

@@ -4,9 +4,9 @@
 
 Maximises the mean over manoeuvres of the log-likelihood per scalar innovation, so that minutes of straight road do
 not outvote a lane change. R stays at sensor level (vehicle file). Nelder-Mead on the logarithms of the 1-sigma values,
-from several starts, and of ``phy-ukf`` then anew from the best, for as long as that gains. The results
-results/physics_q.json and results/physics_parts_q.json are entered as PHY_UKF_Q_STD and PHYSICS_Q_STD; ``physics`` has
-lag, load transfer and bias states there, with the values of the vehicle file.
+from several starts, and of ``phy-ukf`` then anew from the best, for as long as that gains. results/physics_q.json is
+entered as PHY_UKF_Q_STD; results/physics_parts_q.json is near PHYSICS_Q_STD, which is frozen: ``physics`` has lag, load
+transfer and bias states there, with the values of the vehicle file.
 """
 
 from __future__ import annotations

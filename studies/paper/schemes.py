@@ -11,7 +11,7 @@ SCHEMES: dict[str, str] = {
     "linear-regression": "linear in the features of the network",
     "phy-ukf": "the paper's baseline: nominal model, sensor-level R, Q by innovation likelihood",
     "phy-ukf-tuned": "the same, tuned for sideslip",
-    "physics": "lagged axle forces, load transfer, roll-corrected a_y",
+    "physics": "all parts that five other minutes of driving gave evidence for",
     "pure-lstm": "network alone, same inputs",
     "pd-hef-paper": "the paper's filter and adaptation, to the letter",
     "pd-hef-fixed-r": "our hybrid filter, full trust, fixed R",

@@ -159,7 +159,8 @@ def test_every_order_gives_parts_that_are_valid_or_said_to_be_stale(commands: Co
         car = Car.load(commands.car)
         assert _stale(car.notes) == expected, (number, command)
         assert car.vehicle.name.endswith("(identified)") == identified
-        assert ("physics" in car.noise) == tuned
+        assert ("physics" in car.noise) == (tuned or identified)
+        assert (car.fitted_physics is not None) == identified
         assert ("trust" in made) == car.allowed_trust.reason.startswith(("too little", "the car's evidence was found"))
         assert ("trust" in expected) == ("pdhef trust gives it anew" in car.allowed_trust.reason)
         before = after

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from studies import switches
@@ -81,6 +83,17 @@ def test_options_reach_both_filters_of_the_mixture() -> None:
             assert one.vehicle.physics.biases == (name == "biases")
             assert one.slip_gate == (name == "biases")
     assert not plain.physics.vehicle.physics.biases
+
+
+def test_a_part_of_physics_is_switched_in_its_model_and_ships_as_the_table_says() -> None:
+    shipped = make_estimator("physics", Car.load("saloon", network="none"))
+    assert isinstance(shipped, AdaptivePhysics)
+    for part, on in shipped.physics.vehicle.physics:
+        assert {s.default["physics"] for s in switches.SWITCHES if s.name == f"part {part.replace('_', ' ')}"} == {on}
+        switched = switches.with_option(shipped, part, value=not on)
+        assert isinstance(switched, PhysicsFilter)
+        assert {n for n, has in switched.vehicle.physics if has != getattr(shipped.vehicle.physics, n)} == {part}
+        assert switched.q_std == shipped.q_std
 
 
 def test_both_sides_are_scored_where_both_say_something(drive: ConditionDrive) -> None:
