@@ -4,10 +4,10 @@
 
 Short drives of one simulated car whose vehicle file is right, with the friction told. ``physics`` is fitted on five
 minutes of other drives (:mod:`studies.defaults.fit_physics`), its noise with it; the residual network learns what it
-lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter noise of all tuned estimators is chosen on validation
-drives in one search (``pdhef tune``). Seeds other than 0 train networks for spreads and take fit and noise of the
-shipped car. A second set, of other cars of the same kind, is for the model card. Logs that are there already as they
-should be are kept.
+lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
+noise of all tuned estimators is chosen on validation drives in one search (``pdhef tune``). Seeds other than 0 train
+networks for spreads and take fit and noise of the shipped car. A second set, of other cars of the same kind, is for the
+model card. Logs that are there already as they should be are kept.
 """
 
 from __future__ import annotations
@@ -90,11 +90,11 @@ def main(arguments: list[str] | None = None) -> int:
     told = ["--car", car, "--mapping", mapping]
     # The paper's network and the baselines beside it have the nominal model, as the paper has it.
     for model in MODELS:
-        of = ("-o", work / model, "--filter", model, "--jobs", given.jobs, "--resume")
-        pdhef("extract", work / "one_car", *told, *of)
+        output = ("-o", work / model, "--filter", model, "--jobs", given.jobs, "--resume")
+        pdhef("extract", work / "one_car", *told, *output)
     say("train the residual network, and beside it the baselines on the same drives")
-    arguments = ["-o", network, "--baselines", "--seed", given.seed, "--epochs", BASELINE_EPOCHS]
-    beside = _start("train", work / NOMINAL_MODEL, *arguments)
+    how = ("--baselines", "--seed", given.seed, "--epochs", BASELINE_EPOCHS)
+    beside = _start("train", work / NOMINAL_MODEL, "-o", network, *how)
     if given.jobs == 1:
         _finish(beside)
     torch.set_num_threads(1)  # small networks: a second thread brings nothing, a second process does
