@@ -2,20 +2,28 @@
 
 Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
 that no network ever saw. A car's file is fitted to a ramp steer of it (``error_budget.fit_vehicle``), as somebody who
-has measured his car would have it. Drives are split by car.
+has measured his car would have it; ``physics`` of it is identified by the tool on its first drives, and residuals are
+taken from the others: the network is trained as it is served. Drives are split by car.
 """
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
-from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.flat import flat_toml, load_vehicle, vehicle_toml
+from pdhef_logtool.car.parts import PHYSICS, FittedPhysics, FittedValues, physics_sha256
+from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
+from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.learning.car.physics_fit import fit_physics
 from pdhef_logtool.records.errors import SimulationError
+from studies.condition_drives import read_drive
 from studies.error_budget import fit_vehicle
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
@@ -25,8 +33,12 @@ from truthsim.vehicle import GRAVITY_M_S2
 from truthsim.vehicle_choice import choose_vehicle
 
 SEED = 4000
-CARS = 300
+CARS = 40
 DRIVES_PER_CAR = 8
+#: Of these, the drives that a car is identified on; no residual is taken from them. Steps of the fit, some 5 s a car.
+FIT_DRIVES, FIT_ITERATIONS = 3, 4
+#: With so little driving the parts are not chosen: those that a bare car cannot do without, and none that adapts.
+PARTS = PhysicsParts(lag=True, load_transfer=True, braking=True, roll=True, biases=True)
 DRIVE_S = 12.5
 BASE = Path("sample_logs/vehicle.toml")
 KINDS = ("sedan", "suv")
@@ -127,3 +139,46 @@ def write_cars(
     planned = plan_cars(cars, drives, seed, folder, load_vehicle(BASE), kinds)
     head = {"command": "python -m studies.many_cars_table", "seed": seed, "cars": cars, "drives_per_car": drives}
     return run_jobs(planned, folder, head, processes=jobs)
+
+
+def identify_cars(folder: Path) -> list[str]:
+    """Identify the cars of a set on their first drives; return the logs of the others.
+
+    Those of the others stand in a manifest of their own in ``folder``/residuals, with the files of the identified cars.
+    """
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+    by_car: dict[int, list[dict[str, Any]]] = {}
+    for entry in manifest["drives"]:
+        if "sha256" in entry:
+            by_car.setdefault(entry["car"], []).append(entry)
+    others = folder / "residuals"
+    others.mkdir(exist_ok=True)
+    kept = []
+    for index, entries in by_car.items():
+        name = f"car_{index:04d}.toml"
+        if not (others / name).is_file():
+            own = folder / entries[0]["vehicle_file"]
+            (others / name).write_text(identified(own, [folder / e["file"] for e in entries[:FIT_DRIVES]]), "utf-8")
+        for entry in entries[FIT_DRIVES:]:
+            link = others / entry["file"]
+            if not link.exists():
+                link.hardlink_to(folder / entry["file"])
+            kept.append({**entry, "vehicle_file": name})
+    (others / "manifest.json").write_text(json.dumps({**manifest, "drives": kept}), encoding="utf-8")
+    return [str(others / e["file"]) for e in kept]
+
+
+def identified(file: Path, logs: Sequence[Path]) -> str:
+    """Return a car's file with its ``physics`` as the tool identifies it on drives with perfect truth."""
+    own = load_vehicle(file)
+    drives = []
+    for log in logs:
+        read = read_drive(log, Car.of(own))
+        start_ns = int(read.signals.stamps_ns[0])
+        drives.append(FitDrive(read.name, read.signals, read.truth, independent_yaw_rate=True, log_start_ns=start_ns))
+    found = fit_physics(drives, own, PARTS, starts=({},), iterations=FIT_ITERATIONS)
+    values = FittedValues.of(found.vehicle)
+    noise = found.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(own))})
+    physics = FittedPhysics(values=values, noise=noise).model_dump(mode="json", exclude_none=True)
+    text = file.read_text(encoding="utf-8")
+    return flat_toml(text, own, own, {PHYSICS: noise}, None, {PHYSICS: physics})

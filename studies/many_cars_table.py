@@ -17,17 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.car.flat import load_vehicle, vehicle_toml
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.learning.car.identify_command import identify
-from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.fine_tune import train_on_parts
 from pdhef_logtool.learning.network.fit import Recipe
-from pdhef_logtool.learning.network.train_command import train_on
-from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, ModelBundle, load_bundle
+from pdhef_logtool.learning.network.train_command import dataset_for, train_on
+from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL, SHIPPED_FOLDERS, ModelBundle, load_bundle
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from studies import many_cars
@@ -41,8 +40,7 @@ CARS, UNSEEN = ROOT / "out" / "many-cars", ROOT / "out" / "many-cars-unseen"
 #: Runs of the independent simulator that its car is identified on; the others are scored.
 IDENTIFY_ON = ("ramp_100kmh_mu100_long", "normal_40_80kmh_mu090")
 UNSEEN_SEED, UNSEEN_CARS, UNSEEN_DRIVES = 4100, 24, 4
-EPOCHS, HIDDEN = 22, 96
-VARY = 0.1
+EPOCHS = 16
 #: Estimator by the name in the table: registered name, and which network it has.
 COLUMNS = {
     "phy-ukf-tuned": ("phy-ukf-tuned", "one"),
@@ -70,11 +68,12 @@ class Case:
 def train_networks() -> None:
     """Simulate, extract and train; what is there already as it should be is kept."""
     many_cars.write_cars(CARS, cars=many_cars.CARS, drives=many_cars.DRIVES_PER_CAR, seed=many_cars.SEED, jobs=2)
+    logs = many_cars.identify_cars(CARS)
     mapping = CARS / "mapping.toml"
     mapping.write_text(MAPPING, encoding="utf-8")
-    pdhef("extract", CARS, "-o", DATA, "--mapping", mapping, "--vary", VARY, "--jobs", 2, "--resume")
-    recipe = Recipe(seed=0, epochs=EPOCHS, hidden=HIDDEN, feature_names=FEATURES)
-    train_on(read_dataset(DATA), MODEL, recipe, progress=lambda text, _share: print(text, flush=True))
+    pdhef("extract", *logs, "-o", DATA, "--mapping", mapping, "--jobs", 2, "--resume")
+    recipe = Recipe(seed=0, epochs=EPOCHS, feature_names=FEATURES)
+    train_on(dataset_for(DATA, PHYSICS_MODEL), MODEL, recipe, progress=lambda text, _share: print(text, flush=True))
 
 
 def with_shipped_noise(vehicle: VehicleParameters) -> Car:
@@ -86,7 +85,11 @@ def with_shipped_noise(vehicle: VehicleParameters) -> Car:
 def cars_of(folder: Path, split: str | None) -> Iterator[Case]:
     """Yield the drives of a set of many cars."""
     for entry in drives_of(folder, split):
-        yield Case(folder / entry["file"], with_shipped_noise(load_vehicle(folder / entry["vehicle_file"])))
+        found = Car.load(folder / entry["vehicle_file"], network="none", intervals=NO_INTERVALS)
+        car = with_shipped_noise(found.vehicle)
+        if found.fitted_physics is not None:
+            car = replace(found, noise={**car.noise, **found.noise})
+        yield Case(folder / entry["file"], car)
 
 
 def independent_cases(work: Path) -> Iterator[Case]:
@@ -170,7 +173,7 @@ def main() -> None:
     many_cars.write_cars(UNSEEN, cars=UNSEEN_CARS, drives=UNSEEN_DRIVES, seed=UNSEEN_SEED, jobs=2, kinds=kinds)
     models = {"one": load_bundle(given.one), "many": load_bundle(given.many)}
     parts = {
-        "Saloons and SUVs that were not trained on": cars_of(CARS, "test"),
+        "Saloons and SUVs that were not trained on": cars_of(CARS / "residuals", "test"),
         "Hatchbacks, of which none was trained on": cars_of(UNSEEN, None),
     }
     columns = {column: (name, models[which]) for column, (name, which) in COLUMNS.items()}
@@ -202,9 +205,9 @@ Written by `python -m studies.many_cars_table`; networks by `make train-default`
 
 The network for many cars knows mass, geometry, stiffness and peak force of the vehicle file as inputs. It learns from
 {many_cars.CARS} simulated saloons and SUVs with {many_cars.DRIVES_PER_CAR} drives of {many_cars.DRIVE_S:g} s each, all
-with vehicle files and sensors of their own; {VARY:g} is the spread by which files and friction are made wrong on top.
-Friction is told. Filter noise of all estimators is the shipped car's, but that of `physics`: it has no part on a car of
-which nothing was found, and what `pdhef identify` finds through it on the independent simulator's.
+with vehicle files and sensors of their own, after `physics` of each was identified on {many_cars.FIT_DRIVES} of its drives; the
+residuals are those of the others, and so are the drives that are scored. Friction is told. Filter noise of all estimators is the
+shipped car's, but that of `physics`: it has no part on a car of which nothing was found.
 
 {chr(10).join(parts)}"""
 

@@ -72,7 +72,9 @@ def extract(
     split: Annotated[str | None, Option(help="train, validation or test for all drives of this command.")] = None,
     seed: Annotated[int, Option(help="Seed of the split by drive.")] = 0,
     vary: Annotated[float, Option(help="Make friction and car wrong by this spread for a part of the drives.")] = 0.0,
-    model: Annotated[str, Option(help="Whose residuals: physics, or phy-ukf for --paper and --baselines.")] = "physics",
+    model: Annotated[
+        str, Option("--filter", help="Whose residuals: physics, or phy-ukf for --paper and --baselines.")
+    ] = "physics",
     jobs: options.Jobs = 1,
     resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings are as they were.")] = False,
     as_json: options.JsonFlag = False,

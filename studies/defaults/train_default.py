@@ -1,13 +1,13 @@
-"""Make the car that the package ships from nothing: simulate, extract, train, fit, tune, trust, calibrate.
+"""Make the car that the package ships from nothing: simulate, fit, extract, train, tune, trust, calibrate.
 
     python -m studies.defaults.train_default [--seed 0] [-o FOLDER] [--work out/train-default] [--jobs 2]
 
-Short drives of one simulated car whose vehicle file is right, with the friction told. The residual network, the direct
-network, the regression and the paper's network see the same rows. ``physics`` is fitted on five minutes of other drives
-(:mod:`studies.defaults.fit_physics`), its noise with it. Filter noise of all tuned estimators is chosen on validation
-drives in one search (``pdhef tune``). Seeds other than 0 train networks for spreads and take fit and noise of the
-shipped car. A second set, of other cars of the same kind, is for the model card. Logs that are there already as they
-should be are kept.
+Short drives of one simulated car whose vehicle file is right, with the friction told. ``physics`` is fitted on five
+minutes of other drives (:mod:`studies.defaults.fit_physics`), its noise with it; the residual network learns what it
+lacks. The direct network, the regression and the paper's network see the same drives, with the nominal model. Filter
+noise of all tuned estimators is chosen on validation drives in one search (``pdhef tune``). Seeds other than 0 train
+networks for spreads and take fit and noise of the shipped car. A second set, of other cars of the same kind, is for the
+model card. Logs that are there already as they should be are kept.
 """
 
 from __future__ import annotations
@@ -23,11 +23,10 @@ from pathlib import Path
 import torch
 
 from pdhef_logtool.car.car import FIT_FILE, NETWORK_FOLDER, NOISE_FILE, SHIPPED_CARS, UNSURE_FILE, VEHICLE_FILE
-from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.fit import Recipe
-from pdhef_logtool.learning.network.train_command import train_on
+from pdhef_logtool.learning.network.train_command import dataset_for, train_on
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL
-from pdhef_logtool.residual_model.bundle import PAPER_FOLDER, SHIPPED
+from pdhef_logtool.residual_model.bundle import MODELS, NOMINAL_MODEL, PAPER_FOLDER, PHYSICS_MODEL, SHIPPED
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from studies.defaults import fit_physics
 from studies.pages import SAMPLE_VEHICLE, options
@@ -38,7 +37,7 @@ SETS = {"one_car": (1000, "default"), "other_cars": (2000, "randomised"), "evide
 DRIVES = 800
 #: Of the sets that nothing is trained on: for the card, and for the evidence that the network helps.
 OTHER_DRIVES = {"other_cars": 200, "evidence": 60}
-EPOCHS = 40
+EPOCHS, BASELINE_EPOCHS = 22, 40
 PAPER_EPOCHS = 15
 TRIALS = 64
 #: Wrong frictions and vehicle files that the intervals for an unsure car allow for.
@@ -84,32 +83,35 @@ def main(arguments: list[str] | None = None) -> int:
         say(f"simulate {count} drives: {name}")
         what = ["--count", count, "--seed", seed, "--vehicles", vehicles, "--jobs", given.jobs]
         pdhef("simulate", "suite", *what, "-o", work / name)
+    if given.seed == 0:
+        say("fit physics, whose residual the network learns")
+        fit_physics.main(["-o", str(car), "--work", str(work / "fit"), "--jobs", str(given.jobs)])
     say("extract")
     told = ["--car", car, "--mapping", mapping]
-    pdhef("extract", work / "one_car", "-o", work / "dataset", *told, "--jobs", given.jobs, "--resume")
-    say("train the residual network, and beside it the baselines on the same rows")
-    arguments = ["-o", network, "--baselines", "--seed", given.seed, "--epochs", given.epochs]
-    beside = _start("train", work / "dataset", *arguments)
+    # The paper's network and the baselines beside it have the nominal model, as the paper has it.
+    for model in MODELS:
+        output = ("-o", work / model, "--filter", model, "--jobs", given.jobs, "--resume")
+        pdhef("extract", work / "one_car", *told, *output)
+    say("train the residual network, and beside it the baselines on the same drives")
+    how = ("--baselines", "--seed", given.seed, "--epochs", BASELINE_EPOCHS)
+    beside = _start("train", work / NOMINAL_MODEL, "-o", network, *how)
     if given.jobs == 1:
         _finish(beside)
     torch.set_num_threads(1)  # small networks: a second thread brings nothing, a second process does
-    data = read_dataset(work / "dataset")
     recipe = Recipe(seed=given.seed, epochs=given.epochs)
 
     def epoch(text: str, _share: float) -> None:
         say(text)
 
-    train_on(data, network, recipe, progress=epoch)
-    say("train the paper's network on the same rows")
-    paper = replace(recipe, feature_names=PAPER_FEATURES, hidden=128, dropout=0.2, epochs=PAPER_EPOCHS)
-    train_on(data, network / PAPER_FOLDER, paper, progress=epoch)
+    train_on(dataset_for(work / PHYSICS_MODEL, PHYSICS_MODEL), network, recipe, progress=epoch)
+    say("train the paper's network on the same drives")
+    paper = replace(recipe, feature_names=PAPER_FEATURES, hidden=128, dropout=0.2, epochs=PAPER_EPOCHS, odd=False)
+    train_on(dataset_for(work / NOMINAL_MODEL, NOMINAL_MODEL), network / PAPER_FOLDER, paper, progress=epoch)
     _finish(beside)
     # The shipped network goes by its name, wherever the package lies.
     told += ["--network", SHIPPED if car.resolve() == HOME else network]
     validation = [work / "one_car", "--split", "validation", *told]
     if given.seed == 0:
-        say("fit physics")
-        fit_physics.main(["-o", str(car), "--work", str(work / "fit"), "--jobs", str(given.jobs)])
         say("tune the noise of all tuned estimators alike, on validation drives")
         pdhef("tune", *validation, "--trials", given.trials, "--jobs", given.jobs, "-o", car)
     say("evidence that the network helps on this car")

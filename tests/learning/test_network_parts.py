@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from residual_car import CAR, START_NS, drive, window
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.learning.network import baselines, extract_command, fit, train_command
 from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_dataset, run_baselines
 from pdhef_logtool.learning.network.dataset import (
@@ -27,6 +28,7 @@ from pdhef_logtool.learning.network.dataset import (
     drive_file,
     read_dataset,
     read_entry,
+    vehicle_entry,
     write_manifest,
 )
 from pdhef_logtool.learning.network.extract_command import ExtractSettings
@@ -43,7 +45,7 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, ModelError, OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, ModelBundle, Normalisation
-from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.runs.config import RunConfig
 
@@ -55,15 +57,15 @@ TINY = Recipe(FEATURES[:2], hidden=3, layers=1, head=(2,), epochs=9, batch=2, pa
 
 def test_without_truth_there_are_features_and_no_targets() -> None:
     whole = window(drive(2.0))
-    rows = join_rows(residual_windows([replace(whole, truth=None)], CAR, period_s=0.01))
-    with_truth = join_rows(residual_windows([whole], CAR, period_s=0.01))
+    rows = join_rows(residual_windows([replace(whole, truth=None)], PhysicsFilter(CAR), period_s=0.01))
+    with_truth = join_rows(residual_windows([whole], PhysicsFilter(CAR), period_s=0.01))
     np.testing.assert_array_equal(rows.features, with_truth.features)
     assert np.isnan(rows.targets).all() and np.isnan(rows.truth_velocity).all() and not rows.weight.any()
     np.testing.assert_allclose(rows.step_s[:-1], 0.01)
     assert math.isnan(rows.step_s[-1])
     # A window without a stamp changes nothing.
     signals = replace(whole.signals, stamps_ns=whole.signals.stamps_ns[:0])
-    same = join_rows(residual_windows([replace(whole, signals=signals), whole], CAR, period_s=0.01))
+    same = join_rows(residual_windows([replace(whole, signals=signals), whole], PhysicsFilter(CAR), period_s=0.01))
     np.testing.assert_array_equal(same.targets, with_truth.targets)
 
 
@@ -113,9 +115,13 @@ def residual_rows(count: int = 120, **changes: Any) -> ResidualRows:
 
 def entry_of(log: str, split: str, rows: ResidualRows, period_s: float = 0.01) -> dict[str, Any]:
     return {
-        "log": log, "split": split, "rows": len(rows), "usable_rows": int(rows.weight.sum()), "period_s": period_s,
-        "vehicle_sha256": "f" * 64,
+        "name": log, "log": log, "split": split, "rows": len(rows), "usable_rows": int(rows.weight.sum()),
+        "period_s": period_s,
+        "vehicle_sha256": "f" * 64, "source": {"file": log, "sha256": log}, "start_s": 0.0, "end_s": 1.0,
     }  # fmt: skip
+
+
+SETTINGS = {"a": 1, "model": "physics"}
 
 
 def write_dataset(folder: Path, **drives: tuple[str, ResidualRows]) -> None:
@@ -126,7 +132,7 @@ def write_dataset(folder: Path, **drives: tuple[str, ResidualRows]) -> None:
             writer.append(replace(rows, **{k: getattr(rows, k)[a : a + 35] for k in rows.__slots__}))
         entries.append(entry_of(log, split, rows, 0.02 if log == "z" else 0.01))
         writer.finish(entries[-1])
-    write_manifest(folder, entries, [], settings={"a": 1}, seed=3, vehicles=[("f" * 64, CAR)])
+    write_manifest(folder, entries, [], settings=SETTINGS, seed=3, vehicles={"f" * 64: vehicle_entry("f" * 64, CAR)})
 
 
 def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
@@ -147,7 +153,7 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
         "test": {"drives": 0, "rows": 0, "usable_rows": 0},
         "extra": {"drives": 1, "rows": 40, "usable_rows": 39},
     }
-    assert (document["period_s"], document["seed"], document["settings"]) == (0.01, 3, {"a": 1})
+    assert (document["period_s"], document["seed"], document["settings"]) == (0.01, 3, SETTINGS)
     assert document["drives"][2]["file"] == "drives/z.parquet"
     assert read_entry(drive_file(tmp_path, "z")) == entry_of("z", "train", rows, 0.02)
     data = read_dataset(tmp_path)
@@ -196,7 +202,7 @@ def test_parts_of_rows_change_no_byte_and_a_dropped_file_is_gone(tmp_path: Path)
     (tmp_path / "text.parquet").write_text("text")
     assert read_entry(tmp_path / "text.parquet") is None
     with pytest.raises(OutputError, match="extract it again"):
-        write_manifest(tmp_path, [entry_of("x", "train", rows)], [], settings={}, seed=0, vehicles=[])
+        write_manifest(tmp_path, [entry_of("x", "train", rows)], [], settings=SETTINGS, seed=0, vehicles={})
 
 
 # ---- extract ----
@@ -206,7 +212,7 @@ def test_settings_say_what_decides_a_dataset() -> None:
     plain = ExtractSettings(RunConfig(car=Path("a/b.toml"), end="5"))
     assert plain.to_dict() == {
         "car": "b.toml", "mapping": None, "start": None, "end": "5", "sensors": "full", "prefer_truth": "perfect",
-        "truth_smoothing": "auto", "split": None,
+        "truth_smoothing": "auto", "split": None, "model": "physics",
     }  # fmt: skip
     varied = ExtractSettings(RunConfig(friction=0.5), vary=0.1, seed=7).to_dict()
     assert (varied["friction"], varied["vary"], varied["vary_seed"]) == (0.5, 0.1, 7)
@@ -395,7 +401,7 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
         rows, split = residual_rows(60), "train" if job.log_input.stem == "a" else "test"
         writer = DriveWriter(drive_file(job.output, job.log_input.stem), split)
         writer.append(rows)
-        entry = {**entry_of(job.log_input.stem, split, rows), "vehicle_sha256": job.car.physics_sha256}
+        entry = {**entry_of(job.log_input.stem, split, rows), "vehicle_sha256": job.physics[0]}
         writer.finish(entry)
         return replace(extract_command._failure(job, ""), entry=entry)
 
@@ -452,7 +458,9 @@ def test_long_sequences_are_cut_and_what_teaches_nothing_is_left_out() -> None:
     assert (len(first.features), len(last.features)) == (1500, 100)
     assert first.features[:2].tolist() == [[-0.5, 2.0], [0.0, 2.0]]
     assert first.target[0].tolist() == [0.5, -0.5]
-    assert (first.target.dtype, last.weight.sum()) == (torch.float32, 100)
+    assert first.target.dtype == torch.float32
+    # A mean square of 0.25 and the floor.
+    assert (float(first.weight[0]), float(last.weight.sum())) == pytest.approx((1 / 0.35, 100 / 0.35))
     padded = fit._padded([first, last], "cpu")
     assert padded.features.shape == (2, 1500, 2) and not padded.weight[1, 100:].any()
 
@@ -496,9 +504,11 @@ def test_a_batch_runs_in_chunks_with_the_state_carried_but_not_its_gradient() ->
 def test_validation_is_the_weighted_mean_over_all_drives() -> None:
     network: Any = Constant(1.0).train()
     pieces = [_piece([1.0, 3.0], [1.0, 1.0]), _piece([4.0, 9.0], [2.0, 0.0])]
-    assert fit._validate(network, pieces, "cpu") == pytest.approx((0 + 4 + 2 * 9) / 4)
+    assert fit._validate(network, pieces, "cpu", None) == pytest.approx((0 + 4 + 2 * 9) / 4)
     assert not network.training
-    assert fit._validate(network, [_piece([4.0], [0.0])], "cpu") == math.inf
+    assert fit._validate(network, [_piece([4.0], [0.0])], "cpu", None) == math.inf
+    # What says the same to left and right says nothing, made odd.
+    assert fit._validate(network, pieces, "cpu", -torch.ones(1)) == pytest.approx((1 + 9 + 2 * 16) / 4)
 
 
 def test_the_rate_goes_up_for_three_tenths_and_down_to_nothing_or_decays() -> None:
@@ -633,7 +643,8 @@ def arrays(count: int = 200, **changes: Any) -> DriveArrays:
 def dataset(**drives: tuple[str, DriveArrays]) -> Any:
     held = tuple(SimpleNamespace(name=n, split=s, arrays=a) for n, (s, a) in drives.items())
     slow = SimpleNamespace(low_speed_blend_m_s=3.0)
-    return SimpleNamespace(drives=held, sha256="d" * 64, vehicle_name="a car", vehicle=lambda _drive: slow)
+    about = {"model": "physics", "physics_sha256": "e" * 64, "vehicle_name": "a car"}
+    return SimpleNamespace(drives=held, sha256="d" * 64, vehicle=lambda _drive: slow, **about)
 
 
 def test_runs_end_at_new_segments_and_short_or_worthless_ones_are_left_out() -> None:
@@ -804,7 +815,7 @@ def test_the_error_of_a_regression_is_over_all_known_rows() -> None:
 def test_both_baselines_are_made_by_one_recipe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[Any] = []
     model = LinearModel(("vx_m_s",), (0.5,), 0.01, 2.0, {"vehicle": "a car"})
-    monkeypatch.setattr(baselines, "read_dataset", lambda folder: ("data", folder))
+    monkeypatch.setattr(baselines, "dataset_for", lambda folder, model: ("data", folder, model))
     monkeypatch.setattr(baselines, "fit_dataset", lambda data, names: (asked.append((data, names)), model)[1])
     network = SimpleNamespace(to_dict=lambda: {"sha256": "x"})
 
@@ -815,8 +826,8 @@ def test_both_baselines_are_made_by_one_recipe(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(baselines, "train_on", trained)
     progress = print
     found = run_baselines(tmp_path / "d", tmp_path / "m", seed=3, epochs=2, progress=progress)
-    recipe = Recipe(seed=3, epochs=2)
-    data = ("data", tmp_path / "d")
+    recipe = Recipe(seed=3, epochs=2, feature_names=NOMINAL_FEATURES, odd=False)
+    data = ("data", tmp_path / "d", "phy-ukf")
     lstm = tmp_path / "m/baselines/pure-lstm"
     assert asked[0] == (data, recipe.feature_names)
     assert asked[1][:3] == (data, lstm, replace(recipe, target=LATERAL_VELOCITY))

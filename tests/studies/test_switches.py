@@ -86,15 +86,15 @@ def test_options_reach_both_filters_of_the_mixture() -> None:
 
 
 def test_a_part_of_physics_is_switched_in_its_model_and_ships_as_the_table_says() -> None:
-    found = make_estimator("physics", Car.load("saloon", network="none"))
-    assert isinstance(found, AdaptivePhysics)
-    shipped = found.physics
-    for part, on in shipped.vehicle.physics:
+    shipped = make_estimator("physics", Car.load("saloon", network="none"))
+    assert isinstance(shipped, AdaptivePhysics)
+    for part, on in shipped.physics.vehicle.physics:
         assert {s.default["physics"] for s in switches.SWITCHES if s.name == f"part {part.replace('_', ' ')}"} == {on}
         switched = switches.with_option(shipped, part, value=not on)
-        assert isinstance(switched, PhysicsFilter)
-        assert {n for n, has in switched.vehicle.physics if has != getattr(shipped.vehicle.physics, n)} == {part}
-        assert switched.q_std == shipped.q_std
+        assert isinstance(switched, AdaptivePhysics)
+        was, now = shipped.physics.vehicle.physics, switched.physics.vehicle.physics
+        assert {n for n, has in now if has != getattr(was, n)} == {part}
+        assert switched.physics.q_std == shipped.physics.q_std
 
 
 def test_both_sides_are_scored_where_both_say_something(drive: ConditionDrive) -> None:

@@ -339,7 +339,7 @@ def _check_counts(jobs: int, settings: ExtractSettings) -> None:
     if settings.split is not None and settings.split not in SPLITS:
         raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
     if settings.model not in MODELS:
-        raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--model")
+        raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--filter")
 
 
 def _plan_jobs(

@@ -112,7 +112,7 @@ def dataset_for(folder: Path, model: str) -> Dataset:
             expected=f"residuals of {model}",
             got=f"those of {data.model}",
             where=str(folder),
-            remedy=f"pdhef extract LOG... -o DATASET --model {model} writes them, into another folder",
+            remedy=f"pdhef extract LOG... -o DATASET --filter {model} writes them, into another folder",
         )
     return data
 
