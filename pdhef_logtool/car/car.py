@@ -21,6 +21,7 @@ from pdhef_logtool.car.parts import (
     FilterNoise,
     Fit,
     FittedPhysics,
+    FittedValues,
     Intervals,
     LearntOn,
     Noise,
@@ -71,10 +72,11 @@ class WithoutTruth:
     """The vehicle as driving without truth calibrated it, for the log that it is about.
 
     ``told_friction`` : whether the signals' friction is one that the calibration knew too; an estimate, made with the
-    file as it stands, is none. ``note`` : what a reader of the report must know.
+    file as it stands, is none. ``noise`` : of ``physics``. ``note`` : what a reader of the report must know.
     """
 
     vehicle: VehicleParameters
+    noise: FilterNoise
     told_friction: bool
     note: str
 
@@ -226,8 +228,9 @@ class Car:
         found = self.self_calibrated
         if found is None:
             return self
-        car = replace(self.with_vehicle(found.vehicle), self_calibrated=None)
-        return car if PHYSICS in car.noise else car.with_noise(PHYSICS, FilterNoise())
+        physics = FittedPhysics(values=FittedValues.of(found.vehicle), noise=found.noise)
+        car = replace(self.with_vehicle(found.vehicle), fitted_physics=physics, self_calibrated=None)
+        return car.with_noise(PHYSICS, found.noise)
 
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""

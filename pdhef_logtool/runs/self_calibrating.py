@@ -74,7 +74,7 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     if calibration.refused:
         return drive.car
     note = "not causal: its car was calibrated on the whole log, without truth"
-    found = WithoutTruth(calibration.vehicle, told_friction=_told(drive), note=note)
+    found = WithoutTruth(calibration.vehicle, calibration.noise, told_friction=_told(drive), note=note)
     return replace(drive.car, self_calibrated=found)
 
 

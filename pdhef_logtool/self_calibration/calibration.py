@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import (
     GRAVITY_M_S2,
@@ -70,6 +71,9 @@ AY_BIAS_STD, RATE_BIAS_STD, LEVER_STD_M, DELAY_STD_S = 0.1, 0.002, 1.0, 0.02
 #: Share of a bend's lateral acceleration that the road's bank carries; roads have to 0.4, tracks and test grounds 0.
 SUPERELEVATION_STD = 0.2
 
+#: Parts and noise of ``physics`` on a calibrated car, chosen on simulated sweeps and roads: the stiffness was found
+#: with the lag, and the bank takes up what roads do to a_y; what the model leaves of a_y is no white sensor noise.
+PARTS, AY_STD = ("lag", "bank"), 1.0
 #: A stiffness that is less well known is no calibration (sd of its logarithm): of a log that it serves alone, and of a
 #: pool that is exported. On simulated roads, which leave 0.16 to 0.22, the log's own calibration is better than a file
 #: that may be wrong by two, and hardly worse than the right one (docs/self_calibration.md).
@@ -168,9 +172,9 @@ class SelfCalibration:
         return max(found, default=math.inf)
 
     @property
-    def taken(self) -> bool:
-        """Whether estimators may use it."""
-        return not self.refused
+    def noise(self) -> FilterNoise:
+        """The noise of ``physics`` that belongs to it."""
+        return FilterNoise(r_std={"ay_m_s2": max(AY_STD, self.own.sensors.ay_std_m_s2)})
 
     @property
     def text(self) -> str:
@@ -376,7 +380,7 @@ class _Problem:
                 "sensors": own.sensors.model_copy(update=biases),
                 "imu_position_m": (v["lever of a_y"], *own.imu_position_m[1:]),
                 "relaxation_length_m": v["relaxation length"],
-                "physics": own.physics.model_copy(update={"lag": True}),  # the stiffness was found with it
+                "physics": own.physics.model_copy(update=dict.fromkeys(PARTS, True)),
             }
         )
 
