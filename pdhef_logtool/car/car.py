@@ -218,8 +218,7 @@ class Car:
     def has_evidence(self) -> bool:
         """Whether driving has shown this vehicle to be right: it was fitted, or its network was tried with it."""
         fitted = bool(self.learnt_on) or self.fitted_physics is not None
-        trust = self.trust
-        tried = trust is not None and trust.has_evidence and trust.physics_sha256 in (None, self.physics_sha256)
+        tried = self.trust is not None and self.trust.has_evidence and not self._other_than_tried
         return fitted or tried
 
     @property

@@ -54,7 +54,7 @@ def test_the_names_are_names_of_estimators() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["physics", "pd-hef-trust0"])
+@pytest.mark.parametrize("name", ["physics", "pd-hef"])
 def test_what_takes_it_is_not_causal_and_says_why(name: str) -> None:
     if name.startswith("pd-hef"):
         pytest.importorskip("torch")
