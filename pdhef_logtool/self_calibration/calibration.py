@@ -82,8 +82,9 @@ LEAST_KNOWN, LEAST_KNOWN_EXPORTED = 0.25, 0.15
 PLAUSIBLE_UNDERSTEER = (-2e-3, 12e-3)
 #: Least driving above the lowest speed.
 LEAST_S = 15.0
-#: Above this lateral acceleration a car that is steered against its bend drifts; so much of that time makes it a drift.
-DRIFT_AY, DRIFT_STEER_RAD, DRIFT_SHARE = 3.0, math.radians(2.0), 0.1
+#: Above this lateral acceleration a car that is steered against its bend drifts, on average over a second, for in fast
+#: slaloms the yaw rate follows the steering late; so much of that driving makes it a drift.
+DRIFT_AY, DRIFT_STEER_RAD, DRIFT_S, DRIFT_SHARE = 3.0, math.radians(1.0), 1.0, 0.1
 
 #: Where the search starts: θ by name.
 STARTS: tuple[dict[str, float], ...] = (
@@ -290,9 +291,8 @@ def drift_share(drives: Sequence[Driving], vehicle: VehicleParameters) -> float:
     """Return the share of hard driving in which the car is steered against its bend."""
     hard = against = 0
     for d in drives:
-        inside = _inside(d, 0)
-        rate, ay = d.columns[YAW_RATE][inside], d.columns[AY][inside]
-        steer = d.columns[STEER][inside] + d.read_with.steer_offset_rad - vehicle.steer_offset_rad
+        steer, rate, ay = (smoothed(d.columns[row], d.stretches, DRIFT_S) for row in (STEER, YAW_RATE, AY))
+        steer = steer + d.read_with.steer_offset_rad - vehicle.steer_offset_rad
         use = np.abs(ay) > DRIFT_AY
         hard += int(np.count_nonzero(use))
         against += int(np.count_nonzero(use & (steer * np.sign(rate) < -DRIFT_STEER_RAD)))
