@@ -74,10 +74,11 @@ class WithoutTruth:
     """The vehicle as driving without truth calibrated it, for the log that it is about.
 
     ``told_friction`` : whether the signals' friction is one that the calibration knew too; an estimate, made with the
-    file as it stands, is none. ``note`` : what a reader of the report must know.
+    file as it stands, is none. ``noise`` : of ``physics``. ``note`` : what a reader of the report must know.
     """
 
     vehicle: VehicleParameters
+    noise: FilterNoise
     told_friction: bool
     note: str
 
@@ -234,8 +235,7 @@ class Car:
     def has_evidence(self) -> bool:
         """Whether driving has shown this vehicle to be right: it was fitted, or its network was tried with it."""
         fitted = bool(self.learnt_on) or self.fitted_physics is not None
-        trust = self.trust
-        tried = trust is not None and trust.has_evidence and trust.physics_sha256 in (None, self.physics_sha256)
+        tried = self.trust is not None and self.trust.has_evidence and not self._other_than_tried
         return fitted or tried
 
     @property
@@ -244,8 +244,9 @@ class Car:
         found = self.self_calibrated
         if found is None:
             return self
-        car = replace(self.with_vehicle(found.vehicle), self_calibrated=None)
-        return car if PHYSICS in car.noise else car.with_noise(PHYSICS, FilterNoise())
+        physics = FittedPhysics(values=FittedValues.of(found.vehicle), noise=found.noise)
+        car = replace(self.with_vehicle(found.vehicle), fitted_physics=physics, self_calibrated=None)
+        return car.with_noise(PHYSICS, found.noise)
 
     def with_fit(self, fit: Fit) -> Car:
         """Return the car as identification found it; what was found of a network with other tyres counts no more."""

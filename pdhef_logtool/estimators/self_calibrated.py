@@ -23,7 +23,6 @@ SELF_CALIBRATED = frozenset(
         "pd-hef",
         "pd-hef-fixed-r",
         "pd-hef-smoothed",
-        "pd-hef-trust0",
         "pd-hef-trust1",
     }
 )

@@ -74,7 +74,7 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     if calibration.refused:
         return drive.car
     note = "not causal: its car was calibrated on the whole log, without truth"
-    found = WithoutTruth(calibration.vehicle, told_friction=_told(drive), note=note)
+    found = WithoutTruth(calibration.vehicle, calibration.noise, told_friction=_told(drive), note=note)
     return replace(drive.car, self_calibrated=found)
 
 
@@ -99,8 +99,11 @@ def log_sensors(vehicle: VehicleParameters, calibration: SelfCalibration | None)
 
 
 def _asked(config: RunConfig, car: Car) -> bool:
+    """Whether an estimator of a run takes a calibration; the paper's suite has no speed to calibrate with."""
     names = config.estimators
-    return not car.has_evidence and (names is None or bool({OPEN_LOOP, *SELF_CALIBRATED} & set(names)))
+    if car.has_evidence or config.sensors == "esp":
+        return False
+    return names is None or bool({OPEN_LOOP, *SELF_CALIBRATED} & set(names))
 
 
 def _told(drive: Drive) -> bool:

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import (
     GRAVITY_M_S2,
@@ -70,6 +71,9 @@ AY_BIAS_STD, RATE_BIAS_STD, LEVER_STD_M, DELAY_STD_S = 0.1, 0.002, 1.0, 0.02
 #: Share of a bend's lateral acceleration that the road's bank carries; roads have to 0.4, tracks and test grounds 0.
 SUPERELEVATION_STD = 0.2
 
+#: Parts and noise of ``physics`` on a calibrated car, chosen on simulated sweeps and roads: the stiffness was found
+#: with the lag, and the bank takes up what roads do to a_y; what the model leaves of a_y is no white sensor noise.
+PARTS, AY_STD = ("lag", "bank"), 1.0
 #: A stiffness that is less well known is no calibration (sd of its logarithm): of a log that it serves alone, and of a
 #: pool that is exported. On simulated roads, which leave 0.16 to 0.22, the log's own calibration is better than a file
 #: that may be wrong by two, and hardly worse than the right one (docs/self_calibration.md).
@@ -78,8 +82,9 @@ LEAST_KNOWN, LEAST_KNOWN_EXPORTED = 0.25, 0.15
 PLAUSIBLE_UNDERSTEER = (-2e-3, 12e-3)
 #: Least driving above the lowest speed.
 LEAST_S = 15.0
-#: Above this lateral acceleration a car that is steered against its bend drifts; so much of that time makes it a drift.
-DRIFT_AY, DRIFT_STEER_RAD, DRIFT_SHARE = 3.0, math.radians(2.0), 0.1
+#: Above this lateral acceleration a car that is steered against its bend drifts, on average over a second, for in fast
+#: slaloms the yaw rate follows the steering late; so much of that driving makes it a drift.
+DRIFT_AY, DRIFT_STEER_RAD, DRIFT_S, DRIFT_SHARE = 3.0, math.radians(1.0), 1.0, 0.1
 
 #: Where the search starts: θ by name.
 STARTS: tuple[dict[str, float], ...] = (
@@ -168,9 +173,9 @@ class SelfCalibration:
         return max(found, default=math.inf)
 
     @property
-    def taken(self) -> bool:
-        """Whether estimators may use it."""
-        return not self.refused
+    def noise(self) -> FilterNoise:
+        """The noise of ``physics`` that belongs to it."""
+        return FilterNoise(r_std={"ay_m_s2": max(AY_STD, self.own.sensors.ay_std_m_s2)})
 
     @property
     def text(self) -> str:
@@ -286,9 +291,8 @@ def drift_share(drives: Sequence[Driving], vehicle: VehicleParameters) -> float:
     """Return the share of hard driving in which the car is steered against its bend."""
     hard = against = 0
     for d in drives:
-        inside = _inside(d, 0)
-        rate, ay = d.columns[YAW_RATE][inside], d.columns[AY][inside]
-        steer = d.columns[STEER][inside] + d.read_with.steer_offset_rad - vehicle.steer_offset_rad
+        steer, rate, ay = (smoothed(d.columns[row], d.stretches, DRIFT_S) for row in (STEER, YAW_RATE, AY))
+        steer = steer + d.read_with.steer_offset_rad - vehicle.steer_offset_rad
         use = np.abs(ay) > DRIFT_AY
         hard += int(np.count_nonzero(use))
         against += int(np.count_nonzero(use & (steer * np.sign(rate) < -DRIFT_STEER_RAD)))
@@ -376,7 +380,7 @@ class _Problem:
                 "sensors": own.sensors.model_copy(update=biases),
                 "imu_position_m": (v["lever of a_y"], *own.imu_position_m[1:]),
                 "relaxation_length_m": v["relaxation length"],
-                "physics": own.physics.model_copy(update={"lag": True}),  # the stiffness was found with it
+                "physics": own.physics.model_copy(update=dict.fromkeys(PARTS, True)),
             }
         )
 

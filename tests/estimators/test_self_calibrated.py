@@ -9,6 +9,7 @@ import pytest
 from reference_car import cut, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
+from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import run_window
@@ -27,11 +28,11 @@ FOUND = OWN.model_copy(
         "sensors": OWN.sensors.model_copy(update={"ay_bias_m_s2": 0.1, "yaw_rate_bias_rad_s": 0.001}),
     }
 )
-NOTE = "calibrated"
+NOTE, NOISE = "calibrated", FilterNoise(r_std={"ay_m_s2": 1.0})
 
 
 def calibrated(vehicle: VehicleParameters = FOUND, *, told_friction: bool = True) -> Car:
-    return replace(Car.of(OWN), self_calibrated=WithoutTruth(vehicle, told_friction, NOTE))
+    return replace(Car.of(OWN), self_calibrated=WithoutTruth(vehicle, NOISE, told_friction, NOTE))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,8 @@ def test_the_names_are_names_of_estimators() -> None:
     assert SELF_CALIBRATED | {OPEN_LOOP} <= {s.name for s in SPECS}
 
 
-@pytest.mark.parametrize("name", ["physics", "pd-hef-trust0"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["physics", "pd-hef"])
 def test_what_takes_it_is_not_causal_and_says_why(name: str) -> None:
     if name.startswith("pd-hef"):
         pytest.importorskip("torch")

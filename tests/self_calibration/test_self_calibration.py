@@ -15,7 +15,7 @@ from reference_car import FRICTION, Drive, cut, drive, keep, with_noise
 
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.self_calibration.calibration import SelfCalibration, self_calibrate
+from pdhef_logtool.self_calibration.calibration import SelfCalibration, drift_share, self_calibrate
 from pdhef_logtool.self_calibration.driving import LEAST_SPEED_M_S, STEP_S, Driving, DrivingReader
 
 RIGHT = default_vehicle()
@@ -85,7 +85,7 @@ def test_the_calibrated_vehicle_reads_its_signals_with_what_was_found() -> None:
     signals = wide().signals
     calibration = found(replace(signals, steer_rad=signals.steer_rad + 0.005), RIGHT)
     assert calibration.vehicle.steer_offset_rad == pytest.approx(0.005, abs=1e-3)
-    assert calibration.vehicle.physics.lag
+    assert calibration.vehicle.physics.names == ("lag", "bank")
     assert calibration.vehicle.mass_kg == RIGHT.mass_kg
     assert calibration.own is RIGHT
 
@@ -155,3 +155,13 @@ def test_any_losses_give_a_grid_whose_stretches_are_whole(seed: int, share: floa
         assert np.isfinite(d.columns[:, a:b]).all()
         assert (d.columns[1, a:b] > LEAST_SPEED_M_S).all()
     assert (np.diff(d.stretches.ravel()) > 0).all()
+
+
+def test_a_fast_slalom_is_no_drift_and_a_held_counter_steer_is() -> None:
+    """In a fast slalom the yaw rate follows late, so that the steering is often against it."""
+    late = drive(lambda t: 0.02 * math.sin(2.0 * math.pi * t), 20.0).signals
+    late = replace(late, steer_rad=np.roll(late.steer_rad, -25))
+    assert drift_share([driving(late, RIGHT)], RIGHT) == 0.0
+    held = drive(lambda _t: 0.02, 20.0).signals
+    assert drift_share([driving(held, RIGHT)], RIGHT) == 0.0
+    assert drift_share([driving(replace(held, steer_rad=-2.0 * held.steer_rad), RIGHT)], RIGHT) > 0.9

@@ -12,7 +12,7 @@ from typing import Any
 
 from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
 from pdhef_logtool.car.flat import part_toml
-from pdhef_logtool.car.parts import FilterNoise, Fit, FittedPhysics, FittedValues, physics_sha256
+from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, physics_sha256
 from pdhef_logtool.car.store import Change, check_output, write_change
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.learning.drives import (
@@ -115,7 +115,7 @@ def fit_part(calibration: SelfCalibration, drives: Sequence[Any]) -> Fit:
     return Fit(
         physics_sha256=physics_sha256(own),
         values=FittedValues.between(own, vehicle),
-        physics=FittedPhysics(values=FittedValues.of(vehicle), noise=FilterNoise()),
+        physics=FittedPhysics(values=FittedValues.of(vehicle), noise=calibration.noise),
         without_truth=True,
         drives=tuple(drives),
         notes=(calibration.text, "no truth was looked at: what a drive with truth finds is worth more"),
