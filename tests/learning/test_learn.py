@@ -155,6 +155,13 @@ def test_what_is_worse_or_says_less_does_not_stay() -> None:
     assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
 
 
+def test_every_look_at_the_same_driving_is_counted(tmp_path: Path) -> None:
+    file = tmp_path / "looks.json"
+    looks = ([["a", 90.0, 100.0], ["b", 0.0, 10.0]], [["a", 100.0, 110.0]], [["b", 9.0, 20.0]], [["a", 95.0, 105.0]])
+    assert [learn_command._look(file, list(spans)) for spans in looks] == [1, 1, 2, 3]
+    assert learn_command._look(file, []) == 1
+
+
 @pytest.mark.parametrize(
     ("was", "now", "sure"), [(10, 8, True), (10, 7, False), (7, 7, True), (7, 6, False), (3, 4, True), (0, 0, True)]
 )
@@ -167,6 +174,7 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
     line = {"name": "pd-hef-smoothed, learnt", "causal": False, "share": 1.0, "covered": None}
     document = {
         "car_name": "a|b\x1b",
+        "looks": 2,
         "versions": {"tool": "1"},
         "parts": {"fit": {"usable_s": 30.4, "slices": ["x|y_0-30s"]}, "last": {"usable_s": 0.0, "slices": []}},
         "steps": [
@@ -187,6 +195,7 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
         "| one | undone | a: 0.500 | b: 0.750 | why |",
         "| two | not done | – | – | why not |",
         "Nothing was held out.",
+        "Some of it was scored 2 times",
         "| pd-hef-smoothed, learnt (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",
         "| physics, as given | – (no noise) |",
         "- more \\| driving",
@@ -309,7 +318,9 @@ def test_other_settings_begin_anew_and_so_does_fresh(
         return good(*args)
 
     monkeypatch.setattr(learn_command, "STEPS", {"good": step})
-    monkeypatch.setattr(learn_command, "_end", lambda *_: {"car_name": "x", "check": [], "last": [], "more": []})
+    monkeypatch.setattr(
+        learn_command, "_end", lambda *_: {"car_name": "x", "looks": 1, "check": [], "last": [], "more": []}
+    )
     logs = [str(sample_logs_dir / "road.mcap")]
     config = RunConfig(car=guess, start=SLICE.start, end=SLICE.end)
     for count, (holdout, fresh) in enumerate(((0.2, False), (0.3, False), (0.3, True)), start=1):

@@ -24,7 +24,9 @@ def page_markdown(document: Mapping[str, Any]) -> str:
         ("step", "came to", "before", "after", "evidence"),
         ([s["name"], s["status"], _figure(s["before"]), _figure(s["after"]), s["text"]] for s in document["steps"]),
     )
-    lines += ["## The last part, scored once", ""]
+    lines += ["## The last part, scored once at the end", ""]
+    if document["looks"] > 1:
+        lines += [f"Some of it was scored {document['looks']} times by now, in calls with this output: be wary.", ""]
     lines += _scores(document["last"]) if document["last"] else ["Nothing was held out.", ""]
     lines += ["## The same on the part *check*, which decided on the steps", "", *_scores(document["check"])]
     lines += ["## What more driving would pay", ""]
