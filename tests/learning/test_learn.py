@@ -172,14 +172,35 @@ def test_a_gain_is_not_worth_intervals_that_mean_nothing(was: int, now: int, sur
 
 def test_the_page_holds_any_name_and_what_was_not_known() -> None:
     line = {"name": "pd-hef-smoothed, learnt", "causal": False, "share": 1.0, "covered": None}
+    parameter = {
+        "name": "shape",
+        "unit": "1",
+        "value": 1.2,
+        "low95": 1.0,
+        "high95": 1.4,
+        "prior": 1.3,
+        "excited": False,
+    }
+    tried = [
+        {"parts": [], "held_out_deg": [0.2, 0.3], "taken": True},
+        {"parts": ["lag", "roll"], "held_out_deg": [0.1, 0.2], "taken": False},
+    ]
+    found = {"physics_parameters": [parameter], "physics": {"tried": tried}}
     document = {
         "car_name": "a|b\x1b",
         "looks": 2,
         "versions": {"tool": "1"},
         "parts": {"fit": {"usable_s": 30.4, "slices": ["x|y_0-30s"]}, "last": {"usable_s": 0.0, "slices": []}},
         "steps": [
-            {"name": "one", "status": "undone", "text": "why", "before": ["a", 0.5], "after": ["b", 0.75]},
-            {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None},
+            {
+                "name": "one",
+                "status": "undone",
+                "text": "why",
+                "before": ["a", 0.5],
+                "after": ["b", 0.75],
+                "figures": found,
+            },
+            {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None, "figures": {}},
         ],
         "check": [
             {**line, "rmse_deg": [0.1, None, None], "against_hybrid_deg": [-0.02, -0.03, 0.01]},
@@ -194,6 +215,9 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
         "x\\|y_0-30s |",
         "| one | undone | a: 0.500 | b: 0.750 | why |",
         "| two | not done | – | – | why not |",
+        "| shape | 1.2 | 1 to 1.4 | 1.3 | 1 | hardly more than the prior |",
+        "| none | 0.200 | 0.300 | taken |",
+        "| lag, roll | 0.100 | 0.200 |  |",
         "Nothing was held out.",
         "Some of it was scored 2 times",
         "| pd-hef-smoothed, learnt (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",

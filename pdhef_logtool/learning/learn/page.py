@@ -24,6 +24,8 @@ def page_markdown(document: Mapping[str, Any]) -> str:
         ("step", "came to", "before", "after", "evidence"),
         ([s["name"], s["status"], _figure(s["before"]), _figure(s["after"]), s["text"]] for s in document["steps"]),
     )
+    physics = [s for s in document["steps"] if "physics_parameters" in s["figures"]]
+    lines += [line for step in physics for line in _physics(step["figures"])]
     lines += ["## The last part, scored once at the end", ""]
     if document["looks"] > 1:
         lines += [f"Some of it was scored {document['looks']} times by now, in calls with this output: be wary.", ""]
@@ -46,6 +48,27 @@ def _parts(document: Mapping[str, Any]) -> list[str]:
     for name, part in document["parts"].items():
         rows.append([name, f"{part['usable_s']:.0f}", told[name], ", ".join(part["slices"]) or "–"])
     return ["## Parts", "", *_table(("part", "usable seconds", "for", "slices"), rows)]
+
+
+def _physics(figures: Mapping[str, Any]) -> list[str]:
+    """Return the tables of the parameters that were fitted and of the parts that were tried."""
+    rows = []
+    for p in figures["physics_parameters"]:
+        known = "" if p["excited"] else "hardly more than the prior"
+        interval = f"{p['low95']:.4g} to {p['high95']:.4g}"
+        rows.append([p["name"], f"{p['value']:.5g}", interval, f"{p['prior']:.4g}", p["unit"], known])
+    lines = ["## Physics", "", *_table(("parameter", "value", "95 %", "prior", "unit", "the drives say"), rows)]
+    tried = figures["physics"].get("tried", ())
+    if tried:
+        lines += [
+            "Parts of the model, each tried on two halves of the fit part, where one is fitted and the other scored:"
+        ]
+        cells = (
+            [", ".join(t["parts"]) or "none", *(f"{x:.3f}" for x in t["held_out_deg"]), "taken" if t["taken"] else ""]
+            for t in tried
+        )
+        lines += ["", *_table(("parts", "first half °", "second half °", ""), cells)]
+    return lines
 
 
 def _scores(lines: Iterable[Mapping[str, Any]]) -> list[str]:
