@@ -36,6 +36,7 @@ from pdhef_logtool.learning.learn.parts import (
     PARTS,
     WHOLE_DRIVES,
     DriveTimes,
+    all_but_last,
     divided,
     pieces_of,
     shares_of,
@@ -118,6 +119,11 @@ def test_shares_are_of_usable_driving_and_the_network_has_its_own_where_there_is
     assert usable[LAST] == pytest.approx(0.15 * 300.0 - GAP_S / 2, abs=0.5)
     much = split_drives([_times("a", [(0.0, OWN_NETWORK_PART_S + 1.0)])], 0.15)
     assert len(much[FIT]) == len(much[NETWORK]) == len(much[CHECK]) == 2 and len(much[LAST]) == 1
+    assert [s.span_s for s in all_but_last([little], 0.15)] == [(0.0, parts[LAST][0].span_s[0] - GAP_S)]
+    assert [s.span_s for s in all_but_last([little], 0.0)] == [(0.0, 599.95)]
+    many = [_times(f"d{i}", [(0.0, 20.0)]) for i in range(WHOLE_DRIVES)]
+    kept = {s.path for s in all_but_last(many, 0.2)}
+    assert kept == {t.log.path for t in many} - {s.path for s in split_drives(many, 0.2)[LAST]}
     for share in (0.0, 0.15, 0.5):
         assert sum(shares_of(100.0, share).values()) == pytest.approx(1.0)
         assert sum(shares_of(1000.0, share).values()) == pytest.approx(1.0)
@@ -155,6 +161,13 @@ def test_what_is_worse_or_says_less_does_not_stay() -> None:
     assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
 
 
+def test_every_look_at_the_same_driving_is_counted(tmp_path: Path) -> None:
+    file = tmp_path / "looks.json"
+    looks = ([["a", 90.0, 100.0], ["b", 0.0, 10.0]], [["a", 100.0, 110.0]], [["b", 9.0, 20.0]], [["a", 95.0, 105.0]])
+    assert [learn_command._look(file, list(spans)) for spans in looks] == [1, 1, 2, 3]
+    assert learn_command._look(file, []) == 1
+
+
 @pytest.mark.parametrize(
     ("was", "now", "sure"), [(10, 8, True), (10, 7, False), (7, 7, True), (7, 6, False), (3, 4, True), (0, 0, True)]
 )
@@ -165,13 +178,35 @@ def test_a_gain_is_not_worth_intervals_that_mean_nothing(was: int, now: int, sur
 
 def test_the_page_holds_any_name_and_what_was_not_known() -> None:
     line = {"name": "pd-hef-smoothed, learnt", "causal": False, "share": 1.0, "covered": None}
+    parameter = {
+        "name": "shape",
+        "unit": "1",
+        "value": 1.2,
+        "low95": 1.0,
+        "high95": 1.4,
+        "prior": 1.3,
+        "excited": False,
+    }
+    tried = [
+        {"parts": [], "held_out_deg": [0.2, 0.3], "taken": True},
+        {"parts": ["lag", "roll"], "held_out_deg": [0.1, 0.2], "taken": False},
+    ]
+    found = {"physics_parameters": [parameter], "physics": {"tried": tried}}
     document = {
         "car_name": "a|b\x1b",
+        "looks": 2,
         "versions": {"tool": "1"},
         "parts": {"fit": {"usable_s": 30.4, "slices": ["x|y_0-30s"]}, "last": {"usable_s": 0.0, "slices": []}},
         "steps": [
-            {"name": "one", "status": "undone", "text": "why", "before": ["a", 0.5], "after": ["b", 0.75]},
-            {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None},
+            {
+                "name": "one",
+                "status": "undone",
+                "text": "why",
+                "before": ["a", 0.5],
+                "after": ["b", 0.75],
+                "figures": found,
+            },
+            {"name": "two", "status": "not done", "text": "why not", "before": None, "after": None, "figures": {}},
         ],
         "check": [
             {**line, "rmse_deg": [0.1, None, None], "against_hybrid_deg": [-0.02, -0.03, 0.01]},
@@ -186,7 +221,11 @@ def test_the_page_holds_any_name_and_what_was_not_known() -> None:
         "x\\|y_0-30s |",
         "| one | undone | a: 0.500 | b: 0.750 | why |",
         "| two | not done | – | – | why not |",
+        "| shape | 1.2 | 1 to 1.4 | 1.3 | 1 | hardly more than the prior |",
+        "| none | 0.200 | 0.300 | taken |",
+        "| lag, roll | 0.100 | 0.200 |  |",
         "Nothing was held out.",
+        "Some of it was scored 2 times",
         "| pd-hef-smoothed, learnt (not causal) | 0.100 | 100 % | – | -0.020 [-0.030, 0.010] |",
         "| physics, as given | – (no noise) |",
         "- more \\| driving",
@@ -309,7 +348,9 @@ def test_other_settings_begin_anew_and_so_does_fresh(
         return good(*args)
 
     monkeypatch.setattr(learn_command, "STEPS", {"good": step})
-    monkeypatch.setattr(learn_command, "_end", lambda *_: {"car_name": "x", "check": [], "last": [], "more": []})
+    monkeypatch.setattr(
+        learn_command, "_end", lambda *_: {"car_name": "x", "looks": 1, "check": [], "last": [], "more": []}
+    )
     logs = [str(sample_logs_dir / "road.mcap")]
     config = RunConfig(car=guess, start=SLICE.start, end=SLICE.end)
     for count, (holdout, fresh) in enumerate(((0.2, False), (0.3, False), (0.3, True)), start=1):

@@ -11,7 +11,7 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -41,9 +41,10 @@ from pdhef_logtool.learning.drives import (
     tell_drive,
 )
 from pdhef_logtool.learning.learn.page import draw_page, page_markdown
-from pdhef_logtool.learning.learn.parts import CHECK, FIT, LAST, PARTS, DriveTimes, split_drives
+from pdhef_logtool.learning.learn.parts import CHECK, FIT, LAST, PARTS, DriveTimes, all_but_last, split_drives
 from pdhef_logtool.learning.learn.score import score_slices
 from pdhef_logtool.learning.learn.steps import (
+    ALL,
     BASELINE,
     HYBRID,
     SMOOTHED,
@@ -66,7 +67,7 @@ from pdhef_logtool.sinks.report import json_bytes
 FORMAT, FORMAT_VERSION = "pdhef-learn", 1
 #: In the car's folder: the steps' results, and what is told of them.
 WORK, RECORD_FILE, PAGE_FILE, PLOT_FILE = "learn", "learn.record.json", "learn.md", "learn.png"
-STEP_FILE, CAR = "step.json", "car"
+STEP_FILE, CAR, LOOKS_FILE = "step.json", "car", "looks.json"
 #: What may come of a step.
 KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
 #: Steps that do not stay where they change nothing, or where the 95 % intervals then hold less than a share of the
@@ -129,9 +130,10 @@ class CourseResult(LearnResult):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Course:
-    """One call of the command: what it learns with, where, and whom it tells."""
+    """One call of the command: what it learns with, the logs' hashes, where, and whom it tells."""
 
     lesson: Lesson
+    logs: Mapping[Path, str]
     work: Path
     basis: str
     progress: Callable[[str, float], None]
@@ -180,14 +182,16 @@ def learn(
         raise EstimatorError(
             expected="driving to fit and to check", got="too little of one", where="learn", remedy="give longer drives"
         )
-    lesson = Lesson(config, mapping, parts, tuple(times), settings.seed, settings.trials)
+    everything = all_but_last(times, settings.holdout)
+    lesson = Lesson(config, mapping, parts, tuple(times), everything, settings.seed, settings.trials)
     if not (output / VEHICLE_FILE).is_file():
         write_bytes(output / VEHICLE_FILE, vehicle_file(given))
     work = output / WORK
     with OutputFolder(work, (".",)):
         start = _begin(work, given, fresh=fresh)
         basis = digest(_basis(settings, given, records, parts, lesson))
-        course = _Course(lesson, work, basis, progress, say)
+        logs = {i.path: r.sha256 for i, r in zip(inputs, records, strict=True)}
+        course = _Course(lesson, logs, work, basis, progress, say)
         steps, car = _teach(course, start)
         figures = {s.name: s.figures for s in steps if s.status == KEPT}
         kept = [s.name for s in steps if s.status == KEPT]
@@ -344,7 +348,7 @@ def _share(number: int) -> float:
 def _shown(found: dict[str, Any]) -> str:
     """Return what came of a step in a line."""
     if "status" not in found:
-        return "scored once"
+        return "the last part is scored" + ("" if found["looks"] == 1 else f", for the {found['looks']}th time")
     if found["after"] is None:
         return f"{found['status']}: {found['text']}"
     (old, was), (new, now) = found["before"], found["after"]
@@ -424,14 +428,32 @@ def _end(course: _Course, start: Path, car: Path, figures: dict[str, dict[str, A
     """Score the last part once; say what more driving would pay."""
     lesson = course.lesson
     course.progress("scoring the last part, once", _share(len(STEPS) + 1))
-    curve = learning_curve(lesson, car, course.progress)
+    curve = figures[ALL]["curve"] if ALL in figures else learning_curve(lesson, car, course.progress)
+    looks = _look(course.work / LOOKS_FILE, [[course.logs[s.path], *(s.span_s or ())] for s in lesson.parts[LAST]])
     tables = {part: table_of(lesson, start, car, part) for part in (CHECK, LAST)}
     return {
         "car_name": Car.load(car).vehicle.name,
+        "looks": looks,
         **tables,
         "curve": curve,
         "more": what_more_would_pay(lesson, figures, curve),
     }
+
+
+def _look(file: Path, spans: list[list[Any]]) -> int:
+    """Remember that spans [hash of the log, start, end] are scored now; return how often any was, this time included.
+
+    The file outlives ``--fresh`` and other settings: who tries until the last part looks well has fitted to it.
+    """
+    earlier: list[list[list[Any]]] = []
+    with suppress(OSError, ValueError, RecursionError):
+        earlier = json.loads(file.read_text(encoding="utf-8"))["looks"]
+    write_bytes(file, json_bytes({"looks": [*earlier, spans]}))
+
+    def meets(one: list[Any], other: list[Any]) -> bool:
+        return bool(one[0] == other[0] and min(one[2], other[2]) > max(one[1], other[1]))
+
+    return 1 + sum(any(meets(a, b) for a in look for b in spans) for look in earlier)
 
 
 def table_of(lesson: Lesson, start: Path, learnt: Path, part: str) -> list[dict[str, Any]]:

@@ -24,9 +24,16 @@ def page_markdown(document: Mapping[str, Any]) -> str:
         ("step", "came to", "before", "after", "evidence"),
         ([s["name"], s["status"], _figure(s["before"]), _figure(s["after"]), s["text"]] for s in document["steps"]),
     )
-    lines += ["## The last part, scored once", ""]
+    physics = [s for s in document["steps"] if "physics_parameters" in s["figures"]]
+    lines += [line for step in physics for line in _physics(step["figures"])]
+    lines += ["## The last part, scored once at the end", ""]
+    if document["looks"] > 1:
+        lines += [f"Some of it was scored {document['looks']} times by now, in calls with this output: be wary.", ""]
     lines += _scores(document["last"]) if document["last"] else ["Nothing was held out.", ""]
-    lines += ["## The same on the part *check*, which decided on the steps", "", *_scores(document["check"])]
+    lines += ["## The same on the part *check*, which decided on the steps", ""]
+    if any(s["name"] == "all" and s["status"] == "kept" for s in document["steps"]):
+        lines += ["Physics was fitted to it as well in the end: these figures are no evidence.", ""]
+    lines += _scores(document["check"])
     lines += ["## What more driving would pay", ""]
     lines += [f"- {_text(text)}" for text in document["more"]] or ["- nothing is known to be missing"]
     lines += ["", "Versions: " + ", ".join(f"{k} {v}" for k, v in sorted(document["versions"].items()))]
@@ -44,6 +51,27 @@ def _parts(document: Mapping[str, Any]) -> list[str]:
     for name, part in document["parts"].items():
         rows.append([name, f"{part['usable_s']:.0f}", told[name], ", ".join(part["slices"]) or "–"])
     return ["## Parts", "", *_table(("part", "usable seconds", "for", "slices"), rows)]
+
+
+def _physics(figures: Mapping[str, Any]) -> list[str]:
+    """Return the tables of the parameters that were fitted and of the parts that were tried."""
+    rows = []
+    for p in figures["physics_parameters"]:
+        known = "" if p["excited"] else "hardly more than the prior"
+        interval = f"{p['low95']:.4g} to {p['high95']:.4g}"
+        rows.append([p["name"], f"{p['value']:.5g}", interval, f"{p['prior']:.4g}", p["unit"], known])
+    lines = ["## Physics", "", *_table(("parameter", "value", "95 %", "prior", "unit", "the drives say"), rows)]
+    tried = figures["physics"].get("tried", ())
+    if tried:
+        lines += [
+            "Parts of the model, each tried on two halves of the fit part, where one is fitted and the other scored:"
+        ]
+        cells = (
+            [", ".join(t["parts"]) or "none", *(f"{x:.3f}" for x in t["held_out_deg"]), "taken" if t["taken"] else ""]
+            for t in tried
+        )
+        lines += ["", *_table(("parts", "first half °", "second half °", ""), cells)]
+    return lines
 
 
 def _scores(lines: Iterable[Mapping[str, Any]]) -> list[str]:
