@@ -161,6 +161,18 @@ def test_what_is_worse_or_says_less_does_not_stay() -> None:
     assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
 
 
+def test_noise_must_be_better_beyond_doubt() -> None:
+    def errors(size: np.ndarray) -> Errors:
+        return Errors("x", size, np.arange(size.size) * 100_000_000)
+
+    rng = np.random.default_rng(0)
+    old = rng.normal(0.0, 1.0, 900)
+    assert learn_command._confirmed(errors(old), errors(0.9 * old))
+    assert not learn_command._confirmed(errors(old[:700]), errors(0.9 * old[:700]))  # of seven blocks
+    assert not learn_command._confirmed(errors(old), errors(rng.normal(0.0, 0.99, 900)))
+    assert not learn_command._confirmed(errors(0.9 * old), errors(old))
+
+
 def test_every_look_at_the_same_driving_is_counted(tmp_path: Path) -> None:
     file = tmp_path / "looks.json"
     looks = ([["a", 90.0, 100.0], ["b", 0.0, 10.0]], [["a", 100.0, 110.0]], [["b", 9.0, 20.0]], [["a", 95.0, 105.0]])
