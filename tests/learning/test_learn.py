@@ -36,7 +36,6 @@ from pdhef_logtool.learning.learn.parts import (
     PARTS,
     WHOLE_DRIVES,
     DriveTimes,
-    all_but_last,
     divided,
     pieces_of,
     shares_of,
@@ -119,11 +118,6 @@ def test_shares_are_of_usable_driving_and_the_network_has_its_own_where_there_is
     assert usable[LAST] == pytest.approx(0.15 * 300.0 - GAP_S / 2, abs=0.5)
     much = split_drives([_times("a", [(0.0, OWN_NETWORK_PART_S + 1.0)])], 0.15)
     assert len(much[FIT]) == len(much[NETWORK]) == len(much[CHECK]) == 2 and len(much[LAST]) == 1
-    assert [s.span_s for s in all_but_last([little], 0.15)] == [(0.0, parts[LAST][0].span_s[0] - GAP_S)]
-    assert [s.span_s for s in all_but_last([little], 0.0)] == [(0.0, 599.95)]
-    many = [_times(f"d{i}", [(0.0, 20.0)]) for i in range(WHOLE_DRIVES)]
-    kept = {s.path for s in all_but_last(many, 0.2)}
-    assert kept == {t.log.path for t in many} - {s.path for s in split_drives(many, 0.2)[LAST]}
     for share in (0.0, 0.15, 0.5):
         assert sum(shares_of(100.0, share).values()) == pytest.approx(1.0)
         assert sum(shares_of(1000.0, share).values()) == pytest.approx(1.0)

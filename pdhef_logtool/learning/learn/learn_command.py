@@ -42,10 +42,9 @@ from pdhef_logtool.learning.drives import (
 )
 from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
 from pdhef_logtool.learning.learn.page import draw_page, page_markdown
-from pdhef_logtool.learning.learn.parts import CHECK, FIT, LAST, PARTS, DriveTimes, all_but_last, split_drives
+from pdhef_logtool.learning.learn.parts import CHECK, FIT, LAST, PARTS, DriveTimes, split_drives
 from pdhef_logtool.learning.learn.score import score_slices
 from pdhef_logtool.learning.learn.steps import (
-    ALL,
     BASELINE,
     HYBRID,
     SMOOTHED,
@@ -185,8 +184,7 @@ def learn(
         raise EstimatorError(
             expected="driving to fit and to check", got="too little of one", where="learn", remedy="give longer drives"
         )
-    everything = all_but_last(times, settings.holdout)
-    lesson = Lesson(config, mapping, parts, tuple(times), everything, settings.seed, settings.trials)
+    lesson = Lesson(config, mapping, parts, tuple(times), settings.seed, settings.trials)
     if not (output / VEHICLE_FILE).is_file():
         write_bytes(output / VEHICLE_FILE, vehicle_file(given))
     work = output / WORK
@@ -440,7 +438,7 @@ def _end(course: _Course, start: Path, car: Path, figures: dict[str, dict[str, A
     """Score the last part once; say what more driving would pay."""
     lesson = course.lesson
     course.progress("scoring the last part, once", _share(len(STEPS) + 1))
-    curve = figures[ALL]["curve"] if ALL in figures else learning_curve(lesson, car, course.progress)
+    curve = learning_curve(lesson, car, course.progress)
     looks = _look(course.work / LOOKS_FILE, [[course.logs[s.path], *(s.span_s or ())] for s in lesson.parts[LAST]])
     tables = {part: table_of(lesson, start, car, part) for part in (CHECK, LAST)}
     return {
