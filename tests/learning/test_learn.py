@@ -36,7 +36,6 @@ from pdhef_logtool.learning.learn.parts import (
     PARTS,
     WHOLE_DRIVES,
     DriveTimes,
-    all_but_last,
     divided,
     pieces_of,
     shares_of,
@@ -119,11 +118,6 @@ def test_shares_are_of_usable_driving_and_the_network_has_its_own_where_there_is
     assert usable[LAST] == pytest.approx(0.15 * 300.0 - GAP_S / 2, abs=0.5)
     much = split_drives([_times("a", [(0.0, OWN_NETWORK_PART_S + 1.0)])], 0.15)
     assert len(much[FIT]) == len(much[NETWORK]) == len(much[CHECK]) == 2 and len(much[LAST]) == 1
-    assert [s.span_s for s in all_but_last([little], 0.15)] == [(0.0, parts[LAST][0].span_s[0] - GAP_S)]
-    assert [s.span_s for s in all_but_last([little], 0.0)] == [(0.0, 599.95)]
-    many = [_times(f"d{i}", [(0.0, 20.0)]) for i in range(WHOLE_DRIVES)]
-    kept = {s.path for s in all_but_last(many, 0.2)}
-    assert kept == {t.log.path for t in many} - {s.path for s in split_drives(many, 0.2)[LAST]}
     for share in (0.0, 0.15, 0.5):
         assert sum(shares_of(100.0, share).values()) == pytest.approx(1.0)
         assert sum(shares_of(1000.0, share).values()) == pytest.approx(1.0)
@@ -159,6 +153,18 @@ def test_what_is_worse_or_says_less_does_not_stay() -> None:
     assert _compare(_errors(nan, *[1.0] * 10), _errors(9.0, *[0.5] * 10))[1] is True
     assert _compare(_errors(*[1.0] * 10), _errors(nan, nan, *[0.5] * 8))[1] is False
     assert _compare(_errors(1.0, nan), _errors(nan, 1.0))[1] is False
+
+
+def test_noise_must_be_better_beyond_doubt() -> None:
+    def errors(size: np.ndarray) -> Errors:
+        return Errors("x", size, np.arange(size.size) * 100_000_000)
+
+    rng = np.random.default_rng(0)
+    old = rng.normal(0.0, 1.0, 900)
+    assert learn_command._confirmed(errors(old), errors(0.9 * old))
+    assert not learn_command._confirmed(errors(old[:700]), errors(0.9 * old[:700]))  # of seven blocks
+    assert not learn_command._confirmed(errors(old), errors(rng.normal(0.0, 0.99, 900)))
+    assert not learn_command._confirmed(errors(0.9 * old), errors(old))
 
 
 def test_every_look_at_the_same_driving_is_counted(tmp_path: Path) -> None:

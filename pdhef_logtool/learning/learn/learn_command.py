@@ -25,8 +25,8 @@ from pdhef_logtool.car.parts import PHYSICS, digest
 from pdhef_logtool.car.store import Change, check_output, update_car, vehicle_file
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import spec_of
-from pdhef_logtool.evaluation.bootstrap import Interval
-from pdhef_logtool.evaluation.comparison import Compared, Errors, compare
+from pdhef_logtool.evaluation.bootstrap import Interval, block_bootstrap_difference
+from pdhef_logtool.evaluation.comparison import BLOCK_S, Compared, Errors, compare
 from pdhef_logtool.learning.car.axle_forces import usable_stamps
 from pdhef_logtool.learning.car.fit_data import load_fit_drive, period_s
 from pdhef_logtool.learning.drives import (
@@ -40,11 +40,11 @@ from pdhef_logtool.learning.drives import (
     record_head,
     tell_drive,
 )
+from pdhef_logtool.learning.evidence.trust import MIN_BLOCKS
 from pdhef_logtool.learning.learn.page import draw_page, page_markdown
-from pdhef_logtool.learning.learn.parts import CHECK, FIT, LAST, PARTS, DriveTimes, all_but_last, split_drives
+from pdhef_logtool.learning.learn.parts import CHECK, FIT, LAST, PARTS, DriveTimes, split_drives
 from pdhef_logtool.learning.learn.score import score_slices
 from pdhef_logtool.learning.learn.steps import (
-    ALL,
     BASELINE,
     HYBRID,
     SMOOTHED,
@@ -73,6 +73,8 @@ KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
 #: Steps that do not stay where they change nothing, or where the 95 % intervals then hold less than a share of the
 #: errors and less than before: simpler is better, and a gain is not worth an interval that means nothing.
 MUST_GAIN, LEAST_COVERED = ("noise", "training"), 0.8
+#: Identification has found noise through the filter already: another has to be better beyond doubt.
+MUST_CONFIRM = ("noise",)
 #: Usable driving below which nothing is left to fit, to check and to score.
 LEAST_S = 50.0
 #: A candidate that gives an estimate at fewer of the stamps counts as worse.
@@ -182,8 +184,7 @@ def learn(
         raise EstimatorError(
             expected="driving to fit and to check", got="too little of one", where="learn", remedy="give longer drives"
         )
-    everything = all_but_last(times, settings.holdout)
-    lesson = Lesson(config, mapping, parts, tuple(times), everything, settings.seed, settings.trials)
+    lesson = Lesson(config, mapping, parts, tuple(times), settings.seed, settings.trials)
     if not (output / VEHICLE_FILE).is_file():
         write_bytes(output / VEHICLE_FILE, vehicle_file(given))
     work = output / WORK
@@ -374,11 +375,14 @@ def _step(course: _Course, name: str, before: Path, folder: Path) -> dict[str, A
     old, new = (_held_out(lesson, car) for car in (before, folder / CAR))
     (was, now), gains = _compare(old, new)
     unsure = name in MUST_GAIN and not _still_sure(old, new)
-    stays = not unsure and (gains is True if name in MUST_GAIN else gains is not False)
+    doubtful = name in MUST_CONFIRM and not _confirmed(old, new)
+    stays = not unsure and not doubtful and (gains is True if name in MUST_GAIN else gains is not False)
     _tidy(folder, keep_car=stays)
     return {
         "status": KEPT if stays else UNDONE,
-        "text": taught.text + ("; its 95 % intervals hold too few of the errors" if unsure else ""),
+        "text": taught.text
+        + ("; its 95 % intervals hold too few of the errors" if unsure else "")
+        + ("; a gain is not confirmed" if doubtful else ""),
         "before": [old.name, was],
         "after": [new.name, now],
         "figures": taught.figures,
@@ -421,6 +425,12 @@ def _still_sure(old: Errors, new: Errors) -> bool:
     return now >= min(was, LEAST_COVERED)
 
 
+def _confirmed(old: Errors, new: Errors) -> bool:
+    """Return whether the 95 % bounds of a paired block bootstrap say that the new one is better."""
+    found = block_bootstrap_difference(new.error, old.error, new.stamps_ns, block_s=BLOCK_S)
+    return found.blocks >= MIN_BLOCKS and found.high < 0.0
+
+
 # ---- the end ----
 
 
@@ -428,7 +438,7 @@ def _end(course: _Course, start: Path, car: Path, figures: dict[str, dict[str, A
     """Score the last part once; say what more driving would pay."""
     lesson = course.lesson
     course.progress("scoring the last part, once", _share(len(STEPS) + 1))
-    curve = figures[ALL]["curve"] if ALL in figures else learning_curve(lesson, car, course.progress)
+    curve = learning_curve(lesson, car, course.progress)
     looks = _look(course.work / LOOKS_FILE, [[course.logs[s.path], *(s.span_s or ())] for s in lesson.parts[LAST]])
     tables = {part: table_of(lesson, start, car, part) for part in (CHECK, LAST)}
     return {

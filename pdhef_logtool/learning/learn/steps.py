@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.car.car import INTERVALS_FILE, NETWORK_FILE, NETWORK_FOLDER, NO_INTERVALS, NOISE_FILE, Car
+from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.estimators.table import spec_of
@@ -42,8 +42,6 @@ from pdhef_logtool.runs.config import RunConfig
 
 #: The filter that follows the network, whose intervals and trust are learnt; and that smoothed.
 HYBRID, SMOOTHED = "pd-hef", "pd-hef-smoothed"
-#: The step that learns from all but the last part.
-ALL = "all"
 #: The baseline that runs on every vehicle file.
 BASELINE = "phy-ukf"
 #: Estimators whose intervals are calibrated.
@@ -69,16 +67,12 @@ TEACHING = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lesson:
-    """What every step is given: the configuration, slices of drives by part, and how long a search may be.
-
-    ``everything``: slices of all but the last part.
-    """
+    """What every step is given: the configuration, slices of drives by part, and how long a search may be."""
 
     config: RunConfig
     mapping: SignalMapping | None
     parts: Mapping[str, tuple[LogInput, ...]]
     times: tuple[DriveTimes, ...]
-    everything: tuple[LogInput, ...]
     seed: int = 0
     trials: int = 64
 
@@ -135,18 +129,15 @@ def learn_noise(lesson: Lesson, before: Path, output: Path, progress: Progress) 
     """Search the noise of ``physics`` on the fit part, as every filter's is searched."""
     if not spec_of(PHYSICS).tunable:
         raise EstimatorError(expected=f"a search for the noise of {PHYSICS}", got="none", where="noise")
-    (found,) = tune(lesson.parts[FIT], output, _tuning(lesson, before), progress=progress).tuned
+    settings = TuneSettings(
+        config=lesson.config_for(before), names=(PHYSICS,), trials=lesson.trials, seed=lesson.seed, any_split=True
+    )
+    (found,) = tune(lesson.parts[FIT], output, settings, progress=progress).tuned
     score = found.best.score.objective_deg
     text = f"best of {len(found.trials)} trials: {score:.4f}° on the fit part"
     if found.before is not None:
         text += f", {found.before.objective_deg:.4f}° with the noise that identification found"
     return Taught(text, {"fit_deg": score, "trial": found.best.number})
-
-
-def _tuning(lesson: Lesson, car: Path) -> TuneSettings:
-    return TuneSettings(
-        config=lesson.config_for(car), names=(PHYSICS,), trials=lesson.trials, seed=lesson.seed, any_split=True
-    )
 
 
 def try_network(lesson: Lesson, before: Path, output: Path, progress: Progress) -> Taught:
@@ -202,32 +193,6 @@ def learn_intervals(lesson: Lesson, before: Path, output: Path, progress: Progre
     return Taught(f"{names}, on {len(pieces)} pieces of the check part", {"coverage": coverage})
 
 
-def learn_from_all(lesson: Lesson, before: Path, output: Path, progress: Progress) -> Taught:
-    """Find physics and noise once more with the choices that were made, on all but the last part.
-
-    Only where more driving pays, by what half of the fit part was worth, and where nothing rests on a check part that
-    physics was not fitted to. The trust is found anew there: against a physics that has seen it, a network has it hard.
-    """
-    car = Car.load(before)
-    if car.fitted_physics is None:
-        raise EstimatorError(expected="physics that was found here", got="none", where=ALL)
-    if car.source is not None and (car.source / INTERVALS_FILE).is_file():
-        raise EstimatorError(expected="no intervals, which rest on the check part", got="some", where=ALL)
-    curve = learning_curve(lesson, before, progress)
-    if curve is None or not curve["whole_deg"] < curve["half_deg"]:
-        raise EstimatorError(expected="a gain of all of the fit part over half of it", got="none", where=ALL)
-    parts = car.physics_vehicle.physics or PhysicsParts()
-    identify(lesson.everything, output, lesson.config_for(before), holdout=0.0, parts=parts, progress=progress)
-    if (before / NOISE_FILE).is_file():
-        tune(lesson.everything, output, _tuning(lesson, output), progress=progress)
-    if (before / NETWORK_FILE).is_file():
-        own = before / NETWORK_FOLDER
-        _trusted(lesson, output, output, own if own.is_dir() else Path(car.network_name), progress)
-    seconds = sum(d.seconds for d in usable_in(lesson.times, lesson.everything))
-    text = f"fitted to {seconds:.0f} s, the check part among them: its figure there is no evidence, the last part's is"
-    return Taught(text, {"curve": curve})
-
-
 #: In the order in which they are done; each begins with the car that the ones before have left.
 STEPS: dict[str, Teach] = {
     "physics": learn_physics,
@@ -235,7 +200,6 @@ STEPS: dict[str, Teach] = {
     "network": try_network,
     "training": train_network,
     "intervals": learn_intervals,
-    ALL: learn_from_all,
 }
 
 
