@@ -139,14 +139,14 @@ class Drive:
         self.notes.append(text)
         self._tell(f"{self.name}: {text}")
 
-    def windows(self, *, fill_friction: bool = True) -> Iterator[DriveWindow]:
+    def windows(self, *, fill_friction: bool = True, window_s: float | None = None) -> Iterator[DriveWindow]:
         """Read the drive once from start to end; joined, the windows are bit-identical to one window over all.
 
         Parameters
         ----------
-        fill_friction : False leaves the friction that the log says.
+        fill_friction : False leaves the friction that the log says. window_s : None: that of the options.
         """
-        self._reader = DriveReader(self.log, self.plan, self.options.window_s)
+        self._reader = DriveReader(self.log, self.plan, self.options.window_s if window_s is None else window_s)
         if not fill_friction:
             return self._reader.windows()
         self.friction = self.friction.afresh()

@@ -34,7 +34,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.guard import GUARDED, Distrust, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, log_sensors, self_calibrated
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.report import (
@@ -245,7 +245,9 @@ def run_log(
     """
     progress(log_input.stem, 0.0)
     with read_drive(log_input, car, mapping, config.read_options, tell=warn) as drive:
-        calibration = pool if pool is not None else calibrate_drive(drive, config)
+        calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
+        if calibration is not None:
+            drive.tell(calibration.text)
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
         job = _Job(drive, car, calibration, ready, skipped)

@@ -21,7 +21,8 @@ from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.runs import guard
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.pipeline import run_logs
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, read_driving
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, read_driving, self_calibrated
+from pdhef_logtool.self_calibration.calibration import self_calibrate
 from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
@@ -162,3 +163,20 @@ def test_a_car_with_evidence_keeps_its_estimate_and_is_warned_of(
     report = run(sample_logs_dir / "sweep.mcap", car, tmp_path, estimators=("zero", "pd-hef"), end=None)
     assert all(e["causal"] for e in report["estimators"])
     assert any("WARNING" in w for w in report["warnings"])
+
+
+def test_a_calibration_that_contradicts_the_sensors_more_than_the_file_is_refused(
+    sample_logs_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guard, "FACTOR", 1.1)
+    car = Car.load(sample_logs_dir / "vehicle.toml")
+    with read_drive(sample_logs_dir / "sweep.mcap", car) as drive:
+        good = self_calibrate([read_driving(drive)] * 2, car.vehicle)  # twice, so that it is long enough
+        assert not good.refused
+        assert checked(drive, good) is good
+        loose = car.vehicle.tyres.rear.model_copy(update={"B": 1.0})
+        tyres = car.vehicle.tyres.model_copy(update={"rear": loose})
+        bad = checked(drive, replace(good, vehicle=car.vehicle.model_copy(update={"tyres": tyres})))
+        assert bad is not None
+        assert "contradicts the sensors more" in bad.refused
+        assert self_calibrated(drive, bad) is car
