@@ -204,8 +204,8 @@ Written by `python -m studies.many_cars_table`; networks by `make train-default`
 The network for many cars knows mass, geometry, stiffness and peak force of the vehicle file as inputs. It learns from
 {many_cars.CARS} simulated saloons and SUVs with {many_cars.DRIVES_PER_CAR} drives of {many_cars.DRIVE_S:g} s each, all
 with vehicle files and sensors of their own, after `physics` of each was identified on {many_cars.FIT_DRIVES} of its
-drives; the residuals are those of the others, and so are the drives that are scored. Friction is told. Filter noise of all
-estimators is the shipped car's, but that of `physics`: it has no part on a car of which nothing was found.
+drives; the residuals are those of the others, and so are the drives that are scored. Friction is told. Filter noise of
+all estimators is the shipped car's, but that of `physics`: it has no part on a car of which nothing was found.
 
 {chr(10).join(parts)}"""
 

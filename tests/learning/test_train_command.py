@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -102,10 +103,15 @@ def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_
 
 def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="epoch"):
-        run_training(dataset / "train", tmp_path / "m", epochs=0)
+        run_training(dataset, tmp_path / "m", epochs=0)
     with pytest.raises(OutputError, match="extract"):
         run_training(tmp_path, tmp_path / "m")
-    done = _pdhef("train", str(dataset / "train"), "-o", str(tmp_path / "m"), "--epochs", "1")
+    alone = tmp_path / "alone"
+    shutil.copytree(dataset, alone)
+    document = json.loads((alone / "manifest.json").read_text())
+    document["drives"] = [d for d in document["drives"] if d["split"] == "train"]
+    (alone / "manifest.json").write_text(json.dumps(document))
+    done = _pdhef("train", str(alone), "-o", str(tmp_path / "m"), "--epochs", "1")
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "validation" in done.stderr
