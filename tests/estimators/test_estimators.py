@@ -15,6 +15,7 @@ from reference_car import cut, drive, keep, make_signals, rolling_drive, slalom,
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.table import SPECS, Options, check_names, make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
@@ -289,7 +290,9 @@ def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
         np.testing.assert_array_equal(P, np.swapaxes(P, 1, 2))
         assert (np.linalg.eigvalsh(P) > 0).all()
         assert np.isfinite(track.sideslip_std_rad[ok]).all()
-        steps, _ = make_estimator(name, car_of()).filter_steps(signals, None)
+        estimator = make_estimator(name, car_of())
+        one = estimator.physics if isinstance(estimator, AdaptivePhysics) else estimator
+        steps, _ = one.filter_steps(signals, None)
         full = steps.P[steps.valid]
         np.testing.assert_array_equal(full, np.swapaxes(full, 1, 2))
         # scaled to correlations, so that 1e6 m/s beside 1 mrad/s is no matter of rounding

@@ -23,7 +23,7 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import concatenate
-from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
+from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.residual_model.service import NetworkService
@@ -269,11 +269,16 @@ def test_a_missing_accelerometer_leaves_trust_where_it_was(weaving):
 def test_the_table_makes_it_with_a_network_and_skips_it_without():
     names = ("pd-hef-paper", "pd-hef-trust1", "pd-hef")
     available = frozenset(ALIGNED_SIGNALS)
-    estimators, skipped = runnable(names, Car.of(VEHICLE, network=make_bundle()), available)
-    assert [e.name for e in estimators] == ["pd-hef-paper", "pd-hef-trust1", "pd-hef"]
-    assert skipped == []
-    estimators, skipped = runnable(names, Car.of(VEHICLE), available)
-    assert estimators == []
-    assert all("--network" in s.reason for s in skipped)
+    papers = replace(make_bundle(), model=NOMINAL_MODEL)
+    both = replace(make_bundle(), paper_network=papers)
+    for network, ran in (
+        (both, names),
+        (papers, ("pd-hef-paper", "pd-hef")),
+        (make_bundle(), ("pd-hef-trust1", "pd-hef")),
+        (None, ("pd-hef",)),
+    ):
+        estimators, skipped = runnable(names, Car.of(VEHICLE, network=network), available)
+        assert tuple(e.name for e in estimators) == ran
+        assert all("--network" in s.reason or "pdhef train" in s.reason for s in skipped)
     with pytest.raises(UsageError, match="pd-hef-paper"):
         check_names(("pd-hef-paper", "pd-hef", "pd-hef-paper"))

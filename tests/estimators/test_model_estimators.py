@@ -21,7 +21,14 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.release import MAX_PREDICTION_S
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
-from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, RESIDUAL, ModelBundle, Normalisation
+from pdhef_logtool.residual_model.bundle import (
+    LATERAL_VELOCITY,
+    NOMINAL_MODEL,
+    PHYSICS_MODEL,
+    RESIDUAL,
+    ModelBundle,
+    Normalisation,
+)
 from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
@@ -38,12 +45,18 @@ def make_network(target: str, outputs: int) -> ModelBundle:
     network = ResidualNetwork(Architecture(size, 8, 1, (4,), outputs=outputs))
     weights = {k: v.numpy().copy() for k, v in network.state_dict().items()}
     normalisation = Normalisation((0.0,) * size, (5.0,) * size, (1.0,) * outputs)
-    return ModelBundle(ONE_CAR_FEATURES, 8, 1, (4,), 0.01, normalisation, weights, target=target)
+    model = PHYSICS_MODEL if target == RESIDUAL else NOMINAL_MODEL
+    return ModelBundle(ONE_CAR_FEATURES, 8, 1, (4,), 0.01, normalisation, weights, target=target, model=model)
 
 
 #: β = 0.9 v_y,phy / 22 m/s − 0.001 a_y, at 22 m/s.
 REGRESSION = LinearModel(("ay_m_s2", "physics_vy_m_s"), (-0.001, 0.9 / 22.0), 0.0, 2.0)
-MODEL = replace(make_network(RESIDUAL, 2), pure_lstm=make_network(LATERAL_VELOCITY, 1), linear_regression=REGRESSION)
+MODEL = replace(
+    make_network(RESIDUAL, 2),
+    pure_lstm=make_network(LATERAL_VELOCITY, 1),
+    linear_regression=REGRESSION,
+    paper_network=replace(make_network(RESIDUAL, 2), model=NOMINAL_MODEL),
+)
 
 
 def run(name: str, signals: Signals, vehicle=VEHICLE) -> StateTrack:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +13,11 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.car.flat import load_vehicle
+from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.learning.network.train_command import run_training
 from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
+from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.pipeline import run_logs
 
@@ -28,21 +31,23 @@ def _pdhef(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("dataset")
+    return extracted(sample_logs_dir, tmp_path_factory.mktemp("sets") / "physics")
+
+
+def extracted(sample_logs_dir: Path, folder: Path, *options: str) -> Path:
+    """Three slices of one drive, for there are no other sample drives of this length; calls add up."""
     vehicle = str(sample_logs_dir / "vehicle.toml")
     for split, start, end in (("train", "30", "110"), ("validation", "115", "150"), ("test", "155", "190")):
-        # One drive gives three parts only because there are no other sample drives of this length.
-        part = folder / split
         done = _pdhef(
-            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(part), "--car", vehicle, "--split", split,
-            "--start", start, "--end", end,
+            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(folder), "--car", vehicle, "--split", split,
+            "--start", start, "--end", end, *options,
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
     return folder
 
 
 def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tmp_path: Path) -> None:
-    joined = _joined(dataset, tmp_path / "joined")
+    joined = dataset
     done = _pdhef("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
@@ -65,7 +70,10 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     tuned = run_training(joined, tmp_path / "tuned", init=tmp_path / "model", epochs=1)
     assert tuned.bundle.provenance["fine_tuned_from"] == bundle.sha256
     assert tuned.bundle.provenance["fine_tuned_on"] == load_vehicle(sample_logs_dir / "vehicle.toml").name
-    check_baselines(sample_logs_dir, joined, tmp_path, bundle.sha256)
+    with pytest.raises(OutputError, match="--filter phy-ukf"):
+        run_training(joined, tmp_path / "paper", paper=True, epochs=1)
+    nominal = extracted(sample_logs_dir, tmp_path / "nominal", "--filter", "phy-ukf")
+    check_baselines(sample_logs_dir, nominal, tmp_path, bundle.sha256)
 
 
 def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str) -> None:
@@ -79,15 +87,15 @@ def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_
     assert bundle.linear_regression is not None
     assert document["pure_lstm"]["sha256"] == bundle.pure_lstm.sha256
     assert document["linear_regression"]["sha256"] == bundle.linear_regression.sha256
-    same = ("dataset_sha256", "training_sequences", "epochs")
-    assert [bundle.pure_lstm.provenance[k] for k in same] == [bundle.provenance[k] for k in same]
-    assert bundle.pure_lstm.feature_names == bundle.linear_regression.feature_names == bundle.feature_names
+    data = read_dataset(dataset).sha256
+    assert {b.provenance["dataset_sha256"] for b in (bundle.pure_lstm, bundle.linear_regression)} == {data}
+    assert bundle.pure_lstm.feature_names == bundle.linear_regression.feature_names == NOMINAL_FEATURES
     errors = bundle.linear_regression.provenance["sideslip_rmse_deg"]
     assert 0.0 < errors["train"] < 1.0
     assert errors["test"] is not None
     config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=folder / "model", annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
-    assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression", "pd-hef-paper"}
+    assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression"}
     both = _pdhef("train", str(dataset), "-o", str(folder / "m"), "--baselines", "--init", str(folder / "model"))
     assert both.returncode == 2
     assert len(both.stderr.splitlines()) == 1
@@ -95,28 +103,15 @@ def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_
 
 def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="epoch"):
-        run_training(dataset / "train", tmp_path / "m", epochs=0)
+        run_training(dataset, tmp_path / "m", epochs=0)
     with pytest.raises(OutputError, match="extract"):
         run_training(tmp_path, tmp_path / "m")
-    done = _pdhef("train", str(dataset / "train"), "-o", str(tmp_path / "m"), "--epochs", "1")
+    alone = tmp_path / "alone"
+    shutil.copytree(dataset, alone)
+    document = json.loads((alone / "manifest.json").read_text())
+    document["drives"] = [d for d in document["drives"] if d["split"] == "train"]
+    (alone / "manifest.json").write_text(json.dumps(document))
+    done = _pdhef("train", str(alone), "-o", str(tmp_path / "m"), "--epochs", "1")
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "validation" in done.stderr
-
-
-def _joined(dataset: Path, target: Path) -> Path:
-    """Join datasets of one vehicle by hand: their drives' files side by side, their manifests' drives in one list."""
-    target.mkdir()
-    manifest = None
-    for part in sorted(dataset.iterdir()):
-        document = json.loads((part / "manifest.json").read_text())
-        for drive in document["drives"]:
-            name = f"{part.name}.parquet"
-            (target / name).write_bytes((part / drive["file"]).read_bytes())
-            drive["file"], drive["log"] = name, part.name
-        if manifest is None:
-            manifest = document
-        else:
-            manifest["drives"] += document["drives"]
-    (target / "manifest.json").write_text(json.dumps(manifest))
-    return target

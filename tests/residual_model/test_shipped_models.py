@@ -37,16 +37,16 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     assert model is not None
     assert car.network is not None and car.network.sha256 == model.sha256
     assert car.trust is not None and car.trust.network_sha256 == model.sha256
-    assert car.allowed_trust.cap == 1.0
+    assert car.allowed_trust.cap == 0.5
     assert car.notes == ()
-    assert {"phy-ukf-tuned", "physics", "pd-hef"} <= set(car.noise)
-    assert {n.network_sha256 for n in car.noise.values()} == {None, model.sha256}
+    assert {"phy-ukf-tuned", "physics"} == set(car.noise)
     for chosen in (None, UNSURE):
         intervals = Car.load("saloon", intervals=chosen).intervals
         assert intervals is not None
         by_name = {e.estimator: e.algorithm for e in intervals.entries}
         assert by_name["pd-hef"].network_sha256 == model.sha256
-        assert by_name["pd-hef"].physics_sha256 == intervals.physics_sha256 == car.physics_sha256
+        assert by_name["pd-hef"].physics_sha256 == car.physics_of("physics")
+        assert intervals.physics_sha256 == car.physics_sha256
     assert Car.load("saloon", intervals=NO_INTERVALS).intervals is None
 
 
