@@ -17,10 +17,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from pdhef_logtool.car.descent import Descent, descend
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import (
@@ -352,8 +353,7 @@ class _Problem:
             first = np.array([start.get(p.name, 0.0) for p in self.priors])
             ends.append(self._descend(first, FIRST_ITERATIONS))
             progress((number + 1) / total)
-        theta, _, _ = min(ends, key=lambda end: end[2])
-        theta, normal, _ = self._descend(theta, ITERATIONS)
+        theta, normal, _ = self._descend(min(ends, key=lambda end: end.cost).theta, ITERATIONS)
         progress(1.0)
         return theta, np.sqrt(np.diag(np.linalg.inv(normal)))
 
@@ -407,69 +407,49 @@ class _Problem:
             errors(d.columns, d.stretches, STEP_S, p, self._filter, FORGOTTEN, out, found)
         return [f[:, k] for f, k in zip(self._found, self._kept, strict=True)]
 
-    def _cost(self, found: Sequence[FloatArray], theta: FloatArray) -> float:
+    def _cost(self, found: _Tried, theta: FloatArray) -> float:
         fit = sum(
             n * math.log(_robust_square(e[row]) + FLOORS[row] ** 2)
-            for e, n in zip(found, self._samples, strict=True)
+            for e, n in zip(found.of_logs, self._samples, strict=True)
             for row in (OF_RATE, OF_AY)
         )
-        return fit + float(theta @ theta) + self._gradient_error(theta) ** 2
+        return fit + float(theta @ theta) + found.gradient**2
 
     def _gradient_error(self, theta: FloatArray) -> float:
         vehicle = self.vehicle(theta)
         return (vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction) - USUAL_UNDERSTEER) / UNDERSTEER_STD
 
-    def _descend(self, theta: FloatArray, iterations: int) -> tuple[FloatArray, FloatArray, float]:
-        """Return θ, the normal matrix there with the priors in it, and the cost (Levenberg-Marquardt)."""
-        found = self._errors(self._track(theta))
-        value = self._cost(found, theta)
-        damping = 1e-2
-        normal = np.eye(theta.size)
-        for _ in range(iterations):
-            scales, at = self._scales(found), self._gradient_error(theta)
-            residual = np.append(_scaled(found, scales), at)
-            jac = np.empty((residual.size, theta.size))
-            for i in range(theta.size):
-                moved = theta.copy()
-                moved[i] += DERIVATIVE_STEP
-                shifted = np.append(_scaled(self._errors(self._track(moved)), scales), self._gradient_error(moved))
-                jac[:, i] = (shifted - residual) / DERIVATIVE_STEP
-            normal = jac.T @ jac + np.eye(theta.size)
-            slope = jac.T @ residual + theta
-            better = False
-            for _ in range(6):
-                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
-                step *= min(1.0, MAX_STEP / float(np.max(np.abs(step))))
-                there = self._errors(self._track(theta + step))
-                new = self._cost(there, theta + step)
-                if new < value:
-                    better = True
-                    break
-                damping *= 6.0
-            if not better:
-                break
-            gain = value - new
-            theta, found, value = theta + step, there, new
-            damping = max(damping / 5.0, 1e-5)
-            if gain < MIN_GAIN * sum(self._samples):
-                break
-        return theta, normal, value
+    def _tried(self, theta: FloatArray) -> _Tried:
+        return _Tried(self._errors(self._track(theta)), self._gradient_error(theta))
 
-    def _scales(self, found: Sequence[FloatArray]) -> list[tuple[FloatArray, FloatArray]]:
-        """Return, for each log, the 1-sigma of its channels [2] and the root of an error's weight."""
-        scales = []
-        for e, n in zip(found, self._samples, strict=True):
-            sigma = np.array([math.sqrt(_robust_square(e[row]) + FLOORS[row] ** 2) for row in (OF_RATE, OF_AY)])
-            scales.append((sigma, np.sqrt(n / max(e.shape[1], 1)) / sigma))
-        return scales
+    def _descend(self, theta: FloatArray, iterations: int) -> Descent:
+        found, _ = descend(
+            self._tried,
+            self._cost,
+            self._scaled,
+            theta,
+            iterations=iterations,
+            least_gain=lambda _: MIN_GAIN * sum(self._samples),
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
+        return found
+
+    def _scaled(self, found: _Tried, at: _Tried) -> FloatArray:
+        """Return the residuals of errors, each log's channels in the scales and cut at the limits that ``at`` has."""
+        parts = []
+        for e, other, n in zip(found.of_logs, at.of_logs, self._samples, strict=True):
+            sigma = np.array([math.sqrt(_robust_square(other[row]) + FLOORS[row] ** 2) for row in (OF_RATE, OF_AY)])
+            limit, weight = ROBUST * sigma[:, None], np.sqrt(n / max(other.shape[1], 1)) / sigma
+            parts.append((weight[:, None] * np.clip(e, -limit, limit)).ravel())
+        return np.append(np.concatenate(parts), found.gradient)
 
 
-def _scaled(found: Sequence[FloatArray], scales: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    parts = []
-    for e, (sigma, weight) in zip(found, scales, strict=True):
-        limit = ROBUST * sigma[:, None]
-        parts.append((weight[:, None] * np.clip(e, -limit, limit)).ravel())
-    return np.concatenate(parts)
+class _Tried(NamedTuple):
+    """What was found at a θ: the errors [2, n] of each log, and the understeer gradient's distance from its prior."""
+
+    of_logs: list[FloatArray]
+    gradient: float
 
 
 def _robust_square(error: FloatArray) -> float:

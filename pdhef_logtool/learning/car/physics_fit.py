@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
@@ -235,9 +236,21 @@ def fit_physics(
         return fit + float(theta @ theta) + _nis_residual(found) ** 2
 
     firsts = [np.array([first.get(p.name, 0.0) for p in priors]) for first in starts]
-    ends = [_minimise(errors, cost, first, iterations) for first in firsts]
-    theta, jac, found, value = min(ends, key=lambda end: end[3])
-    std = np.sqrt(np.diag(np.linalg.inv(jac.T @ jac + np.eye(theta.size))))
+    ends = [
+        descend(
+            errors,
+            cost,
+            _scaled,
+            first,
+            iterations=iterations,
+            least_gain=_least_gain,
+            derivative_step=DERIVATIVE_STEP,
+            max_step=MAX_STEP,
+        )
+        for first in firsts
+    ]
+    (theta, normal, value), found = min(ends, key=lambda end: end[0].cost)
+    std = np.sqrt(np.diag(np.linalg.inv(normal)))
     vehicle, noise = build_car(start, parts, priors, theta, digits=6)
     squares = sum(float(np.sum(d.error**2)) for d in found)
     rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in found))))
@@ -259,53 +272,18 @@ def _nis_residual(found: Sequence[DriveError]) -> float:
     return math.log(sum(d.nis * d.seconds for d in found) / max(total, 1e-9)) / NIS_LOG_STD
 
 
-def _minimise(
-    errors: Callable[[FloatArray], list[DriveError]],
-    cost: Callable[[Sequence[DriveError], FloatArray], float],
-    theta: FloatArray,
-    iterations: int,
-) -> tuple[FloatArray, FloatArray, list[DriveError], float]:
-    """Return θ, the Jacobian of the scaled errors there without the priors, the errors and the cost."""
-    found = errors(theta)
-    value = cost(found, theta)
-    damping = 1e-2
+def _least_gain(found: Sequence[DriveError]) -> float:
+    return MIN_GAIN * max(1.0, sum(d.seconds for d in found) / CORRELATION_S)
 
-    def scaled(there: Sequence[DriveError], at: Sequence[DriveError]) -> FloatArray:
-        parts = []
-        for d, now in zip(there, at, strict=True):
-            s = _scale(now)
-            weight = math.sqrt(now.seconds / CORRELATION_S / max(now.counted, 1))
-            parts.append(weight * np.clip(d.error, -ROBUST * s, ROBUST * s) / s)
-        return np.concatenate([*parts, [_nis_residual(there)]])
 
-    jac = np.zeros((1, theta.size))
-    for _ in range(iterations):
-        at = scaled(found, found)
-        jac = np.empty((at.size, theta.size))
-        for i in range(theta.size):
-            moved = theta.copy()
-            moved[i] += DERIVATIVE_STEP
-            jac[:, i] = (scaled(errors(moved), found) - at) / DERIVATIVE_STEP
-        normal = jac.T @ jac + np.eye(theta.size)
-        gradient = jac.T @ at + theta
-        better = False
-        for _ in range(6):
-            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
-            step *= min(1.0, MAX_STEP / float(np.max(np.abs(step))))
-            there = errors(theta + step)
-            new = cost(there, theta + step)
-            if new < value:
-                better = True
-                break
-            damping *= 6.0
-        if not better:
-            break
-        gain = value - new
-        theta, found, value = theta + step, there, new
-        damping = max(damping / 5.0, 1e-5)
-        if gain < MIN_GAIN * max(1.0, sum(d.seconds for d in found) / CORRELATION_S):
-            break
-    return theta, jac, found, value
+def _scaled(there: Sequence[DriveError], at: Sequence[DriveError]) -> FloatArray:
+    """Return the errors and the term of the NIS as residuals, with the scales of the errors ``at`` a place."""
+    parts = []
+    for d, now in zip(there, at, strict=True):
+        s = _scale(now)
+        weight = math.sqrt(now.seconds / CORRELATION_S / max(now.counted, 1))
+        parts.append(weight * np.clip(d.error, -ROBUST * s, ROBUST * s) / s)
+    return np.concatenate([*parts, [_nis_residual(there)]])
 
 
 #: Parts in the order in which it is tried to do without them, what is least known of first.

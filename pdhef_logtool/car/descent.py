@@ -1,0 +1,74 @@
+"""Levenberg-Marquardt for fits to driving: robust errors of all drives, whose scales follow them, and normal priors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from pdhef_logtool.records.signals import FloatArray
+
+#: Tries to find a better place before the search ends, each with so much more damping; and what a success takes off it.
+_TRIES, _MORE, _LESS = 6, 6.0, 5.0
+
+_Errors = TypeVar("_Errors")
+
+
+class Descent(NamedTuple):
+    """Where a descent ended: θ, the normal matrix of the last step with the priors in it, and the cost."""
+
+    theta: FloatArray
+    normal: FloatArray
+    cost: float
+
+
+def descend(
+    errors: Callable[[FloatArray], _Errors],
+    cost: Callable[[_Errors, FloatArray], float],
+    scaled: Callable[[_Errors, _Errors], FloatArray],
+    theta: FloatArray,
+    *,
+    iterations: int,
+    least_gain: Callable[[_Errors], float],
+    derivative_step: float,
+    max_step: float,
+) -> tuple[Descent, _Errors]:
+    """Return where a descent of the cost ends, and the errors there.
+
+    Parameters
+    ----------
+    errors : of parameters θ [K], which are distances from the prior in its standard deviations.
+    cost : of errors and θ, with |θ|² for the priors in it.
+    scaled : residuals [R] of errors with the scales that others have, whose squares the cost stands for.
+    least_gain : of the cost, below which the search ends, by the errors then.
+    derivative_step, max_step : of θ: for derivatives, and the largest that the search makes.
+    """
+    found = errors(theta)
+    value = cost(found, theta)
+    damping = 1e-2
+    normal = np.eye(theta.size)
+    for _ in range(iterations):
+        at = scaled(found, found)
+        jac = np.empty((at.size, theta.size))
+        for i in range(theta.size):
+            moved = theta.copy()
+            moved[i] += derivative_step
+            jac[:, i] = (scaled(errors(moved), found) - at) / derivative_step
+        normal = jac.T @ jac + np.eye(theta.size)
+        gradient = jac.T @ at + theta
+        gain = 0.0
+        for _ in range(_TRIES):
+            step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+            step *= min(1.0, max_step / float(np.max(np.abs(step))))
+            there = errors(theta + step)
+            new = cost(there, theta + step)
+            if new < value:
+                gain = value - new
+                theta, found, value = theta + step, there, new
+                damping = max(damping / _LESS, 1e-5)
+                break
+            damping *= _MORE
+        if gain <= 0.0 or gain < least_gain(found):
+            break
+    return Descent(theta, normal, value), found
