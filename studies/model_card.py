@@ -76,7 +76,7 @@ def page(work: Path, car: Car) -> str:
     model, folder = car.network, car.source
     assert model is not None and folder is not None
     size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-    manifest = json.loads((work / "dataset" / "manifest.json").read_text(encoding="utf-8"))
+    manifest = json.loads((work / model.model / "manifest.json").read_text(encoding="utf-8"))
     recipe = model.provenance["recipe"]
     splits = ", ".join(f"{n} {s['drives']} drives" for n, s in manifest["splits"].items())
     networks = [network_line("residual network", model)]
@@ -95,8 +95,9 @@ def page(work: Path, car: Car) -> str:
 Written by `python -m studies.model_card`; the model by `make train-default`.
 
 - Place: `pdhef_logtool/models/default`, {size / 2**20:.2f} MB, sha256 `{model.sha256[:16]}…`.
-- What it is for: the residual of the nominal single-track model of the simulated saloon (`vehicle.toml` beside it,
-  with the filter noise that belongs to it). On another car its trust is capped by that car's own evidence.
+- What it is for: what `physics` of the simulated saloon lacks (`vehicle.toml` and `fit.toml` beside it). On another car
+  its trust is capped by that car's own evidence; on this one it is {car.allowed_trust.cap:g}. The baselines beside it
+  are of the nominal model and older: they did not change with it.
 - Data: simulated, {DRIVES} drives of 12.5 s of that car (seed {SETS["one_car"][0]}), friction 0.3 to 1.0, 40 to
   120 km/h, sensors with METHOD's noise, biases and delays; friction is told by the simulator. {splits}; split by drive.
 - Training: seed {recipe["seed"]}, one cycle up to a learning rate of {recipe["learning_rate"]:g}, on

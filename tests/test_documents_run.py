@@ -61,7 +61,7 @@ def test_the_api_page_runs_as_it_stands(sample_logs_dir: Path, tmp_path: Path) -
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "adaptive-hybrid-ukf" in done.stdout
+    assert "adaptive-physics" in done.stdout
     assert (tmp_path / "out" / "mycar" / "noise.toml").is_file()
 
 

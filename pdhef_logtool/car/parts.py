@@ -267,7 +267,7 @@ class Algorithm(Record):
 
     Attributes
     ----------
-    algorithm : for example ``adaptive-hybrid-ukf``. options : that change its structure.
+    algorithm : for example ``adaptive-physics``. options : that change its structure.
     noise : process and measurement 1-sigma. use_speed : whether the speed sensor enters after the start.
     physics_sha256, network_sha256 : of what of the car it uses; None: nothing.
     """

@@ -583,16 +583,16 @@ def test_what_comes_and_goes_is_found(part, entry, value):
 def test_its_noise_comes_from_the_car_where_it_has_some():
     v = vehicle()
     bare = physics_filter(v)
-    assert "physics" not in default_names(Car.of(v)), "it runs where identify found the car through it"
+    assert "physics" in default_names(Car.of(v))
     assert bare.q_std == PHYSICS_Q_STD
     assert bare.measurement_std.tolist() == [0.12, 0.004, 0.08]
     noise = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
     car = Car.of(v, noise={"physics": noise})
     assert "physics" in default_names(car)
-    tuned = make_estimator("physics", car)
+    tuned = make_estimator("physics", car).physics
     assert tuned.q_std == (0.05, 0.02, 0.02, *PHYSICS_Q_STD[3:])
     assert tuned.measurement_std.tolist() == [0.8, 0.004, 0.08]
-    assert not make_estimator("physics", car, Options(use_speed=False)).use_speed
+    assert not make_estimator("physics", car, Options(use_speed=False)).physics.use_speed
 
 
 def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_others(noisy):
@@ -608,10 +608,11 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     car = replace(
         Car.of(own, noise={"physics": FilterNoise()}), fitted_physics=FittedPhysics(values=values, noise=FilterNoise())
     )
-    estimator = make_estimator("physics", car)
+    adaptive = make_estimator("physics", car)
+    estimator = adaptive.physics
     fitted = values.applied_to(own)
     assert (estimator.vehicle, estimator.read_with) == (fitted, own)
-    assert resolve(estimator).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
+    assert resolve(adaptive).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
     assert resolve(estimator).structure == resolve(physics_filter(fitted)).structure
     ours, _ = estimator.run(correct_signals(noisy, own), None)
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)

@@ -538,6 +538,7 @@ def _scripted(monkeypatch: pytest.MonkeyPatch, losses: list[float]) -> list[list
 
     monkeypatch.setattr(fit, "_train_batch", batch)
     monkeypatch.setattr(fit, "_validate", validate)
+    monkeypatch.setattr(fit, "_balanced", lambda piece: piece)  # a piece is known by its weight
     return batches
 
 
@@ -570,7 +571,8 @@ def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(
     fresh = fit._weights(fit._new_network(TINY, None))
     np.testing.assert_allclose(bundle.weights["head.0.bias"] - fresh["head.0.bias"], 9.0, rtol=1e-6)
     assert (bundle.feature_names, bundle.hidden, bundle.period_s) == (FEATURES[:2], 3, 0.01)
-    assert bundle.normalisation == normalisation_of(training, FEATURES[:2])
+    assert bundle.normalisation == normalisation_of(training, FEATURES[:2], odd=True)
+    assert bundle.odd and bundle.normalisation.feature_mean[1] == 0.0
     # What is found done is not done again.
     again, same = train(training, training[:2], TINY, tmp_path)
     assert (again.sha256, same) == (bundle.sha256, history)

@@ -184,8 +184,8 @@ def test_a_point_of_the_grid_is_the_estimator_with_that_setting(made, car):
     drive = read_drive(folder / manifest["drives"][0]["file"], car)
     base = make_estimator(fixed_grid.BASE, car)
     whole, _ = base.run(drive.signals, None)
-    rate, _, _ = base.residual_rate(drive.signals, None)
-    shared, _ = fixed_grid.at(base, fixed_grid.Setting(1.0, 1.0, 1.0)).filter.run(drive.signals, None, rate)
+    rate = base.inputs(drive.signals, None)[0].rate
+    shared, _ = fixed_grid.at(base, fixed_grid.Setting(1.0, 1.0, 1.0)).physics.run(drive.signals, None, rate)
     np.testing.assert_array_equal(whole.vy_m_s, shared.vy_m_s)
 
 
