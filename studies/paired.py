@@ -84,9 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     lines = [
         "# Before and now, in pairs",
         "",
-        "Written by `python -m studies.paired`; every figure comes from the files that it names. Before: the physics was",
-        "`physics-plus`, `pd-hef` the network on `phy-ukf`. Worse: the whole 95 % interval of the ratio above 1, and the",
-        f"figure more than {100 * (WORSE_RATIO - 1):.0f} % and more than {WORSE_DEG:g}° higher.",
+        "Written by `python -m studies.paired`; every figure comes from the files that it names. Before: the physics",
+        "was `physics-plus`, `pd-hef` the network on `phy-ukf`. Worse: all of the 95 % interval of the ratio above 1,",
+        f"and the figure more than {100 * (WORSE_RATIO - 1):.0f} % and more than {WORSE_DEG:g}° higher.",
         "",
     ]
     found = []
