@@ -152,10 +152,42 @@ def d2_rows(
     ]
 
 
+def driving_products(
+    track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: LogSensors
+) -> tuple[FloatArray, int]:
+    """Return what :func:`driven_d2` needs of a window, to be added up, and its samples.
+
+    That are the products [4, 4] of the changes over 2 s of v_y, v_x r and a_y, and of the residual that d2 squares.
+    """
+    residual, changes = _lateral_changes(signals, track, low_speed_m_s, sensors)
+    rows = np.concatenate([changes, residual[None]])
+    rows = rows[:, np.isfinite(rows).all(axis=0)]
+    return np.stack([(rows * row).sum(axis=1) for row in rows]), rows.shape[1]
+
+
+def driven_d2(products: FloatArray, samples: int) -> float:
+    """Return that part of d2 in m/s which goes with v_y, v_x r and a_y: what the model is wrong by as the car turns.
+
+    The rest is the road's: a bank moves a_y and says nothing of the estimate. NaN without samples.
+    """
+    if samples < products.shape[0]:
+        return float("nan")
+    of_residual = products[:-1, -1]
+    explained = float(of_residual @ np.linalg.pinv(products[:-1, :-1], hermitian=True) @ of_residual)
+    return float(np.sqrt(max(explained, 0.0) / samples))
+
+
 def _lateral_change_residual(
     signals: Signals, track: StateTrack, low_speed_m_s: float, sensors: LogSensors
 ) -> FloatArray:
     """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN where it cannot be told."""
+    return _lateral_changes(signals, track, low_speed_m_s, sensors)[0]
+
+
+def _lateral_changes(
+    signals: Signals, track: StateTrack, low_speed_m_s: float, sensors: LogSensors
+) -> tuple[FloatArray, FloatArray]:
+    """Return that residual [N], and the changes over the same 2 s of v_y, v_x r and a_y [3, N]."""
     t = signals.stamps_ns
     speed = _carried_speed(signals)
     rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
@@ -170,7 +202,10 @@ def _lateral_change_residual(
     earlier = np.searchsorted(t, t - round(D2_SPAN_S * 1e9), side="right") - 1
     i = np.maximum(earlier, 0)
     whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((D2_SPAN_S + MAX_STEP_S) * 1e9))
-    return np.where(whole, vy - vy[i] - (gained - gained[i]), np.nan)
+    followed = np.stack([vy, turn, signals.ay_m_s2])
+    return np.where(whole, vy - vy[i] - (gained - gained[i]), np.nan), np.where(
+        whole, followed - followed[:, i], np.nan
+    )
 
 
 def sensor_rows(signals: Signals, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float) -> list[MetricRow]:
