@@ -154,27 +154,33 @@ def d2_rows(
 
 def driving_products(
     track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: LogSensors
-) -> tuple[FloatArray, int]:
-    """Return what :func:`driven_d2` needs of a window, to be added up, and its samples.
+) -> tuple[FloatArray, float]:
+    """Return what :func:`driven_d2` needs of a window, to be added up: integrals over time [4, 4], and how long, s.
 
-    That are the products [4, 4] of the changes over 2 s of v_y, v_x r and a_y, and of the residual that d2 squares.
+    They are of the products of the changes over 2 s of v_y, v_x r and a_y, and of the residual that d2 squares.
     """
     residual, changes = _lateral_changes(signals, track, low_speed_m_s, sensors)
     rows = np.concatenate([changes, residual[None]])
-    rows = rows[:, np.isfinite(rows).all(axis=0)]
-    return np.stack([(rows * row).sum(axis=1) for row in rows]), rows.shape[1]
+    step_s = np.minimum(np.diff(signals.stamps_ns, prepend=signals.stamps_ns[:1]) * 1e-9, MAX_STEP_S)
+    known = np.isfinite(rows).all(axis=0)
+    rows, step_s = rows[:, known], step_s[known]
+    return np.stack([(rows * row * step_s).sum(axis=1) for row in rows]), float(step_s.sum())
 
 
-def driven_d2(products: FloatArray, samples: int) -> float:
+def driven_d2(products: FloatArray, seconds: float) -> float:
     """Return that part of d2 in m/s which goes with v_y, v_x r and a_y: what the model is wrong by as the car turns.
 
-    The rest is the road's: a bank moves a_y and says nothing of the estimate. NaN without samples.
+    The rest is the road's: a bank moves a_y and says nothing of the estimate. What the rest would
+    explain by chance, with 2 s as one sample, is believed the less. NaN for less than five of them.
     """
-    if samples < products.shape[0]:
+    if seconds < 5.0 * D2_SPAN_S:
         return float("nan")
     of_residual = products[:-1, -1]
-    explained = float(of_residual @ np.linalg.pinv(products[:-1, :-1], hermitian=True) @ of_residual)
-    return float(np.sqrt(max(explained, 0.0) / samples))
+    fit = float(of_residual @ np.linalg.pinv(products[:-1, :-1], hermitian=True) @ of_residual)
+    explained = min(max(fit, 0.0), float(products[-1, -1]))
+    chance = len(of_residual) * D2_SPAN_S / seconds * (float(products[-1, -1]) - explained)
+    believed = explained**2 / (explained + chance) if explained > 0.0 else 0.0
+    return float(np.sqrt(believed / seconds))
 
 
 def _lateral_change_residual(

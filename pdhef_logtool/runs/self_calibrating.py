@@ -103,7 +103,7 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -
     slow = drive.car.vehicle.low_speed_blend_m_s
     carries: list[Any] = [None] * len(estimators)
     squares, counts = [0.0] * len(estimators), [0] * len(estimators)
-    products, samples = [np.zeros((4, 4)) for _ in estimators], [0] * len(estimators)
+    products, seconds = [np.zeros((4, 4)) for _ in estimators], [0.0] * len(estimators)
     for window in drive.windows(fill_friction=_told(drive), window_s=WINDOW_S):
         signals = window.signals
         whole = {ALL: np.ones(len(signals), dtype=np.bool_)}
@@ -112,11 +112,11 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -
             for row in d2_rows(track, signals, whole, log="", low_speed_m_s=slow, sensors=sensors):
                 squares[i] += row.value**2 * row.n
                 counts[i] += row.n
-            more, n = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
+            more, lasted = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
             products[i] += more
-            samples[i] += n
+            seconds[i] += lasted
     whole_d2 = (math.sqrt(total / n) if n else math.nan for total, n in zip(squares, counts, strict=True))
-    return list(zip(whole_d2, map(driven_d2, products, samples), strict=True))
+    return list(zip(whole_d2, map(driven_d2, products, seconds), strict=True))
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:

@@ -178,7 +178,7 @@ def test_a_calibration_that_contradicts_the_sensors_more_than_the_file_is_refuse
         kept = checked(drive, good)
         assert kept is not None
         assert not kept.refused
-        assert 0.0 < kept.driven_d2_m_s < 1.0
+        assert np.isnan(kept.driven_d2_m_s)  # eight seconds are too few for it
         loose = car.vehicle.tyres.rear.model_copy(update={"B": 1.0})
         tyres = car.vehicle.tyres.model_copy(update={"rear": loose})
         bad = checked(drive, replace(good, vehicle=car.vehicle.model_copy(update={"tyres": tyres})))
