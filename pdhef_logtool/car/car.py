@@ -9,6 +9,7 @@ says so.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -75,12 +76,16 @@ class WithoutTruth:
 
     ``told_friction`` : whether the signals' friction is one that the calibration knew too; an estimate, made with the
     file as it stands, is none. ``noise`` : of ``physics``. ``note`` : what a reader of the report must know.
+    ``varied`` : the vehicle one posterior 1-sigma away, in directions that are independent. ``driven_d2_m_s`` : d2 of
+    ``physics`` on the log as far as it goes with the driving, NaN where that cannot be told.
     """
 
     vehicle: VehicleParameters
     noise: FilterNoise
     told_friction: bool
     note: str
+    varied: tuple[VehicleParameters, ...] = ()
+    driven_d2_m_s: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -35,6 +35,11 @@ class StandIn:
         of_estimator: Estimator = getattr(self.estimator, "calibrated_as", self.estimator)
         return of_estimator
 
+    @property
+    def intervals_note(self) -> str:
+        """What its intervals are made of, where no calibrated ones are to take their place."""
+        return getattr(self.estimator, "intervals_note", "")
+
     def run(self, signals: Signals, carry: Any | None, ahead: Signals | None = None) -> tuple[StateTrack, Any]:
         """Process one window (see :class:`~.base.Estimator`)."""
         track, carry = run_window(self.estimator, signals, carry, ahead)

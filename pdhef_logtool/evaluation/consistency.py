@@ -152,10 +152,48 @@ def d2_rows(
     ]
 
 
+def driving_products(
+    track: StateTrack, signals: Signals, *, low_speed_m_s: float, sensors: LogSensors
+) -> tuple[FloatArray, float]:
+    """Return what :func:`driven_d2` needs of a window, to be added up: integrals over time [4, 4], and how long, s.
+
+    They are of the products of the changes over 2 s of v_y, v_x r and a_y, and of the residual that d2 squares.
+    """
+    residual, changes = _lateral_changes(signals, track, low_speed_m_s, sensors)
+    rows = np.concatenate([changes, residual[None]])
+    step_s = np.minimum(np.diff(signals.stamps_ns, prepend=signals.stamps_ns[:1]) * 1e-9, MAX_STEP_S)
+    known = np.isfinite(rows).all(axis=0)
+    rows, step_s = rows[:, known], step_s[known]
+    return np.stack([(rows * row * step_s).sum(axis=1) for row in rows]), float(step_s.sum())
+
+
+def driven_d2(products: FloatArray, seconds: float) -> float:
+    """Return that part of d2 in m/s which goes with v_y, v_x r and a_y: what the model is wrong by as the car turns.
+
+    The rest is the road's: a bank moves a_y and says nothing of the estimate. What the rest would
+    explain by chance, with 2 s as one sample, is believed the less. NaN for less than five of them.
+    """
+    if seconds < 5.0 * D2_SPAN_S:
+        return float("nan")
+    of_residual = products[:-1, -1]
+    fit = float(of_residual @ np.linalg.pinv(products[:-1, :-1], hermitian=True) @ of_residual)
+    explained = min(max(fit, 0.0), float(products[-1, -1]))
+    chance = len(of_residual) * D2_SPAN_S / seconds * (float(products[-1, -1]) - explained)
+    believed = explained**2 / (explained + chance) if explained > 0.0 else 0.0
+    return float(np.sqrt(believed / seconds))
+
+
 def _lateral_change_residual(
     signals: Signals, track: StateTrack, low_speed_m_s: float, sensors: LogSensors
 ) -> FloatArray:
     """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN where it cannot be told."""
+    return _lateral_changes(signals, track, low_speed_m_s, sensors)[0]
+
+
+def _lateral_changes(
+    signals: Signals, track: StateTrack, low_speed_m_s: float, sensors: LogSensors
+) -> tuple[FloatArray, FloatArray]:
+    """Return that residual [N], and the changes over the same 2 s of v_y, v_x r and a_y [3, N]."""
     t = signals.stamps_ns
     speed = _carried_speed(signals)
     rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
@@ -170,7 +208,10 @@ def _lateral_change_residual(
     earlier = np.searchsorted(t, t - round(D2_SPAN_S * 1e9), side="right") - 1
     i = np.maximum(earlier, 0)
     whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((D2_SPAN_S + MAX_STEP_S) * 1e9))
-    return np.where(whole, vy - vy[i] - (gained - gained[i]), np.nan)
+    followed = np.stack([vy, turn, signals.ay_m_s2])
+    return np.where(whole, vy - vy[i] - (gained - gained[i]), np.nan), np.where(
+        whole, followed - followed[:, i], np.nan
+    )
 
 
 def sensor_rows(signals: Signals, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float) -> list[MetricRow]:

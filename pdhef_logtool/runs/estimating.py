@@ -86,11 +86,14 @@ def estimate_windows(
 
 def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
     """Return what puts the car's intervals on the tracks of estimators, by what they really are."""
-    algorithms = {}
+    algorithms, own = {}, {}
     for estimator in estimators:
+        if note := getattr(estimator, "intervals_note", ""):
+            own[estimator.name] = note
+            continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
-    return TrackCalibrator(car.intervals, algorithms)
+    return TrackCalibrator(car.intervals, algorithms, own)
 
 
 class DeadReckoning:

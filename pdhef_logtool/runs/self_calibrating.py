@@ -73,7 +73,7 @@ def read_driving(drive: Drive) -> Driving:
 
 
 def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibration | None:
-    """Return a calibration, refused where ``physics`` on it contradicts the sensors of a drive more than on the file.
+    """Return a calibration with its d2, refused where that of ``physics`` on it exceeds that on the file.
 
     The factor is that of the guard; on simulated drives with right and wrong files d2 never rose by more than 1 %.
     """
@@ -82,22 +82,28 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
     from pdhef_logtool.estimators.physics_ukf import of_car
     from pdhef_logtool.estimators.table import make_estimator
 
-    estimators = (of_car(drive.car), make_estimator("physics", self_calibrated(drive, calibration)))
-    file, found = _d2_of(drive, estimators, log_sensors(drive.car.vehicle, calibration))
+    alone = self_calibrated(drive, replace(calibration, varied=()))  # d2 asks for no interval
+    estimators = (of_car(drive.car), make_estimator("physics", alone))
+    (file, _), (found, driven) = _d2_of(drive, estimators, log_sensors(drive.car.vehicle, calibration))
+    calibration = replace(calibration, driven_d2_m_s=driven)
     if not found > guard.FACTOR * file:
         return calibration
     why = f"physics contradicts the sensors more on it than on the file, d2 is {found:.3g} against {file:.3g} m/s"
     return replace(calibration, refused=why)
 
 
-def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -> list[float]:
-    """Return d2 of estimators over a drive, in m/s, window by window of a fixed length; NaN where it cannot be told."""
-    from pdhef_logtool.evaluation.consistency import d2_rows
+def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -> list[tuple[float, float]]:
+    """Return d2 of estimators over a drive, and its part that goes with the driving, window by window, in m/s.
+
+    The windows have a fixed length. NaN where it cannot be told.
+    """
+    from pdhef_logtool.evaluation.consistency import d2_rows, driven_d2, driving_products
     from pdhef_logtool.evaluation.metrics import ALL
 
     slow = drive.car.vehicle.low_speed_blend_m_s
     carries: list[Any] = [None] * len(estimators)
     squares, counts = [0.0] * len(estimators), [0] * len(estimators)
+    products, seconds = [np.zeros((4, 4)) for _ in estimators], [0.0] * len(estimators)
     for window in drive.windows(fill_friction=_told(drive), window_s=WINDOW_S):
         signals = window.signals
         whole = {ALL: np.ones(len(signals), dtype=np.bool_)}
@@ -106,7 +112,11 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -
             for row in d2_rows(track, signals, whole, log="", low_speed_m_s=slow, sensors=sensors):
                 squares[i] += row.value**2 * row.n
                 counts[i] += row.n
-    return [math.sqrt(total / n) if n else math.nan for total, n in zip(squares, counts, strict=True)]
+            more, lasted = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)
+            products[i] += more
+            seconds[i] += lasted
+    whole_d2 = (math.sqrt(total / n) if n else math.nan for total, n in zip(squares, counts, strict=True))
+    return list(zip(whole_d2, map(driven_d2, products, seconds), strict=True))
 
 
 def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
@@ -114,7 +124,14 @@ def self_calibrated(drive: Drive, calibration: SelfCalibration | None) -> Car:
     if calibration is None or calibration.refused:
         return drive.car
     note = "not causal: its car was calibrated on the whole log, without truth"
-    found = WithoutTruth(calibration.vehicle, calibration.noise, told_friction=_told(drive), note=note)
+    found = WithoutTruth(
+        calibration.vehicle,
+        calibration.noise,
+        told_friction=_told(drive),
+        note=note,
+        varied=calibration.varied,
+        driven_d2_m_s=calibration.driven_d2_m_s,
+    )
     return replace(drive.car, self_calibrated=found)
 
 

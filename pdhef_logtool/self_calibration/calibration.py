@@ -38,6 +38,7 @@ from pdhef_logtool.self_calibration.single_track import (
     FRICTION,
     OF_AY,
     OF_RATE,
+    SPEED,
     STEER,
     YAW_RATE,
     TrackParameters,
@@ -86,6 +87,9 @@ LEAST_S = 15.0
 #: Above this lateral acceleration a car that is steered against its bend drifts, on average over a second, for in fast
 #: slaloms the yaw rate follows the steering late; so much of that driving makes it a drift.
 DRIFT_AY, DRIFT_STEER_RAD, DRIFT_S, DRIFT_SHARE = 3.0, math.radians(1.0), 1.0, 0.1
+
+#: Directions of the posterior that a band follows, at most: those in which the drive's own sideslip is known least.
+VARIED = 5
 
 #: Where the search starts: θ by name.
 STARTS: tuple[dict[str, float], ...] = (
@@ -155,6 +159,8 @@ class SelfCalibration:
     refused : why the file stays as it stands; empty if it does not.
     rms : of yaw rate, rad/s, and a_y, m/s², that the model leaves; of_file : that the file's leaves.
     seconds : of driving that counted. logs : in the pool.
+    varied : the vehicle one posterior 1-sigma away in each of the directions that move its sideslip most.
+    driven_d2_m_s : d2 of ``physics`` on it as far as it goes with the driving, NaN where no drive told.
     """
 
     own: VehicleParameters
@@ -166,6 +172,8 @@ class SelfCalibration:
     of_file: tuple[float, float]
     seconds: float
     logs: int
+    varied: tuple[VehicleParameters, ...] = ()
+    driven_d2_m_s: float = math.nan
 
     @property
     def stiffness_sd(self) -> float:
@@ -253,7 +261,8 @@ def self_calibrate(
         why = f"{seconds:.0f} s above {LEAST_SPEED_M_S:g} m/s, {LEAST_S:g} are needed"
         return SelfCalibration(own, own, (), None, why, (math.nan,) * 2, (math.nan,) * 2, seconds, len(drives))
     problem = _Problem(drives, own)
-    theta, std = problem.solve(progress)
+    theta, covariance = problem.solve(progress)
+    std = np.sqrt(np.diag(covariance))
     vehicle = problem.vehicle(theta, digits=6)
     parameters = tuple(
         Calibrated(p.name, p.unit, p.value(float(t)), p.mean, float(s) * p.std, p.std, p.log)
@@ -269,6 +278,7 @@ def self_calibrate(
         problem.rms_of_file(),
         seconds,
         len(drives),
+        problem.varied(theta, covariance),
     )
     return _with_refusal(found, drives, least_known)
 
@@ -346,7 +356,7 @@ class _Problem:
         self.priors = _priors(drives, own)
 
     def solve(self, progress: Callable[[float], None]) -> tuple[FloatArray, FloatArray]:
-        """Return θ and its posterior 1-sigma."""
+        """Return θ [n] and its posterior covariance [n, n]."""
         ends = []
         total = len(STARTS) + 1
         for number, start in enumerate(STARTS):
@@ -355,7 +365,25 @@ class _Problem:
             progress((number + 1) / total)
         theta, normal, _ = self._descend(min(ends, key=lambda end: end.cost).theta, ITERATIONS)
         progress(1.0)
-        return theta, np.sqrt(np.diag(np.linalg.inv(normal)))
+        return theta, np.asarray(np.linalg.inv(normal), dtype=np.float64)
+
+    def varied(self, theta: FloatArray, covariance: FloatArray) -> tuple[VehicleParameters, ...]:
+        """Return the vehicle 1-sigma away along the directions that move the open-loop v_y / v_x of the logs most.
+
+        They are uncorrelated in the posterior and in what they do to the sideslip.
+        """
+        root = np.linalg.cholesky(covariance)
+        at = self._sideslip(theta)
+        moved = np.stack([self._sideslip(theta + root[:, i]) - at for i in range(theta.size)])
+        _, axes = np.linalg.eigh(moved @ moved.T)
+        steps = root @ axes[:, ::-1][:, :VARIED]  # largest first
+        return tuple(self.vehicle(theta + step, digits=6) for step in steps.T)
+
+    def _sideslip(self, theta: FloatArray) -> FloatArray:
+        """Return the open-loop v_y / v_x of all logs, of what a vehicle holds: without delays and superelevation."""
+        self._errors(_track_of(self.vehicle(theta), self._own, {}))
+        parts = zip(self._drives, self._out, self._kept, strict=True)
+        return np.concatenate([out[2, k] / d.columns[SPEED, k] for d, out, k in parts])
 
     def vehicle(self, theta: FloatArray, *, digits: int = 17) -> VehicleParameters:
         """Return the file with the parameters at θ."""

@@ -46,10 +46,12 @@ class TrackCalibrator:
 
     ``algorithms`` says by name what ran, then what else its intervals may be taken from. Intervals are found by the
     structure of what ran, never by its name; what else they rest on (noise, physics, network) is compared and told.
+    ``own`` says by name what is told of intervals that stay as they are.
     """
 
     intervals: Intervals | None
     algorithms: Mapping[str, Sequence[Algorithm]]
+    own: Mapping[str, str] = field(default_factory=dict)
     _carries: dict[str, FeatureCarry] = field(default_factory=dict)
     _has_interval: set[str] = field(default_factory=set)
 
@@ -73,6 +75,8 @@ class TrackCalibrator:
         """Return what the report says of an estimator's intervals; nothing for one without."""
         if name not in self._has_interval:
             return ()
+        if name in self.own:
+            return (self.own[name],)
         found = self._found(name)
         if self.intervals is None or found is None:
             return ("intervals not calibrated",)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,15 +10,19 @@ import pytest
 from reference_car import cut, drive, slalom, with_noise
 
 from pdhef_logtool.car.car import Car, WithoutTruth
-from pdhef_logtool.car.parts import FilterNoise
+from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import run_window
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
+from pdhef_logtool.estimators.physics_ukf import physics_filter
+from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE, SELF_CALIBRATED, SelfCalibrated
+from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import SPECS, default_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.watches.intervals import make_inflation
 
 OWN = default_vehicle()
 FOUND = OWN.model_copy(
@@ -33,6 +38,19 @@ NOTE, NOISE = "calibrated", FilterNoise(r_std={"ay_m_s2": 1.0})
 
 def calibrated(vehicle: VehicleParameters = FOUND, *, told_friction: bool = True) -> Car:
     return replace(Car.of(OWN), self_calibrated=WithoutTruth(vehicle, NOISE, told_friction, NOTE))
+
+
+def with_band(share: float = 0.1, d2_m_s: float = 0.1) -> Car:
+    """Return a calibrated car whose steering offset and rear stiffness are known to a share of a radian and of it."""
+    rear = FOUND.tyres.rear
+    assert rear.B is not None
+    softer = FOUND.tyres.model_copy(update={"rear": rear.model_copy(update={"B": rear.B * (1.0 - share)})})
+    varied = (
+        FOUND.model_copy(update={"steer_offset_rad": FOUND.steer_offset_rad + 0.05 * share}),
+        FOUND.model_copy(update={"tyres": softer}),
+    )
+    found = WithoutTruth(FOUND, NOISE, True, NOTE, varied=varied, driven_d2_m_s=d2_m_s)
+    return replace(Car.of(OWN), self_calibrated=found)
 
 
 @pytest.fixture(scope="module")
@@ -100,3 +118,64 @@ def test_windows_change_no_bit(name: str, signals: Signals) -> None:
     (whole,) = tracks(name, calibrated(), signals)
     parts = tracks(name, calibrated(), cut(signals, 0, 111), cut(signals, 111, len(signals)))
     np.testing.assert_array_equal(np.concatenate([p.vy_m_s for p in parts]), whole.vy_m_s)
+
+
+def test_windows_change_no_bit_of_the_band(signals: Signals) -> None:
+    (whole,) = tracks("physics", with_band(), signals)
+    parts = tracks("physics", with_band(), *(cut(signals, a, b) for a, b in ((0, 1), (1, 111), (111, len(signals)))))
+    for column in ("vy_m_s", "sideslip_std_rad", "covariance"):
+        np.testing.assert_array_equal(np.concatenate([getattr(p, column) for p in parts]), getattr(whole, column))
+
+
+def test_the_band_changes_no_estimate(signals: Signals) -> None:
+    (plain,), (banded,) = (tracks("physics", car, signals) for car in (calibrated(), with_band()))
+    for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis"):
+        np.testing.assert_array_equal(getattr(banded, column), getattr(plain, column))
+    np.testing.assert_array_equal(banded.yaw_rate_std_rad_s, plain.yaw_rate_std_rad_s)
+    assert (np.linalg.eigvalsh(banded.covariance[10:]) > 0.0).all()
+
+
+@pytest.mark.parametrize("wider", [{"share": 0.3}, {"d2_m_s": 0.3}])
+def test_what_is_known_less_has_the_wider_band(wider: dict[str, float], signals: Signals) -> None:
+    (narrow,), (wide,) = tracks("physics", with_band(), signals), tracks("physics", with_band(**wider), signals)
+    for column in ("sideslip_std_rad", "vy_std_m_s"):
+        assert np.mean(getattr(wide, column)) > 1.3 * np.mean(getattr(narrow, column))
+
+
+def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
+    """The parameters' part is what the filter does on the other vehicles; d2's is a velocity."""
+    (plain,), (alone,), (both,) = (
+        tracks("physics", car, signals) for car in (calibrated(), with_band(d2_m_s=0.0), with_band(d2_m_s=0.1))
+    )
+    found = with_band().self_calibrated
+    assert found is not None
+    read = [corrected_anew(signals, OWN, v) for v in (FOUND, *found.varied)]
+    filters = [physics_filter(v, NOISE) for v in (FOUND, *found.varied)]
+    middle, *others = (f.run(s, None)[0].vy_m_s for f, s in zip(filters, read, strict=True))
+    away = sum((vy - middle) ** 2 for vy in others)
+    expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + away
+    fast = plain.vx_m_s > OWN.low_speed_blend_m_s
+    np.testing.assert_allclose(alone.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
+    np.testing.assert_allclose((both.vy_std_m_s**2 - alone.vy_std_m_s**2)[fast], (0.1 * D2_SHARE) ** 2, rtol=1e-6)
+
+
+def test_without_d2_its_own_interval_counts_as_it_is(signals: Signals) -> None:
+    (plain,), (banded,) = tracks("physics", calibrated(), signals), tracks("physics", with_band(0.0, math.nan), signals)
+    np.testing.assert_array_equal(banded.sideslip_std_rad, plain.sideslip_std_rad)
+    told = calibrator(Car.of(OWN), [make_estimator("physics", with_band(0.0, math.nan))])
+    assert told.own["physics"] == "intervals: own and parameters"
+
+
+def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
+    """Neither for a calibrated car, nor for what stands in for another estimator there."""
+    estimator = make_estimator("physics", with_band())
+    assert isinstance(estimator, SelfCalibrated)
+    inflation = make_inflation((9.0,) * 7, (9.0,) * 3)
+    algorithms = map(resolve, (estimator, estimator.estimator))
+    entries = tuple(IntervalEntry(estimator="e", algorithm=a, inflation=inflation) for a in algorithms)
+    intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
+    for one in (estimator, StandIn(estimator, "pd-hef", "why")):
+        track, _ = run_window(one, signals, None, None)
+        applied = calibrator(replace(with_band(), intervals=intervals), [one])
+        assert applied.add(track, signals) is track
+        assert applied.notes(one.name) == ("intervals: own, parameters and d2",)

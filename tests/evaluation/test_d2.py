@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.evaluation import blocks
-from pdhef_logtool.evaluation.consistency import LogSensors, d2_rows
+from pdhef_logtool.evaluation.consistency import LogSensors, d2_rows, driven_d2, driving_products
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
@@ -46,6 +46,35 @@ def track(vy: np.ndarray) -> StateTrack:
 def d2(of: Signals, vy: np.ndarray, sensors: LogSensors) -> MetricRow:
     (row,) = d2_rows(track(vy), of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
     return row
+
+
+def driven(of: Signals, vy: np.ndarray, *ends: int) -> float:
+    """Return the part of d2 that goes with the driving, of windows that end there."""
+    total, seconds = np.zeros((4, 4)), 0.0
+    for a, b in zip((0, *ends), (*ends, T.size), strict=True):
+        part, estimate = of.rows(a, b), track(vy).rows(a, b)
+        products, lasted = driving_products(estimate, part, low_speed_m_s=3.0, sensors=SENSORS)
+        total, seconds = total + products, seconds + lasted
+    return driven_d2(total, seconds)
+
+
+def test_what_a_wrong_model_does_goes_with_the_driving_and_a_rough_road_does_not() -> None:
+    wrong = VY + 0.02 * SPEED * RATE
+    assert driven(signals(SENSORS), VY) < 2e-3
+    assert driven(signals(SENSORS), wrong) == pytest.approx(d2(signals(SENSORS), wrong, SENSORS).value, rel=0.02)
+    road = replace(signals(SENSORS), ay_m_s2=signals(SENSORS).ay_m_s2 + 0.3 * np.sin(2.3 * T))
+    assert d2(road, VY, SENSORS).value > 0.1
+    assert driven(road, VY) < 0.1 * d2(road, VY, SENSORS).value
+
+
+def test_windows_of_it_add_up() -> None:
+    wrong = VY + 0.02 * SPEED * RATE
+    assert driven(signals(SENSORS), wrong, 1500, 4000) == pytest.approx(driven(signals(SENSORS), wrong), rel=0.1)
+
+
+def test_it_is_not_told_of_too_little_driving() -> None:
+    assert np.isnan(driven_d2(np.eye(4), 9.0))
+    assert np.isnan(driven(signals(SENSORS), np.full(T.size, np.nan)))
 
 
 def test_the_true_lateral_velocity_contradicts_nothing_once_the_sensors_are_known() -> None:

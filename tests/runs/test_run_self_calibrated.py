@@ -72,6 +72,8 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert told["physics"]["algorithm"]["physics_sha256"] != report["vehicle"]["sha256"]
     assert report["self_calibration"]["understeer"]["contradicts"]
     assert any("calibrated without truth" in w and "contradicts" in w for w in report["warnings"])
+    assert "intervals: own, parameters and d2" in told["physics"]["notes"]
+    assert not any("intervals" in note for note in told["open-loop-calibrated"]["notes"])
 
 
 def test_a_wrong_file_is_mended(calibrated: Path) -> None:
@@ -173,7 +175,10 @@ def test_a_calibration_that_contradicts_the_sensors_more_than_the_file_is_refuse
     with read_drive(sample_logs_dir / "sweep.mcap", car) as drive:
         good = self_calibrate([read_driving(drive)] * 2, car.vehicle)  # twice, so that it is long enough
         assert not good.refused
-        assert checked(drive, good) is good
+        kept = checked(drive, good)
+        assert kept is not None
+        assert not kept.refused
+        assert np.isnan(kept.driven_d2_m_s)  # eight seconds are too few for it
         loose = car.vehicle.tyres.rear.model_copy(update={"B": 1.0})
         tyres = car.vehicle.tyres.model_copy(update={"rear": loose})
         bad = checked(drive, replace(good, vehicle=car.vehicle.model_copy(update={"tyres": tyres})))

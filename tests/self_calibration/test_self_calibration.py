@@ -165,3 +165,26 @@ def test_a_fast_slalom_is_no_drift_and_a_held_counter_steer_is() -> None:
     held = drive(lambda _t: 0.02, 20.0).signals
     assert drift_share([driving(held, RIGHT)], RIGHT) == 0.0
     assert drift_share([driving(replace(held, steer_rad=-2.0 * held.steer_rad), RIGHT)], RIGHT) > 0.9
+
+
+def test_the_vehicles_of_the_band_spread_as_the_posterior_does() -> None:
+    """Together no more than the posterior of each parameter, and most of that of a stiffness, which moves the car."""
+    calibration = found(with_noise(wide().signals, 3), wrong(2.0, 0.5))
+    assert len(calibration.varied) == 5
+    by = {p.name: p for p in calibration.parameters}
+    middle = calibration.vehicle
+    for axle, front in (("front", True), ("rear", False)):
+        at = math.log(middle.cornering_stiffness_n_per_rad(front, middle.assumed_friction))
+        away = [math.log(v.cornering_stiffness_n_per_rad(front, v.assumed_friction)) - at for v in calibration.varied]
+        sd = by[f"{axle} cornering stiffness"].sd
+        assert 0.7 * sd < math.sqrt(sum(x**2 for x in away)) < 1.05 * sd
+
+
+def test_less_driving_spreads_them_wider() -> None:
+    def spread(signals: Signals) -> float:
+        of = found(signals, RIGHT)
+        at = of.vehicle.cornering_stiffness_n_per_rad(False, of.vehicle.assumed_friction)
+        return sum(math.log(v.cornering_stiffness_n_per_rad(False, v.assumed_friction) / at) ** 2 for v in of.varied)
+
+    signals = with_noise(wide().signals, 3)
+    assert spread(cut(signals, 0, 2000)) > 1.5 * spread(signals)
