@@ -361,9 +361,9 @@ class ColumnarLog:
         for id_ in sorted(block.rows, key=lambda id_: self._rank[c].get(id_, -1)):
             topic = channels[id_].topic if id_ in channels else ""
             rows = block.rows[id_]
-            unused = self.occupied.unused(topic, c, span, block.log_time_ns[rows])
-            if unused is not None:
-                rows = rows[~unused]
+            if self.occupied.left_out:
+                unused = self.occupied.unused(topic, c, span, block.log_time_ns[rows])
+                rows = rows if unused is None else rows[~unused]
             rows = rows if keep is None else rows[keep[rows]]
             if topic in plans and rows.size:
                 columns = self._decode(topic, plans[topic], c, span, id_, block, rows)

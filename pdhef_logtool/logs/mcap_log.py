@@ -600,10 +600,13 @@ class _Walk:
         first = self.chunk[1]
         record = of.source.read(first, self.index_end - first)
         times = np.frombuffer(b"".join([record[a - first : b - first] for a, b in self.index_at]), dtype="<u8")[0::2]
+        ends = list(accumulate(counts.values()))
         back = times[1:] < times[:-1]
-        back[[n - 1 for n in accumulate(counts.values())][:-1]] = False  # from a channel to the next one
-        span = min(int(times.min()), MAX_TIME_NS), min(int(times.max()), MAX_TIME_NS)
-        return span == self.head[:2], not back.any()
+        back[[n - 1 for n in ends[:-1]]] = False  # from a channel to the next one
+        ordered = not back.any()
+        some = times[[0, *ends[:-1], *(n - 1 for n in ends)]] if ordered else times  # first and last of each
+        span = min(int(some.min()), MAX_TIME_NS), min(int(some.max()), MAX_TIME_NS)
+        return span == self.head[:2], ordered
 
     def _data_end(self, at: int, end: int) -> None:
         """Note the CRC of the data section."""

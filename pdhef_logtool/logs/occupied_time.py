@@ -88,9 +88,10 @@ class OccupiedTime:
         return self.intervals[-1][1] if self.intervals else 0
 
     def unused(self, topic: str, c: int, span: Span, log_time_ns: IntArray) -> BoolArray | None:
-        """Tell which of a topic's messages in a span (all of them, in file order) are left out; None: none of them."""
-        if not self.left_out:
-            return None
+        """Tell which of a topic's messages in a span (all of them, in file order) are left out; None: none of them.
+
+        To be asked where anything is ``left_out`` at all.
+        """
         unused = ~_inside(log_time_ns, self.intervals) | _cut_out(log_time_ns, topic, (c, span.index), self.cuts)
         return unused if unused.any() else None
 
