@@ -12,8 +12,9 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.service import NetworkService
 
-#: Fields of an estimator that are no option: what it is called and told of it, and what its signals come back from.
-_TOLD = {"name", "causal", "notes", "read_with", "calibration", "reason"}
+#: Fields of an estimator that are no option: what it is called and told of it, what its signals come back from, and
+#: what it shares with others.
+_TOLD = {"name", "causal", "notes", "read_with", "calibration", "reason", "compared"}
 _NOISE = {"q_std", "r_std"}
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -55,6 +55,29 @@ class Carry:
     compared: tuple[FilterCarry, ...]
 
 
+class Compared:
+    """The filters that a band compares, run once a window for all estimators of a calibration that share them."""
+
+    def __init__(self) -> None:
+        self._asked: tuple[Signals, tuple[FilterCarry, ...] | None, tuple[PhysicsFilter, ...]] | None = None
+        self._answer: tuple[list[FloatArray], tuple[FilterCarry, ...]] = ([], ())
+
+    def run(
+        self,
+        filters: tuple[PhysicsFilter, ...],
+        window: Signals,
+        signals: Signals,
+        carry: tuple[FilterCarry, ...] | None,
+    ) -> tuple[list[FloatArray], tuple[FilterCarry, ...]]:
+        """Return v_y of each filter [N] and the carries; ``window``, carry and filters tell if it was asked before."""
+        asked = self._asked
+        if asked is None or asked[0] is not window or asked[1] is not carry or asked[2] != filters:
+            runs = [f.run(signals, c) for f, c in zip(filters, carry or [None] * len(filters), strict=True)]
+            self._asked = window, carry, filters
+            self._answer = [t.vy_m_s for t, _ in runs], tuple(c for _, c in runs)
+        return self._answer
+
+
 @dataclass(frozen=True)
 class SelfCalibrated:
     """An estimator on the calibrated vehicle.
@@ -63,12 +86,14 @@ class SelfCalibrated:
     ----------
     estimator : on the calibrated vehicle. calibration : where that comes from.
     read_with : the vehicle that the drive's signals were read with.
+    compared : what the band compares, where several estimators of one calibration share it.
     """
 
     estimator: Estimator
     calibration: WithoutTruth
     read_with: VehicleParameters
     causal: bool = False
+    compared: Compared | None = field(default=None, compare=False)
 
     @property
     def name(self) -> str:
@@ -94,7 +119,7 @@ class SelfCalibrated:
 
     def run(self, signals: Signals, carry: Carry | None, ahead: Signals | None = None) -> tuple[StateTrack, Carry]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        signals = self._of_friction(signals)
+        window, signals = signals, self._of_friction(signals)
         track, after = run_window(
             self.estimator,
             self._read(signals),
@@ -103,14 +128,13 @@ class SelfCalibrated:
         )
         if self.name == OPEN_LOOP:  # it gives no interval
             return track, Carry(after, ())
-        before = [None] * len(self._compared) if carry is None else carry.compared
-        runs = [f.run(signals, c) for f, c in zip(self._compared, before, strict=True)]
+        compared, before = self.compared or Compared(), None if carry is None else carry.compared
+        vy, carried = compared.run(self._filters, window, signals, before)
         slow = self.calibration.vehicle.low_speed_blend_m_s
-        track = widened(track, [t.vy_m_s for t, _ in runs], self.calibration.driven_d2_m_s, slow)
-        return track, Carry(after, tuple(c for _, c in runs))
+        return widened(track, vy, self.calibration.driven_d2_m_s, slow), Carry(after, carried)
 
     @cached_property
-    def _compared(self) -> tuple[PhysicsFilter, ...]:
+    def _filters(self) -> tuple[PhysicsFilter, ...]:
         """The physics filter on the vehicle and on those away from it; none where there are none of those."""
         found = self.calibration
         vehicles = (found.vehicle, *found.varied) if found.varied else ()

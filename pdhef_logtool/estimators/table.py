@@ -13,7 +13,7 @@ from typing import Literal
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FORMER_FILTERS
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
+from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, Compared, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 from pdhef_logtool.residual_model.service import NetworkService
@@ -30,11 +30,13 @@ class Options:
     use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only starts them (METHOD §1).
     trust : of the hybrid filters, in [0, 1]; None: what the car's evidence allows.
     network : of the car, ready to run, where several estimators share it; None: made anew.
+    compared : what the bands of estimators on a self-calibrated car compare, shared as well.
     """
 
     use_speed: bool = True
     trust: float | None = None
     network: NetworkService | None = field(default=None, compare=False)
+    compared: Compared = field(default_factory=Compared, compare=False)
 
     def service(self, car: Car) -> NetworkService:
         """Return the car's network, ready to run."""
@@ -109,7 +111,8 @@ class Spec:
         if car.self_calibrated is None or self.name not in {OPEN_LOOP, *SELF_CALIBRATED}:
             estimator: Estimator = build(self.name, car, options)
             return estimator
-        return SelfCalibrated(build(self.name, car.calibrated_car, options), car.self_calibrated, car.vehicle)
+        estimator = build(self.name, car.calibrated_car, options)
+        return SelfCalibrated(estimator, car.self_calibrated, car.vehicle, compared=options.compared)
 
 
 #: In the order of the tables.

@@ -14,10 +14,10 @@ from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import run_window
-from pdhef_logtool.estimators.physics_ukf import physics_filter
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.estimators.stand_in import StandIn
-from pdhef_logtool.estimators.table import SPECS, default_names, make_estimator
+from pdhef_logtool.estimators.table import SPECS, Options, default_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -125,6 +125,23 @@ def test_windows_change_no_bit_of_the_band(signals: Signals) -> None:
     parts = tracks("physics", with_band(), *(cut(signals, a, b) for a, b in ((0, 1), (1, 111), (111, len(signals)))))
     for column in ("vy_m_s", "sideslip_std_rad", "covariance"):
         np.testing.assert_array_equal(np.concatenate([getattr(p, column) for p in parts]), getattr(whole, column))
+
+
+def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, monkeypatch: pytest.MonkeyPatch) -> None:
+    car, names, half = with_band(), ("physics", "pd-hef"), len(signals) // 2
+    windows = cut(signals, 0, half), cut(signals, half, len(signals))
+    alone = {name: tracks(name, car, *windows) for name in names}
+    run, asked = PhysicsFilter.run, []
+    monkeypatch.setattr(PhysicsFilter, "run", lambda *given: (asked.append(given[0]), run(*given))[1])
+    options = Options()
+    estimators, carries = [make_estimator(name, car, options) for name in names], [None, None]
+    for number, window in enumerate(windows):
+        for i, estimator in enumerate(estimators):
+            track, carries[i] = run_window(estimator, window, carries[i], None)
+            expected = alone[names[i]][number]
+            np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
+            np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
+    assert len(asked) == 3 * len(windows), "three filters a window, not a window and estimator"
 
 
 def test_the_band_changes_no_estimate(signals: Signals) -> None:
