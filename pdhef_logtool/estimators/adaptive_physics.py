@@ -28,7 +28,6 @@ from pdhef_logtool.estimators.filter_shell import VX, VY, YAW_RATE, Z_AY, Poster
 from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.reasons import BURST_AY
 from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
@@ -275,7 +274,7 @@ class AdaptivePhysics:
         dt = step_durations_s(plain.stamps_ns, carry.last_stamp_ns if carry else None)
         innovations = np.stack([plain.innovation[:, Z_AY], scaled.innovation[:, Z_AY]], axis=1)
         starts: BoolArray = ~np.isfinite(plain.prior[:, VX])
-        skip = faults.reason & BURST_AY > 0
+        skip = faults.extra_r[:, AY] > 0.0
         usual = np.maximum(faults.usual_std[:, AY], IDENTIFIED_SHARE * self.physics.measurement_std[Z_AY])
         out = np.empty(count)
         given = (
