@@ -26,7 +26,8 @@ chance reaches once in ``HOURS_TO_FALSE_ALARM`` of clean driving:
   likes; the burst that is looked for is five times. The usual noise is here a high quantile of e that falls more slowly
   than it rises: rough roads are remembered, and held samples (e = 0) do not make it small.
 * spikes: more of them than a long tail has, or one far beyond it.
-* stuck, missing: for ``REPORTED_AFTER_S``. Dead: within one band for ``DEAD_REPORTED_AFTER_S`` of turning.
+* stuck, missing: for ``STUCK_REPORTED_AFTER_S``, ``MISSING_REPORTED_AFTER_S``. Dead: within one band for
+  ``DEAD_REPORTED_AFTER_S`` of turning.
 
 ``docs/false_alarms.md`` has the rates and delays.
 """
@@ -127,7 +128,7 @@ FIRST_GUESS_S, FIRST_GAIN = 1.0, 5.0
 SPIKE_AT_LIMIT_NATS, SPIKE_POWER, SPIKE_FORGOTTEN_NATS_PER_S = 2.4, 3.0, 1.0
 SPIKE_NATS = math.log(3600.0 * HOURS_TO_FALSE_ALARM * QUESTIONS)
 #: Least time for which a channel is stuck or missing before that is reported.
-REPORTED_AFTER_S = 0.1
+STUCK_REPORTED_AFTER_S, MISSING_REPORTED_AFTER_S = 0.05, 0.1
 #: Least time for which both others have turned while a dead channel stayed in one band; for a_y half of it to each
 #: side, for a bank can take all of it away on one.
 DEAD_REPORTED_AFTER_S = 0.5
@@ -409,11 +410,11 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
             spike, beyond = False, 0.0
             c[C_UNSEEN_S] += step
             if not math.isfinite(z):
-                if c[C_UNSEEN_S] >= REPORTED_AFTER_S:
+                if c[C_UNSEEN_S] >= MISSING_REPORTED_AFTER_S:
                     mask |= MISSING_AY << i
                 c[C_NOISE] = _decayed(c, usual, step)
             elif _stuck(c, z, step, moving, w[W_SMOOTH_R]):
-                if c[C_RUN_S] >= REPORTED_AFTER_S:
+                if c[C_RUN_S] >= STUCK_REPORTED_AFTER_S:
                     mask |= STUCK_AY << i
                 usable[k, i] = math.nan
                 c[C_NOISE] = _decayed(c, usual, step)

@@ -221,7 +221,7 @@ def test_five_identical_samples_are_stuck_and_reported_a_little_later(channel, v
     assert not stuck[~bad].any()
     assert stuck[first + sf.STUCK_SAMPLES - 1 : first + bad.sum()].all()
     told = reported(result, reasons.STUCK_AY, channel)
-    np.testing.assert_array_equal(told, bad & (t - t[first] > sf.REPORTED_AFTER_S + 0.005))
+    np.testing.assert_array_equal(told, bad & (t - t[first] > sf.STUCK_REPORTED_AFTER_S - 0.005))
 
 
 @pytest.mark.parametrize("quantum", [0.002, 0.01, 0.02])
@@ -279,7 +279,7 @@ def test_missing_samples_are_said_and_harm_nothing(clean):
     result = found(with_column(clean, sf.YAW_RATE, gone, np.nan))
     np.testing.assert_array_equal(unused(result, sf.YAW_RATE), gone)
     told = result.reason & reasons.MISSING_YAW_RATE > 0
-    np.testing.assert_array_equal(told, gone & (t > 3.995 + sf.REPORTED_AFTER_S))
+    np.testing.assert_array_equal(told, gone & (t > 3.995 + sf.MISSING_REPORTED_AFTER_S))
     assert not (result.reason & ~reasons.MISSING_YAW_RATE).any()
 
 
