@@ -121,8 +121,10 @@ DIFFERENCES_PER_SAMPLE = 2.3
 BURST_NATS = DIFFERENCES_PER_SAMPLE * math.log(3600.0 * SAMPLES_PER_S * HOURS_TO_FALSE_ALARM * QUESTIONS)
 BURST_OVER, BURST_LIKELY = 0.5, 0.25
 #: The level of e that ``SHARE_HEALTHY`` of the samples exceed is guessed in this time, with this gain; nothing is
-#: reported meanwhile. Afterwards it doubles in ``LEARNING_S`` at most.
+#: reported meanwhile. Afterwards it doubles in ``LEARNING_S`` at most. A level that was learnt in this time is worth
+#: half: twice the evidence is asked for.
 FIRST_GUESS_S, FIRST_GAIN = 1.0, 5.0
+HALF_KNOWN_S = 3.0
 #: A spike at its limit is evidence of so much, and more as this power of what it is beyond it by; so much is forgotten
 #: in a second. With a tail of the fourth power and a spike in 45 s (Student's t with 4 degrees) it does not add up.
 SPIKE_AT_LIMIT_NATS, SPIKE_POWER, SPIKE_FORGOTTEN_NATS_PER_S = 2.4, 3.0, 1.0
@@ -211,6 +213,12 @@ def _decayed(c, usual, dt):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _asked(c, nats):  # type: ignore[no-untyped-def]
+    """Return the evidence that is asked for where ``nats`` would do with a level that is known for sure."""
+    return nats * (1.0 + HALF_KNOWN_S / max(c[C_LEVEL_S], FIRST_GUESS_S))
+
+
+@njit(cache=True)
 def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
     """Add what a squared difference says for a burst, and learn the level that such differences usually have."""
     age = c[C_AGE]
@@ -219,8 +227,9 @@ def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
     nats = NATS_BEYOND if beyond and moving and known else NATS_WITHIN
     # Samples that follow each other faster are not independent: road and body are slower.
     nats *= min(1.0, age * SAMPLES_PER_S)
-    c[C_BURST] = min(max(c[C_BURST] + nats, 0.0), BURST_NATS)
-    if c[C_BURST] >= BURST_NATS:
+    asked = _asked(c, BURST_NATS)
+    c[C_BURST] = min(max(c[C_BURST] + nats, 0.0), asked)
+    if c[C_BURST] >= asked:
         c[C_BURST_TOLD] = 1.0
     elif c[C_BURST] < BURST_OVER * BURST_NATS:
         c[C_BURST_TOLD] = 0.0
@@ -240,8 +249,9 @@ def _weigh_spike(c, beyond, dt):  # type: ignore[no-untyped-def]
     c[C_SPIKE] = max(c[C_SPIKE] - SPIKE_FORGOTTEN_NATS_PER_S * dt, 0.0)
     if beyond <= 1.0 or c[C_LEVEL_S] <= FIRST_GUESS_S or c[C_BURST] > BURST_LIKELY * BURST_NATS:
         return False
-    c[C_SPIKE] = min(c[C_SPIKE] + SPIKE_AT_LIMIT_NATS + SPIKE_POWER * math.log(beyond), 2.0 * SPIKE_NATS)
-    return c[C_SPIKE] >= SPIKE_NATS
+    asked = _asked(c, SPIKE_NATS)
+    c[C_SPIKE] = min(c[C_SPIKE] + SPIKE_AT_LIMIT_NATS + SPIKE_POWER * math.log(beyond), 2.0 * asked)
+    return c[C_SPIKE] >= asked
 
 
 @njit(cache=True)
