@@ -148,9 +148,11 @@ def roads(car: Car, seed: int, hours: float) -> Iterator[Clean]:
         ("road, 200 Hz, each sample written four times", "sedan", 0.9, silent, lambda s, rng: faster(s, rng, hold=4)),
         ("road, surfaces of 1 to 3 times the noise, kerbs of 8 times", "sedan", 0.9, silent, surfaces),
     ]
-    for kind, vehicle, friction, noise, change in kinds:
+    for place, (kind, vehicle, friction, noise, change) in enumerate(kinds):
         for part in range(20):
-            drive_seed, name = seed + part, vehicle if vehicle == "sedan" else f"{vehicle}~{seed + part}"
+            # No two roads share a noise.
+            drive_seed = seed + 100 * (place + 1) + part
+            name = vehicle if vehicle == "sedan" else f"{vehicle}~{drive_seed}"
             given = {"friction": friction, "duration_s": 3600.0 * hours, "noise": noise}
             signals = simulated(car, "road", name, drive_seed, **given)
             if signals is not None:
@@ -373,8 +375,8 @@ def page(given: Any, parts: dict[str, str]) -> str:
     """Return the page."""
     return f"""# Sensor faults that are reported
 
-Written by `python -m studies.false_alarms --seed {given.seed} --hours {given.hours:g} --drives {given.drives}`; every
-figure comes from that command.
+Written by `python -m studies.false_alarms --seed {given.seed} --hours {given.hours:g} --drives {given.drives}`;
+every figure comes from that command.
 
 A report of a sensor fault has to be rare on a healthy car: at most one interval in an hour of clean driving, of all
 kinds together. What the filters do with single samples is another matter, and has not changed: they weight down or
