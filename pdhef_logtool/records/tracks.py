@@ -54,7 +54,7 @@ class StateTrack:
     ``valid`` is False where the source says that its state must not be used. ``diverged`` flags the stamps at
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
     ``mixture_weight`` (of all filters of an adaptive estimator but its first) and ``reason`` (bits of
-    :mod:`pdhef_logtool.records.reasons`, why samples were not used as usual) are [N], or of length 0 where the source
+    :mod:`pdhef_logtool.records.reasons`, what is reported of a_y and yaw rate) are [N], or of length 0 where the source
     has none; so are roll and bank, the share by which all lateral forces are larger, and the biases by which sensors
     read too much.
     """

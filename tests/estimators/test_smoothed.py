@@ -264,7 +264,7 @@ def rough() -> Signals:
 
 @pytest.fixture(scope="module")
 def faulty(rough) -> Signals:
-    """The same with a stuck gyro, a burst on both sensors and spikes."""
+    """The same with a stuck gyro, a burst on both sensors, spikes and missing samples."""
     rng = np.random.default_rng(3)
     t = (rough.stamps_ns - rough.stamps_ns[0]) * 1e-9
     ay, yaw_rate = rough.ay_m_s2.copy(), rough.yaw_rate_rad_s.copy()
@@ -272,7 +272,9 @@ def faulty(rough) -> Signals:
     burst = (t > 6.2) & (t < 7.2)
     ay[burst] += 2.4 * rng.standard_normal(burst.sum())
     yaw_rate[burst] += 0.08 * rng.standard_normal(burst.sum())
-    ay[np.searchsorted(t, (0.7, 2.5, 4.4))] += 8.0
+    ay[np.searchsorted(t, (0.7, 2.5, 4.4, 4.6, 4.8))] += 8.0
+    ay[(t > 5.0) & (t < 5.2)] = np.nan
+    yaw_rate[(t > 5.4) & (t < 5.6)] = np.nan
     return replace(rough, ay_m_s2=ay, yaw_rate_rad_s=yaw_rate)
 
 
