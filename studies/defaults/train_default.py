@@ -36,8 +36,8 @@ HOME = SHIPPED_CARS["saloon"]
 SETS = {"one_car": (1000, "default"), "other_cars": (2000, "randomised"), "evidence": (3000, "default")}
 DRIVES = 800
 #: Of the sets that nothing is trained on: for the card, and for the evidence that the network helps.
-OTHER_DRIVES = {"other_cars": 200, "evidence": 60}
-EPOCHS, BASELINE_EPOCHS = 22, 40
+OTHER_DRIVES = {"other_cars": 200, "evidence": 200}
+EPOCHS, BASELINE_EPOCHS = 66, 40
 PAPER_EPOCHS = 15
 TRIALS = 64
 #: Wrong frictions and vehicle files that the intervals for an unsure car allow for.
