@@ -220,8 +220,7 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
         if calibration["understeer"] is not None and calibration["understeer"]["contradicts"]:
             said.append("the drive understeers otherwise than the file")
     if friction is not None and modelled:
-        how = f"estimated ({friction['summary']})" if friction["estimated"] else f"told ({friction['source']})"
-        said.append(f"friction {how}")
+        said.append(f"friction {_friction(friction)}")
     if main.distrusted:
         said.append(main.why)
     trust = (own["algorithm"] or {"options": {}})["options"].get("trust")
@@ -229,6 +228,13 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
         found = f"network trusted at {trust:g} by the car's evidence"
         said.append(found if trust else "no network, for want of evidence that it helps")
     return said
+
+
+def _friction(friction: Mapping[str, Any]) -> str:
+    source: str = friction["source"]
+    if friction["estimated"]:
+        return f"estimated ({friction['summary']})"
+    return source if source.startswith("assumed") else f"told ({source})"
 
 
 def _car(vehicle: Mapping[str, Any]) -> str:

@@ -287,10 +287,10 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         f"vehicle {report['vehicle']['name']}",
         "",
     ]
-    if report["answer"] is not None:
-        lines += _bullets("Answer", [text for text in report["answer"]["texts"].values() if text])
+    if answer := report.get("answer"):
+        lines += _bullets("Answer", [text for text in answer["texts"].values() if text])
     lines += _bullets("Warnings", report["warnings"])
-    lines += _bullets("Remarks", report["remarks"])
+    lines += _bullets("Remarks", report.get("remarks", ()))
     lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
     lines += _truth_lines(report["truth"])
     if found := friction_line(report):
@@ -303,7 +303,7 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     for e in report["estimators"]:
         happened = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
         told = [f"skipped: {e['reason']}"] if e["reason"] else []
-        notes = "; ".join([*told, *e["notes"], *e["intervals"], *filter(None, happened)])
+        notes = "; ".join([*told, *e["notes"], *e.get("intervals", ()), *filter(None, happened)])
         kind = "causal" if e["causal"] else "not causal"
         lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
     lines += ["", "## Signals", ""]

@@ -142,7 +142,7 @@ def test_slice_scores_the_slice_alone(sample_logs_dir: Path, tmp_path: Path) -> 
 
 def test_log_without_truth_still_runs(sample_logs_dir: Path, tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml")
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("all",))
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
@@ -173,7 +173,7 @@ def test_estimates_do_not_depend_on_whether_truth_is_mapped(
 def test_missing_signal_skips_the_estimators_that_need_it(sample_logs_dir: Path, tmp_path: Path) -> None:
     no_steering = NO_TRUTH_MAPPING[NO_TRUTH_MAPPING.index("[signals.ax_m_s2]") :]
     (tmp_path / "m.toml").write_text(no_steering)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml")
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("all",))
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     assert result.results[0].report is not None

@@ -96,6 +96,7 @@ def test_what_was_assumed_of_car_friction_and_network() -> None:
     estimated = FrictionFacts("estimate", estimated=True, observable_share=0.01, summary="observable 1 % of the time")
     assert "friction estimated (observable 1 %" in texts(friction=estimated)["assumed"]
     assert "--friction" in texts(friction=estimated)["next"]
+    assert "friction assumed, 1;" in texts(friction=FrictionFacts("assumed, 1"))["assumed"]
     assert texts(replace(MAIN, name="zero"))["assumed"] == "no model of the car: zero needs none"
 
 
