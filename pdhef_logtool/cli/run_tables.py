@@ -296,13 +296,15 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
 
 def _look_at(report: _Report, inside: float | None, main: str) -> str:
     """Return what of a log a person should look at, in a few words; ``main`` where the logs' main estimators differ."""
+    stands_in = report["answer"]["stands_in"]
     failed = sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks") or [])
     scored = any(m["signal"] == "sideslip_rad" and m["metric"] == "rmse" for m in report["metrics"])
     found = [
-        f"by {main}" if main else "",
+        f"by {stands_in}" if stands_in else f"by {main}" if main else "",
         f"{failed} check{'s' * (failed > 1)} failed" if failed else "",
         "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
         "no truth" if not report["truth"]["available"] else "" if scored else "not scored",
+        "diverged" if diverged_line(report, report["answer"]["main"]) else "",
         "band too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
     ]
     return ", ".join(filter(None, found))

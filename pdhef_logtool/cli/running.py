@@ -120,7 +120,7 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
 
     console.show(result, render_run, as_json)
     for one in result.results:
-        if one.outcome.failed is not None and one.report is not None:  # of the others it was told as a warning
+        if one.outcome.failed is not None and one.report is not None:  # of the others the tables say it
             console.say(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
     failed = [v for v in result.verdicts if v.failed]
     for verdict in failed:

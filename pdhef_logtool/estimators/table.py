@@ -173,7 +173,7 @@ SPECS: tuple[Spec, ...] = (
         "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="optional",
     ),
     Spec(
-        "pd-hef-trust1", "pd-hef at trust 1, whatever the car allows (needs a network)",
+        "pd-hef-trust1", "pd-hef at trust 1, whatever the car allows (needs a network; to be named, not one of all)",
         "pd_hef:build", _ESP, 0x882255, in_all=False, network="residual",
     ),
     Spec(

@@ -15,6 +15,7 @@ from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.pipeline import LogResult, RunResult
+from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.report import EstimatorFacts, LogFacts, LogOutcome, TruthFacts
 
 NAMES = [s.name for s in SPECS]
@@ -127,6 +128,17 @@ def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
     assert text.count("monday") == 1  # there is nothing more to say of it
     assert "bad  failed: no log" in text
     assert "4 logs: 3 done, 1 failed, 1 with input lost" in text
+
+
+def test_the_joint_table_says_who_answers_and_what_to_look_at() -> None:
+    diverged = [Event("pd-hef diverged", 0, 10**9, "")]
+    narrow = [*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", 0.5))]
+    stood_in = report(replace(MAIN, stands_in="open-loop"), metrics=GOOD)
+    text = shown(named("monday", segments=diverged), named("tuesday", metrics=narrow), stood_in, width=120)
+    looks = [rows(text, name)[0].rstrip().split("  ")[-1].strip() for name in ("monday", "tuesday", "drive")]
+    assert looks == ["diverged", "band too narrow", "by open-loop"]
+    other = shown(named("monday"), report(replace(MAIN, name="zero"), metrics=GOOD))
+    assert ("by pd-hef" in rows(other, "monday")[0], "by zero" in rows(other, "drive")[0]) == (True, True)
 
 
 def test_named_estimators_keep_their_table_a_log() -> None:
