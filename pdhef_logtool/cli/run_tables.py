@@ -53,6 +53,8 @@ _LEAVE_FIRST = (
     *("v_x\nRMSE m/s", "\nmax °", "1 s lateral\nRMSE m", "v_y\nRMSE m/s", "\np95 °", "a_y\nRMSE m/s²", "\nNIS/dof"),
     *("\nlag ms", "linear\nRMSE °", "yaw rate\nRMSE °/s", "nonlinear\nRMSE °"),
 )
+#: Channels that are named where several share a loss.
+_MOST_PLACES = 3
 _TEXTS = {
     "result": "Result",
     "consistency": "Consistency",
@@ -136,7 +138,7 @@ def _render_log(one: LogResult, console: Console, alike: _Alike | None) -> None:
     elif answer is not None:
         texts = {**texts, "next": texts.get("next", "nothing is needed; pdhef view OUTPUT shows the drive")}
     tabled = alike is None or answer["named"]
-    above = [*_failed_checks(report), *_losses(report)]
+    above = list(_failed_checks(report))
     below = list(_below(report, () if alike is None else alike.remarks, tabled=tabled))
     if not (tabled or texts or above or below):
         return
@@ -188,15 +190,19 @@ def _failed_checks(report: _Report) -> Iterable[str | Text]:
 
 
 def _losses(report: _Report) -> Iterable[str]:
-    for loss in report["losses"]:
-        word = "lost" if loss["severity"] == "lost" else "note"
+    """Yield what of the input was lost, then what else is known of it; what several channels share stands once."""
+    where: dict[tuple[str, str, str], list[str]] = {}
+    for loss in sorted(report["losses"], key=lambda x: x["severity"] != "lost"):
         told = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
-        count = "" if told else f"{loss['count']} × "
+        what = loss["what"] if told else f"{loss['count']} × {loss['what']}"
         span = ""
         if loss["start_ns"] is not None and loss["end_ns"] is not None:
             start = report["log"]["start_ns"]
             span = f", {(loss['start_ns'] - start) / 1e9:.2f} to {(loss['end_ns'] - start) / 1e9:.2f} s"
-        yield f"{word}: {count}{loss['what']} ({loss['where']}{span})"
+        where.setdefault(("lost" if loss["severity"] == "lost" else "note", what, span), []).append(loss["where"])
+    for (word, what, span), places in where.items():
+        more = f" and {len(places) - _MOST_PLACES} more" if len(places) > _MOST_PLACES else ""
+        yield f"{word}: {what} ({', '.join(places[:_MOST_PLACES])}{more}{span})"
 
 
 def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[str]:
@@ -219,6 +225,7 @@ def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[s
                 happened.setdefault(found, []).append(estimator["name"])
     for found, names in happened.items():
         yield f"{', '.join(names)}: {found}"
+    yield from _losses(report)
     yield from (f"note: {remark}" for remark in report["remarks"] if remark not in told)
 
 

@@ -170,7 +170,7 @@ def _consistency(main: MainFacts, figures: _Figures) -> str:
         else:
             said.append(
                 f"{follows}, which sideslip 0 does too ({naive:.2f}): little sideslip, a biased accelerometer, a "
-                "banked road or a wrong model; it tells nothing"
+                "banked road or a wrong model, so that it tells nothing"
             )
     nis, dof = (figures.get((main.name, "state", metric)) for metric in ("nis", "nis_dof"))
     if nis is not None and dof:

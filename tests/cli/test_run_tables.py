@@ -146,6 +146,14 @@ def test_named_estimators_keep_their_table_a_log() -> None:
     assert len(rows(text, "estimator")) == 2
 
 
+def test_what_channels_share_stands_once_and_below_the_answer() -> None:
+    gaps = [Loss("gap", "no samples for 2 s", f"/a.{i}", 0, 2 * 10**9, severity="note") for i in range(5)]
+    text = shown(named("drive", losses=[*gaps, Loss("bad-chunk", "a chunk", "a.mcap", count=2)]))
+    assert text.count("no samples") == 1
+    assert "note: no samples for 2 s (/a.0, /a.1, /a.2 and 2 more, 0.00 to 2.00 s)" in text
+    assert text.index("Result") < text.index("lost: 2 × a chunk (a.mcap)") < text.index("note: no samples")
+
+
 def test_long_names_of_logs_stay_whole() -> None:
     name = "recording_of_a_long_day_" * 4
     text = shown(named(name), named("b"))

@@ -72,7 +72,7 @@ def test_a_truth_of_gnss_alone_says_why_there_is_no_figure() -> None:
     assert said["band"].startswith("not checked")
 
 
-@pytest.mark.parametrize(("d2", "proof"), [(0.1, "no proof"), (0.95, "it tells nothing")])
+@pytest.mark.parametrize(("d2", "proof"), [(0.1, "no proof"), (0.95, "so that it tells nothing")])
 def test_without_truth_the_consistency_is_put_in_words(d2: float, proof: str) -> None:
     metrics = figures(
         ("pd-hef", "vy_m_s", "d2", d2), ("zero", "vy_m_s", "d2", 1.0),
