@@ -53,8 +53,8 @@ _LEAVE_FIRST = (
     *("v_x\nRMSE m/s", "\nmax °", "1 s lateral\nRMSE m", "v_y\nRMSE m/s", "\np95 °", "a_y\nRMSE m/s²", "\nNIS/dof"),
     *("\nlag ms", "linear\nRMSE °", "yaw rate\nRMSE °/s", "nonlinear\nRMSE °"),
 )
-#: Channels that are named where several share a loss.
-_MOST_PLACES = 3
+#: Channels that are named where several share a loss, and checks where several are undecided.
+_MOST_PLACES, _MOST_UNDECIDED = 3, 4
 _TEXTS = {
     "result": "Result",
     "consistency": "Consistency",
@@ -186,7 +186,8 @@ def _failed_checks(report: _Report) -> Iterable[str | Text]:
             yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {check['evidence']}{remedy}")
     undecided = [check["name"] for check in checks if check["verdict"] == "undecided"]
     if undecided:
-        yield f"not decided by this drive: {', '.join(undecided)}"
+        more = f" and {len(undecided) - _MOST_UNDECIDED} more" if len(undecided) > _MOST_UNDECIDED else ""
+        yield f"not decided by this drive: {', '.join(undecided[:_MOST_UNDECIDED])}{more}"
 
 
 def _losses(report: _Report) -> Iterable[str]:
