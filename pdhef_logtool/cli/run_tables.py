@@ -108,13 +108,17 @@ class _Alike:
 
     @classmethod
     def of(cls, reports: Sequence[_Report]) -> _Alike:
-        first, *others = map(_texts, reports)
+        first, *others = [{key: _clauses(key, text) for key, text in _texts(report).items()} for report in reports]
         by_remark: dict[str, list[str]] = {}
         for report in reports:
             for remark in report["remarks"]:
                 by_remark.setdefault(remark, []).append(report["log"]["name"])
         return cls(
-            {key: text for key, text in first.items() if all(texts.get(key) == text for texts in others)},
+            {
+                key: "; ".join(common)
+                for key, clauses in first.items()
+                if (common := [c for c in clauses if all(c in texts.get(key, ()) for texts in others)])
+            },
             {remark: logs for remark, logs in by_remark.items() if len(logs) > 1},
         )
 
@@ -133,8 +137,12 @@ def _render_log(one: LogResult, console: Console, alike: _Alike | None) -> None:
     texts = _texts(report)
     if alike is not None:
         scored = _figures(report).get((answer["main"], "sideslip_rad", "all", "rmse")) is not None
-        said = {*alike.texts, *(("result", "band") if scored else ())}
-        texts = {key: text for key, text in texts.items() if key not in said}
+        texts = {
+            key: "; ".join(own)
+            for key, text in texts.items()
+            if not (scored and key in ("result", "band"))
+            and (own := [c for c in _clauses(key, text) if c not in _clauses(key, alike.texts.get(key, ""))])
+        }
     elif answer is not None:
         texts = {**texts, "next": texts.get("next", "nothing is needed; pdhef view OUTPUT shows the drive")}
     tabled = alike is None or answer["named"]
@@ -166,6 +174,11 @@ def _texts(report: _Report) -> dict[str, str]:
         name = best["name"] if best["causal"] else f"{best['name']} (not causal)"
         texts["hindsight"] = f"by this log's truth {name} was best, {error} RMSE; nothing was chosen by it"
     return {key: texts[key] for key in _TEXTS if texts.get(key)}
+
+
+def _clauses(key: str, text: str) -> list[str]:
+    """Return what is told of several logs once, clause by clause where the clauses stand for themselves."""
+    return text.split("; ") if key in ("assumed", "next") else [text]
 
 
 def _lines(texts: Mapping[str, str]) -> Table:

@@ -208,7 +208,7 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
         said = [f"no model of the car: {main.name} needs none"]
     elif calibrated:
         where = "this log" if calibration["logs"] == 1 else f"{calibration['logs']} logs"
-        said = [f"{_car(vehicle)}, calibrated on {where} without truth and so not causal"]
+        said = [_car(vehicle), f"calibrated on {where} without truth and so not causal"]
     elif vehicle["file"] is None:
         said = [_car(vehicle)]
     else:

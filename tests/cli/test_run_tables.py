@@ -16,7 +16,7 @@ from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.runs.pipeline import LogResult, RunResult
 from pdhef_logtool.sinks.base import Event
-from pdhef_logtool.sinks.report import EstimatorFacts, LogFacts, LogOutcome, TruthFacts
+from pdhef_logtool.sinks.report import EstimatorFacts, FrictionFacts, LogFacts, LogOutcome, TruthFacts
 
 NAMES = [s.name for s in SPECS]
 GOOD = [
@@ -139,6 +139,13 @@ def test_the_joint_table_says_who_answers_and_what_to_look_at() -> None:
     assert looks == ["diverged", "band too narrow", "by open-loop"]
     other = shown(named("monday"), report(replace(MAIN, name="zero"), metrics=GOOD))
     assert ("by pd-hef" in rows(other, "monday")[0], "by zero" in rows(other, "drive")[0]) == (True, True)
+
+
+def test_what_is_assumed_of_all_logs_is_said_once_and_the_rest_with_each() -> None:
+    told = named("tuesday", friction=FrictionFacts("estimate", estimated=True, observable_share=1.0, summary="seen"))
+    text = shown(named("monday"), told)
+    assert text.count("car golf") == text.count("network trusted") == 1
+    assert text.index("car golf") < text.index("friction told (option, 0.9)") < text.index("friction estimated (seen)")
 
 
 def test_named_estimators_keep_their_table_a_log() -> None:

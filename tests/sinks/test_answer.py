@@ -104,7 +104,7 @@ def test_a_calibrated_car_is_said_to_be_and_a_refusal_with_its_reason() -> None:
     estimators = [EstimatorFacts("pd-hef", causal=False, algorithm={"physics_sha256": SHA, "options": {}})]
     told = {"refused": None, "logs": 1, "understeer": {"contradicts": True}}
     said = texts(vehicle_proven=False, estimators=estimators, calibration=told)
-    assert "car golf, calibrated on this log without truth and so not causal" in said["assumed"]
+    assert "car golf; calibrated on this log without truth and so not causal" in said["assumed"]
     assert "the drive understeers otherwise than the file" in said["assumed"]
     said = texts(vehicle_proven=False, calibration={"refused": "too short", "logs": 1, "understeer": None})
     assert "as its file has it, which no driving proved; not calibrated on this log: too short" in said["assumed"]
