@@ -111,8 +111,12 @@ def drive(
     tyre: Force = magic_tyre,
     speed_every: int = 2,
     delay_ns: int | np.ndarray = 0,
+    side_pull_m_s2: float = 0.0,
 ) -> Drive:
-    """Drive with inputs that are held from stamp to stamp, noise-free sensors at the centre of gravity."""
+    """Drive with inputs that are held from stamp to stamp, noise-free sensors at the centre of gravity.
+
+    ``side_pull_m_s2`` is the part of gravity that pulls to the left on a banked road; no accelerometer feels it.
+    """
     dt = np.full(round(duration_s / step_s), step_s) if np.isscalar(step_s) else np.asarray(step_s)
     dt = np.round(dt * 1e9) * 1e-9
     n = len(dt) + 1
@@ -126,6 +130,7 @@ def drive(
         ay[k] = forces(*state[k], delta[k], mu, tyre)[0]
         if k + 1 < n:
             state[k + 1] = runge_kutta(state[k], delta[k], ax[k], mu, dt[k], 2, tyre)
+            state[k + 1, 1] += side_pull_m_s2 * dt[k]
     measured_speed = np.where(np.arange(n) % speed_every == 0, state[:, 0], np.nan)
     signals = make_signals(
         dt,

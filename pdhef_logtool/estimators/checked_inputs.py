@@ -39,7 +39,7 @@ class CheckedInputs:
     def nbytes(self) -> int:
         """Memory that this takes beside the signals it was made of."""
         f = self.faults
-        arrays = [self.rate, f.extra_r, f.noise_std, f.usual_std, f.reason]
+        arrays = [self.rate, f.extra_r, f.noise_std, f.reason]
         arrays += [x for s in (f.filtered, f.network) for x in (s.ay_m_s2, s.yaw_rate_rad_s)]
         return sum(a.nbytes for a in arrays)
 

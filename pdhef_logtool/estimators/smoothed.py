@@ -1,8 +1,7 @@
 """``pd-hef-smoothed``: Rauch-Tung-Striebel smoothing over ``pd-hef`` (METHOD §12, §14). Not causal.
 
-Forward runs F1 of ``pd-hef``, the car's physics filter with its residual, on checked signals
-(:mod:`~.checked_inputs`);
-backward, from the last step that is seen,
+Forward run the filters of ``pd-hef``, each with its residual, on checked signals (:mod:`~.checked_inputs`);
+backward goes each of them, from the last step that is seen,
 
     G_k = C_{k,k+1} P_{k+1|k}⁻¹
     x^s_k = x_k + G_k (x^s_{k+1} − x_{k+1|k})
@@ -16,24 +15,36 @@ is a known input of the step, so that it stands in x_{k+1|k} and needs no term o
 - Where the gate opened, the inflated covariance counts as that of the prediction: process noise of that step.
 - The detector is causal: what comes later does not make it find a fault sooner.
 
+They are mixed as in :mod:`~.adaptive_physics`, with the likelihood of what comes later, forgotten with its distance,
+beside that of what came before: Λ_k + Λ'_k.
+
 A log is smoothed in blocks of fixed time, counted from its first step: each with all that follows up to the end of the
 next block. So a step sees from one to two blocks ahead, memory is bounded, and no window changes a bit.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.adaptive_physics import (
+    FORGET_S,
+    RESTART_GAP_S,
+    AdaptivePhysics,
+    gather_evidence,
+    mix,
+    weigh,
+)
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, r_scale
-from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
+from pdhef_logtool.estimators.filter_shell import AX_BIAS, VX, PosteriorSteps
 from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, StepLinks
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import StepColumns
+from pdhef_logtool.records.release import StepColumns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
@@ -125,33 +136,58 @@ def _smooth(forward, links, span, smoothed):  # type: ignore[no-untyped-def]
             out_P[k] = Ps
 
 
-def smooth_steps(
-    steps: PosteriorSteps, links: StepLinks, count: int, origin_ns: int, block_ns: int
-) -> tuple[FloatArray, FloatArray]:
-    """Return smoothed states [count, n] and covariances [count, n, n] of the first ``count`` steps.
+def spans(steps: PosteriorSteps, count: int, origin_ns: int, block_ns: int) -> Iterator[tuple[int, int, int]]:
+    """Yield of each block that begins in the first ``count`` steps its first and last step there, and the last it sees.
 
     A step of block b, counted from ``origin_ns``, is smoothed with what is given of blocks b and b + 1.
     """
-    n = steps.x.shape[1]
-    x, P = np.empty((count, n)), np.empty((count, n, n))
-    forward, tied = (steps.x, steps.P, steps.prior), (links.kind, links.predicted_P, links.cross)
     block = (steps.stamps_ns - origin_ns) // block_ns
     for b in np.unique(block[:count]).tolist():
         first, behind = (int(i) for i in np.searchsorted(block, (b, b + 1)))
-        end = int(np.searchsorted(block, b + 2)) - 1
-        _smooth(forward, tied, (first, min(behind, count) - 1, end), (x, P))
+        yield first, min(behind, count) - 1, int(np.searchsorted(block, b + 2)) - 1
+
+
+def smooth_steps(
+    steps: PosteriorSteps, links: StepLinks, count: int, origin_ns: int, block_ns: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return smoothed states [count, n] and covariances [count, n, n] of the first ``count`` steps (see `spans`)."""
+    n = steps.x.shape[1]
+    x, P = np.empty((count, n)), np.empty((count, n, n))
+    forward, tied = (steps.x, steps.P, steps.prior), (links.kind, links.predicted_P, links.cross)
+    for span in spans(steps, count, origin_ns, block_ns):
+        _smooth(forward, tied, span, (x, P))
     return x, P
+
+
+@njit(cache=True)
+def _look_back(dt, likelihood, starts, span, out):  # type: ignore[no-untyped-def]
+    """Add to Λ [K, H] of the first steps of a span the likelihood of what follows them in it."""
+    first, last, end = span
+    later = np.zeros(likelihood.shape[1])
+    for k in range(end - 1, first - 1, -1):
+        if starts[k + 1] or not dt[k + 1] <= RESTART_GAP_S:
+            later[:] = 0.0
+        else:
+            if np.isfinite(likelihood[k + 1]).all():
+                later += likelihood[k + 1]
+            later *= math.exp(-dt[k + 1] / FORGET_S)
+        if k <= last:
+            out[k] += later
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForwardSteps(StepColumns):
-    """Steps of the forward pass: posteriors, what ties them, and what was wrong with their samples.
-
-    ``extra_r`` [K, 2] and ``reason`` [K] are those of :class:`~.sensor_faults.SensorFaults`.
-    """
+    """Steps of a filter's forward pass: posteriors, and what ties them."""
 
     posterior: PosteriorSteps
     links: StepLinks
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedSteps(StepColumns):
+    """What all filters share: their evidence Λ [K, H], and ``extra_r`` [K, 2] and ``reason`` [K] of the detector."""
+
+    evidence: FloatArray
     extra_r: FloatArray
     reason: IntArray
 
@@ -162,24 +198,26 @@ class ForwardSteps(StepColumns):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedCarry:
-    """State of the inputs and of the forward filter behind all steps that are taken; those ahead of the output.
+    """State of the inputs, the forward filters [H] and their evidence behind all steps that are taken; those ahead.
 
     ``inputs`` is None where all inputs are known beforehand. ``origin_ns`` is where the blocks begin.
     """
 
     inputs: InputCarry | None
-    forward: FilterCarry
-    ahead: ForwardSteps
+    forward: tuple[FilterCarry, ...]
+    evidence: FloatArray
+    ahead: tuple[ForwardSteps, ...]
+    shared: SharedSteps
     origin_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
 class SmoothedPhysics:
-    """The car's physics filter with trust times the residual, smoothed.
+    """The car's physics filters with trust times the residual, smoothed.
 
     Parameters
     ----------
-    filtered : what is smoothed: its inputs, and its F1 runs forward.
+    filtered : what is smoothed: its inputs, and its filters run forward.
     block_s : a step sees at least this much ahead, in s, and at most twice as much.
     notes : what the report says of it.
     """
@@ -194,11 +232,6 @@ class SmoothedPhysics:
     def look_ahead_s(self) -> float:
         """How much of what follows a window :meth:`run` is to be given."""
         return 2.0 * self.block_s
-
-    @property
-    def filter(self) -> PhysicsFilter:
-        """The filter that runs forward."""
-        return replace(self.filtered.physics, name=self.name)
 
     def run(
         self,
@@ -224,44 +257,89 @@ class SmoothedPhysics:
             if end < len(signals):
                 horizon_ns = given.stamps_ns[end - 1] + round(self.look_ahead_s * 1e9)
                 seen = int(np.searchsorted(given.stamps_ns, horizon_ns, side="right"))
-            taken = first + (0 if carry is None else len(carry.ahead))
+            taken = first + (0 if carry is None else len(carry.shared))
             fresh = given.rows(taken, seen)
             inputs = None if carry is None else carry.inputs
             if known is None:
                 checked, inputs = self.filtered.inputs(fresh, inputs)
             else:
                 checked = known.cut(taken, seen)
-            steps, forward = self._filtered(checked, None if carry is None else carry.forward)
+            steps, shared, forward, evidence = self._filtered(checked, carry)
             if carry is not None:
-                steps = carry.ahead.joined(steps)
+                steps = tuple(before.joined(now) for before, now in zip(carry.ahead, steps, strict=True))
+                shared = carry.shared.joined(shared)
             origin_ns = carry.origin_ns if carry else None
             if origin_ns is None and len(given):
                 origin_ns = int(given.stamps_ns[0])
-            parts.append(self._smoothed(given.rows(first, end), steps, forward, origin_ns or 0))
-            carry = SmoothedCarry(inputs, forward, steps.since(end - first), origin_ns)
+            parts.append(self._smoothed(given.rows(first, end), steps, shared, forward, origin_ns or 0))
+            passed = end - first
+            ahead_of = tuple(one.since(passed) for one in steps)
+            carry = SmoothedCarry(inputs, forward, evidence, ahead_of, shared.since(passed), origin_ns)
         assert carry is not None
         return concatenate(parts), carry
 
-    def _filtered(self, checked: CheckedInputs, carry: FilterCarry | None) -> tuple[ForwardSteps, FilterCarry]:
-        """Run the filter forward over steps that it has not taken yet."""
-        faults = checked.faults
-        steps, after, links = self.filter.linked_steps(
-            faults.filtered, carry, self.filtered.trust * checked.rate, faults.extra_r
+    def _filtered(
+        self, checked: CheckedInputs, carry: SmoothedCarry | None
+    ) -> tuple[tuple[ForwardSteps, ...], SharedSteps, tuple[FilterCarry, ...], FloatArray]:
+        """Run the filters forward over steps that they have not taken yet; the last two are carried on."""
+        faults, filters = checked.faults, self.filtered.filters
+        rate = self.filtered.trust * checked.rate
+        before = carry.forward if carry else [None] * len(filters)
+        runs = [f.linked_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
+        gathered, evidence = gather_evidence(
+            [steps for steps, _, _ in runs],
+            carry.forward[0].last_stamp_ns if carry else None,
+            carry.evidence if carry else np.zeros(len(filters)),
         )
-        return ForwardSteps(steps, links, faults.extra_r, faults.reason), after
+        shared = SharedSteps(gathered, faults.extra_r, faults.reason)
+        forward = tuple(ForwardSteps(steps, links) for steps, _, links in runs)
+        return forward, shared, tuple(after for _, after, _ in runs), evidence
 
-    def _smoothed(self, signals: Signals, steps: ForwardSteps, after: FilterCarry, origin_ns: int) -> StateTrack:
+    # positional: the steps and what belongs to them.
+    def _smoothed(
+        self,
+        signals: Signals,
+        steps: Sequence[ForwardSteps],
+        shared: SharedSteps,
+        after: Sequence[FilterCarry],
+        origin_ns: int,
+    ) -> StateTrack:
         """Smooth the steps of ``signals``, which are the first of ``steps``, with all of them."""
-        count = len(signals)
-        x, P = smooth_steps(steps.posterior, steps.links, count, origin_ns, round(self.block_s * 1e9))
-        here = replace(steps.posterior.until(count), x=x, P=P, ready_ns=signals.stamps_ns)
-        # Known at its own stamp, a step is not predicted: what comes back is the step itself.
-        track, _ = self.filter.outputs(signals, None, here, after)
+        count, block_ns = len(signals), round(self.block_s * 1e9)
+        physics = self.filtered.physics
+        tracks, valid = [], []
+        for one, forward, carry in zip(self.filtered.filters, steps, after, strict=True):
+            x, P = smooth_steps(forward.posterior, forward.links, count, origin_ns, block_ns)
+            here = replace(forward.posterior.until(count), x=x, P=P, ready_ns=signals.stamps_ns)
+            # Known at its own stamp, a step is not predicted: what comes back is the step itself.
+            track, _ = one.outputs(signals, None, here, carry)
+            tracks.append(track)
+            valid.append(here.valid)
+        track = tracks[0]
+        told: dict[str, Any] = {}
+        if len(tracks) > 1:
+            evidence = self._two_sided([f.posterior for f in steps], shared.evidence, count, origin_ns)
+            weights = weigh(evidence + self.filtered.prior, np.stack(valid, axis=1))
+            track = mix(weights, tracks)
+            told["mixture_weight"] = np.where(track.valid, 1.0 - weights[:, 0], np.nan)
         return replace(
             track,
+            name=self.name,
             network_trust=np.where(track.valid, self.filtered.trust, np.nan),
-            r_scale=np.where(track.valid, r_scale(steps.extra_r[:count], self.filter.measurement_std), 1.0),
+            r_scale=np.where(track.valid, r_scale(shared.extra_r[:count], physics.measurement_std), 1.0),
             nis=np.full(count, np.nan),  # a smoothed state has no innovation
             nis_dof=np.zeros(count),
-            reason=steps.reason[:count],
+            reason=shared.reason[:count],
+            **told,
         )
+
+    def _two_sided(
+        self, steps: Sequence[PosteriorSteps], evidence: FloatArray, count: int, origin_ns: int
+    ) -> FloatArray:
+        """Return Λ + Λ' [count, H]."""
+        out = evidence[:count].copy()
+        likelihood = np.stack([s.log_likelihood for s in steps], axis=1)
+        dt, starts = step_durations_s(steps[0].stamps_ns, None), ~np.isfinite(steps[0].prior[:, VX])
+        for span in spans(steps[0], count, origin_ns, round(self.block_s * 1e9)):
+            _look_back(dt, likelihood, starts, span, out)
+        return out

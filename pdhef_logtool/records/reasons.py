@@ -1,4 +1,4 @@
-"""Why a sample of a_y or yaw rate was not used as usual: the bits of a track's ``reason``, and their names.
+"""What is reported to be wrong with a_y or yaw rate: the bits of a track's ``reason``, and their names.
 
 The bits stand in estimates.parquet and in ``pdhef_msgs/VehicleStateEstimate``: none may change its meaning.
 """

@@ -53,8 +53,8 @@ class StateTrack:
     length 0 when the source gives none. ``x_m``, ``y_m``, ``yaw_rad`` are in a local ENU frame.
     ``valid`` is False where the source says that its state must not be used. ``diverged`` flags the stamps at
     which the estimator itself reports divergence. ``nis`` has the degrees of freedom ``nis_dof`` at each stamp.
-    ``mixture_weight`` (of an adaptive estimator's second filter) and ``reason`` (bits of
-    :mod:`pdhef_logtool.records.reasons`, why samples were not used as usual) are [N], or of length 0 where the source
+    ``mixture_weight`` (of all filters of an adaptive estimator but its first) and ``reason`` (bits of
+    :mod:`pdhef_logtool.records.reasons`, what is reported of a_y and yaw rate) are [N], or of length 0 where the source
     has none; so are roll and bank, the share by which all lateral forces are larger, and the biases by which sensors
     read too much.
     """

@@ -515,7 +515,7 @@ def _blueprint() -> rrb.Blueprint:
         plot("/nis", "Normalised innovation squared"),
         plot("/network_trust", "Network trust"),
         plot("/r_scale", "Factor on R"),
-        plot("/mixture_weight", "Weight of the filter with a force scale"),
+        plot("/mixture_weight", "Weight of the filters with a force scale or a bank"),
         rrb.StateTimelineView(origin="/reasons", name="Why samples were not used as usual"),
         plot("/vx_m_s", "Longitudinal velocity [m/s]"),
         plot("/vy_m_s", "Lateral velocity [m/s]"),

@@ -17,6 +17,19 @@ For each of a_y and yaw rate:
 
 Stuck, dead and spiked samples are missing samples. s₀ is the vehicle file's, or what the log has as its usual noise
 where that is more: a rough car is no burst.
+
+All of that is what the filters do with a sample, and it costs little where nothing is wrong: real noise has long tails,
+and each of its outliers is weighted down. What is *reported* needs evidence that adds up (Page's test, in nats) to what
+chance reaches once in ``HOURS_TO_FALSE_ALARM`` of clean driving:
+
+* burst: samples beyond 3 sigma of the log's own usual noise. Healthy noise may be twice the usual one for as long as it
+  likes; the burst that is looked for is five times. The usual noise is here a high quantile of e that falls more slowly
+  than it rises: rough roads are remembered, and held samples (e = 0) do not make it small.
+* spikes: more of them than a long tail has, or one far beyond it.
+* stuck, missing: for ``STUCK_REPORTED_AFTER_S``, ``MISSING_REPORTED_AFTER_S``. Dead: within one band for
+  ``DEAD_REPORTED_AFTER_S`` of turning.
+
+``docs/false_alarms.md`` has the rates and delays.
 """
 
 from __future__ import annotations
@@ -31,7 +44,7 @@ from pdhef_logtool.car.nominal_model import measured_lateral_acceleration, model
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.reasons import BURST_AY, BURST_YAW_RATE, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
+from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
 from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 
@@ -92,6 +105,36 @@ QUIET_AFTER_S = 1.0
 WITNESS_SPEED_M_S = 6.0
 WITNESS_SETTLED_S = 1.0
 
+#: What is reported: hours of clean driving to a false alarm, and what an hour has of samples and of questions.
+HOURS_TO_FALSE_ALARM = 1.0
+SAMPLES_PER_S = 100.0
+QUESTIONS = 4.0
+#: Noise that is healthy and noise that is a burst, over the usual sigma; and the sigmas beyond which a sample counts.
+HEALTHY_FACTOR, BURST_FACTOR, BEYOND_SIGMA = 2.0, 5.0, 3.0
+SHARE_HEALTHY, SHARE_BURST = (math.erfc(BEYOND_SIGMA / f / math.sqrt(2.0)) for f in (HEALTHY_FACTOR, BURST_FACTOR))
+NATS_BEYOND = math.log(SHARE_BURST / SHARE_HEALTHY)
+NATS_WITHIN = math.log((1.0 - SHARE_BURST) / (1.0 - SHARE_HEALTHY))
+#: Differences share samples: this many tell as much as one alone.
+DIFFERENCES_PER_SAMPLE = 2.3
+#: Evidence from which on a burst is reported, and the shares of it down to which it then is, and from which on spikes
+#: are those of a burst.
+BURST_NATS = DIFFERENCES_PER_SAMPLE * math.log(3600.0 * SAMPLES_PER_S * HOURS_TO_FALSE_ALARM * QUESTIONS)
+BURST_OVER, BURST_LIKELY = 0.5, 0.25
+#: The level of e that ``SHARE_HEALTHY`` of the samples exceed is guessed in this time, with this gain; nothing is
+#: reported meanwhile. Afterwards it doubles in ``LEARNING_S`` at most. A level that was learnt in this time is worth
+#: half: twice the evidence is asked for.
+FIRST_GUESS_S, FIRST_GAIN = 1.0, 5.0
+HALF_KNOWN_S = 3.0
+#: A spike at its limit is evidence of so much, and more as this power of what it is beyond it by; so much is forgotten
+#: in a second. With a tail of the fourth power and a spike in 45 s (Student's t with 4 degrees) it does not add up.
+SPIKE_AT_LIMIT_NATS, SPIKE_POWER, SPIKE_FORGOTTEN_NATS_PER_S = 2.4, 3.0, 1.0
+SPIKE_NATS = math.log(3600.0 * HOURS_TO_FALSE_ALARM * QUESTIONS)
+#: Least time for which a channel is stuck or missing before that is reported.
+STUCK_REPORTED_AFTER_S, MISSING_REPORTED_AFTER_S = 0.05, 0.1
+#: Least time for which both others have turned while a dead channel stayed in one band; for a_y half of it to each
+#: side, for a bank can take all of it away on one.
+DEAD_REPORTED_AFTER_S = 0.5
+
 # Memory of a channel.
 C_Z, C_AGE, C_E = 0, 3, 6  # three last samples, their ages, four last e
 C_COUNT, C_NOISE, C_USUAL, C_LEARNT_S = 10, 11, 12, 13
@@ -99,7 +142,9 @@ C_TRACK, C_TRACK_RATE, C_TRACK_AGE, C_SPIKES, C_NOISE_BEFORE = 14, 15, 16, 17, 1
 C_LAST, C_RUN, C_REPEATS, C_MOVED_S = 19, 20, 21, 22
 C_DEAD, C_DEAD_S, C_ALIVE_S, C_QUIET_S, C_SMOOTH, C_TURN_AT_START, C_TURN_MOST = 23, 24, 25, 26, 27, 28, 29
 C_ANCHOR, C_STUCK = 30, 31
-CHANNEL_MEMORY = 32
+C_LEVEL, C_LEVEL_S, C_BURST, C_BURST_TOLD, C_SPIKE = 32, 33, 34, 35, 36
+C_RUN_S, C_UNSEEN_S, C_SILENT_LEFT_S, C_SILENT_RIGHT_S = 37, 38, 39, 40
+CHANNEL_MEMORY = 41
 # Memory of the witnesses: speed and its age, the open-loop model's v_y and r, the smoothed r, and what held before.
 W_SPEED, W_SPEED_AGE, W_VY, W_R, W_SMOOTH_R, W_SMOOTH_AY, W_SETTLED_S, W_STEER, W_FRICTION = range(9)
 WITNESS_MEMORY = 9
@@ -121,15 +166,14 @@ class SensorFaults:
     Attributes
     ----------
     extra_r : [N, 2], variance beyond the usual one, m²/s⁴ and rad²/s²; 0 where the channel is as usual.
-    noise_std, usual_std : [N, 2], 1-sigma ŝ of now, and what is usual.
-    reason : int64 [N], bits of :mod:`pdhef_logtool.records.reasons`.
+    noise_std : [N, 2], 1-sigma ŝ of now.
+    reason : int64 [N], what is reported, bits of :mod:`pdhef_logtool.records.reasons`.
     filtered : the signals for filters; samples that are stuck, dead or a spike are missing.
     network : the signals for the network's inputs; samples of a burst are missing as well.
     """
 
     extra_r: FloatArray
     noise_std: FloatArray
-    usual_std: FloatArray
     reason: IntArray
     filtered: Signals
     network: Signals
@@ -168,8 +212,53 @@ def _decayed(c, usual, dt):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _asked(c, nats):  # type: ignore[no-untyped-def]
+    """Return the evidence that is asked for where ``nats`` would do with a level that is known for sure."""
+    return nats * (1.0 + HALF_KNOWN_S / max(c[C_LEVEL_S], FIRST_GUESS_S))
+
+
+@njit(cache=True)
+def _weigh_burst(c, e, s0, moving):  # type: ignore[no-untyped-def]
+    """Add what a squared difference says for a burst, and learn the level that such differences usually have."""
+    age = c[C_AGE]
+    known = c[C_LEVEL_S] > FIRST_GUESS_S
+    beyond = e > max(BEYOND_SIGMA * BEYOND_SIGMA * s0 * s0, HEALTHY_FACTOR * HEALTHY_FACTOR * c[C_LEVEL])
+    nats = NATS_BEYOND if beyond and moving and known else NATS_WITHIN
+    # Samples that follow each other faster are not independent: road and body are slower.
+    nats *= min(1.0, age * SAMPLES_PER_S)
+    asked = _asked(c, BURST_NATS)
+    c[C_BURST] = min(max(c[C_BURST] + nats, 0.0), asked)
+    if c[C_BURST] >= asked:
+        c[C_BURST_TOLD] = 1.0
+    elif c[C_BURST] < BURST_OVER * BURST_NATS:
+        c[C_BURST_TOLD] = 0.0
+    if not moving:
+        return
+    c[C_LEVEL_S] += age
+    rate = math.log(2.0) / (1.0 - SHARE_HEALTHY) * max(1.0 / LEARNING_S, 1.0 / c[C_LEVEL_S])
+    if not known:
+        rate = FIRST_GAIN / c[C_LEVEL_S]
+    level = max(c[C_LEVEL], 0.01 * s0 * s0)
+    c[C_LEVEL] = level * math.exp(rate * age * ((1.0 if e > level else 0.0) - SHARE_HEALTHY))
+
+
+@njit(cache=True)
+def _weigh_spike(c, beyond, dt):  # type: ignore[no-untyped-def]
+    """Add what a sample ``beyond`` times its limit says for spikes that are no chance; return whether to report it."""
+    c[C_SPIKE] = max(c[C_SPIKE] - SPIKE_FORGOTTEN_NATS_PER_S * dt, 0.0)
+    if beyond <= 1.0 or c[C_LEVEL_S] <= FIRST_GUESS_S or c[C_BURST] > BURST_LIKELY * BURST_NATS:
+        return False
+    asked = _asked(c, SPIKE_NATS)
+    c[C_SPIKE] = min(c[C_SPIKE] + SPIKE_AT_LIMIT_NATS + SPIKE_POWER * math.log(beyond), 2.0 * asked)
+    return c[C_SPIKE] >= asked
+
+
+@njit(cache=True)
 def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped-def]
-    """Take a sample into the memory of its channel; return whether it is a spike. Updates ŝ² and the usual noise."""
+    """Take a sample into the memory of its channel; return whether it is a spike, and how far beyond its limit.
+
+    Updates ŝ² and the usual noise. The limit that counts for reports is that of the level that was learnt.
+    """
     usual = max(s0 * s0, c[C_USUAL])
     if c[C_AGE] > DIFFERENCE_SPAN_S:
         _forget(c)
@@ -177,18 +266,17 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
         c[C_TRACK], c[C_TRACK_RATE] = z, 0.0
         c[C_TRACK_AGE] = 0.0
         c[C_SPIKES] = 0.0
-        spike = False
+        spike, beyond = False, 0.0
     else:
         age = c[C_TRACK_AGE]
         ahead = c[C_TRACK] + age * c[C_TRACK_RATE]
         miss = z - ahead
         sigma = TRACK_INNOVATION_RATIO * math.sqrt(max(usual, c[C_NOISE]))
+        bend = curvature * age * age / TRACK_RATE_GAIN
         # The rate is not known before the third sample.
-        spike = (
-            c[C_COUNT] >= 3.0
-            and age <= DIFFERENCE_SPAN_S
-            and abs(miss) > SPIKE_SIGMA * sigma + curvature * age * age / TRACK_RATE_GAIN
-        )
+        spike = c[C_COUNT] >= 3.0 and age <= DIFFERENCE_SPAN_S and abs(miss) > SPIKE_SIGMA * sigma + bend
+        learnt = TRACK_INNOVATION_RATIO * HEALTHY_FACTOR / BEYOND_SIGMA * math.sqrt(c[C_LEVEL])
+        beyond = abs(miss) / (SPIKE_SIGMA * max(sigma, learnt) + bend)
         if spike and c[C_SPIKES] >= MAX_SPIKES:
             # A jump or a burst: the samples are what they are.
             spike = False
@@ -212,6 +300,7 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
     difference, gain = _difference(c, z)
     if math.isfinite(gain):
         e = difference * difference / gain
+        _weigh_burst(c, e, s0, learn)
         c[C_E + 3], c[C_E + 2], c[C_E + 1] = c[C_E + 2], c[C_E + 1], c[C_E]
         c[C_E] = e
         if learn and not spike:
@@ -227,7 +316,7 @@ def _noise_and_spike(c, z, dt, s0, curvature, learn):  # type: ignore[no-untyped
         c[C_Z + i], c[C_AGE + i] = c[C_Z + i - 1], c[C_AGE + i - 1]
     c[C_Z], c[C_AGE] = z, 0.0
     c[C_COUNT] = min(c[C_COUNT] + 1.0, 3.0)
-    return spike
+    return spike, beyond
 
 
 @njit(cache=True)
@@ -238,6 +327,7 @@ def _stuck(c, z, dt, moving, turning):  # type: ignore[no-untyped-def]
     """
     same = z == c[C_LAST] and c[C_RUN] > 0.0
     c[C_RUN] = c[C_RUN] + 1.0 if same else 1.0
+    c[C_RUN_S] = c[C_RUN_S] + dt if same else 0.0
     c[C_LAST] = z
     if not same:
         c[C_TURN_AT_START] = turning
@@ -270,11 +360,15 @@ def _judge_witness(c, own, one, other, least, band, dt):  # type: ignore[no-unty
     if abs(own - c[C_ANCHOR]) > band:
         c[C_ANCHOR] = own
         c[C_DEAD_S] = 0.0
+        c[C_SILENT_LEFT_S] = 0.0
+        c[C_SILENT_RIGHT_S] = 0.0
     weakest = min(abs(one), abs(other))
     agree = one * other > 0.0 and weakest > least
     reading = own if one > 0.0 else -own
     silent = agree and abs(reading) < DEAD_SHARE * weakest
     c[C_DEAD_S] = c[C_DEAD_S] + dt if silent else 0.0
+    if silent:
+        c[C_SILENT_LEFT_S if one > 0.0 else C_SILENT_RIGHT_S] += dt
     speaks = agree and reading > ALIVE_SHARE * weakest
     c[C_ALIVE_S] = c[C_ALIVE_S] + dt if speaks else 0.0
     quiet = max(abs(one), abs(other), abs(own)) < QUIET_RAD_S
@@ -300,13 +394,14 @@ def _open_loop(w, steer, friction, dt, p):  # type: ignore[no-untyped-def]
 def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignore[no-untyped-def]
     """Run over one window; ``dt[k]`` ends at step k, NaN = start of a log. Memories are updated in place."""
     dt, steer, ay, yaw_rate, speed, friction = window
-    extra, noise, usual_noise, reason, usable = found
+    extra, noise, reason, usable = found
     for k in range(dt.shape[0]):
         step = dt[k] if math.isfinite(dt[k]) else 0.0
-        mask = 0
+        mask, raised = 0, False
         if step > SPEED_HOLD_S:
             for i in range(CHANNELS):
                 _forget(channels[i])
+                channels[i, C_BURST], channels[i, C_BURST_TOLD], channels[i, C_UNSEEN_S] = 0.0, 0.0, -step
             w[W_SETTLED_S] = 0.0
         if math.isfinite(speed[k]):
             w[W_SPEED], w[W_SPEED_AGE] = abs(speed[k]), 0.0
@@ -321,24 +416,34 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
             c[C_TRACK_AGE] += step
             usable[k, i] = z
             usual = max(s0[i] * s0[i], c[C_USUAL])
+            spike, beyond = False, 0.0
+            c[C_UNSEEN_S] += step
             if not math.isfinite(z):
-                mask |= MISSING_AY << i
+                if c[C_UNSEEN_S] >= MISSING_REPORTED_AFTER_S:
+                    mask |= MISSING_AY << i
                 c[C_NOISE] = _decayed(c, usual, step)
             elif _stuck(c, z, step, moving, w[W_SMOOTH_R]):
-                mask |= STUCK_AY << i
+                if c[C_RUN_S] >= STUCK_REPORTED_AFTER_S:
+                    mask |= STUCK_AY << i
                 usable[k, i] = math.nan
                 c[C_NOISE] = _decayed(c, usual, step)
                 _forget(c)
-            elif _noise_and_spike(c, z, step, s0[i], CURVATURE[i], moving):
+            else:
+                spike, beyond = _noise_and_spike(c, z, step, s0[i], CURVATURE[i], moving)
+                if spike:
+                    usable[k, i] = math.nan
+                if c[C_BURST_TOLD] > 0.0:
+                    mask |= BURST_AY << i
+            if math.isfinite(z):
+                c[C_UNSEEN_S] = 0.0
+            if _weigh_spike(c, beyond if spike else 0.0, step):
                 mask |= SPIKE_AY << i
-                usable[k, i] = math.nan
             usual = max(s0[i] * s0[i], c[C_USUAL])
             extra[k, i] = 0.0
             if c[C_NOISE] > BURST_RATIO * usual:
-                mask |= BURST_AY << i
+                raised = True
                 extra[k, i] = c[C_NOISE] - s0[i] * s0[i]
             noise[k, i] = math.sqrt(max(c[C_NOISE], usual))
-            usual_noise[k, i] = math.sqrt(usual)
 
         mu = friction[k] if math.isfinite(friction[k]) else w[W_FRICTION] if w[W_FRICTION] > 0.0 else default_friction
         w[W_FRICTION] = mu
@@ -360,8 +465,7 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
                     own = usable[k, i] / v if i == AY else usable[k, i]
                     channels[i, C_SMOOTH] += gain * (own - channels[i, C_SMOOTH])
             clear = math.isfinite(usable[k, AY]) and math.isfinite(usable[k, YAW_RATE])
-            clear = clear and mask & (BURST_AY | BURST_YAW_RATE) == 0
-            if clear and w[W_SETTLED_S] >= WITNESS_SETTLED_S:
+            if clear and not raised and w[W_SETTLED_S] >= WITNESS_SETTLED_S:
                 of_ay, of_r = channels[AY, C_SMOOTH], channels[YAW_RATE, C_SMOOTH]
                 least = WITNESS_RAD_S + WITNESS_NOISE_SIGMAS * max(s0[AY] / v, s0[YAW_RATE])
                 drift = w[W_SMOOTH_AY] - w[W_SMOOTH_R]  # the model's v̇_y over v_x
@@ -380,7 +484,10 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
                 channels[i, C_QUIET_S] = 0.0
         for i in range(CHANNELS):
             if channels[i, C_DEAD] > 0.0:
-                mask |= DEAD_AY << i
+                left, right = channels[i, C_SILENT_LEFT_S], channels[i, C_SILENT_RIGHT_S]
+                silent_s = left + right if i == YAW_RATE else 2.0 * min(left, right)
+                if silent_s >= DEAD_REPORTED_AFTER_S:
+                    mask |= DEAD_AY << i
                 usable[k, i] = math.nan
         reason[k] = mask
 
@@ -388,7 +495,7 @@ def _detect(window, default_friction, s0, p, channels, w, found):  # type: ignor
 def no_faults(signals: Signals) -> SensorFaults:
     """Return signals of which nobody asks whether something is wrong."""
     nothing = np.zeros((len(signals), CHANNELS))
-    return SensorFaults(nothing, nothing, nothing, np.zeros(len(signals), dtype=np.int64), signals, signals)
+    return SensorFaults(nothing, nothing, np.zeros(len(signals), dtype=np.int64), signals, signals)
 
 
 def find_faults(
@@ -409,7 +516,7 @@ def find_faults(
         step_durations_s(signals.stamps_ns, before_ns), signals.steer_rad, signals.ay_m_s2, signals.yaw_rate_rad_s,
         signals.speed_m_s, signals.friction,
     )  # fmt: skip
-    extra, noise, usual, usable = (np.empty((count, 2)) for _ in range(4))
+    extra, noise, usable = (np.empty((count, 2)) for _ in range(3))
     reason = np.empty(count, dtype=np.int64)
     s0 = np.array([vehicle.sensors.ay_std_m_s2, vehicle.sensors.yaw_rate_std_rad_s])
     _detect(
@@ -419,13 +526,13 @@ def find_faults(
         model_parameters(vehicle),
         channels,
         witness,
-        (extra, noise, usual, reason, usable),
+        (extra, noise, reason, usable),
     )
     last = last_stamp_ns(signals.stamps_ns, before_ns)
     filtered: dict[str, Any] = {"ay_m_s2": usable[:, AY].copy(), "yaw_rate_rad_s": usable[:, YAW_RATE].copy()}
     seen: dict[str, Any] = {
-        "ay_m_s2": np.where(reason & BURST_AY, np.nan, usable[:, AY]),
-        "yaw_rate_rad_s": np.where(reason & BURST_YAW_RATE, np.nan, usable[:, YAW_RATE]),
+        "ay_m_s2": np.where(extra[:, AY] > 0.0, np.nan, usable[:, AY]),
+        "yaw_rate_rad_s": np.where(extra[:, YAW_RATE] > 0.0, np.nan, usable[:, YAW_RATE]),
     }
-    faults = SensorFaults(extra, noise, usual, reason, replace(signals, **filtered), replace(signals, **seen))
+    faults = SensorFaults(extra, noise, reason, replace(signals, **filtered), replace(signals, **seen))
     return faults, FaultCarry(channels, witness, last)

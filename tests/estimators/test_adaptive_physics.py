@@ -15,7 +15,7 @@ from reference_car import cut, drive, slalom, tanh_tyre, with_noise
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import default_vehicle
-from pdhef_logtool.estimators.adaptive_physics import SIDESLIP_TO_RAD, AdaptivePhysics, mix
+from pdhef_logtool.estimators.adaptive_physics import CURES, LEAST_WEIGHT, UNPROVEN, AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
@@ -192,19 +192,48 @@ def test_a_biased_accelerometer_gives_little_weight():
     assert weights(adaptive(), replace(signals, ay_m_s2=signals.ay_m_s2 + 0.16)).mean() < 0.05
 
 
-def test_at_a_very_large_sideslip_it_has_no_weight(weak):
-    """A car that spins out: the weight is that of F1 wherever F1 says so."""
-    estimator = adaptive()
-    made = drive(lambda t: 0.3 * min(1.0, max(0.0, t - 2.0)), 6.0, speed=25.0, mu=0.3)
-    signals = noisy(made)
-    steps, _ = PHYSICS.filter_steps(signals, None)
-    large = np.abs(np.arctan2(steps.x[:, 1], steps.x[:, 0])) > SIDESLIP_TO_RAD
-    track, _ = estimator.run(signals, None)
-    first, _ = fixed().run(signals, None)
-    gone = np.flatnonzero(large)[1:] + 1  # one step later it is put out
-    gone = gone[gone < len(signals)]
-    if len(gone):
-        np.testing.assert_array_equal(track.vy_m_s[gone], first.vy_m_s[gone])
+def proven(*cures: str, **options) -> AdaptivePhysics:
+    parts = VEHICLE.physics.model_copy(update=dict.fromkeys(cures, True))
+    vehicle = VEHICLE.model_copy(update={"physics": parts})
+    return AdaptivePhysics(replace(PHYSICS, vehicle=vehicle), SILENT, **{"trust": 1.0, **options})
+
+
+def test_each_filter_has_one_cure_and_a_proven_one_need_not_earn_its_weight():
+    for own in ((), ("force_scale",), CURES):
+        estimator = proven(*own)
+        cures = [tuple(c for c in CURES if getattr(f.vehicle.physics, c)) for f in estimator.filters]
+        assert cures == [(), *((c,) for c in CURES)]
+        assert estimator.prior.tolist() == [0.0, *(0.0 if c in own else -UNPROVEN for c in CURES)]
+    alone = proven(*CURES, adaptive=False)
+    assert alone.filters == (alone.physics,)
+
+
+def test_a_banked_road_is_taken_for_one(made):
+    """The bend leans: a part of what holds the car in it is its weight, which no accelerometer feels."""
+    leaning = drive(slalom(0.035, 0.5), 12.0, speed=22.0, side_pull_m_s2=-9.80665 * 0.08)
+    signals = noisy(leaning, 7)
+    lone, _ = fixed().run(signals, None)
+    for estimator in (adaptive(), proven("bank")):
+        track, _ = estimator.run(signals, None)
+        assert np.nanmean(track.bank_rad[600:]) > 0.03
+        errors = [np.sqrt(np.nanmean((x.sideslip_rad - leaning.sideslip)[600:] ** 2)) for x in (track, lone)]
+        assert errors[0] < 0.6 * errors[1]
+        flat, _ = estimator.run(noisy(made, 7), None)
+        assert abs(np.nanmean(flat.bank_rad)) < 0.01
+
+
+@given(st.lists(st.tuples(st.floats(-800, 800), st.booleans()), min_size=1, max_size=4))
+def test_weights_are_shares_of_what_can_be_used(filters):
+    evidence = np.array([[e for e, _ in filters]])
+    usable = np.array([[u for _, u in filters]])
+    weights = weigh(evidence, usable)
+    assert (weights[~usable] == 0.0).all()
+    assert weights.sum() == pytest.approx(1.0 if usable.any() else 0.0)
+    for i, j in [(i, j) for i in range(len(filters)) for j in range(len(filters)) if weights[0, i] and weights[0, j]]:
+        assert np.log(weights[0, i] / weights[0, j]) == pytest.approx(evidence[0, i] - evidence[0, j], abs=1e-6)
+    best = np.max(evidence, where=usable, initial=-np.inf)
+    lost = usable & (weights == 0.0)
+    assert (evidence[lost] < best + np.log(LEAST_WEIGHT) + np.log(len(filters)) + 1e-9).all()
 
 
 def test_the_mixture_has_the_moments_of_its_samples():
@@ -219,7 +248,7 @@ def test_the_mixture_has_the_moments_of_its_samples():
         )
         for m, p in zip(means, P, strict=True)
     ]
-    mixed = mix(np.array([0.3]), *tracks)
+    mixed = mix(np.array([[0.7, 0.3]]), tracks)
     n = 400_000
     drawn = np.concatenate(
         [rng.multivariate_normal(m, p, int(share * n)) for m, p, share in zip(means, P, (0.7, 0.3), strict=True)]
@@ -230,11 +259,13 @@ def test_the_mixture_has_the_moments_of_its_samples():
     np.testing.assert_allclose(mixed.covariance[0], np.cov(drawn.T), atol=1e-3)
     assert mixed.sideslip_std_rad[0] == pytest.approx(np.arctan2(drawn[:, 1], drawn[:, 0]).std(), rel=0.02)
     lone = replace(tracks[0], valid=np.array([False]), vy_m_s=np.array([np.nan]))
-    assert mix(np.array([0.3]), lone, tracks[1]).vy_m_s[0] == tracks[1].vy_m_s[0]
-    assert mix(np.array([0.3]), tracks[1], lone).vy_m_s[0] == tracks[1].vy_m_s[0]
+    for weights in ([[0.7, 0.3]], [[1.0, 0.0]]):
+        assert mix(np.array(weights), [lone, tracks[1]]).vy_m_s[0] == tracks[1].vy_m_s[0]
+    assert mix(np.array([[0.7, 0.3]]), [tracks[1], lone]).vy_m_s[0] == tracks[1].vy_m_s[0]
+    assert not mix(np.array([[0.7, 0.3]]), [lone, lone]).valid[0]
 
 
-def test_trust_scales_the_network_in_both_filters(made):
+def test_trust_scales_the_network_in_all_filters(made):
     wrong = NetworkService(_bundle((0.5, 0.2)))
     signals = noisy(made)
     a, _ = adaptive(wrong, trust=0.0).run(signals, None)

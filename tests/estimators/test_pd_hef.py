@@ -91,7 +91,6 @@ def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...]) -> None:
             if f.name not in ("name", "network_trust"):
                 np.testing.assert_array_equal(getattr(track, f.name), getattr(physics, f.name), err_msg=f.name)
     assert not _same(trusted.run(signals, None)[0], physics)
-    assert (trusted.scaled is None) == ("force_scale" in parts)
 
 
 def test_windows_join_bit_for_bit() -> None:

@@ -264,7 +264,7 @@ def rough() -> Signals:
 
 @pytest.fixture(scope="module")
 def faulty(rough) -> Signals:
-    """The same with a stuck gyro, a burst on both sensors and spikes."""
+    """The same with a stuck gyro, a burst on both sensors, spikes and missing samples."""
     rng = np.random.default_rng(3)
     t = (rough.stamps_ns - rough.stamps_ns[0]) * 1e-9
     ay, yaw_rate = rough.ay_m_s2.copy(), rough.yaw_rate_rad_s.copy()
@@ -272,7 +272,9 @@ def faulty(rough) -> Signals:
     burst = (t > 6.2) & (t < 7.2)
     ay[burst] += 2.4 * rng.standard_normal(burst.sum())
     yaw_rate[burst] += 0.08 * rng.standard_normal(burst.sum())
-    ay[np.searchsorted(t, (0.7, 2.5, 4.4))] += 8.0
+    ay[np.searchsorted(t, (0.7, 2.5, 4.4, 4.6, 4.8))] += 8.0
+    ay[(t > 5.0) & (t < 5.2)] = np.nan
+    yaw_rate[(t > 5.4) & (t < 5.6)] = np.nan
     return replace(rough, ay_m_s2=ay, yaw_rate_rad_s=yaw_rate)
 
 
@@ -311,7 +313,7 @@ def test_steps_at_once_change_no_bit(faulty, monkeypatch):
     monkeypatch.setattr(smoothed, "STEPS_AT_ONCE", 37)
     again, _ = estimator.run(cut(faulty, 0, 400), None, cut(faulty, 400, 600))
     properties.same_bits(again, whole)
-    assert len(carry.ahead) == 200, "what was filtered ahead is kept and not filtered twice"
+    assert len(carry.shared) == 200, "what was filtered ahead is kept and not filtered twice"
 
 
 def test_a_carry_can_be_used_twice(faulty):
@@ -365,7 +367,7 @@ def test_left_and_right_are_mirrored(rough):
 def test_the_covariance_is_never_larger_than_the_filters(which, parts, request):
     s = request.getfixturevalue(which)
     estimator = smoother(parts=parts)
-    steps, _, links = estimator.filter.linked_steps(s, None)
+    steps, _, links = estimator.filtered.physics.linked_steps(s, None)
     x, P = smooth_steps(steps, links, len(s), 0, ALL * NS * 100)
     done = steps.valid
     scale = np.sqrt(np.einsum("kii->ki", steps.P))[done]
@@ -394,9 +396,9 @@ def test_nothing_behind_a_gap_tells_of_before(rough):
     whole, _ = smoother().run(rough, None)
     before, _ = smoother().run(cut(rough, 0, gap), None)
     properties.same_bits(whole, before, gap)
-    checked, _ = smoother().filtered.inputs(cut(rough, 0, gap), None)
-    filtered = smoother().filter.filter_steps(checked.faults.filtered, None, checked.rate, checked.faults.extra_r)
-    assert whole.vy_m_s[gap - 1] == filtered[0].x[-1, 1], "at the end of a stretch it is the filter"
+    stretch = replace(cut(rough, 0, gap), ready_ns=rough.stamps_ns[:gap])
+    filtered, _ = smoother().filtered.run(stretch, None)
+    assert before.vy_m_s[-1] == filtered.vy_m_s[-1], "at the end of a stretch it is the filter"
 
 
 @pytest.mark.parametrize("parts", [(), ("biases",)])
@@ -406,7 +408,7 @@ def test_it_is_nearer_to_the_truth_than_its_filter(parts):
         made = drive(slalom(0.03, 0.4 + 0.1 * seed), 10.0, 20.0 + seed, step_s=0.01)
         signals = with_noise(made.signals, seed=seed)
         estimator = flat_smoother(parts)
-        filtered, _ = estimator.filter.run(signals, None)
+        filtered, _ = estimator.filtered.run(replace(signals, ready_ns=signals.stamps_ns), None)
         track, _ = estimator.run(signals, None)
         both = filtered.valid & track.valid
         errors.append([np.mean((e.sideslip_rad - made.sideslip)[both] ** 2) for e in (track, filtered)])
@@ -482,7 +484,17 @@ def test_it_starts_from_what_the_adaptive_filter_starts_from(faulty):
     np.testing.assert_array_equal(track.reason, adaptive.reason)
     np.testing.assert_array_equal(track.r_scale, adaptive.r_scale)
     assert track.r_scale.max() > 5.0
-    assert len(track.mixture_weight) == 0, "it has no second filter"
+
+
+def test_its_weights_know_what_comes_later():
+    """The grip is a quarter less than told: the filter has to find out, and the smoother knows from the start."""
+    made = drive(slalom(0.035, 0.5), 12.0, speed=22.0, mu=0.75 * 0.85)
+    signals = with_noise(made.signals, 0)
+    signals.friction[:] = 0.85
+    estimator = flat_smoother()
+    weights = [e.run(signals, None)[0].mixture_weight for e in (estimator, estimator.filtered)]
+    assert weights[0][:150].mean() > weights[1][:150].mean() + 0.2
+    assert weights[0].mean() > 0.9
 
 
 def test_links_cost_the_filter_no_bit(rough):

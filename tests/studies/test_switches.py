@@ -73,13 +73,12 @@ def test_steering_that_counts_when_it_arrives_is_old_and_nothing_waits_for_it(dr
     np.testing.assert_array_equal(seen[0].ready_ns, drive.signals.stamps_ns)
 
 
-def test_options_reach_both_filters_of_the_mixture() -> None:
+def test_options_reach_all_filters_of_the_mixture() -> None:
     plain = AdaptivePhysics(PhysicsFilter(VEHICLE))
     for name in ("biases", "slip_gate"):
         switched = switches.with_option(plain, name, value=name == "biases")
         assert isinstance(switched, AdaptivePhysics)
-        assert switched.scaled is not None
-        for one in (switched.physics, switched.scaled):
+        for one in (switched.physics, *switched.filters):
             assert one.vehicle.physics.biases == (name == "biases")
             assert one.slip_gate == (name == "biases")
     assert not plain.physics.vehicle.physics.biases

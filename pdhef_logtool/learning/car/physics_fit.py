@@ -8,6 +8,9 @@ where s_i is the RMS of the filter's sideslip error on drive i, N_i its length o
 and s_0 what is not believed to be beaten. With a fixed σ in place of the log, "σ is what remains" has two fixed points,
 and a poor start ends at the worse one (METHOD §16). The last term fixes the scale of Q and R, of which the gain knows
 the ratio alone. It is minimised by Gauss-Newton steps on errors over their present s_i, derivatives by differences.
+
+Force scale and bank are states of the one filter here, and filters of their own in service
+(:mod:`~pdhef_logtool.estimators.adaptive_physics`): through the bank of them the noise follows few drives too closely.
 """
 
 from __future__ import annotations

@@ -126,8 +126,8 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
     """Return the cap that the errors allow.
 
     - Too little excited driving: 0.
-    - 1, if the 95 % bounds of a paired block bootstrap confirm that the squared error at trust 1 is below that at
-      trust 0, and that it is no more than :data:`TOLERANCE` of the RMSE above that of the best lower trust.
+    - The largest trust of which the 95 % bounds of a paired block bootstrap confirm that its squared error is below
+      that at trust 0, and that it is no more than :data:`TOLERANCE` of the RMSE above that of the best lower trust.
     - Else the largest trust up to :data:`UNCONFIRMED_CAP` whose squared error is below that at trust 0.
     - Else 0.
     """
@@ -145,10 +145,16 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
         low, high = np.percentile((draws @ row) / (draws @ counts), [50.0 * (1.0 - LEVEL), 50.0 * (1.0 + LEVEL)])
         return Bound(value, float(low), float(high))
 
-    best = int(np.argmin(mean[:-1])) if total else 0
+    lower = [int(np.argmin(mean[:i])) if total and i else 0 for i in range(len(TRUSTS))]
+    best = lower[-1]
     against_zero = tuple(bound(row - squares[0]) for row in squares)
-    tolerated = bound(squares[-1] - (1.0 + TOLERANCE) ** 2 * squares[best])
-    cap, reason = _rule(errors, mean, against_zero[-1], tolerated, TRUSTS[best], blocks)
+    tolerated = [bound(row - (1.0 + TOLERANCE) ** 2 * squares[b]) for row, b in zip(squares, lower, strict=True)]
+    confirmed = [
+        t
+        for t, gain, more in zip(TRUSTS, against_zero, tolerated, strict=True)
+        if t > 0.0 and gain.high_deg2 < 0.0 and more.high_deg2 <= 0.0
+    ]
+    cap, reason = _rule(errors, mean, against_zero[-1], max(confirmed, default=0.0), TRUSTS[best], blocks)
     return TrustDecision(
         cap=cap,
         reason=reason,
@@ -163,18 +169,18 @@ def decide_cap(errors: BlockErrors, *, seed: int = 0) -> TrustDecision:
 
 
 def _rule(
-    errors: BlockErrors, mean: FloatArray, gain: Bound, tolerated: Bound, best: float, blocks: int
+    errors: BlockErrors, mean: FloatArray, gain: Bound, confirmed: float, best: float, blocks: int
 ) -> tuple[float, str]:
-    """Return cap and reason; bounds that are NaN confirm nothing."""
+    """Return cap and reason; bounds that are NaN confirm nothing. ``gain`` is that of trust 1."""
     if not errors.excited_s >= MIN_EXCITED_S:
         return 0.0, (
             f"too little to decide on: {errors.excited_s:.1f} s above {EXCITED_M_S2:g} m/s², at least "
             f"{MIN_EXCITED_S:g} s are needed"
         )
-    if gain.high_deg2 < 0.0 and tolerated.high_deg2 <= 0.0:
+    if confirmed == TRUSTS[-1]:
         return 1.0, "the gain at trust 1 is confirmed"
     gained = [t for t, m in zip(TRUSTS, mean, strict=True) if 0.0 < t <= UNCONFIRMED_CAP and m < mean[0]]
-    if not gained:
+    if not gained and confirmed <= UNCONFIRMED_CAP:
         return 0.0, "no gain over physics alone"
     if blocks < MIN_BLOCKS:
         why = f"{blocks} blocks are too few to confirm trust 1 ({MIN_BLOCKS} are needed)"
@@ -184,4 +190,6 @@ def _rule(
         why = "the gain at trust 1 is not confirmed"
     else:
         why = f"trust 1 may be more than {TOLERANCE:.0%} worse than trust {best:g}"
+    if confirmed > UNCONFIRMED_CAP:
+        return confirmed, f"the gain at trust {confirmed:g} is confirmed; {why}"
     return max(gained), f"a gain on the mean; {why}"
