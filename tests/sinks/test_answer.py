@@ -52,7 +52,13 @@ def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "said"), [(0.95, "holds"), (0.91, "nearly holds"), (0.7, "does not hold, it is too narrow")]
+    ("share", "said"),
+    [
+        (1.0, "holds, and is wider than it need be"),
+        (0.95, "holds"),
+        (0.91, "nearly holds"),
+        (0.7, "does not hold, it is too narrow"),
+    ],
 )
 def test_whether_the_band_holds(share: float, said: str) -> None:
     band = texts(metrics=[*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", share))])["band"]
