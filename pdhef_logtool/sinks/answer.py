@@ -20,6 +20,10 @@ HOLDS, NEARLY_HOLDS = 0.94, 0.90
 _WIDE = 0.995
 #: Two errors that differ by less than this share are said to be the same.
 _SAME = 0.03
+#: A ratio below this is told with a decimal.
+_FEW = 10.0
+#: Rad: a truth whose sideslip stays below this on average was not measured.
+_NO_SIDESLIP_RAD = 1e-5
 #: An estimate whose d2 is not less than this share of that of sideslip 0 has nothing to show for itself.
 _LESS = 0.8
 #: NIS over its degrees of freedom beyond which sensors are said to surprise a filter less or more than it expects.
@@ -103,6 +107,8 @@ def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
     said += [_against(own, other, text) for text, other in others]
     if "sideslip_rad" in truth["not_independent"]:
         said.append("that truth is an input or the estimate itself: no independent check")
+    if (measured := figures.get(("zero", "sideslip_rad", "rmse"))) is not None and measured < _NO_SIDESLIP_RAD:
+        said.append("but that truth's sideslip is 0 throughout, as of one that does not measure it")
     naive = None if main.name == main.naive else _error(figures, main.naive)
     useless = ". It is of no use here" if naive is not None and own > (1.0 + _SAME) * naive else ""
     return ", ".join(said) + useless
@@ -114,15 +120,15 @@ def _against(own: float, other: float, text: str) -> str:
         return f"the same as {beside}"
     if abs(own - other) <= _SAME * other:
         return f"as good as {beside}"
-    if own > 2.0 * other:
-        return f"{own / other:.2g} times as far off as {beside}"
+    if own == 0.0 or other == 0.0:
+        return f"{'nearer' if own < other else 'farther off'} than {beside}"
+    times = max(own, other) / min(own, other)
+    shown = f"{times:.1f}" if times < _FEW else f"{times:.0f}"
     if own > other:
-        return f"{own / other - 1.0:.0%} farther off than {beside}"
-    return (
-        f"{other / own:.2g} times nearer than {beside}"
-        if own < 0.5 * other
-        else f"{1.0 - own / other:.0%} nearer than {beside}"
-    )
+        return (
+            f"{shown} times as far off as {beside}" if times > 2.0 else f"{times - 1.0:.0%} farther off than {beside}"
+        )
+    return f"{shown} times nearer than {beside}" if times > 2.0 else f"{1.0 - own / other:.0%} nearer than {beside}"
 
 
 def _truth_of(report: Report, name: str) -> str:

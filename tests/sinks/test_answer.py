@@ -33,13 +33,19 @@ def test_the_result_says_how_good_against_which_truth_and_against_whom() -> None
         (1.0, "the same as sideslip 0"),
         (0.99, "as good as sideslip 0"),
         (1.5, "50% farther off than sideslip 0"),
-        (3.0, "3 times as far off as sideslip 0"),
+        (3.0, "3.0 times as far off as sideslip 0"),
     ],
 )
 def test_an_estimate_that_is_worse_than_none_is_said_to_be_of_no_use(own: float, said: str) -> None:
     result = texts(metrics=errors_deg(pd_hef=own, zero=1.0))["result"]
     assert said in result
     assert ("It is of no use here" in result) == (own > 1.1)
+
+
+@pytest.mark.parametrize(("own", "zero"), [(0.3, 0.0), (0.0, 0.3), (0.0, 0.0)])
+def test_an_error_of_nothing_is_no_division(own: float, zero: float) -> None:
+    result = texts(metrics=errors_deg(pd_hef=own, zero=zero))["result"]
+    assert ("that truth's sideslip is 0 throughout" in result) == (zero == 0.0)
 
 
 def test_a_truth_that_is_an_input_is_no_independent_check() -> None:
