@@ -119,13 +119,16 @@ def _run(tree: Path, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     folder = "pdhef_logtool/models/default"
     shipped = folder if (tree / folder / "noise.toml").is_file() else f"{folder}/vehicle.toml"
+    # An older tree runs them all without being asked.
+    table = (tree / "pdhef_logtool" / "estimators" / "table.py").read_text(encoding="utf-8")
+    every = ["--estimators", "all"] if "ALL_ESTIMATORS" in table else []
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(tree)}
     for case in cases(shipped):
         if case.needs_drives and not DRIVES.is_dir():
             print(f"{case.name}: no ../shared, left out")
             continue
         target = out / (f"{case.name}.toml" if case.words[0] == "identify" else case.name)
-        words = [w.format(drives=DRIVES, out=out) for w in case.words]
+        words = [w.format(drives=DRIVES, out=out) for w in case.words] + (every if case.words[0] == "run" else [])
         command = [sys.executable, "-m", "pdhef_logtool", *words, "-o", str(target)]
         done = subprocess.run(command, cwd=tree, env=environment, capture_output=True, text=True, check=False)
         print(f"{tree.name}: {case.name} ended with {done.returncode}", flush=True)

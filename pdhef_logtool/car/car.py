@@ -172,6 +172,12 @@ class Car:
         return replace(car, notes=tuple(stale))
 
     @property
+    def file_name(self) -> str | None:
+        """Its folder or file without where that lies, the name of a shipped one, None for the default car."""
+        shipped = [name for name, folder in SHIPPED_CARS.items() if folder == self.source]
+        return shipped[0] if shipped else None if self.source is None else self.source.name or str(self.source)
+
+    @property
     def physics_sha256(self) -> str:
         """Digest of the physics that estimators run with."""
         return physics_sha256(self.vehicle)

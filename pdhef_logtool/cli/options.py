@@ -34,7 +34,15 @@ _File = Path | None
 #: The shared options by the name of the configuration's entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
     "car": Annotated[_File, Option()],
-    "estimators": Annotated[_Text, Option("--estimators", "-e", help="Comma-separated; see pdhef estimators.")],
+    "cars": Annotated[_File, Option(help="cars.toml: a car per log, by folder, metadata or name: docs/car.md.")],
+    "estimators": Annotated[
+        _Text,
+        Option(
+            "--estimators",
+            "-e",
+            help="Comma-separated (pdhef estimators), or all. Default: the main one, physics, zero.",
+        ),
+    ],
     "mapping": Annotated[
         _File, Option("--mapping", "-m", help="mapping.toml: topic.field -> signal; default: by message type.")
     ],

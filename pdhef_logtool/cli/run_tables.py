@@ -1,49 +1,83 @@
-"""What ``pdhef run`` and ``pdhef metrics`` print: one table a log, then the verdicts."""
+"""What ``pdhef run`` and ``pdhef metrics`` print: the answer in words, a table, what to look at, the verdicts."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+from rich.measure import Measurement
+from rich.padding import Padding
+from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table
-from pdhef_logtool.sinks.report import diverged_line, friction_line, reasons_line
+from pdhef_logtool.sinks.answer import NEARLY_HOLDS, degrees
+from pdhef_logtool.sinks.report import diverged_line, reasons_line
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.table import Table
 
     from pdhef_logtool.evaluation.thresholds import Verdict
     from pdhef_logtool.runs.pipeline import LogResult, RunResult
 
+_Report: TypeAlias = Mapping[str, Any]
+#: Head, signal, segment, metric, factor to the shown unit, digits.
+_Column: TypeAlias = tuple[str, str, str, str, float, int]
+
 _DEG = math.degrees(1.0)
-#: Column head, signal, metric, factor to the shown unit, digits.
-_COLUMNS: tuple[tuple[str, str, str, float, int], ...] = (
-    ("sideslip\nRMSE °", "sideslip_rad", "rmse", _DEG, 3),
-    ("\np95 °", "sideslip_rad", "p95_abs", _DEG, 3),
-    ("\nmax °", "sideslip_rad", "max_abs", _DEG, 2),
-    ("\nlag ms", "sideslip_rad", "lag_s", 1e3, 0),
-    ("\n95 % cover", "sideslip_rad", "coverage95", 1.0, 2),
-    ("v_y\nRMSE m/s", "vy_m_s", "rmse", 1.0, 3),
-    ("v_x\nRMSE m/s", "vx_m_s", "rmse", 1.0, 3),
-    ("yaw rate\nRMSE °/s", "yaw_rate_rad_s", "rmse", _DEG, 3),
-    ("a_y\nRMSE m/s²", "ay_m_s2", "rmse", 1.0, 3),
-    ("1 s lateral\nRMSE m", "lateral_1s_m", "rmse", 1.0, 3),
+_COLUMNS: tuple[_Column, ...] = (
+    ("sideslip\nRMSE °", "sideslip_rad", "all", "rmse", _DEG, 3),
+    ("\np95 °", "sideslip_rad", "all", "p95_abs", _DEG, 3),
+    ("\nmax °", "sideslip_rad", "all", "max_abs", _DEG, 2),
+    ("\nlag ms", "sideslip_rad", "all", "lag_s", 1e3, 0),
+    ("in 95 %\nband", "sideslip_rad", "all", "coverage95", 1.0, 2),
+    ("v_y\nRMSE m/s", "vy_m_s", "all", "rmse", 1.0, 3),
+    ("v_x\nRMSE m/s", "vx_m_s", "all", "rmse", 1.0, 3),
+    ("yaw rate\nRMSE °/s", "yaw_rate_rad_s", "all", "rmse", _DEG, 3),
+    ("a_y\nRMSE m/s²", "ay_m_s2", "all", "rmse", 1.0, 3),
+    ("1 s lateral\nRMSE m", "lateral_1s_m", "all", "rmse", 1.0, 3),
+    ("linear\nRMSE °", "sideslip_rad", "linear", "rmse", _DEG, 3),
+    ("nonlinear\nRMSE °", "sideslip_rad", "nonlinear", "rmse", _DEG, 3),
+    ("\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2),
 )
-#: Where there is no truth.
-_WITHOUT_TRUTH = (("v_y\nd2 m/s", "vy_m_s", "d2", 1.0, 3),)
-_SEGMENTS = ("linear", "nonlinear")
-_LEAVE_FIRST = ("v_x\nRMSE m/s", "\nmax °", "1 s lateral\nRMSE m", "v_y\nRMSE m/s", "\np95 °", "a_y\nRMSE m/s²")
-#: Width of the columns that always stand: name, two segments, NIS.
-_FIXED_WIDTH = 43
+#: Where there is no truth: no column of errors.
+_WITHOUT_TRUTH: tuple[_Column, ...] = (
+    ("sideslip: RMS\nfrom {main} °", "sideslip_rad", "all", "from_main", _DEG, 3),
+    ("v_y against sensors\nd2 m/s", "vy_m_s", "all", "d2", 1.0, 3),
+    ("surprise\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2),
+)
+#: What a narrow terminal does without, first to last.
+_LEAVE_FIRST = (
+    *("v_x\nRMSE m/s", "\nmax °", "1 s lateral\nRMSE m", "v_y\nRMSE m/s", "\np95 °", "a_y\nRMSE m/s²", "\nNIS/dof"),
+    *("\nlag ms", "linear\nRMSE °", "yaw rate\nRMSE °/s", "nonlinear\nRMSE °"),
+)
+#: Channels that are named where several share a loss, and checks where several are undecided.
+_MOST_PLACES, _MOST_UNDECIDED = 3, 4
+_TEXTS = {
+    "result": "Result",
+    "consistency": "Consistency",
+    "band": "95 % band",
+    "hindsight": "In hindsight",
+    "assumed": "Assumed",
+    "next": "Next",
+}
 
 
 def render_run(result: RunResult, console: Console) -> None:
-    """Print one table a log and where the outputs are."""
+    """Print the answer of each log, or of several in one table, and where the outputs are."""
+    reports = [r.report for r in result.results if r.report is not None]
+    alike = None
+    if len(reports) > 1 and all(report["answer"] for report in reports):
+        alike = _Alike.of(reports)
+        console.print(_joint_table(reports))
+        console.print(_lines(alike.texts))
+        for remark, logs in alike.remarks.items():
+            _print_indented(f"note: {remark} ({', '.join(logs)})", console)
+        console.print()
     for one in result.results:
-        _render_log(one, console)
+        _render_log(one, console, alike)
     if result.verdicts:
         _render_verdicts(result.verdicts, console)
     failed = [r for r in result.results if r.report is None]
@@ -65,82 +99,233 @@ def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
     console.print(f"{len(verdicts)} verdicts, {sum(v.failed for v in verdicts)} failed\n")
 
 
-def _render_log(one: LogResult, console: Console) -> None:
+@dataclass(frozen=True, slots=True)
+class _Alike:
+    """What is said once of several logs: ``texts`` of all of them, ``remarks`` with the logs that they are on."""
+
+    texts: Mapping[str, str]
+    remarks: Mapping[str, Sequence[str]]
+
+    @classmethod
+    def of(cls, reports: Sequence[_Report]) -> _Alike:
+        first, *others = [{key: _clauses(key, text) for key, text in _texts(report).items()} for report in reports]
+        by_remark: dict[str, list[str]] = {}
+        for report in reports:
+            for remark in report["remarks"]:
+                by_remark.setdefault(remark, []).append(report["log"]["name"])
+        return cls(
+            {
+                key: "; ".join(common)
+                for key, clauses in first.items()
+                if (common := [c for c in clauses if all(c in texts.get(key, ()) for texts in others)])
+            },
+            {remark: logs for remark, logs in by_remark.items() if len(logs) > 1},
+        )
+
+
+def _print_indented(line: str | Text, console: Console) -> None:
+    console.print(Padding(line, (0, 0, 0, 2)))
+
+
+def _render_log(one: LogResult, console: Console, alike: _Alike | None) -> None:
+    """Print one log; ``alike`` is what was said of several, whose joint table has the figures. None: it is alone."""
     report = one.report
     if report is None:
         console.print(Text.assemble((one.outcome.log, "bold"), f"  {one.outcome.outcome}\n"))
         return
-    drive = f"{report['log']['kind']}, {report['log']['duration_s']:.1f} s, vehicle {report['vehicle']['name']}"
-    console.print(Text.assemble((one.outcome.log, "bold"), f"  {drive}"))
-    for loss in report["losses"]:
-        word = "lost" if loss["severity"] == "lost" else "note"
+    answer = report["answer"]
+    texts = _texts(report)
+    if alike is not None:
+        scored = _figures(report).get((answer["main"], "sideslip_rad", "all", "rmse")) is not None
+        texts = {
+            key: "; ".join(own)
+            for key, text in texts.items()
+            if not (scored and key in ("result", "band"))
+            and (own := [c for c in _clauses(key, text) if c not in _clauses(key, alike.texts.get(key, ""))])
+        }
+    elif answer is not None:
+        texts = {**texts, "next": texts.get("next", "nothing is needed; pdhef view OUTPUT shows the drive")}
+    tabled = alike is None or answer["named"]
+    above = list(_failed_checks(report))
+    below = list(_below(report, () if alike is None else alike.remarks, tabled=tabled))
+    if not (tabled or texts or above or below):
+        return
+    about = f"  {report['log']['kind']}, {report['log']['duration_s']:.1f} s" if alike is None else ""
+    console.print(Text.assemble((one.outcome.log, "bold"), about))
+    for line in above:
+        _print_indented(line, console)
+    if texts:
+        console.print(_lines(texts))
+    if tabled:
+        console.print(_table(report, console))
+    for line in below:
+        _print_indented(line, console)
+    console.print()
+
+
+def _texts(report: _Report) -> dict[str, str]:
+    """Return what is said in words, in its order; nothing where nothing was estimated."""
+    answer = report["answer"]
+    if answer is None:
+        return {}
+    texts, best = dict(answer["texts"]), answer["best_in_hindsight"]
+    if best is not None and best["name"] != answer["main"]:
+        error = degrees(best["sideslip_rmse_rad"])
+        name = best["name"] if best["causal"] else f"{best['name']} (not causal)"
+        texts["hindsight"] = f"by this log's truth {name} was best, {error} RMSE; nothing was chosen by it"
+    return {key: texts[key] for key in _TEXTS if texts.get(key)}
+
+
+def _clauses(key: str, text: str) -> list[str]:
+    """Return what is told of several logs once, clause by clause where the clauses stand for themselves."""
+    return text.split("; ") if key in ("assumed", "next") else [text]
+
+
+def _lines(texts: Mapping[str, str]) -> Table:
+    lines = Table.grid(padding=(0, 2, 0, 0))
+    lines.add_column(no_wrap=True)
+    lines.add_column(overflow="fold")
+    for key, text in texts.items():
+        lines.add_row(f"  {_TEXTS[key]}", text)
+    return lines
+
+
+def _failed_checks(report: _Report) -> Iterable[str | Text]:
+    checks = report.get("checks") or []
+    for check in checks:
+        if check["verdict"] == "failed":
+            waived = "waived" if check["waived"] else "FAILED"
+            remedy = f" Remedy: {check['remedy']}" if check["remedy"] else ""
+            yield Text.assemble(f"{waived}: ", (check["name"], "bold"), f": {check['evidence']}{remedy}")
+    undecided = [check["name"] for check in checks if check["verdict"] == "undecided"]
+    if undecided:
+        more = f" and {len(undecided) - _MOST_UNDECIDED} more" if len(undecided) > _MOST_UNDECIDED else ""
+        yield f"not decided by this drive: {', '.join(undecided[:_MOST_UNDECIDED])}{more}"
+
+
+def _losses(report: _Report) -> Iterable[str]:
+    """Yield what of the input was lost, then what else is known of it; what several channels share stands once."""
+    where: dict[tuple[str, str, str], list[str]] = {}
+    for loss in sorted(report["losses"], key=lambda x: x["severity"] != "lost"):
         told = loss["count"] is None or loss["kind"] == "gap" or str(loss["count"]) in loss["what"].split()
-        count = "" if told else f"{loss['count']} × "
+        what = loss["what"] if told else f"{loss['count']} × {loss['what']}"
         span = ""
         if loss["start_ns"] is not None and loss["end_ns"] is not None:
             start = report["log"]["start_ns"]
             span = f", {(loss['start_ns'] - start) / 1e9:.2f} to {(loss['end_ns'] - start) / 1e9:.2f} s"
-        console.print(f"  {word}: {count}{loss['what']} ({loss['where']}{span})")
-    console.print(_table(report, console.width))
-    if not report["truth"]["available"]:
-        console.print("  no truth in this log: estimates, NIS and disagreement only")
-        for row in report["metrics"]:
-            if row["metric"] == "disagreement_rms" and row["segment"] == "all" and row["value"] is not None:
-                pair = " and ".join(row["estimator"].split("~"))
-                console.print(f"  sideslip of {pair}: rms difference {row['value'] * _DEG:.3f}°")
-    if report["truth"]["not_independent"]:
-        console.print("  † the truth is an input or the estimate itself: no independent check")
-    if found := friction_line(report):
-        console.print(f"  friction: {found}")
+        where.setdefault(("lost" if loss["severity"] == "lost" else "note", what, span), []).append(loss["where"])
+    for (word, what, span), places in where.items():
+        more = f" and {len(places) - _MOST_PLACES} more" if len(places) > _MOST_PLACES else ""
+        yield f"{word}: {what} ({', '.join(places[:_MOST_PLACES])}{more}{span})"
+
+
+def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[str]:
+    """Yield what belongs below the table: its marks, what did not run, what happened, and remarks not yet ``told``."""
+    shown = _shown(report)
+    if tabled and report["truth"]["not_independent"]:
+        yield "† the truth is an input or the estimate itself: no independent check"
+    if tabled and any(not e["causal"] for e in shown):
+        yield "* not causal: uses what was measured later"
+    skipped: dict[str, list[str]] = {}
     for estimator in report["estimators"]:
         if estimator["outcome"] == "skipped":
-            console.print(f"  {estimator['name']} skipped: {estimator['reason']}")
-    for note, names in _notes(report).items():
-        console.print(f"  {', '.join(names)}: {note}")
-    console.print()
+            skipped.setdefault(estimator["reason"], []).append(estimator["name"])
+    for reason, names in skipped.items():
+        yield f"{', '.join(names)} skipped: {reason}"
+    happened: dict[str, list[str]] = {}
+    for estimator in shown:
+        for found in (diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])):
+            if found:
+                happened.setdefault(found, []).append(estimator["name"])
+    for found, names in happened.items():
+        yield f"{', '.join(names)}: {found}"
+    yield from _losses(report)
+    yield from (f"note: {remark}" for remark in report["remarks"] if remark not in told)
 
 
-def _notes(report: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return what the estimators have to say, reasons last, with the names of all that say the same."""
-    told: dict[str, list[str]] = {}
-    for estimator in report["estimators"]:
-        found = [diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])]
-        for note in [*estimator["notes"], *filter(None, found)]:
-            told.setdefault(note, []).append(estimator["name"])
-    return told
+def _shown(report: _Report) -> list[Mapping[str, Any]]:
+    """Return the estimators that a person is shown: the answer first, or those that know the future last."""
+    answer = report["answer"]
+    ran = {e["name"]: e for e in report["estimators"] if e["outcome"] == "ran"}
+    if answer is not None and not answer["named"]:
+        return [ran[name] for name in answer["shown"]]
+    return sorted(ran.values(), key=lambda e: not e["causal"])
 
 
-def _table(report: Mapping[str, Any], width: int) -> Table:
+def _figures(report: _Report) -> dict[tuple[str, str, str, str], float | None]:
+    """Return the figures by estimator, signal, segment and metric, with those that are made of two."""
     values = {(m["estimator"], m["signal"], m["segment"], m["metric"]): m["value"] for m in report["metrics"]}
-    present = {(m["signal"], m["metric"]) for m in report["metrics"] if m["segment"] == "all"}
+    main = None if report["answer"] is None else report["answer"]["main"]
+    for (name, signal, segment, metric), value in list(values.items()):
+        if metric == "nis" and value is not None and (dof := values.get((name, signal, segment, "nis_dof"))):
+            values[name, signal, segment, "nis_ratio"] = value / dof
+        if metric == "disagreement_rms" and main in (pair := name.split("~")):
+            other = next((n for n in pair if n != main), main)
+            values[str(other), signal, segment, "from_main"] = value
+    return values
+
+
+def _table(report: _Report, console: Console) -> Table:
+    """Return the figures of the estimators that are shown, in as many columns as the terminal is wide enough for."""
+    values, shown = _figures(report), _shown(report)
     asked = _COLUMNS if report["truth"]["available"] else _WITHOUT_TRUTH
-    shown = [c for c in asked if (c[1], c[2]) in present]
-    # On a narrow terminal the columns that matter least go, rather than all of them being squeezed.
-    for head in _LEAVE_FIRST:
-        if _width(shown) > width:
-            shown = [c for c in shown if c[0] != head]
-    dependent = report["truth"]["not_independent"]
-    scored = {m["segment"] for m in report["metrics"] if (m["signal"], m["metric"]) == ("sideslip_rad", "rmse")}
-    by_segment = [s for s in _SEGMENTS if s in scored]
-    nis = any(m["metric"] == "nis" for m in report["metrics"])
-    heads = [head + (" †" if signal in dependent else "") for head, signal, *_ in shown]
-    heads += [f"{segment}\nRMSE °" for segment in by_segment] + ["\nNIS/dof"] * nis
-    errors = table("\nestimator", *(f">{head}" for head in heads))
-    ran = [e for e in report["estimators"] if e["outcome"] == "ran"]
-    for estimator in sorted(ran, key=lambda e: not e["causal"]):  # those that know the future stand apart, below
+    names = [e["name"] for e in shown]
+    columns = [c for c in asked if any(values.get((name, *c[1:4])) is not None for name in names)]
+    for leave in (None, *_LEAVE_FIRST):
+        columns = [c for c in columns if c[0] != leave]
+        made = _table_of(report, shown, columns, values)
+        if Measurement.get(console, console.options.update(max_width=10_000), made).maximum <= console.width:
+            break
+    return made
+
+
+def _table_of(
+    report: _Report,
+    shown: Sequence[Mapping[str, Any]],
+    columns: Sequence[_Column],
+    values: Mapping[tuple[str, str, str, str], float | None],
+) -> Table:
+    dependent, answer = report["truth"]["not_independent"], report["answer"]
+    main = "" if answer is None else answer["main"]
+    heads = [c[0].format(main=main) + (" †" if c[1] in dependent else "") for c in columns]
+    made = table("\nestimator", *(f">{head}" for head in heads))
+    for column in made.columns:
+        column.no_wrap = True
+    for estimator in shown:
         name = estimator["name"]
-        cells = [name + ("" if estimator["causal"] else " (not causal)")]
-        cells += [cell(values.get((name, signal, "all", metric)), f, d) for _, signal, metric, f, d in shown]
-        cells += [cell(values.get((name, "sideslip_rad", s, "rmse")), _DEG, 3) for s in by_segment]
-        cells += [cell(_nis_ratio(values, name), digits=2)] * nis
-        errors.add_row(*cells)
-    return errors
+        figures = (cell(values.get((name, *c[1:4])), c[4], c[5]) for c in columns)
+        made.add_row(name + ("" if estimator["causal"] else " *"), *figures)
+    return made
 
 
-def _width(columns: list[tuple[str, str, str, float, int]]) -> int:
-    return _FIXED_WIDTH + sum(max(len(line) for line in head.splitlines()) + 2 for head, *_ in columns)
+def _joint_table(reports: Sequence[_Report]) -> Table:
+    """Return one line a log: the errors of the main estimator, physics and the naive one, and what to look at."""
+    mains = list(dict.fromkeys(report["answer"]["main"] for report in reports))
+    rivals = [n for n in ("physics", "zero") if [n] != mains and any(n in r["answer"]["shown"] for r in reports)]
+    head = f">{mains[0]}\nRMSE °" if len(mains) == 1 else ">sideslip\nRMSE °"
+    joint = table("\nlog", ">\ns", head, *(f">{n}\nRMSE °" for n in rivals), ">in 95 %\nband", "\nlook at", fold=1)
+    joint.columns[-1].overflow = "fold"
+    for report in reports:
+        values, main = _figures(report), report["answer"]["main"]
+        errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), _DEG, 3) for n in (main, *rivals)]
+        inside = values.get((main, "sideslip_rad", "all", "coverage95"))
+        seconds = f"{report['log']['duration_s']:.0f}"
+        notes = _look_at(report, inside, main if len(mains) > 1 else "")
+        joint.add_row(report["log"]["name"], seconds, *errors, cell(inside), notes)
+    return joint
 
 
-def _nis_ratio(values: Mapping[tuple[str, str, str, str], float | None], name: str) -> float | None:
-    nis, dof = values.get((name, "state", "all", "nis")), values.get((name, "state", "all", "nis_dof"))
-    return None if nis is None or not dof else nis / dof
+def _look_at(report: _Report, inside: float | None, main: str) -> str:
+    """Return what of a log a person should look at, in a few words; ``main`` where the logs' main estimators differ."""
+    stands_in = report["answer"]["stands_in"]
+    failed = sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks") or [])
+    scored = any(m["signal"] == "sideslip_rad" and m["metric"] == "rmse" for m in report["metrics"])
+    found = [
+        f"by {stands_in}" if stands_in else f"by {main}" if main else "",
+        f"{failed} check{'s' * (failed > 1)} failed" if failed else "",
+        "input lost" if any(x["severity"] == "lost" for x in report["losses"]) else "",
+        "no truth" if not report["truth"]["available"] else "" if scored else "not scored",
+        "diverged" if diverged_line(report, report["answer"]["main"]) else "",
+        "band too narrow" if inside is not None and inside < NEARLY_HOLDS else "",
+    ]
+    return ", ".join(filter(None, found))

@@ -26,11 +26,15 @@ RECORDING = "recording.rrd"
     "pdhef run drive.mcap -o out",
     "pdhef run drive.bag -o out --car mycar --mapping mapping.toml",
     "pdhef run logs/ -o out --estimators zero,phy-ukf --annotate sidecar",
+    "pdhef run fleet/ -o out --cars cars.toml",
     "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
     "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
-    "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).",
-    shared="estimators annotate sensors friction thresholds config_file network intervals calibrate model calibration",
+    "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
+    'cars.toml, its cars and folders beside it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
+    '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
+    shared="cars estimators annotate sensors friction thresholds config_file network intervals calibrate model "
+    "calibration",
     car="Your car (default: a sedan)",
 )
 def run(
@@ -116,7 +120,7 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
 
     console.show(result, render_run, as_json)
     for one in result.results:
-        if one.outcome.failed is not None and one.report is not None:  # of the others it was told as a warning
+        if one.outcome.failed is not None and one.report is not None:  # of the others the tables say it
             console.say(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
     failed = [v for v in result.verdicts if v.failed]
     for verdict in failed:

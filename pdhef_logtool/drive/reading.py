@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Self
 
@@ -72,7 +72,7 @@ class Drive:
     name : of the log in tables and folders. missing : signals that the mapping lacks. plan : what was decided from the
         first minutes; another one may be put in its place before reading.
     friction : what :meth:`windows` fills in; another one may be put in its place before reading.
-    notes : everything that was told of this drive.
+    notes : everything that was told of this drive: what may be wrong. remarks : what else is worth knowing.
     """
 
     name: str
@@ -84,6 +84,7 @@ class Drive:
     notes: list[str]
     friction: FrictionSource
     _tell: Tell
+    remarks: list[str] = field(default_factory=list)
     _reader: DriveReader | None = None
     _sha256: str = ""
 
@@ -228,6 +229,7 @@ def read_drive(
         start_s, end_s = log_input.span_s
         options = replace(options, start=f"{start_s:.9f}", end=f"{end_s:.9f}")
     notes: list[str] = []
+    remarks: list[str] = []
 
     def told(text: str) -> None:
         notes.append(text)
@@ -236,7 +238,7 @@ def read_drive(
     opened = open_log(log_input.path, options.limits)
     try:
         chosen, missing = choose_mapping(
-            opened, mapping, told, prefer_truth=options.prefer_truth, require_signals=require_sensors
+            opened, mapping, told, remarks.append, prefer_truth=options.prefer_truth, require_signals=require_sensors
         )
         if adjust is not None:
             chosen = adjust(opened, chosen, told)
@@ -248,11 +250,11 @@ def read_drive(
         _tell_doubts(plan, told)
         friction = friction_of(plan, car.vehicle, options)
         if friction.note:
-            told(friction.note)
+            remarks.append(friction.note)
     except BaseException:
         opened.close()
         raise
-    return Drive(log_input.stem, opened, car, options, plan, missing, notes, friction, tell)
+    return Drive(log_input.stem, opened, car, options, plan, missing, notes, friction, tell, remarks)
 
 
 def one_log(argument: str) -> LogInput:

@@ -55,7 +55,7 @@ class Spec:
     needs : aligned signals without which it cannot run.
     colour : 0xRRGGBB in every plot, tellable apart with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
     causal : whether an estimate at t uses only what had arrived by t.
-    default : whether it runs where none are named.
+    in_all : whether it is one of :data:`ALL_ESTIMATORS`.
     network : which part of a network bundle it needs; empty: none; ``optional``: it runs without as well.
     needs_noise : whether it cannot run without noise of its own in the car.
     tunable : whether ``pdhef tune`` searches its noise.
@@ -67,7 +67,7 @@ class Spec:
     needs: frozenset[str]
     colour: int
     causal: bool = True
-    default: bool = True
+    in_all: bool = True
     network: Literal["", "optional", "residual", "paper", "pure_lstm", "linear_regression"] = ""
     needs_noise: bool = False
     tunable: bool = False
@@ -115,6 +115,8 @@ class Spec:
         return SelfCalibrated(estimator, car.self_calibrated, car.vehicle, compared=options.compared)
 
 
+#: In place of names: every estimator that the car suits.
+ALL_ESTIMATORS = "all"
 #: In the order of the tables.
 SPECS: tuple[Spec, ...] = (
     Spec(
@@ -171,8 +173,8 @@ SPECS: tuple[Spec, ...] = (
         "pd_hef:build_smoothed", _ESP, 0x332288, causal=False, network="optional",
     ),
     Spec(
-        "pd-hef-trust1", "pd-hef at trust 1, whatever the car allows (needs a network)",
-        "pd_hef:build", _ESP, 0x882255, default=False, network="residual",
+        "pd-hef-trust1", "pd-hef at trust 1, whatever the car allows (needs a network; to be named, not one of all)",
+        "pd_hef:build", _ESP, 0x882255, in_all=False, network="residual",
     ),
     Spec(
         "pd-hef-paper", "the paper's hybrid filter with its adaptive mechanism, to the letter (needs its network)",
@@ -201,12 +203,14 @@ def spec_of(name: str) -> Spec:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise UsageError if a name is unknown or occurs twice, or there is none."""
+    """Raise UsageError if a name is unknown or occurs twice, or there is none; :data:`ALL_ESTIMATORS` stands alone."""
+    if tuple(names) == (ALL_ESTIMATORS,):
+        return
     known = [s.name for s in SPECS]
     wrong = [n for n in names if n not in known] + sorted({n for n in names if names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
-            expected=f"estimators out of {', '.join(known)}",
+            expected=f"{ALL_ESTIMATORS}, or estimators out of {', '.join(known)}",
             got=", ".join(wrong) or "none",
             where="--estimators",
             remedy=former(wrong),
@@ -218,12 +222,12 @@ def former(names: Sequence[str]) -> str:
     return "; ".join(f"{n} is {FORMER_FILTERS[n]} now" for n in names if n in FORMER_FILTERS)
 
 
-def default_names(car: Car) -> tuple[str, ...]:
-    """Return the estimators that run when none are named: every default one that the car has what it needs for.
+def all_names(car: Car) -> tuple[str, ...]:
+    """Return the estimators that :data:`ALL_ESTIMATORS` stands for: those that the car has what they need for.
 
     Baselines and physics first, then what rests on a network.
     """
-    suited = [s for s in SPECS if s.default and not s.missing(car)]
+    suited = [s for s in SPECS if s.in_all and not s.missing(car)]
     return tuple(s.name for s in sorted(suited, key=lambda s: bool(s.network)))
 
 
@@ -233,17 +237,17 @@ def make_estimator(name: str, car: Car, options: Options | None = None) -> Estim
 
 
 def runnable(
-    names: Sequence[str] | None, car: Car, available: frozenset[str], options: Options | None = None
+    names: Sequence[str], car: Car, available: frozenset[str], options: Options | None = None
 ) -> tuple[list[Estimator], list[Skipped]]:
     """Split estimators into those whose needs car and log meet, built, and those that are skipped with the reason.
 
     Parameters
     ----------
-    names : None: :func:`default_names`. available : signals of the log.
+    names : of estimators, or :data:`ALL_ESTIMATORS` alone. available : signals of the log.
     """
     estimators: list[Estimator] = []
     skipped: list[Skipped] = []
-    for spec in map(spec_of, default_names(car) if names is None else names):
+    for spec in map(spec_of, all_names(car) if tuple(names) == (ALL_ESTIMATORS,) else names):
         lacking = sorted(spec.needs - available)
         reason = spec.missing(car) or (f"the log has no {', '.join(lacking)}" if lacking else "")
         if reason:

@@ -240,7 +240,7 @@ def record_of(
         truth=tuple(sorted({source.label for source in drive.mapping.truth.values()})),
         friction_from=drive.friction.label,
         losses=drive.losses,
-        notes=tuple(drive.notes),
+        notes=(*drive.notes, *drive.remarks),
         left_out=left_out,
         bytes_held=0 if whole is None else whole.nbytes,
     )

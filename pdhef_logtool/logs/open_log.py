@@ -73,6 +73,28 @@ def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET) -> DriveLog:
     return ColumnarLog(path, kind, [container], distro=container.distro)
 
 
+def log_metadata(path: Path, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
+    """Return what a log says of itself: MCAP metadata records by ``key`` and ``record.key``, rosbag2's ``custom_data``.
+
+    Raises
+    ------
+    LogError : as for :func:`open_log`.
+    """
+    log = open_log(path, budget)
+    try:
+        assert isinstance(log, ColumnarLog)
+        found: dict[str, str] = {}
+        for container in log.containers:
+            for record in container.metadata_records():
+                found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
+    finally:
+        log.close()
+    if is_log_folder(path):
+        custom = _read_metadata(path, budget).get("custom_data")
+        found |= {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+    return found
+
+
 def is_log_folder(path: Path) -> bool:
     """Tell whether a folder is one log (a rosbag2 folder) rather than a folder of logs."""
     return path.is_dir() and (path / "metadata.yaml").is_file()

@@ -29,11 +29,14 @@ def choose_mapping(
     log: DriveLog,
     mapping: Mapping | None,
     tell: Callable[[str], None],
+    remark: Callable[[str], None],
     *,
     prefer_truth: Literal["perfect", "rtk"],
     require_signals: bool = True,
 ) -> tuple[Mapping, tuple[str, ...]]:
     """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently.
+
+    ``tell`` is called with what may be wrong, ``remark`` with what else is worth knowing.
 
     Raises
     ------
@@ -44,13 +47,13 @@ def choose_mapping(
     if mapping is not None:
         check_mapping(mapping, log)
         for note in mapping.notes:
-            tell(note)
+            remark(note)
         return mapping, tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
     found = auto_map(log, prefer_truth=prefer_truth)
     for ambiguity in found.ambiguities:
         tell(str(ambiguity))
     for note in found.mapping.notes:
-        tell(note)
+        remark(note)
     if require_signals and not found.mapping.signals:
         raise MappingError(
             expected="topics of well-known message types",

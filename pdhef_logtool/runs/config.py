@@ -19,7 +19,7 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 
-_FILES = ("car", "mapping", "thresholds", "network", "intervals")
+_FILES = ("car", "cars", "mapping", "thresholds", "network", "intervals")
 #: What may stand in place of a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
@@ -50,8 +50,10 @@ class RunConfig:
 
     Attributes
     ----------
-    estimators : names, in the order of the tables; None = every one that the car suits.
+    estimators : names, in the order of the tables; ``all`` alone = every one that the car suits; None = the main one,
+        ``physics`` and ``zero``, with those that they are checked against (:func:`~.guard.default_names`).
     car : a car's folder, a vehicle.toml, or ``saloon``, the shipped one; None = the default sedan.
+    cars : a table that says which car each log has, instead of ``car``; None = the same for all.
     mapping : file; None = recognised types.
     start, end : slice as given (:func:`~pdhef_logtool.drive.options.parse_time`); None = the log's own.
     annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only.
@@ -69,6 +71,7 @@ class RunConfig:
 
     estimators: Names | None = None
     car: Path | None = None
+    cars: Path | None = None
     mapping: Path | None = None
     start: Time | None = None
     end: Time | None = None
@@ -117,6 +120,8 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         path = Path("pdhef.toml")
     raw = {} if path is None else _read_file(path)
     given = {key: value for key, value in flags.items() if value is not None}
+    if {"car", "cars"} & given.keys():  # one stands for the other
+        raw = {key: value for key, value in raw.items() if key not in {"car", "cars"}}
     if "friction" in given:
         given["friction"] = parse_friction(given["friction"])
     for where, entries in ((str(path), raw), ("options", {**raw, **given})):

@@ -14,6 +14,7 @@ from pdhef_logtool.estimators.table import Options, Skipped, runnable
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
+from pdhef_logtool.runs.guard import default_names
 from pdhef_logtool.sinks.base import TRUTH
 
 if TYPE_CHECKING:
@@ -47,7 +48,8 @@ class Estimates:
 
 
 def choose(drive: Drive, names: Sequence[str] | None = None) -> tuple[list[Estimator], list[Skipped]]:
-    """Return the estimators that a drive and its car let run, and those that they do not; None = the usual ones."""
+    """Return the estimators that a drive and its car let run, and those that they do not; ``names`` as for estimate."""
+    names = default_names(drive.car, drive.available) if names is None else names
     return runnable(names, drive.car, drive.available, Options(drive.options.use_speed))
 
 
@@ -56,7 +58,8 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
 
     Parameters
     ----------
-    drive : of :func:`~pdhef_logtool.drive.reading.read_drive`. names : of estimators; None = those that a run takes.
+    drive : of :func:`~pdhef_logtool.drive.reading.read_drive`. names : of estimators; None = those that a run
+        takes; ``["all"]`` = every one that the car suits.
 
     Raises
     ------

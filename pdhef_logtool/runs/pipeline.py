@@ -30,14 +30,16 @@ from pdhef_logtool.records.errors import (
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
+from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
-from pdhef_logtool.runs.guard import GUARDED, Distrust, distrust
+from pdhef_logtool.runs.guard import GUARDED, Distrust, choose_main, default_names, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.sinks.base import Event, Sink
 from pdhef_logtool.sinks.report import (
+    CarFacts,
     EstimatorFacts,
     FrictionFacts,
     LogFacts,
@@ -152,36 +154,58 @@ def run_logs(
         The output folder cannot be written, or another command is writing to it.
     """
     inputs = find_logs(arguments)
-    car = Car.load(config.car, network=config.network, intervals=config.intervals)
+    cars = RunCars.of(config, warn)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
     thresholds = read_thresholds(config, junit)
-    if config.car is None:
-        warn(f"no --car: the default {car.vehicle.name} is assumed, so the model-based estimates are of another car")
-    for note in car.notes:
-        warn(note)
-    check_places(inputs, output, config, mapping, junit)
+    check_places(inputs, output, config, mapping, junit, cars.paths)
     results: list[LogResult] = []
-    pool = calibrate_pool(inputs, car, mapping, config) if config.calibrate == "pool" else None
+    had = [_car_of(cars, log_input, alone=len(inputs) == 1) for log_input in inputs]
+    pools = _pools(inputs, had, mapping, config) if config.calibrate == "pool" else {}
     with OutputFolder(output, (LOGS,)) as outputs:
         for number, log_input in enumerate(inputs):
 
             def of_all(text: str, share: float, number: int = number) -> None:
                 progress(text, (number + share) / len(inputs))
 
+            car = had[number]
             try:
+                if isinstance(car, Exception):
+                    raise car
+                pool = pools.get(id(car))
                 result = run_log(log_input, outputs, config, car, mapping, pool=pool, progress=of_all, warn=warn)
             except Exception as error:  # one bad log never stops the others, whatever is wrong with it
                 if len(inputs) == 1:
                     raise
                 result = _failed(log_input, error)
-                warn(result.outcome.failed or "")
+                warn(f"{log_input.path.name} failed, the others go on")  # why stands with the results
             except BaseException as stop:
                 stop.add_note(f"{number} of {len(inputs)} logs are done")
                 raise
             results.append(judge(result, thresholds))
-        write_run(output, config.to_dict(), results, car)
+        write_run(output, config.to_dict(), results, [car for car in had if isinstance(car, Car)])
         write_verdicts(junit, results)
     return RunResult(output, tuple(results))
+
+
+def _car_of(cars: RunCars, log_input: LogInput, *, alone: bool) -> Car | Exception:
+    """Return the car of a log, or what is wrong with it; of a log that is ``alone`` that is raised."""
+    try:
+        return cars.of_log(log_input)
+    except Exception as error:  # one bad log never stops the others
+        if alone:
+            raise
+        return error
+
+
+def _pools(
+    inputs: Sequence[LogInput], had: Sequence[Car | Exception], mapping: Mapping | None, config: RunConfig
+) -> dict[int, SelfCalibration | None]:
+    """Return what all logs of a car together say of it, by the car's identity."""
+    logs: dict[int, list[LogInput]] = {}
+    cars = {id(car): car for car in had if isinstance(car, Car)}
+    for log_input, car in zip(inputs, had, strict=True):
+        logs.setdefault(id(car), []).append(log_input)
+    return {key: calibrate_pool(logs[key], car, mapping, config) for key, car in cars.items()}
 
 
 def _failed(log_input: LogInput, error: Exception) -> LogResult:
@@ -246,8 +270,6 @@ def run_log(
     progress(log_input.stem, 0.0)
     with read_drive(log_input, car, mapping, config.read_options, tell=warn) as drive:
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
-        if calibration is not None:
-            drive.tell(calibration.text)
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
         job = _Job(drive, car, calibration, ready, skipped)
@@ -304,7 +326,7 @@ def _run_estimators(
                 observable = friction_events(drive.friction, signals)
                 found = replace(found, events=sorted([*found.events, *observable], key=in_time))
         if against := distrust(found.rows):
-            drive.tell(f"WARNING: {against.text}")
+            drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
             if falls_back:
                 raise _FallBackError(against)
         rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
@@ -317,7 +339,8 @@ def _run_estimators(
             EstimatorFacts(
                 e.name,
                 causal=e.causal,
-                notes=(*notes_of(e), *intervals.notes(e.name)),
+                notes=notes_of(e),
+                intervals=intervals.notes(e.name),
                 reasons=found.reasons[e.name],
                 algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
             )
@@ -326,17 +349,24 @@ def _run_estimators(
         left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
         facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
         calibration = None if job.calibration is None else job.calibration.to_dict()
-        report = build_report(replace(facts, friction=friction_facts(drive.friction), calibration=calibration))
+        main = choose_main(ready, rows, proven=drive.car.has_evidence, named=config.estimators is not None)
+        facts = replace(facts, friction=friction_facts(drive.friction), calibration=calibration, main=main)
+        report = build_report(facts)
         from pdhef_logtool.sinks.parquet import write_metrics
 
         for sink in sinks:
             sink.finish(report, events)
         write_metrics(change.file("metrics.parquet"), rows)
         write_json(change.file("report.json"), report)
-    outcome = outcome_of(drive, losses)
+    outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car))
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
     return LogResult(outcome, change.target, report, tuple(rows))
+
+
+def _car_facts(car: Car) -> CarFacts:
+    network = None if car.network is None else car.network.sha256
+    return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network)
 
 
 def _short(algorithm: Algorithm | None) -> str:
@@ -350,9 +380,8 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
 
 def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[Estimator], list[Skipped]]:
     """Return the estimators that can run and those that cannot; raises EstimatorError if none can."""
-    estimators, skipped = runnable(config.estimators, car, drive.available, Options(drive.options.use_speed))
-    for skip in skipped:
-        drive.tell(f"{skip.name} is skipped: {skip.reason}")
+    names = config.estimators or default_names(car, drive.available)
+    estimators, skipped = runnable(names, car, drive.available, Options(drive.options.use_speed))
     if not estimators:
         raise EstimatorError(
             expected="at least one estimator that can run",
@@ -470,6 +499,8 @@ def report_facts(
         missing_signals=list(drive.missing),
         vehicle_name=car.vehicle.name,
         vehicle_sha256=car.physics_sha256,
+        vehicle_file=car.file_name,
+        vehicle_proven=car.has_evidence,
         estimators=list(estimators),
         truth=TruthFacts(
             quantities=[
@@ -485,6 +516,7 @@ def report_facts(
         file_bytes=drive.byte_ledgers,
         samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
+        remarks=drive.remarks,
         versions=tool_versions(),
     )
 
@@ -514,7 +546,12 @@ def log_place(stem: str) -> str:
 
 
 def check_places(
-    inputs: Sequence[LogInput], output: Path | None, config: RunConfig, mapping: Mapping | None, junit: Path | None
+    inputs: Sequence[LogInput],
+    output: Path | None,
+    config: RunConfig,
+    mapping: Mapping | None,
+    junit: Path | None,
+    cars: Sequence[Path | None] = (),
 ) -> None:
     """Refuse to write over what is read; raises UsageError."""
     can = () if mapping is None or mapping.can is None else mapping.can.dbc
@@ -522,15 +559,19 @@ def check_places(
     folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
     files += [folder / name for folder in folders for name in LOG_FILES]
     check_no_input(
-        [*(i.path for i in inputs), *config.files, *can], files if junit is None else [*files, junit], folders
+        [*(i.path for i in inputs), *config.files, *cars, *can], files if junit is None else [*files, junit], folders
     )
 
 
-def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult], car: Car | None = None) -> None:
-    """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values."""
+def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult], cars: Sequence[Car] = ()) -> None:
+    """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values.
+
+    ``cars`` : of the logs; the run has a network where all have the same.
+    """
     from pdhef_logtool.sinks.parquet import write_metrics
 
-    network = None if car is None else car.network
-    used = None if car is None or network is None else {"name": Path(car.network_name).name, "sha256": network.sha256}
+    networks = {None if c.network is None else (Path(c.network_name).name, c.network.sha256) for c in cars}
+    only = networks.pop() if len(networks) == 1 else None
+    used = None if only is None else {"name": only[0], "sha256": only[1]}
     write_metrics(output / METRICS_FILE, [row for r in results for row in r.rows])
     write_json(output / RUN_FILE, build_run(tool_versions(), config, used, [r.outcome for r in results]))

@@ -15,6 +15,7 @@ from pdhef_logtool.drive.options import WINDOW_S
 from pdhef_logtool.drive.reading import Drive, read_drive
 from pdhef_logtool.estimators.base import Estimator, run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
+from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
@@ -80,7 +81,6 @@ def checked(drive: Drive, calibration: SelfCalibration | None) -> SelfCalibratio
     if calibration is None or calibration.refused:
         return calibration
     from pdhef_logtool.estimators.physics_ukf import of_car
-    from pdhef_logtool.estimators.table import make_estimator
 
     alone = self_calibrated(drive, replace(calibration, varied=()))  # d2 asks for no interval
     estimators = (of_car(drive.car), make_estimator("physics", alone))
@@ -160,7 +160,7 @@ def _asked(config: RunConfig, car: Car) -> bool:
     names = config.estimators
     if car.has_evidence or config.sensors == "esp":
         return False
-    return names is None or bool({OPEN_LOOP, *SELF_CALIBRATED} & set(names))
+    return names is None or bool({ALL_ESTIMATORS, OPEN_LOOP, *SELF_CALIBRATED} & set(names))
 
 
 def _told(drive: Drive) -> bool:

@@ -19,6 +19,7 @@ from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.sinks.answer import MainFacts, answer_of
 from pdhef_logtool.sinks.base import Event
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class SourceFacts:
 class EstimatorFacts:
     """One estimator that was asked for: ``skipped`` holds the reason if it did not run.
 
+    ``notes``: what it has to say of itself. ``intervals``: what its 95 % intervals are made of, empty without.
     ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the
     name, with its digest; None if it did not run.
     """
@@ -80,6 +82,7 @@ class EstimatorFacts:
     causal: bool
     skipped: str | None = None
     notes: Sequence[str] = ()
+    intervals: Sequence[str] = ()
     reasons: Sequence[ReasonFacts] | None = None
     algorithm: Mapping[str, Any] | None = None
 
@@ -112,6 +115,9 @@ class FrictionFacts:
 class ReportFacts:
     """Everything that report.json says about one log.
 
+    ``vehicle_file``: the car's folder or file, None where none was given; ``vehicle_proven``: whether driving with
+    truth showed it to be right. ``main``: the estimator that is the answer, None where nothing was estimated.
+    ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
     ``calibration``: what the drive said of its car without truth, None where it was not asked.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
     """
@@ -123,6 +129,8 @@ class ReportFacts:
     vehicle_sha256: str
     estimators: Sequence[EstimatorFacts]
     truth: TruthFacts
+    vehicle_file: str | None = None
+    vehicle_proven: bool = False
     friction: FrictionFacts | None = None
     calibration: Mapping[str, Any] | None = None
     metrics: Sequence[MetricRow] = ()
@@ -131,12 +139,24 @@ class ReportFacts:
     file_bytes: Sequence[ByteLedger] = ()
     samples: Sequence[SampleCount] = ()
     warnings: Sequence[str] = ()
+    remarks: Sequence[str] = ()
+    main: MainFacts | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
+class CarFacts:
+    """The car that a log of a run had: folder or file (None: none was given), vehicle, digests of physics, network."""
+
+    file: str | None
+    name: str
+    sha256: str
+    network_sha256: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class LogOutcome:
-    """How one log of a run ended.
+    """How one log of a run ended, with which car; None where it was not read or nothing was estimated.
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
     """
@@ -146,6 +166,7 @@ class LogOutcome:
     sha256: str | None
     failed: str | None = None
     lost: Sequence[str] = ()
+    car: CarFacts | None = None
 
     @property
     def outcome(self) -> str:
@@ -178,7 +199,12 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "topics": [{"type" if k == "type_name" else k: v for k, v in topic.items()} for topic in topics],
         },
         "mapping": {"signals": list(facts.signals), "missing": list(facts.missing_signals)},
-        "vehicle": {"name": facts.vehicle_name, "sha256": facts.vehicle_sha256},
+        "vehicle": {
+            "name": facts.vehicle_name,
+            "sha256": facts.vehicle_sha256,
+            "file": facts.vehicle_file,
+            "proven": facts.vehicle_proven,
+        },
         "estimators": [
             {
                 "name": e.name,
@@ -187,6 +213,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
                 "reason": e.skipped,
                 "algorithm": e.algorithm,
                 "notes": list(e.notes),
+                "intervals": list(e.intervals),
                 "reasons": None if e.reasons is None else list(e.reasons),
             }
             for e in facts.estimators
@@ -203,9 +230,11 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "losses": list(facts.losses),
         "ledger": {"bytes": list(facts.file_bytes), "samples": list(facts.samples)},
         "warnings": list(facts.warnings),
+        "remarks": list(facts.remarks),
         "versions": dict(facts.versions),
     }
-    return {key: jsonable(value) for key, value in document.items()}
+    document = {key: jsonable(value) for key, value in document.items()}
+    return {**document, "answer": None if facts.main is None else answer_of(document, facts.main)}
 
 
 def build_run(
@@ -230,7 +259,8 @@ def build_run(
         "config": dict(config),
         "model": None if model is None else dict(model),
         "logs": [
-            {"log": o.log, "file": PurePath(o.file).name, "sha256": o.sha256, "outcome": o.outcome} for o in outcomes
+            {"log": o.log, "file": PurePath(o.file).name, "sha256": o.sha256, "outcome": o.outcome, "car": o.car}
+            for o in outcomes
         ],
     }
     return {key: jsonable(value) for key, value in document.items()}
@@ -257,7 +287,10 @@ def report_markdown(report: Mapping[str, Any]) -> str:
         f"vehicle {report['vehicle']['name']}",
         "",
     ]
+    if answer := report.get("answer"):
+        lines += _bullets("Answer", [text for text in answer["texts"].values() if text])
     lines += _bullets("Warnings", report["warnings"])
+    lines += _bullets("Remarks", report.get("remarks", ()))
     lines += _bullets("Losses", [f"{x['what']} ({x['where']})" for x in report["losses"]])
     lines += _truth_lines(report["truth"])
     if found := friction_line(report):
@@ -270,7 +303,7 @@ def report_markdown(report: Mapping[str, Any]) -> str:
     for e in report["estimators"]:
         happened = [diverged_line(report, e["name"]), reasons_line(e, log["start_ns"])]
         told = [f"skipped: {e['reason']}"] if e["reason"] else []
-        notes = "; ".join([*told, *e["notes"], *filter(None, happened)])
+        notes = "; ".join([*told, *e["notes"], *e.get("intervals", ()), *filter(None, happened)])
         kind = "causal" if e["causal"] else "not causal"
         lines.append(f"- **{e['name']}** ({kind})" + (f": {notes}" if notes else ""))
     lines += ["", "## Signals", ""]

@@ -83,9 +83,8 @@ class TrackCalibrator:
         made = self.intervals
         of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
         then, now = found[0].algorithm, found[1]
-        said = [f"intervals calibrated on {made.car} for friction and vehicle {of}"]
-        said += [
-            f"those intervals were made with other {what}"
+        others = [
+            what
             for what, differs in (
                 ("physics", then.physics_sha256 not in (None, now.physics_sha256)),
                 ("filter noise", then.noise != now.noise),
@@ -94,7 +93,8 @@ class TrackCalibrator:
             )
             if differs
         ]
-        return tuple(said)
+        but = f", but with other {' and '.join(others)}" if others else ""
+        return (f"intervals calibrated on {made.car} for friction and vehicle {of}{but}",)
 
     def _found(self, name: str) -> tuple[IntervalEntry, Algorithm] | None:
         """Return the entry for a name and the algorithm that it was found by."""

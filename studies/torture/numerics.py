@@ -216,7 +216,7 @@ def _judge(
     changed = change(drive)
     write_samples(path, changed if isinstance(changed, list) else [changed])
     process = measured(
-        "run", str(path), "-o", str(folder / "out"), "--car", "saloon", "--annotate", "none", limit_s=120.0
+        "run", str(path), "-o", str(folder / "out"), "--car", "saloon", "--annotate", "none", "-e", "all", limit_s=120.0
     )
     verdict = judge(process, codes)
     table = folder / "out" / "logs" / "drive" / "estimates.parquet"

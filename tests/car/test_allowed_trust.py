@@ -132,7 +132,8 @@ def test_the_report_says_the_cap_and_why(
         assert why in note
         assert note in report_markdown(report)
         render_run(result, Console(width=400))
-        assert f"pd-hef: {note}" in capsys.readouterr().out
+        said = f"network trusted at {cap:g} by the car's evidence" if cap else "no network, for want of evidence"
+        assert said in capsys.readouterr().out
         folder = tmp_path / f"out{cap}" / "logs" / "dlc"
         track = read_track(folder / "estimates.parquet", "pd-hef")
         assert set(np.unique(track.network_trust[track.valid])) == {cap}

@@ -80,10 +80,11 @@ def test_what_is_told_is_noted_and_named(sample_logs_dir: Path, car: Car) -> Non
     without = car.with_vehicle(car.vehicle.model_copy(update={"friction": None}))
     with read_drive(sample_logs_dir / "dlc.mcap", without, tell=told.append) as drive:
         drive.tell("one more")
-        notes = list(drive.notes)
+        notes, remarks = list(drive.notes), list(drive.remarks)
     assert told == [f"dlc: {note}" for note in notes]
-    assert any("/rtk/odometry not used" in note for note in notes)
-    assert any("friction" in note for note in notes)
+    # No alarms: they are kept, not told.
+    assert any("/rtk/odometry not used" in remark for remark in remarks)
+    assert any("friction" in remark for remark in remarks)
     assert notes[-1] == "one more"
 
 

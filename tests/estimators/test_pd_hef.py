@@ -177,7 +177,8 @@ def test_it_needs_a_model_and_says_so() -> None:
 def test_run_with_a_model_writes_its_hash_and_its_estimates(sample_logs_dir: Path, tmp_path: Path) -> None:
     bundle = _bundle((0.0, 0.0))
     bundle.save(tmp_path / "model")
-    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=tmp_path / "model", annotate="none")
+    names, car = ("pd-hef", "pd-hef-fixed-r"), sample_logs_dir / "vehicle.toml"
+    config = RunConfig(car=car, network=tmp_path / "model", estimators=names, annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     assert bundle.sha256 in (tmp_path / "out" / "run.json").read_text()

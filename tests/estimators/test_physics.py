@@ -47,7 +47,7 @@ from pdhef_logtool.estimators.physics_model import (
     step_count,
 )
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, PhysicsFilter, _draw, _moments, physics_filter
-from pdhef_logtool.estimators.table import Options, default_names, make_estimator
+from pdhef_logtool.estimators.table import Options, all_names, make_estimator
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import concatenate
 
@@ -583,12 +583,12 @@ def test_what_comes_and_goes_is_found(part, entry, value):
 def test_its_noise_comes_from_the_car_where_it_has_some():
     v = vehicle()
     bare = physics_filter(v)
-    assert "physics" in default_names(Car.of(v))
+    assert "physics" in all_names(Car.of(v))
     assert bare.q_std == PHYSICS_Q_STD
     assert bare.measurement_std.tolist() == [0.12, 0.004, 0.08]
     noise = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
     car = Car.of(v, noise={"physics": noise})
-    assert "physics" in default_names(car)
+    assert "physics" in all_names(car)
     tuned = make_estimator("physics", car).physics
     assert tuned.q_std == (0.05, 0.02, 0.02, *PHYSICS_Q_STD[3:])
     assert tuned.measurement_std.tolist() == [0.8, 0.004, 0.08]

@@ -17,7 +17,7 @@ from pdhef_logtool.estimators.base import run_window
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.estimators.stand_in import StandIn
-from pdhef_logtool.estimators.table import SPECS, Options, default_names, make_estimator
+from pdhef_logtool.estimators.table import SPECS, Options, all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -95,8 +95,8 @@ def test_what_does_not_take_it_is_as_without(name: str) -> None:
 
 
 def test_the_open_loop_model_runs_once_more_only_on_a_calibrated_car() -> None:
-    assert OPEN_LOOP in default_names(calibrated())
-    assert OPEN_LOOP not in default_names(Car.of(OWN))
+    assert OPEN_LOOP in all_names(calibrated())
+    assert OPEN_LOOP not in all_names(Car.of(OWN))
     with pytest.raises(UsageError, match="has not calibrated"):
         make_estimator(OPEN_LOOP, Car.of(OWN))
 

@@ -30,8 +30,8 @@ from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import (
     SPECS,
     Options,
+    all_names,
     check_names,
-    default_names,
     make_estimator,
     runnable,
     spec_of,
@@ -117,7 +117,7 @@ def test_a_line_builds_what_it_says(spec: Any) -> None:
     assert (estimator.name, estimator.causal) == (spec.name, spec.causal)
     assert isinstance(estimator, LookingAhead) == (not spec.causal)
     assert spec_of(spec.name) is spec
-    assert (spec.name in default_names(CAR)) == spec.default
+    assert (spec.name in all_names(CAR)) == spec.in_all
     assert spec.needs <= frozenset(ALIGNED_SIGNALS)
 
 
@@ -163,12 +163,12 @@ def test_a_car_that_lacks_something_skips_it_with_the_remedy(spec: Any) -> None:
         assert "--network" in skipped[0].reason or "pdhef identify" in skipped[0].reason
         with pytest.raises(UsageError, match=spec.name):
             make_estimator(spec.name, Car.of(VEHICLE))
-    assert (spec.name in default_names(Car.of(VEHICLE))) == (spec.default and not lacks)
+    assert (spec.name in all_names(Car.of(VEHICLE))) == (spec.in_all and not lacks)
 
 
 def test_physics_runs_on_any_car_and_without_a_fit_it_has_no_part() -> None:
     bare = Car.of(VEHICLE)
-    assert "physics" in default_names(bare)
+    assert "physics" in all_names(bare)
     adaptive = make_estimator("physics", bare)
     assert isinstance(adaptive, AdaptivePhysics)
     estimator = adaptive.physics

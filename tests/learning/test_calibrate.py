@@ -327,7 +327,7 @@ def test_a_run_uses_it_says_so_and_windows_change_nothing(
         result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config)
         report = result.results[0].report
         assert report is not None
-        notes = {e["name"]: "; ".join(e["notes"]) for e in report["estimators"]}
+        notes = {e["name"]: "; ".join(e["intervals"]) for e in report["estimators"]}
         assert ("intervals not calibrated" if name == "plain" else "calibrated on truthsim saloon") in notes["phy-ukf"]
         assert "calibrated" not in notes["zero"]
         assert "other physics" not in notes["phy-ukf"]

@@ -125,6 +125,7 @@ class ReadDrive:
         topic = SimpleNamespace(label="/ins.v")
         self.mapping = SimpleNamespace(truth={"vy_m_s": topic, "vx_m_s": topic})
         self.friction, self.losses, self.notes = SimpleNamespace(label="none"), (), ["a note"]
+        self.remarks = ["a remark"]
         self.available = whole.plan.alignment.available
         self._whole, self.asked = whole, {}
 
@@ -147,7 +148,7 @@ def test_a_drive_is_loaded_with_what_is_known_of_it(monkeypatch: pytest.MonkeyPa
     assert whole is WHOLE
     assert read.asked == {"fill_friction": False, "max_bytes": 7}
     assert (found.name, found.file, found.sha256, found.split) == ("made", "made.mcap", "1" * 64, "test")
-    assert (found.truth, found.friction_from, found.notes) == (("/ins.v",), "none", ("a note",))
+    assert (found.truth, found.friction_from, found.notes) == (("/ins.v",), "none", ("a note", "a remark"))
     assert (found.seconds, found.span_s) == (pytest.approx(6.0), pytest.approx((1.5, 7.5)))
     assert found.counts == {"scored_stamps": 601} and found.left_out == ""
     assert found.bytes_held == WHOLE.nbytes > 601 * 8

@@ -59,7 +59,8 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     }  # fmt: skip
     assert pl.read_parquet(tmp_path / "model" / "history.parquet").height == 2
     assert bundle.provenance["dataset_sha256"]
-    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=tmp_path / "model", annotate="none")
+    car, network = sample_logs_dir / "vehicle.toml", tmp_path / "model"
+    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef"}
     again = run_training(joined, tmp_path / "again", epochs=2)
@@ -93,7 +94,8 @@ def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_
     errors = bundle.linear_regression.provenance["sideslip_rmse_deg"]
     assert 0.0 < errors["train"] < 1.0
     assert errors["test"] is not None
-    config = RunConfig(car=sample_logs_dir / "vehicle.toml", network=folder / "model", annotate="none")
+    car, network = sample_logs_dir / "vehicle.toml", folder / "model"
+    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression"}
     both = _pdhef("train", str(dataset), "-o", str(folder / "m"), "--baselines", "--init", str(folder / "model"))

@@ -135,7 +135,7 @@ def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_p
         (tmp_path / "mapping.toml").write_text(("fill_recognised = true\n" if filled else "") + text)
         told: list[str] = []
         mapping, missing = choose_mapping(
-            log, load_mapping(tmp_path / "mapping.toml"), told.append, prefer_truth="perfect"
+            log, load_mapping(tmp_path / "mapping.toml"), pytest.fail, told.append, prefer_truth="perfect"
         )
         assert len(told) == filled  # which truth it is
         assert mapping.signals["friction"].topic == "/truth/perfect/state"

@@ -8,7 +8,7 @@ import pytest
 
 from pdhef_logtool.car.car import NO_INTERVALS, UNSURE, Car
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.table import default_names, make_estimator
+from pdhef_logtool.estimators.table import all_names, make_estimator
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, model_folder, open_model
 from pdhef_logtool.residual_model.features import FEATURES, ONE_CAR_FEATURES
@@ -53,6 +53,6 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
 def test_every_shipped_interval_is_of_what_runs_on_the_shipped_car() -> None:
     car = Car.load("saloon")
     assert car.intervals is not None
-    ran = {name: resolve(make_estimator(name, car)) for name in default_names(car)}
+    ran = {name: resolve(make_estimator(name, car)) for name in all_names(car)}
     for entry in car.intervals.entries:
         assert entry.algorithm == ran[entry.estimator], entry.estimator

@@ -12,7 +12,7 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
-from pdhef_logtool.estimators.table import SPECS, default_names
+from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.pipeline import run_logs
@@ -63,7 +63,9 @@ def _value(metrics: pl.DataFrame, estimator: str, signal: str, metric: str, segm
 @pytest.fixture(scope="module")
 def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("dlc")
-    result = run_logs([str(sample_logs_dir / "dlc.mcap")], out, _config(sample_logs_dir, annotate="full"))
+    result = run_logs(
+        [str(sample_logs_dir / "dlc.mcap")], out, _config(sample_logs_dir, annotate="full", estimators=("all",))
+    )
     assert result.exit_code == 0
     return out
 
@@ -82,11 +84,11 @@ def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) ->
     jsonschema.validate(run, load_schema("run.schema.json"))
     assert run["logs"][0]["outcome"] == "ok"
     names = [e["name"] for e in report["estimators"]]
-    plain = [s.name for s in SPECS if s.default and not s.network and not s.needs_noise and s.name != OPEN_LOOP]
+    plain = [s.name for s in SPECS if s.in_all and not s.network and not s.needs_noise and s.name != OPEN_LOOP]
     assert names[: len(plain)] == plain
-    assert set(names[len(plain) :]) <= {s.name for s in SPECS if s.network and s.default}  # where a network is shipped
+    assert set(names[len(plain) :]) <= {s.name for s in SPECS if s.network and s.in_all}  # where a network is shipped
     assert not set(names) & {s.name for s in SPECS if s.needs_noise}  # the file is not an identified one
-    assert names == list(default_names(Car.load(sample_logs_dir / "vehicle.toml")))
+    assert names == list(all_names(Car.load(sample_logs_dir / "vehicle.toml")))
 
 
 def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> None:
@@ -112,7 +114,9 @@ def test_windows_change_no_number(sample_logs_dir: Path, tmp_path: Path) -> None
     frames = []
     for name, window_s in (("whole", 600.0), ("cut", 1.7)):
         out = tmp_path / name
-        run_logs([str(sample_logs_dir / "dlc.mcap")], out, _config(sample_logs_dir, window_s=window_s))
+        run_logs(
+            [str(sample_logs_dir / "dlc.mcap")], out, _config(sample_logs_dir, window_s=window_s, estimators=("all",))
+        )
         estimates = pl.read_parquet(out / "logs/dlc/estimates.parquet").sort("estimator", "stamp_ns")
         frames.append((estimates, pl.read_parquet(out / "metrics.parquet")))
     for whole, cut in zip(*frames, strict=True):
@@ -120,7 +124,9 @@ def test_windows_change_no_number(sample_logs_dir: Path, tmp_path: Path) -> None
 
 
 def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path, dlc_run: Path) -> None:
-    run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full"))
+    run_logs(
+        [str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full", estimators=("all",))
+    )
     for name in ("run.json", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
         assert (tmp_path / name).read_bytes() == (dlc_run / name).read_bytes(), name
 
@@ -136,7 +142,7 @@ def test_slice_scores_the_slice_alone(sample_logs_dir: Path, tmp_path: Path) -> 
 
 def test_log_without_truth_still_runs(sample_logs_dir: Path, tmp_path: Path) -> None:
     (tmp_path / "m.toml").write_text(NO_TRUTH_MAPPING)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml")
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("all",))
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
@@ -167,7 +173,7 @@ def test_estimates_do_not_depend_on_whether_truth_is_mapped(
 def test_missing_signal_skips_the_estimators_that_need_it(sample_logs_dir: Path, tmp_path: Path) -> None:
     no_steering = NO_TRUTH_MAPPING[NO_TRUTH_MAPPING.index("[signals.ax_m_s2]") :]
     (tmp_path / "m.toml").write_text(no_steering)
-    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml")
+    config = _config(sample_logs_dir, mapping=tmp_path / "m.toml", estimators=("all",))
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert result.exit_code == 0
     assert result.results[0].report is not None

@@ -75,10 +75,11 @@ def test_a_slippery_road_is_found(slippery: Any) -> None:
 
 def test_the_terminal_and_the_warnings_say_it(slippery: Any) -> None:
     result, report, _ = slippery
-    assert any("estimated on line" in w for w in report["warnings"])
+    assert any("estimated on line" in r for r in report["remarks"])
     console = Console(file=io.StringIO(), width=200)
     render_run(result, console)
-    assert f"friction: estimate, {report['friction']['summary']}" in console.file.getvalue()  # type: ignore[attr-defined]
+    said = " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
+    assert f"friction estimated ({report['friction']['summary']})" in said
     assert "of the time" in report["friction"]["summary"]
 
 

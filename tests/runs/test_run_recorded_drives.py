@@ -20,7 +20,10 @@ REFERENCE = Path(__file__).resolve().parents[1] / "reference"
 
 def _run(log: Path, mapping: str, vehicle: str, out: Path) -> tuple[pl.DataFrame, pl.DataFrame, int]:
     config = RunConfig(
-        mapping=REFERENCE / "mappings" / mapping, car=REFERENCE / "vehicles" / vehicle, annotate="sidecar"
+        mapping=REFERENCE / "mappings" / mapping,
+        car=REFERENCE / "vehicles" / vehicle,
+        estimators=("all",),
+        annotate="sidecar",
     )
     result = run_logs([str(log)], out, config)
     folder = out / "logs" / result.results[0].outcome.log

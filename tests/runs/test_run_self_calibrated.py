@@ -71,9 +71,10 @@ def test_calibrated_estimators_are_not_causal_and_say_so_and_the_others_keep_the
     assert told["phy-ukf"]["algorithm"]["physics_sha256"] == report["vehicle"]["sha256"]
     assert told["physics"]["algorithm"]["physics_sha256"] != report["vehicle"]["sha256"]
     assert report["self_calibration"]["understeer"]["contradicts"]
-    assert any("calibrated without truth" in w and "contradicts" in w for w in report["warnings"])
-    assert "intervals: own, parameters and d2" in told["physics"]["notes"]
-    assert not any("intervals" in note for note in told["open-loop-calibrated"]["notes"])
+    assert "calibrated on this log without truth" in report["answer"]["texts"]["assumed"]
+    assert "the drive understeers otherwise" in report["answer"]["texts"]["assumed"]
+    assert told["physics"]["intervals"] == ["intervals: own, parameters and d2"]
+    assert told["open-loop-calibrated"]["intervals"] == []
 
 
 def test_a_wrong_file_is_mended(calibrated: Path) -> None:
@@ -115,7 +116,7 @@ def test_a_short_log_is_refused_and_the_file_stays(sample_logs_dir: Path, wrong_
     assert "are needed" in report["self_calibration"]["refused"]
     told = {e["name"]: e for e in report["estimators"]}
     assert told["open-loop-calibrated"]["outcome"] == "skipped"
-    assert any("the file stays as it stands" in w for w in report["warnings"])
+    assert "not calibrated on this log" in report["answer"]["texts"]["assumed"]
 
 
 def test_a_car_with_evidence_is_not_calibrated(sample_logs_dir: Path) -> None:

@@ -94,7 +94,7 @@ def test_report_follows_its_schema_and_keeps_what_it_was_told(tmp_path):
     ]
     assert report["mapping"]["missing"] == ["friction"]
     assert report["mapping"]["signals"][0]["source"] == "/imu.linear_acceleration.y"
-    assert report["vehicle"] == {"name": "sedan", "sha256": SHA}
+    assert report["vehicle"] == {"name": "sedan", "sha256": SHA, "file": None, "proven": False}
     assert [(e["name"], e["outcome"], e["reason"]) for e in report["estimators"]] == [
         ("phy-ukf", "ran", None),
         ("pd-hef", "skipped", "no model"),
@@ -144,7 +144,20 @@ def test_report_without_truth_follows_its_schema_too():
 
 @pytest.mark.parametrize(
     "part",
-    ["log", "mapping", "vehicle", "estimators", "truth", "metrics", "segments", "losses", "warnings", "versions"],
+    [
+        "log",
+        "mapping",
+        "vehicle",
+        "estimators",
+        "truth",
+        "metrics",
+        "segments",
+        "losses",
+        "warnings",
+        "remarks",
+        "answer",
+        "versions",
+    ],
 )
 def test_schema_misses_every_part(part):
     report = build_report(facts())

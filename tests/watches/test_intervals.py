@@ -244,9 +244,7 @@ def test_the_notes_say_for_what_intervals_were_made() -> None:
         ({"network_sha256": "34" * 32}, "network"),
         ({"use_speed": False}, "sensors (with or without the speed)"),
     ):
-        assert notes(_intervals(), ALGORITHM.model_copy(update=changes)).endswith(
-            f"as told; those intervals were made with other {said}"
-        )
+        assert notes(_intervals(), ALGORITHM.model_copy(update=changes)).endswith(f"as told, but with other {said}")
     # The physics that the whole car has now are no matter: those of what ran are.
     assert notes(_intervals(physics_sha256="cd" * 32)) == f"{made} as told"
 

@@ -16,7 +16,7 @@ from pdhef_logtool.car.store import Change, update_car
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.reading import Tell, friction_of
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.table import Options, runnable
+from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, runnable
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, smooth
 from pdhef_logtool.learning.drives import (
@@ -203,7 +203,9 @@ def _run_drive(
             signals = replace(signals, friction=seen.friction)  # the best that is known of the drive, for the bins
         presumed = car if assumed is vehicle else car.with_vehicle(assumed)
         available = drive.plan.alignment.available
-        estimators, _ = runnable(config.estimators, presumed, available, Options(options.use_speed))
+        estimators, _ = runnable(
+            config.estimators or (ALL_ESTIMATORS,), presumed, available, Options(options.use_speed)
+        )
         for window in estimate_windows(replace(drive, signals=seen), estimators, watched=False, drawn=False):
             for estimator, track in zip(estimators, window.tracks, strict=True):
                 part = drive_samples(track, seen, signals, drive.truth, vehicle, number, wrong=wrong)

@@ -1,0 +1,167 @@
+"""What a run prints: the answer first, within the terminal's width, names whole, nothing twice."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from run_report import MAIN, MODEL, SHA, errors_deg, figures, report
+
+from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.estimators.table import SPECS
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.runs.pipeline import LogResult, RunResult
+from pdhef_logtool.sinks.base import Event
+from pdhef_logtool.sinks.report import EstimatorFacts, FrictionFacts, LogFacts, LogOutcome, TruthFacts
+
+NAMES = [s.name for s in SPECS]
+GOOD = [
+    *errors_deg(pd_hef=0.1, physics=0.2, zero=1.0),
+    *figures(("pd-hef", "sideslip_rad", "coverage95", 0.96), ("pd-hef", "yaw_rate_rad_s", "rmse", 0.01)),
+]
+ALL_METRICS = [
+    row
+    for name in NAMES
+    for row in figures(
+        *((name, "sideslip_rad", metric, 0.01) for metric in ("rmse", "p95_abs", "max_abs", "lag_s", "coverage95")),
+        *((name, signal, "rmse", 0.1) for signal in ("vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2", "lateral_1s_m")),
+        (name, "state", "nis", 1.0),
+        (name, "state", "nis_dof", 2.0),
+    )
+]
+CHECK = {"subject": "steer_rad", "evidence": "its gain is -1.", "remedy": "scale = -1", "waived": False}
+
+
+def shown(*reports: dict[str, Any], width: int = 80, failed: str = "") -> str:
+    results = [
+        LogResult(LogOutcome(r["log"]["name"], "a.mcap", SHA, lost=["x"] * len(r["losses"])), None, r, ())
+        for r in reports
+    ]
+    if failed:
+        results.append(LogResult(LogOutcome("bad", "bad.mcap", None, failed=failed), None, None, ()))
+    console = Console(width=width, record=True, file=io.StringIO(), highlight=False, markup=False)
+    render_run(RunResult(Path("out"), tuple(results)), console)
+    return console.export_text()
+
+
+def named(name: str, **changes: Any) -> dict[str, Any]:
+    log = LogFacts(name, "a.mcap", "mcap", SHA, 0, 10_000_000_000)
+    return report(**{"metrics": GOOD, **changes}, log=log)
+
+
+def rows(text: str, *names: str) -> list[str]:
+    """Return the lines that begin with one of the names, as those of a table do."""
+    return [line for line in text.splitlines() if line.strip().startswith(names)]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_every_estimator_fits_and_keeps_its_whole_name(width: int) -> None:
+    every = [EstimatorFacts(n, causal=n != "pd-hef-smoothed", algorithm=MODEL) for n in NAMES]
+    main = replace(MAIN, shown=NAMES, named=True)
+    text = shown(report(main, estimators=every, metrics=ALL_METRICS), width=width)
+    assert all(len(line) <= width for line in text.splitlines())
+    assert "…" not in text
+    table = {line.split()[0] for line in text.splitlines() if line.startswith(" ") and line.split()}
+    assert set(NAMES) <= table
+    assert "pd-hef-smoothed *" in text
+    assert "* not causal" in text
+    assert ("max °" in text) == (width == 120)  # what matters least has given way
+
+
+def test_the_answer_stands_first_then_three_rows() -> None:
+    text = shown(named("drive"))
+    order = [text.index(word) for word in ("drive", "Result", "95 % band", "Assumed", "Next", "estimator")]
+    assert order == sorted(order)
+    assert [line.split()[0] for line in rows(text, "pd-hef ", "physics ", "zero ")] == ["pd-hef", "physics", "zero"]
+
+
+def test_hindsight_is_one_line_and_only_where_another_was_better() -> None:
+    assert "In hindsight" not in shown(named("drive"))
+    text = shown(named("drive", metrics=errors_deg(pd_hef=0.3, zero=0.1)))
+    assert "In hindsight  by this log's truth zero was best, 0.100° RMSE; nothing was" in text
+
+
+def test_hashes_and_notes_stay_in_the_report() -> None:
+    estimators = [EstimatorFacts("pd-hef", causal=True, notes=[f"network {SHA}"], algorithm=MODEL)]
+    assert SHA[:12] not in shown(report(replace(MAIN, shown=["pd-hef"]), estimators=estimators))
+
+
+def test_without_truth_there_is_no_column_of_errors() -> None:
+    metrics = figures(
+        ("pd-hef", "vy_m_s", "d2", 0.1),
+        ("zero", "vy_m_s", "d2", 1.0),
+        ("physics~pd-hef", "sideslip_rad", "disagreement_rms", 0.01),
+    )
+    text = shown(named("drive", truth=TruthFacts(), metrics=metrics))
+    assert "Consistency" in text
+    assert "RMSE" not in text
+    assert "from pd-hef °" in text
+    assert rows(text, "physics ")[0].split() == ["physics", "0.573", "-"]
+
+
+def test_failed_checks_stand_above_the_table_and_undecided_ones_are_named() -> None:
+    document = report(metrics=GOOD)
+    checks = [("steer_rad.sign", "failed"), ("ay_m_s2.unit", "undecided"), ("speed_m_s.unit", "passed")]
+    document["checks"] = [{**CHECK, "name": name, "verdict": verdict} for name, verdict in checks]
+    text = shown(document)
+    assert text.index("FAILED: steer_rad.sign: its gain is -1. Remedy: scale = -1") < text.index("estimator")
+    assert "not decided by this drive: ay_m_s2.unit" in text
+    assert "speed_m_s.unit" not in text
+    document["checks"][0]["waived"] = True
+    assert "waived: steer_rad.sign" in shown(document)
+
+
+def test_several_logs_have_one_table_and_say_once_what_holds_for_all() -> None:
+    first, second = named("monday"), named("tuesday", truth=TruthFacts(), metrics=[], remarks=["a remark"])
+    lost = named("wednesday", losses=[Loss("gap", "0.4 s without samples", "/imu")], remarks=["a remark"])
+    text = shown(first, second, lost, failed="no log")
+    assert all(len(line) <= 80 for line in text.splitlines())
+    assert rows(text, "monday")[0].split() == ["monday", "10", "0.100", "0.200", "1.000", "0.96"]
+    assert rows(text, "tuesday")[0].split()[-2:] == ["no", "truth"]
+    assert rows(text, "wednesday")[0].split()[-2:] == ["input", "lost"]
+    assert text.count("car golf") == text.count("a remark") == 1
+    assert "note: a remark (tuesday, wednesday)" in text
+    assert text.count("monday") == 1  # there is nothing more to say of it
+    assert "bad  failed: no log" in text
+    assert "4 logs: 3 done, 1 failed, 1 with input lost" in text
+
+
+def test_the_joint_table_says_who_answers_and_what_to_look_at() -> None:
+    diverged = [Event("pd-hef diverged", 0, 10**9, "")]
+    narrow = [*errors_deg(pd_hef=0.1), *figures(("pd-hef", "sideslip_rad", "coverage95", 0.5))]
+    stood_in = report(replace(MAIN, stands_in="open-loop"), metrics=GOOD)
+    text = shown(named("monday", segments=diverged), named("tuesday", metrics=narrow), stood_in, width=120)
+    looks = [rows(text, name)[0].rstrip().split("  ")[-1].strip() for name in ("monday", "tuesday", "drive")]
+    assert looks == ["diverged", "band too narrow", "by open-loop"]
+    other = shown(named("monday"), report(replace(MAIN, name="zero"), metrics=GOOD))
+    assert ("by pd-hef" in rows(other, "monday")[0], "by zero" in rows(other, "drive")[0]) == (True, True)
+
+
+def test_what_is_assumed_of_all_logs_is_said_once_and_the_rest_with_each() -> None:
+    told = named("tuesday", friction=FrictionFacts("estimate", estimated=True, observable_share=1.0, summary="seen"))
+    text = shown(named("monday"), told)
+    assert text.count("car golf") == text.count("network trusted") == 1
+    assert text.index("car golf") < text.index("friction told (option, 0.9)") < text.index("friction estimated (seen)")
+
+
+def test_named_estimators_keep_their_table_a_log() -> None:
+    text = shown(*(report(replace(MAIN, named=True), metrics=GOOD) for _ in range(2)))
+    assert len(rows(text, "estimator")) == 2
+
+
+def test_what_channels_share_stands_once_and_below_the_answer() -> None:
+    gaps = [Loss("gap", "no samples for 2 s", f"/a.{i}", 0, 2 * 10**9, severity="note") for i in range(5)]
+    text = shown(named("drive", losses=[*gaps, Loss("bad-chunk", "a chunk", "a.mcap", count=2)]))
+    assert text.count("no samples") == 1
+    assert "note: no samples for 2 s (/a.0, /a.1, /a.2 and 2 more, 0.00 to 2.00 s)" in text
+    assert text.index("Result") < text.index("lost: 2 × a chunk (a.mcap)") < text.index("note: no samples")
+
+
+def test_long_names_of_logs_stay_whole() -> None:
+    name = "recording_of_a_long_day_" * 4
+    text = shown(named(name), named("b"))
+    assert name in "".join(line.split()[0] for line in text.splitlines() if line.strip())

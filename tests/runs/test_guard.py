@@ -1,0 +1,130 @@
+"""What runs by default, and which estimator is the answer: by the car's evidence, else by d2, never by the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.stand_in import StandIn
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.signals import ALIGNED_SIGNALS
+from pdhef_logtool.runs import frames, guard
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.guard import choose_main, default_names
+from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.sinks.answer import MainFacts
+
+EVERY = frozenset(ALIGNED_SIGNALS)
+#: Truth as it is, and the same shuffled: the sideslip of something else at another speed.
+TRUTH = """
+fill_recognised = true
+[truth.vx_m_s]
+topic = "/truth/perfect/odometry"
+field = "twist.twist.linear.x"
+[truth.vy_m_s]
+topic = "/truth/perfect/odometry"
+field = "twist.twist.linear.y"
+"""
+SHUFFLED = TRUTH.replace('linear.y"', 'angular.z"\nscale = -7.0').replace('linear.x"', 'linear.x"\nscale = 0.5')
+
+
+def ran(*names: str) -> list[Estimator]:
+    return [cast(Estimator, SimpleNamespace(name=name)) for name in names]
+
+
+def d2(**values: float) -> list[MetricRow]:
+    return [MetricRow("drive", n.replace("_", "-"), "vy_m_s", "all", "d2", v, "m/s", 9) for n, v in values.items()]
+
+
+def main(names: list[Estimator], rows: list[MetricRow], *, proven: bool = False, named: bool = False) -> MainFacts:
+    return choose_main(names, rows, proven=proven, named=named)
+
+
+def test_a_proven_car_runs_three_and_an_unproven_one_what_guards_it_as_well() -> None:
+    assert default_names(Car.load("saloon"), EVERY) == ("zero", "physics", "pd-hef")
+    unproven = default_names(Car.of(default_vehicle()), EVERY)
+    assert set(unproven) == {"zero", "open-loop", "phy-ukf", "physics", "pd-hef"}
+    assert "linear-regression" not in unproven
+
+
+@pytest.mark.parametrize(
+    ("lacks", "instead"),
+    [({"steer_rad"}, {"kinematic"}), ({"ay_m_s2"}, {"open-loop"}), ({"steer_rad", "ay_m_s2"}, set())],
+)
+@pytest.mark.parametrize("car", ["saloon", None])
+def test_a_log_that_lacks_what_physics_needs_runs_what_does_with_less(
+    lacks: set[str], instead: set[str], car: str | None
+) -> None:
+    assert set(default_names(Car.load(car), EVERY - lacks)) == {"zero", "physics", "pd-hef", *instead}
+
+
+def test_the_main_one_is_the_best_of_its_kind_whatever_the_order() -> None:
+    assert main(ran("zero", "kinematic", "physics", "pd-hef"), [], proven=True).name == "pd-hef"
+    assert main(ran("zero", "phy-ukf", "open-loop"), []).name == "phy-ukf"
+    assert main(ran("zero", "kinematic"), []).name == "kinematic"
+    assert main(ran("zero", "pure-lstm", "gyro"), []).name == "pure-lstm"
+    assert main(ran("gyro", "zero"), []).name == "zero"
+
+
+def test_evidence_goes_before_d2_and_d2_before_the_order() -> None:
+    rows = d2(pd_hef=0.5, physics=0.5, open_loop=0.1, zero=0.9)
+    names = ran("zero", "open-loop", "physics", "pd-hef")
+    proven = main(names, rows, proven=True)
+    assert (proven.name, proven.chosen_by, proven.distrusted) == ("pd-hef", "evidence", False)
+    found = main(names, rows)
+    assert (found.name, found.chosen_by, found.distrusted) == ("open-loop", "d2", True)
+    assert "pd-hef contradicts the sensors more than open-loop" in found.why
+    within = main(names, d2(pd_hef=0.11, open_loop=0.1, zero=0.9))
+    assert (within.name, within.chosen_by, within.distrusted) == ("pd-hef", "d2", False)
+    assert main(names, []).chosen_by == "order"
+
+
+def test_what_stands_in_for_the_main_one_is_told() -> None:
+    best = ran("open-loop")[0]
+    found = main([*ran("zero", "physics"), StandIn(best, "pd-hef", "because")], d2(pd_hef=0.1, zero=0.9))
+    assert (found.name, found.stands_in, found.distrusted) == ("pd-hef", "open-loop", True)
+    assert "open-loop stands in its place" in found.why
+
+
+def test_three_are_shown_the_answer_first_unless_they_were_named() -> None:
+    names = ran("zero", "open-loop", "phy-ukf", "physics", "pd-hef")
+    assert list(main(names, []).shown) == ["pd-hef", "physics", "zero"]
+    assert list(main(names, [], named=True).shown) == [e.name for e in names]
+    assert list(main(names, d2(pd_hef=1.0, phy_ukf=0.1)).shown) == ["phy-ukf", "physics", "zero"]
+
+
+def test_the_interface_for_scripts_runs_the_same_ones(sample_logs_dir: Path) -> None:
+    with read_drive(sample_logs_dir / "step.mcap", Car.load("saloon")) as drive:
+        assert [e.name for e in frames.choose(drive)[0]] == ["zero", "physics", "pd-hef"]
+        assert len(frames.choose(drive, ["all"])[0]) > 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("calibrate", ["off", "log"])
+def test_the_truth_of_a_log_never_chooses(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calibrate: Any
+) -> None:
+    """Whatever is best by d2 is taken here, so that a choice by the truth would show."""
+    monkeypatch.setattr(guard, "FACTOR", 0.0)
+    answers, best = [], set()
+    for name, text in (("right", TRUTH), ("shuffled", SHUFFLED)):
+        (tmp_path / f"{name}.toml").write_text(text)
+        config = RunConfig(mapping=tmp_path / f"{name}.toml", annotate="none", calibrate=calibrate, end="+4s")
+        result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / name, config).results[0]
+        assert result.report is not None
+        answer = result.report["answer"]
+        assert answer["best_in_hindsight"] is not None
+        best.add(answer["best_in_hindsight"]["sideslip_rmse_rad"])
+        answers.append({key: answer[key] for key in ("main", "chosen_by", "why", "stands_in", "shown")})
+    assert len(best) == 2  # the two truths are not the same
+    assert answers[0] == answers[1]
+    assert answers[0]["chosen_by"] == "d2"
+    a, b = ((tmp_path / n / "logs/dlc/metrics.parquet").read_bytes() for n in ("right", "shuffled"))
+    assert a != b
