@@ -30,7 +30,8 @@ RECORDING = "recording.rrd"
     "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).",
-    shared="estimators annotate sensors friction thresholds config_file network intervals calibrate model calibration",
+    shared="estimators annotate sensors friction thresholds config_file network intervals calibrate waived model "
+    "calibration",
     car="Your car (default: a sedan)",
 )
 def run(

@@ -19,6 +19,7 @@ from pdhef_logtool.drive.alignment import (
     no_alignment,
     plan_alignment,
 )
+from pdhef_logtool.drive.checks import check_drive
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -40,6 +41,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
 )
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
 from pdhef_logtool.records.signals import Channel, Loss, Signals, join_signals
@@ -65,6 +67,7 @@ class DrivePlan:
     latency : of the truth against the sensors; None without truth yaw rate or gyro.
     dependent : truth quantities that are an input of the estimators, with the reason.
     derivation : by truth quantity, how it is derived.
+    checks : of signals, truth and vehicle file.
     """
 
     mapping: Mapping
@@ -79,6 +82,7 @@ class DrivePlan:
     survey_truth: dict[str, Channel]
     start_ns: int
     end_ns: int
+    checks: tuple[Check, ...] = ()
 
     @property
     def truth_latency_s(self) -> float:
@@ -135,7 +139,7 @@ def plan_drive(
     else:
         alignment = no_alignment(survey.signals)
     truth = plan_truth(survey.truth, truth_position_m=vehicle.truth_position_m) if survey.truth else None
-    latency = None
+    latency = derived = None
     derivation: dict[str, str] = {}
     if truth is not None:
         derived = derive_truth(survey.truth, plan=truth)
@@ -157,6 +161,7 @@ def plan_drive(
         survey_truth=survey.truth,
         start_ns=start_ns,
         end_ns=end_ns,
+        checks=check_drive(survey.signals, survey.truth, derived, vehicle),
     )
 
 

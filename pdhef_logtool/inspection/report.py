@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from pdhef_logtool.drive.plausibility import GRID_S, PlausibilityWarning, plausibility_warnings
+from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
@@ -34,14 +33,13 @@ from pdhef_logtool.mapping import (
 )
 from pdhef_logtool.mapping.clocks import sources_by_clock
 from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 
 WINDOW_NS = 600_000_000_000
-#: Signals are held against one another over so much of a log's beginning.
-PLAUSIBILITY_NS = 6 * WINDOW_NS
 #: Kinds of loss that are counted by topic and concern all its signals.
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.
@@ -119,7 +117,8 @@ class Inspection:
     ----------
     kind : of log. start_ns, end_ns : log time, [start, end).
     signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
-    ambiguities, notes : of the mapping. warnings : contradictions with physics. lost : every loss and note of reading.
+    ambiguities, notes : of the mapping. checks : what physics says of signals and truth. lost : every loss and note of
+        reading.
     """
 
     path: str
@@ -134,7 +133,7 @@ class Inspection:
     missing: tuple[str, ...]
     ambiguities: tuple[Ambiguity, ...]
     notes: tuple[str, ...]
-    warnings: tuple[PlausibilityWarning, ...]
+    checks: tuple[Check, ...]
     lost: tuple[Loss, ...]
 
     @property
@@ -164,7 +163,7 @@ class Inspection:
             "missing": self.missing,
             "ambiguities": self.ambiguities,
             "notes": self.notes,
-            "warnings": self.warnings,
+            "checks": self.checks,
             "lost": self.lost,
         }
         return {key: jsonable(value) for key, value in document.items()}
@@ -207,7 +206,7 @@ def inspect_drive_log(
     steps = {t.name: StepStatistics() for t in log.topics}
     delays = {t.name: DelayStatistics() for t in log.topics}
     gathered: dict[tuple[str, str], _Gathered] = {}
-    thinned: dict[str, list[Channel]] = {name: [] for name in mapping.signals}
+    survey: MappedChannels | None = None
     losses: list[tuple[Loss, ...]] = []
     for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
         for name, columns in log.read_stamps(start, end).items():
@@ -216,8 +215,7 @@ def inspect_drive_log(
         channels = read_signals(log, mapping, clocks, start, end)
         losses.append(channels.losses)
         _gather(channels, gathered)
-        for name, channel in channels.signals.items() if start < log.start_ns + PLAUSIBILITY_NS else ():
-            thinned[name].append(_thin(channel))
+        survey = survey or channels  # the first ten minutes, as in a run
     reading = merge_losses(losses)
     signals, truth = (
         {n: _signal_report(s, section, gathered, clocks, reading, log, mapping.quality) for n, s in sources.items()}
@@ -236,7 +234,7 @@ def inspect_drive_log(
         missing=missing_signals(mapping),
         ambiguities=ambiguities,
         notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
-        warnings=plausibility_warnings({n: _joined(parts) for n, parts in thinned.items() if parts}),
+        checks=() if survey is None else _checks(survey),
         # Last, since a log knows all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),
     )
@@ -264,20 +262,9 @@ def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]
                 entry.values.add(channel.values)
 
 
-def _thin(channel: Channel) -> Channel:
-    """Average a channel within the cells of the plausibility checks' grid, so that hours of it fit into memory."""
-    cell_ns = int(GRID_S * 1e9)
-    cells, first, count = np.unique(channel.stamps_ns // cell_ns, return_index=True, return_counts=True)
-    total = np.add.reduceat(channel.values, first, axis=0) if first.shape[0] else channel.values
-    stamps = cells * cell_ns + cell_ns // 2
-    return replace(channel, stamps_ns=stamps, arrival_ns=stamps, values=total / count if count.shape[0] else total)
-
-
-def _joined(parts: list[Channel]) -> Channel:
-    """Join thinned windows; the cell at a seam may come twice and is averaged later."""
-    stamps = np.concatenate([p.stamps_ns for p in parts])
-    values = np.concatenate([p.values for p in parts])
-    return replace(parts[0], stamps_ns=stamps, arrival_ns=stamps, values=values)
+def _checks(survey: MappedChannels) -> tuple[Check, ...]:
+    derived = derive_truth(survey.truth) if survey.truth else None
+    return check_drive(survey.signals, survey.truth, derived)
 
 
 # ------------------------------------------------------------------------------------------------ reports
@@ -384,8 +371,9 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
             text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
             if math.isfinite(report.minimum):
                 text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
-            warned = [w.message for w in inspection.warnings if name in (w.suspects or w.signals)]
-            lines = [f"WARNING: {w}" for w in warned] if section == "signals" else []
+            subject = name if section == "signals" else f"truth.{name}"
+            doubts = [c for c in inspection.checks if c.subject == subject and c.verdict != "passed"]
+            lines = [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
             comments[f"{section}.{name}"] = "\n".join([text, *lines])
     head = [f"Written from {Path(inspection.path).name}."]
     head += [f"Ambiguous: {a}" for a in inspection.ambiguities]

@@ -18,6 +18,7 @@ from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, find_logs
 from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import (
     EXIT_FAILURE,
     EXIT_GATE,
@@ -77,7 +78,7 @@ _DERIVED_UNITS = {"position_m": "m"}
 class LogResult:
     """What came out of one log; ``report`` is the document of report.json, None if the log failed.
 
-    ``verdicts``: how its figures stand against the thresholds; None without thresholds.
+    ``verdicts``: how its figures stand against the thresholds; None without thresholds. ``checks``: those of the drive.
     """
 
     outcome: LogOutcome
@@ -85,6 +86,13 @@ class LogResult:
     report: dict[str, Any] | None
     rows: tuple[MetricRow, ...]
     verdicts: tuple[Verdict, ...] | None = None
+    checks: tuple[Check, ...] = ()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all of the log could be used and no check failed that counts."""
+        failed = any(c.verdict == "failed" and not c.waived for c in self.checks)
+        return self.outcome.outcome == "ok" and not failed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,12 +104,12 @@ class RunResult:
 
     @property
     def exit_code(self) -> int:
-        """0 if all is well, 4 if a threshold failed, 3 if input was lost or some logs failed, 1 if all failed."""
+        """0 if all is well, 4 if a threshold failed, 3 if input was lost, a check or some logs failed, 1 if all did."""
         if all(r.outcome.failed is not None for r in self.results):
             return EXIT_FAILURE
         if any(v.failed for v in self.verdicts):
             return EXIT_GATE
-        return EXIT_OK if all(r.outcome.outcome == "ok" for r in self.results) else EXIT_PARTIAL
+        return EXIT_OK if all(r.is_whole for r in self.results) else EXIT_PARTIAL
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
@@ -336,7 +344,7 @@ def _run_estimators(
     outcome = outcome_of(drive, losses)
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
-    return LogResult(outcome, change.target, report, tuple(rows))
+    return LogResult(outcome, change.target, report, tuple(rows), checks=drive.checks)
 
 
 def _short(algorithm: Algorithm | None) -> str:
@@ -485,6 +493,7 @@ def report_facts(
         file_bytes=drive.byte_ledgers,
         samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
+        checks=drive.checks,
         versions=tool_versions(),
     )
 
