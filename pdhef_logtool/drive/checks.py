@@ -62,6 +62,8 @@ def check_drive(
     truth: Mapping[str, Channel] | None = None,
     derived: TruthTrack | None = None,
     vehicle: VehicleParameters | None = None,
+    *,
+    mounting_is_known: bool = False,
 ) -> tuple[Check, ...]:
     """Return the checks of mapped signals, of the truth and of the vehicle file; nothing that they decide is a guess.
 
@@ -69,11 +71,13 @@ def check_drive(
     ----------
     signals, truth : by name, SI, as mapped. derived : truth at the CG.
     vehicle : its file is held against the drive; None, or the default car: there is none.
+    mounting_is_known : gravity has shown that the IMU is not upside down.
     """
     truth = truth or {}
     columns, speed_name = drive_columns(signals, truth, derived)
     relations = measured_relations(columns, speed_name)
-    found = _by_relations(signals, columns, relations)
+    groups = _groups({} if mounting_is_known else signals, columns)
+    found = _by_relations(signals, columns, relations, groups)
     wrong = {c.subject for c in found if c.verdict == "failed"}
     found += _levels(columns, speed_name, driving_is_known=not wrong & {"yaw_rate_rad_s", "ay_m_s2", speed_name})
     if derived is not None:
@@ -138,13 +142,16 @@ def _turning(vx: FloatArray, vy: FloatArray) -> FloatArray:
 
 
 def _by_relations(
-    signals: Mapping[str, Channel], columns: Mapping[str, FloatArray], relations: Sequence[Relation]
+    signals: Mapping[str, Channel],
+    columns: Mapping[str, FloatArray],
+    relations: Sequence[Relation],
+    groups: Sequence[tuple[str, ...]],
 ) -> list[Check]:
     """Judge sign, unit and field of every signal that a relation is about."""
     names = [n for n in columns if n in signals or n in _JUDGED_TRUTH]
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
-    explanations = smallest_explanations(relations, known_mistakes(list(columns), _groups(signals, columns)))
+    explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
     blamed: dict[str, list[Mistake]] = {n: [] for n in columns}
     for mistake in (m for chosen in explanations for m in chosen):
         for name in mistake.factors:

@@ -251,6 +251,8 @@ def read_drive(
             raise no_samples(log_input.path)
         slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         plan = plan_drive(opened, chosen, car.vehicle, *slice_ns, require_imu=require_sensors)
+        for note in plan.mapping.notes[len(chosen.notes) :]:
+            told(note)
         _tell_doubts(plan, options, told)
         friction = friction_of(plan, car.vehicle, options)
         if friction.note:

@@ -343,19 +343,34 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
     return found
 
 
-def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
-    """Relate yaw rate and a_y to what the wheels of an axle turn faster on the right: no wheel is mounted wrong.
+def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
+    """Return other measurements of the yaw rate than the gyro's, to any factor; steering only where nothing else is."""
+    found = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    if speed_name is None:
+        return found
+    speed = columns[speed_name]
+    found += _axle_differences(columns, speed)
+    steers = [n for n in ("steer_rad", "steering_wheel_rad") if n in columns]
+    return found or [(f"{n} x speed", columns[n] * speed) for n in steers]
 
-    Each wheel is scaled to the speed first: its unit and its radius are others' matter.
-    """
+
+def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[tuple[str, FloatArray]]:
+    """Return what the wheels of each axle turn faster on the right, scaled to the speed: radii and units aside."""
     moving = moving_at(speed)
-    pairs = []
+    found = []
     for unit in ("m_s", "rad_s"):
         for axle in ("r", "f"):
             pair = [columns.get(f"wheel_speed_{axle}{side}_{unit}") for side in "lr"]
             scaled = [_scaled_to(w, speed, moving) for w in pair if w is not None]
             if len(scaled) == 2:
-                pairs.append((f"wheel speeds {axle}r - {axle}l", scaled[1] - scaled[0]))
+                found.append((f"wheel speeds {axle}r - {axle}l", scaled[1] - scaled[0]))
+    return found
+
+
+def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
+    """Relate yaw rate and a_y to what the wheels of an axle turn faster on the right: no wheel is mounted wrong."""
+    moving = moving_at(speed)
+    pairs = _axle_differences(columns, speed)
     found = []
     for name, factor, powers in (
         ("yaw_rate_rad_s", np.ones_like(speed), {"yaw_rate_rad_s": -1, speed_name: 1}),

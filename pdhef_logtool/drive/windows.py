@@ -19,14 +19,13 @@ from pdhef_logtool.drive.alignment import (
     no_alignment,
     plan_alignment,
 )
-from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
     dependent_signals,
     derive_truth,
     estimate_truth_latency,
-    plan_truth,
     truth_at,
     yaw_rate_channel,
 )
@@ -131,18 +130,19 @@ def plan_drive(
     MappingError : The log lacks what is mapped, or there is no IMU to set the stamps.
     """
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
-    survey = read_signals(log, mapping, clocks, start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle.truth_position_m)
+    mapping, survey = looked_at.mapping, looked_at.channels
     if require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
             survey.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
         )
     else:
         alignment = no_alignment(survey.signals)
-    truth = plan_truth(survey.truth, truth_position_m=vehicle.truth_position_m) if survey.truth else None
-    latency = derived = None
+    truth, derived = looked_at.truth_plan, looked_at.truth
+    latency = None
     derivation: dict[str, str] = {}
-    if truth is not None:
-        derived = derive_truth(survey.truth, plan=truth)
+    if derived is not None:
         derivation = dict(derived.derivation)
         gyro = survey.signals.get("yaw_rate_rad_s")
         rate = survey.truth.get("yaw_rate_rad_s") or yaw_rate_channel(derived)
@@ -161,7 +161,7 @@ def plan_drive(
         survey_truth=survey.truth,
         start_ns=start_ns,
         end_ns=end_ns,
-        checks=check_drive(survey.signals, survey.truth, derived, vehicle),
+        checks=looked_at.all_checks(vehicle),
     )
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.truth import derive_truth
+from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
@@ -203,10 +202,11 @@ def inspect_drive_log(
         mapping = given
     mapping = resolve_mapping(log, mapping)
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    looked_at = survey_log(log, mapping, clocks, (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS)))
+    mapping = looked_at.mapping
     steps = {t.name: StepStatistics() for t in log.topics}
     delays = {t.name: DelayStatistics() for t in log.topics}
     gathered: dict[tuple[str, str], _Gathered] = {}
-    survey: MappedChannels | None = None
     losses: list[tuple[Loss, ...]] = []
     for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
         for name, columns in log.read_stamps(start, end).items():
@@ -215,7 +215,6 @@ def inspect_drive_log(
         channels = read_signals(log, mapping, clocks, start, end)
         losses.append(channels.losses)
         _gather(channels, gathered)
-        survey = survey or channels  # the first ten minutes, as in a run
     reading = merge_losses(losses)
     signals, truth = (
         {n: _signal_report(s, section, gathered, clocks, reading, log, mapping.quality) for n, s in sources.items()}
@@ -234,7 +233,7 @@ def inspect_drive_log(
         missing=missing_signals(mapping),
         ambiguities=ambiguities,
         notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
-        checks=() if survey is None else _checks(survey),
+        checks=looked_at.all_checks(),
         # Last, since a log knows all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),
     )
@@ -260,11 +259,6 @@ def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]
             entry.steps.add(stamps)
             if channel.values.ndim == 1:
                 entry.values.add(channel.values)
-
-
-def _checks(survey: MappedChannels) -> tuple[Check, ...]:
-    derived = derive_truth(survey.truth) if survey.truth else None
-    return check_drive(survey.signals, survey.truth, derived)
 
 
 # ------------------------------------------------------------------------------------------------ reports
