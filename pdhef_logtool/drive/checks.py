@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import Sensors, VehicleParameters, default_vehicle
 from pdhef_logtool.drive.columns import columns_on_grid, derivative, independent_samples, moving_at
 from pdhef_logtool.drive.relations import (
     G,
@@ -22,7 +23,7 @@ from pdhef_logtool.drive.relations import (
     measured_relations,
     smallest_explanations,
 )
-from pdhef_logtool.drive.truth import TruthTrack
+from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack, channel_of
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray
 
@@ -36,6 +37,12 @@ OTHER_AXIS_M_S2 = 5.0
 SIDESLIP_OFFSET_RAD = math.radians(0.15)
 #: No car drives sideways: half of its moving time beyond that, the heading and the velocity do not belong together.
 SIDEWAYS_RAD = math.radians(20.0)
+#: An accelerometer stands off the place in the file by more than a mounting in the cabin explains; m.
+LEVER_M = 0.5
+#: Production gyros are good to 1 %, cheap ones to 3 %.
+GAIN_ERROR = 0.05
+#: A gyro's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
+GYRO_DELAY_S = 0.03
 #: Understeer gradients that have opposite signs and are this far from neutral; rad per m/s^2. Cars have 0.002 to 0.006.
 NEUTRAL_RAD_PER_M_S2 = 0.0006
 #: Steering angle over what the file's ratio and wheelbase make of the curvature.
@@ -63,6 +70,7 @@ def check_drive(
     derived: TruthTrack | None = None,
     vehicle: VehicleParameters | None = None,
     *,
+    latency: LatencyEstimate | None = None,
     mounting_is_known: bool = False,
 ) -> tuple[Check, ...]:
     """Return the checks of mapped signals, of the truth and of the vehicle file; nothing that they decide is a guess.
@@ -71,6 +79,7 @@ def check_drive(
     ----------
     signals, truth : by name, SI, as mapped. derived : truth at the CG.
     vehicle : its file is held against the drive; None, or the default car: there is none.
+    latency : of the truth against the gyro, or the gyro's own.
     mounting_is_known : gravity has shown that the IMU is not upside down.
     """
     truth = truth or {}
@@ -79,9 +88,11 @@ def check_drive(
     groups = _groups({} if mounting_is_known else signals, columns)
     found = _by_relations(signals, columns, relations, groups)
     wrong = {c.subject for c in found if c.verdict == "failed"}
-    found += _levels(columns, speed_name, driving_is_known=not wrong & {"yaw_rate_rad_s", "ay_m_s2", speed_name})
+    known = not wrong & {"yaw_rate_rad_s", "ay_m_s2", speed_name}
+    found += _levels(columns, speed_name, (vehicle or default_vehicle()).sensors, driving_is_known=known)
     if derived is not None:
         found += _sideslip_checks(columns)
+        found += _sensor_error_checks(columns, latency, vehicle or default_vehicle(), wrong)
     if vehicle is not None and vehicle != default_vehicle():
         found += _vehicle_checks(columns, speed_name, vehicle)
     unique: dict[str, Check] = {}
@@ -104,10 +115,7 @@ def drive_columns(
     channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
     if derived is not None:
         for name in _TRUTH:
-            values = getattr(derived.track, name)
-            known = np.isfinite(values)
-            stamps = derived.track.stamps_ns[known]
-            channels[f"truth.{name}"] = Channel(f"truth.{name}", "", "", stamps, stamps, values[known])
+            channels[f"truth.{name}"] = channel_of(derived, name)
         # As mapped: a wrong unit is wrapped away in what is derived of it, and a derived a_y says nothing new.
         channels |= {f"truth.{n}": truth[n] for n in ("sideslip_rad", "ay_m_s2") if n in truth}
     columns = columns_on_grid(channels)
@@ -234,7 +242,9 @@ def _not_excited(name: str, relations: Sequence[Relation]) -> Check:
 # --------------------------------------------------------------------------------------------- gravity
 
 
-def _levels(columns: Mapping[str, FloatArray], speed_name: str | None, *, driving_is_known: bool) -> list[Check]:
+def _levels(
+    columns: Mapping[str, FloatArray], speed_name: str | None, sensors: Sensors, *, driving_is_known: bool
+) -> list[Check]:
     """Judge what driving leaves of the accelerometers' means: gravity on an axis that should be level."""
     checks = []
     speed = None if speed_name is None else columns[speed_name]
@@ -252,7 +262,8 @@ def _levels(columns: Mapping[str, FloatArray], speed_name: str | None, *, drivin
             rest, known = columns[name], np.isfinite(columns[name])
         if independent_samples(int(np.count_nonzero(known))) < 2.0:
             continue
-        check = _level(name, float(np.mean(rest[known])), float(np.mean(columns[name][known])))
+        bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
+        check = _level(name, float(np.mean(rest[known])) - bias, float(np.mean(columns[name][known])) - bias)
         if driving_is_known or check.name == f"{name}.axis":
             checks.append(check)
     return checks
@@ -340,6 +351,84 @@ def fit(
     spread = float(np.sqrt(np.mean((b - a @ coefficients) ** 2) * samples / (samples - len(regressors))))
     covariance = np.linalg.inv(a.T @ a / a.shape[0]) * spread**2 / samples
     return coefficients, np.sqrt(np.diag(covariance)), spread
+
+
+# ------------------------------------------------------------------------------ lever, gain and delay
+
+
+@dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """What regression on truth says of an accelerometer's place and of a gyro's gain, with standard errors.
+
+    Attributes
+    ----------
+    lever_m : of the accelerometer ahead of the CG. yaw_rate_gain : what the gyro reads of 1.
+    """
+
+    lever_m: float
+    lever_error_m: float
+    yaw_rate_gain: float
+    gain_error: float
+
+
+def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
+    """Regress a_y and the gyro on the truth; NaN for what the drive does not tell.
+
+    a_y is the truth's v̇_y + v_x r, as far as roll makes it larger; a lever adds the derivative of the yaw rate, a delay
+    takes the derivative of a_y off, a bias adds a constant.
+    """
+    nothing = (math.nan, math.inf)
+    lever = gain = nothing
+    needed = [columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")]
+    vx, vy, rate = needed
+    gyro, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
+    if rate is not None and gyro is not None:
+        everywhere = np.ones(rate.shape[0], np.bool_)
+        found = fit(gyro, [rate, derivative(rate), np.ones_like(rate)], everywhere)
+        gain = nothing if found is None else (found[0][0], found[1][0])
+    if vx is not None and vy is not None and rate is not None and ay is not None:
+        lateral = derivative(vy) + vx * rate
+        regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate)]
+        found = fit(ay, regressors, moving_at(vx))
+        lever = nothing if found is None else (found[0][0], found[1][0])
+    return SensorErrors(*(float(x) for x in (*lever, *gain)))
+
+
+def _sensor_error_checks(
+    columns: Mapping[str, FloatArray], latency: LatencyEstimate | None, vehicle: VehicleParameters, wrong: set[str]
+) -> list[Check]:
+    """Judge place, gain and delay; nothing is said of what the drive does not tell, or of a signal that is wrong."""
+    checks = []
+    errors = sensor_errors(columns)
+    truth = {f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")}
+    name = "ay_m_s2"
+    if math.isfinite(errors.lever_m) and not wrong & {name, *truth}:
+        place = vehicle.imu_position_m[0]
+        off, error = errors.lever_m - place, errors.lever_error_m
+        evidence = (
+            f"the accelerometer is {errors.lever_m:.2f} +- {error:.2f} m ahead of the CG, the file says {place:g}"
+        )
+        if abs(off) > LEVER_M and abs(off) > SURE * error:
+            remedy = f"imu_position_m = [{errors.lever_m:.2f}, 0.0, 0.0] in the vehicle file, or pdhef identify"
+            checks.append(Check(f"{name}.place", name, "failed", evidence, remedy))
+        elif abs(off) + 2.0 * error < 2.0 * LEVER_M:
+            checks.append(Check(f"{name}.place", name, "passed", evidence))
+    name = "yaw_rate_rad_s"
+    if math.isfinite(errors.yaw_rate_gain) and not wrong & {name, *truth}:
+        gain, error = errors.yaw_rate_gain / vehicle.sensors.yaw_rate_gain, errors.gain_error
+        evidence = f"the gyro reads {gain:.3f} +- {error:.3f} of the truth's yaw rate"
+        if abs(gain - 1.0) > GAIN_ERROR and abs(gain - 1.0) > SURE * error:
+            remedy = f"sensors.yaw_rate_gain = {errors.yaw_rate_gain:.3f} in the vehicle file, or pdhef identify"
+            checks.append(Check(f"{name}.gain", name, "failed", evidence, remedy))
+        elif abs(gain - 1.0) + 2.0 * error < 2.0 * GAIN_ERROR:
+            checks.append(Check(f"{name}.gain", name, "passed", evidence))
+    if latency is not None and latency.reliable and not latency.identical:
+        delay = latency.gyro_delay_s
+        evidence = f"{delay * 1e3:.1f} +- {latency.std_error_s * 1e3:.1f} ms late against the truth"
+        late = delay > GYRO_DELAY_S
+        remedy = f"latency_s = {delay:.4f} more in the mapping, or pdhef identify" if late else ""
+        checks.append(Check(f"{name}.delay", name, "failed" if late else "passed", evidence, remedy))
+    return checks
 
 
 # --------------------------------------------------------------------------------------------- vehicle

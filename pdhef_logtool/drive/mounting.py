@@ -18,7 +18,17 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive, drive_columns
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
 from pdhef_logtool.drive.relations import G, yaw_references
-from pdhef_logtool.drive.truth import TruthPlan, TruthTrack, derive_truth, plan_truth
+from pdhef_logtool.drive.truth import (
+    LatencyEstimate,
+    TruthPlan,
+    TruthTrack,
+    booked_on_the_late,
+    channel_of,
+    derive_truth,
+    estimate_truth_latency,
+    plan_truth,
+    yaw_rate_channel,
+)
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
@@ -276,13 +286,16 @@ class Survey:
     channels: MappedChannels
     truth: TruthTrack | None
     truth_plan: TruthPlan | None
+    latency: LatencyEstimate | None
     checks: tuple[Check, ...]
 
     def all_checks(self, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
         """Return the checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
         known = bool(self.checks) and all(c.verdict == "passed" for c in self.checks)
         channels = self.channels
-        found = check_drive(channels.signals, channels.truth, self.truth, vehicle, mounting_is_known=known)
+        found = check_drive(
+            channels.signals, channels.truth, self.truth, vehicle, latency=self.latency, mounting_is_known=known
+        )
         return (*self.checks, *found)
 
 
@@ -304,16 +317,37 @@ def survey_log(
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
     truth_plan = plan_truth(channels.truth, truth_position_m=truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
-    found = find_mounting(channels.signals, channels.truth, truth, triads, mapping)
+    # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
+    found = find_mounting(channels.signals, {}, None, triads, mapping)
+    blind = found is not None and found.confident
+    if not blind and truth is not None:
+        found = find_mounting(channels.signals, channels.truth, truth, triads, mapping)
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     checks: list[Check] = []
     if found is not None:
-        if mapping.origin == "auto" and found.confident and not found.is_as_named:
+        if mapping.origin == "auto" and blind and not found.is_as_named:
             mapping = turned_mapping(mapping, found, triads)
             channels = read_signals(log, mapping, clocks, *span_ns)
             found = replace(found, named=found.rows)
         checks = mounting_checks(mapping, found, triads)
-    return Survey(mapping, channels, truth, truth_plan, tuple(checks))
+    return Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), tuple(checks))
+
+
+def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
+    """Return how late the truth is against the gyro, or the gyro against the truth; None where one is missing."""
+    gyro = channels.signals.get("yaw_rate_rad_s")
+    if truth is None or gyro is None or not len(gyro):
+        return None
+    rate = channels.truth.get("yaw_rate_rad_s") or yaw_rate_channel(truth)
+    if not len(rate):
+        return None
+    found = estimate_truth_latency(gyro, rate)
+    speed = channels.signals.get("speed_m_s")
+    other = None
+    if speed is not None and speed.source.split(".")[0] != gyro.source.split(".")[0]:
+        vx = channel_of(truth, "vx_m_s")
+        other = estimate_truth_latency(speed, vx) if min(len(speed), len(vx)) >= 2 else None
+    return booked_on_the_late(found, other)
 
 
 def turned_mapping(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> Mapping:

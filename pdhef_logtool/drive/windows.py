@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Mapped
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,9 +25,7 @@ from pdhef_logtool.drive.truth import (
     TruthPlan,
     dependent_signals,
     derive_truth,
-    estimate_truth_latency,
     truth_at,
-    yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import (
@@ -129,6 +127,7 @@ def plan_drive(
     ------
     MappingError : The log lacks what is mapped, or there is no IMU to set the stamps.
     """
+    mapping = with_gyro_delay(mapping, vehicle)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
     looked_at = survey_log(log, mapping, clocks, span_ns, vehicle.truth_position_m)
@@ -140,21 +139,16 @@ def plan_drive(
     else:
         alignment = no_alignment(survey.signals)
     truth, derived = looked_at.truth_plan, looked_at.truth
-    latency = None
     derivation: dict[str, str] = {}
     if derived is not None:
         derivation = dict(derived.derivation)
-        gyro = survey.signals.get("yaw_rate_rad_s")
-        rate = survey.truth.get("yaw_rate_rad_s") or yaw_rate_channel(derived)
-        if gyro is not None and len(gyro) and len(rate):
-            latency = estimate_truth_latency(gyro, rate)
     return DrivePlan(
         mapping=mapping,
         vehicle=vehicle,
         clocks=clocks,
         alignment=alignment,
         truth=truth,
-        latency=latency,
+        latency=looked_at.latency,
         dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
         derivation=derivation,
         survey_signals=survey.signals,
@@ -163,6 +157,16 @@ def plan_drive(
         end_ns=end_ns,
         checks=looked_at.all_checks(vehicle),
     )
+
+
+def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
+    """Return the mapping with the gyro's delay that the car knows: all of it, in place of the mapping's own."""
+    delay_s, gyro = vehicle.sensors.yaw_rate_delay_s, mapping.signals.get("yaw_rate_rad_s")
+    if delay_s == 0.0 or gyro is None or gyro.latency_s == delay_s:
+        return mapping
+    note = f"the car's gyro is {delay_s * 1e3:.1f} ms late, in place of latency_s = {gyro.latency_s:g} of the mapping"
+    signals = {**mapping.signals, gyro.name: replace(gyro, latency_s=delay_s)}
+    return replace(mapping, signals=signals, notes=(*mapping.notes, note))
 
 
 @dataclass(slots=True)

@@ -456,6 +456,8 @@ def report_facts(
         found = plan.latency
         measured = f"{found.latency_s * 1e3:.1f} ms ± {found.std_error_s * 1e3:.1f} ms" if found.reliable else "unknown"
         verdict = "applied" if plan.truth_latency_s else "not applied: it does not stand out of its own uncertainty"
+        if found.gyro_delay_s:
+            verdict = "so that the truth is not moved"
         notes.append(f"latency {measured} ({found.reason}), {verdict}")
     notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
     if "cg" in plan.derivation:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive
-from pdhef_logtool.drive.truth import derive_truth
+from pdhef_logtool.drive.mounting import truth_latency
+from pdhef_logtool.drive.truth import LatencyEstimate, booked_on_the_late, derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, auto_map, fit_clocks, load_mapping, read_signals
 from pdhef_logtool.records.checks import Check
@@ -299,3 +300,63 @@ def test_every_mistake_is_found_on_a_recorded_drive(shared_dir: Path) -> None:
 def test_the_instrument_with_its_yaw_rate_to_the_right(shared_dir: Path) -> None:
     found = survey(shared_dir / "data" / "drives" / "lunda_v40", "lunda_v40")
     assert verdicts(checked(found, yaw_rate_rad_s=-1.0), "failed") == {"yaw_rate_rad_s.sign"}
+
+
+# ------------------------------------------------------------------------------------ lever, gain, delay
+
+
+def planted(found: MappedChannels, lever_m: float = 0.0, gain: float = 1.0, delay_s: float = 0.0) -> MappedChannels:
+    """Return a simulated log with an accelerometer off the CG and a gyro with a gain and late stamps."""
+    signals = dict(found.signals)
+    gyro, lateral = signals["yaw_rate_rad_s"], signals["ay_m_s2"]
+    rate = found.truth["yaw_rate_rad_s"]
+    time_s = (rate.stamps_ns - rate.stamps_ns[0]) * 1e-9
+    turning = np.interp((lateral.stamps_ns - rate.stamps_ns[0]) * 1e-9, time_s, np.gradient(rate.values, time_s))
+    late = gyro.stamps_ns + round(delay_s * 1e9)
+    signals["yaw_rate_rad_s"] = replace(gyro, values=gain * gyro.values, stamps_ns=late)
+    signals["ay_m_s2"] = replace(lateral, values=lateral.values + lever_m * turning)
+    return replace(found, signals=signals)
+
+
+def late_checks(found: MappedChannels, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
+    truth = derive_truth(found.truth)
+    return check_drive(found.signals, found.truth, truth, vehicle, latency=truth_latency(found, truth))
+
+
+@pytest.mark.parametrize(
+    ("errors", "name"),
+    [
+        ({}, ""),
+        ({"lever_m": -1.45}, "ay_m_s2.place"),
+        ({"gain": 1.08}, "yaw_rate_rad_s.gain"),
+        ({"delay_s": 0.038}, "yaw_rate_rad_s.delay"),
+    ],
+)
+def test_place_gain_and_delay_are_told_apart(sample_logs_dir: Path, errors: dict[str, float], name: str) -> None:
+    checks = late_checks(planted(survey(sample_logs_dir / "sweep.mcap"), **errors))
+    assert verdicts(checks, "failed") == ({name} if name else set())
+    assert {"ay_m_s2.place", "yaw_rate_rad_s.gain", "yaw_rate_rad_s.delay"} <= {c.name for c in checks}
+
+
+def test_what_the_car_knows_of_its_sensors_fails_nothing(sample_logs_dir: Path, saloon: VehicleParameters) -> None:
+    found = planted(survey(sample_logs_dir / "sweep.mcap"), lever_m=-1.45, gain=1.08)
+    sensors = saloon.sensors.model_copy(update={"yaw_rate_gain": 1.08})
+    knows = saloon.model_copy(update={"imu_position_m": (-1.45, 0.0, 0.0), "sensors": sensors})
+    assert verdicts(late_checks(found, saloon), "failed") == {"ay_m_s2.place", "yaw_rate_rad_s.gain"}
+    assert verdicts(late_checks(found, knows), "failed") == set()
+
+
+@pytest.mark.parametrize("delay_s", [0.038, -0.038])
+def test_a_delay_is_booked_on_what_is_late(sample_logs_dir: Path, delay_s: float) -> None:
+    found = planted(survey(sample_logs_dir / "sweep.mcap"), delay_s=delay_s)
+    latency = truth_latency(found, derive_truth(found.truth))
+    late_gyro, late_truth = max(delay_s, 0.0), max(-delay_s, 0.0)
+    assert latency.gyro_delay_s == pytest.approx(late_gyro, abs=0.002)
+    assert latency.latency_s == pytest.approx(late_truth, abs=0.002)
+
+
+def test_sensors_that_are_all_late_by_the_same_leave_it_with_the_truth() -> None:
+    gyro = LatencyEstimate(-0.038, 0.99, 0.001, True, False, "")
+    assert booked_on_the_late(gyro, replace(gyro, latency_s=-0.035)).latency_s == -0.038
+    assert booked_on_the_late(gyro, replace(gyro, latency_s=0.010)).gyro_delay_s == 0.038
+    assert booked_on_the_late(replace(gyro, latency_s=-0.004), None).latency_s == -0.004

@@ -56,7 +56,8 @@ def load_fit_drive(
     The car gives geometry only (lever arms, steering ratio, wheel radius).
     """
     vehicle = car.vehicle
-    sensors = vehicle.sensors.model_copy(update={"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0})
+    none = {"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0, "yaw_rate_gain": 1.0}
+    sensors = vehicle.sensors.model_copy(update=none)
     as_measured = vehicle.model_copy(update={"steer_offset_rad": 0.0, "sensors": sensors})
     record, whole = load_drive(log_input, car.with_vehicle(as_measured), mapping, replace(options, friction=None))
     if whole is None or whole.truth is None:
