@@ -24,6 +24,7 @@ from pdhef_logtool.drive.relations import (
     smallest_explanations,
 )
 from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack, channel_of
+from pdhef_logtool.mapping import MappedChannels
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray
 
@@ -100,6 +101,25 @@ def check_drive(
         if check.name not in unique or _BADNESS[check.verdict] > _BADNESS[unique[check.name].verdict]:
             unique[check.name] = check
     return tuple(unique.values())
+
+
+def explained_factors(
+    channels: MappedChannels, derived: TruthTrack | None, *, known_mounting: bool
+) -> dict[str, tuple[float, str]]:
+    """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it."""
+    columns, speed_name = drive_columns(channels.signals, channels.truth, derived)
+    relations = measured_relations(columns, speed_name)
+    groups = _groups({} if known_mounting else channels.signals, columns)
+    explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
+    if len(explanations) != 1:
+        return {}
+    bad = [r for r in relations if r.tells and not r.accepts()]
+    found = {}
+    for mistake in explanations[0]:
+        for name, factor in mistake.factors.items():
+            evidence = next((r.evidence for r in bad if name in r.powers), "")
+            found[name] = (factor, f"{mistake.words}: {evidence}")
+    return found
 
 
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}

@@ -187,15 +187,21 @@ def _turned(
         samples = independent_samples(int(np.count_nonzero(use)))
         if samples < MIN_SAMPLES:
             return None
-        a, z = driven[use] - driven[use].mean(), level[use] - level[use].mean()
-        power = float(np.sum(np.abs(a) ** 2))
-        if power <= 0.0:
+        # What a sensor off the CG reads beside them goes with the yaw acceleration.
+        turning = 1j * derivative(rate)
+        use &= np.isfinite(turning)
+        a = np.stack([driven[use] - driven[use].mean(), turning[use] - turning[use].mean()], axis=1)
+        z = level[use] - level[use].mean()
+        power = float(np.sum(np.abs(z) ** 2))
+        if np.linalg.matrix_rank(a) < 2 or power <= 0.0:
             return None
-        factor = complex(np.sum(z * a.conj())) / power
-        left_over = float(np.mean(np.abs(z - factor * a) ** 2)) / 2.0
-        error = math.degrees(math.sqrt(left_over / (samples * power / a.size)) / max(abs(factor), 1e-9))
-        correlation = abs(factor) * math.sqrt(power / max(float(np.sum(np.abs(z) ** 2)), 1e-12))
+        factors = np.linalg.lstsq(a, z, rcond=None)[0]
+        factor, left_over = complex(factors[0]), z - a @ factors
+        spread = float(np.mean(np.abs(left_over) ** 2)) / 2.0
+        variance = float(np.linalg.inv((a.conj().T @ a).real / a.shape[0])[0, 0]) * spread / samples
         gain = abs(factor)
+        error = math.degrees(math.sqrt(variance) / max(gain, 1e-9))
+        correlation = math.sqrt(max(0.0, 1.0 - float(np.sum(np.abs(left_over) ** 2)) / power))
         angle = float(np.angle(factor))
         forward = math.cos(angle) * e1 + math.sin(angle) * e2
         rotation = np.stack([forward, np.cross(axis, forward), axis])
@@ -287,14 +293,29 @@ class Survey:
     truth: TruthTrack | None
     truth_plan: TruthPlan | None
     latency: LatencyEstimate | None
-    checks: tuple[Check, ...]
+    triads: tuple[Triad | None, Triad | None] = (None, None)
+    mounting: Mounting | None = None
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Whether each of the IMU's signals is read from the axis that the drive says."""
+        return () if self.mounting is None else tuple(mounting_checks(self.mapping, self.mounting, self.triads))
+
+    @property
+    def is_mounted(self) -> bool:
+        """Whether the IMU is known to be read from the right axes."""
+        return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
 
     def all_checks(self, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
         """Return the checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
-        known = bool(self.checks) and all(c.verdict == "passed" for c in self.checks)
         channels = self.channels
         found = check_drive(
-            channels.signals, channels.truth, self.truth, vehicle, latency=self.latency, mounting_is_known=known
+            channels.signals,
+            channels.truth,
+            self.truth,
+            vehicle,
+            latency=self.latency,
+            mounting_is_known=self.is_mounted,
         )
         return (*self.checks, *found)
 
@@ -323,14 +344,13 @@ def survey_log(
     if not blind and truth is not None:
         found = find_mounting(channels.signals, channels.truth, truth, triads, mapping)
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
-    checks: list[Check] = []
-    if found is not None:
-        if mapping.origin == "auto" and blind and not found.is_as_named:
-            mapping = turned_mapping(mapping, found, triads)
-            channels = read_signals(log, mapping, clocks, *span_ns)
-            found = replace(found, named=found.rows)
-        checks = mounting_checks(mapping, found, triads)
-    return Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), tuple(checks))
+    if found is not None and mapping.origin == "auto" and blind and not found.is_as_named:
+        note = f"{found.text}, and is read so: {found.evidence}"
+        signals = turned_signals(mapping, found, triads)
+        mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
+        channels = read_signals(log, mapping, clocks, *span_ns)
+        found = replace(found, named=found.rows)
+    return Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), triads, found)
 
 
 def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
@@ -350,21 +370,22 @@ def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> Latency
     return booked_on_the_late(found, other)
 
 
-def turned_mapping(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> Mapping:
-    """Return the mapping that reads forward, left and up of the sensor as it is mounted."""
+def turned_signals(
+    mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]
+) -> dict[str, SignalSource]:
+    """Return the mapping's signals with forward, left and up of the sensor as it is mounted."""
     accelerations, rates = triads
     assert accelerations is not None and rates is not None
     signals = dict(mapping.signals)
     for i, name in enumerate(MOUNTED):
         if name in signals:
             signals[name] = (rates if i == 2 else accelerations).turned(signals[name], mounting.rows[i])
-    note = f"{mounting.text}, and is read so: {mounting.evidence}"
-    return replace(mapping, signals=signals, notes=(*mapping.notes, note))
+    return signals
 
 
 def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> list[Check]:
     """Return for each of the IMU's signals whether it is read from the axis that the drive says."""
-    turned = turned_mapping(mapping, mounting, triads).signals
+    turned = turned_signals(mapping, mounting, triads)
     checks = []
     for i, name in enumerate(MOUNTED):
         if name not in mapping.signals:

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
@@ -116,7 +118,8 @@ class Inspection:
     ----------
     kind : of log. start_ns, end_ns : log time, [start, end).
     signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
-    ambiguities, notes : of the mapping. checks : what physics says of signals and truth. lost : every loss and note of
+    ambiguities, notes : of the mapping. checks : what physics says of signals and truth.
+    proposals : corrections of the mapping that are certain. lost : every loss and note of
         reading.
     """
 
@@ -133,6 +136,7 @@ class Inspection:
     ambiguities: tuple[Ambiguity, ...]
     notes: tuple[str, ...]
     checks: tuple[Check, ...]
+    proposals: tuple[Proposal, ...]
     lost: tuple[Loss, ...]
 
     @property
@@ -163,6 +167,7 @@ class Inspection:
             "ambiguities": self.ambiguities,
             "notes": self.notes,
             "checks": self.checks,
+            "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
         }
         return {key: jsonable(value) for key, value in document.items()}
@@ -234,6 +239,7 @@ def inspect_drive_log(
         ambiguities=ambiguities,
         notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
         checks=looked_at.all_checks(),
+        proposals=mapping_proposals(looked_at),
         # Last, since a log knows all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),
     )
@@ -367,7 +373,8 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
                 text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
             subject = name if section == "signals" else f"truth.{name}"
             doubts = [c for c in inspection.checks if c.subject == subject and c.verdict != "passed"]
-            lines = [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
+            done = any(p.subject == subject for p in inspection.proposals)
+            lines = [] if done else [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
             comments[f"{section}.{name}"] = "\n".join([text, *lines])
     head = [f"Written from {Path(inspection.path).name}."]
     head += [f"Ambiguous: {a}" for a in inspection.ambiguities]
@@ -381,7 +388,7 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
 
 
 def write_mapping(inspection: Inspection, path: Path) -> None:
-    """Write the inspection's mapping as a TOML file that is ready to edit.
+    """Write the inspection's mapping, with the corrections that it proposes, as a TOML file that is ready to edit.
 
     Raises
     ------
@@ -391,7 +398,8 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
         raise OutputError(
             expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
         )
-    text = mapping_to_toml(inspection.mapping, comments=mapping_comments(inspection))
+    mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
+    text = mapping_to_toml(mapping, comments=mapping_comments(inspection))
     write_bytes(path, text.encode())
 
 
