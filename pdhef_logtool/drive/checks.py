@@ -104,14 +104,17 @@ def check_drive(
 
 
 def explained_factors(
-    channels: MappedChannels, derived: TruthTrack | None, *, known_mounting: bool
+    channels: MappedChannels, derived: TruthTrack | None, *, known_mounting: bool, most: int = 2
 ) -> dict[str, tuple[float, str]]:
-    """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it."""
+    """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it.
+
+    ``most``: mistakes at once that are believed.
+    """
     columns, speed_name = drive_columns(channels.signals, channels.truth, derived)
     relations = measured_relations(columns, speed_name)
     groups = _groups({} if known_mounting else channels.signals, columns)
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
-    if len(explanations) != 1:
+    if len(explanations) != 1 or len(explanations[0]) > most:
         return {}
     bad = [r for r in relations if r.tells and not r.accepts()]
     found = {}
@@ -163,7 +166,9 @@ def _turning(vx: FloatArray, vy: FloatArray) -> FloatArray:
     speed = np.hypot(vx, vy)
     with np.errstate(divide="ignore", invalid="ignore"):
         rate = (vx * ay - vy * ax) / speed**2
-    return np.where(moving_at(speed), rate, np.nan)
+    # Slower, the noise of a position turns the path.
+    with np.errstate(invalid="ignore"):
+        return np.where(moving_at(speed) & (speed > 1.0), rate, np.nan)
 
 
 # ------------------------------------------------------------------------------- sign, unit, right field

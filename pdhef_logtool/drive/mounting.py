@@ -15,9 +15,9 @@ from itertools import permutations, product
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import check_drive, drive_columns
+from pdhef_logtool.drive.checks import check_drive, drive_columns, explained_factors
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
-from pdhef_logtool.drive.relations import G, yaw_references
+from pdhef_logtool.drive.relations import G, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -87,6 +87,8 @@ class Mounting:
         """Roll, pitch and yaw of the sensor in the car: it is turned by yaw first, then pitch, then roll."""
         m = self.rotation
         pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
+        if abs(m[2, 0]) > 1.0 - 1e-6:  # straight up or down: roll and yaw are one angle
+            return 0.0, math.degrees(pitch), math.degrees(math.atan2(-m[0, 1], m[1, 1]))
         roll, yaw = math.atan2(m[2, 1], m[2, 2]), math.atan2(m[1, 0], m[0, 0])
         return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
 
@@ -94,7 +96,8 @@ class Mounting:
     def text(self) -> str:
         """The rotation in words."""
         roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in self.degrees)
-        return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg"
+        mirrored = "" if self.hand > 0.0 else ", its angular rates with the opposite sign"
+        return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg{mirrored}"
 
 
 def find_mounting(
@@ -125,6 +128,8 @@ def find_mounting(
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
+    if len(ups) > 1 and not references:  # gravity does not say which way is up
+        references = steering_references(columns, speed_name)
     found = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
     hands = [1.0] * (len(found) // 2) + [-1.0] * (len(found) // 2)
     # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
@@ -160,7 +165,8 @@ def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
         return [mean / size]
     if size > COMPENSATED_M_S2:
         return []
-    spread = np.nanstd(w, axis=0)
+    whole = np.isfinite(w).all(axis=1)
+    spread = w[whole].std(axis=0) if whole.any() else np.zeros(3)
     axis = int(np.argmax(spread))
     if spread[axis] <= 0.0:
         return []
@@ -317,7 +323,14 @@ class Survey:
             latency=self.latency,
             mounting_is_known=self.is_mounted,
         )
-        return (*self.checks, *found)
+        if self.mounting is None or not self.is_mounted:
+            return (*self.checks, *found)
+        # Right axes have right signs, and gravity says the unit.
+        evidence = self.mounting.evidence
+        settled = {f"{n}.sign" for n in MOUNTED}
+        known = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in found]
+        shown = [k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)]
+        return (*self.checks, *shown)
 
 
 def survey_log(
@@ -326,10 +339,16 @@ def survey_log(
     clocks: dict[str, ClockModel],
     span_ns: tuple[int, int],
     truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    rescale: bool = True,
 ) -> Survey:
-    """Read a span of a log and find how its IMU is mounted.
+    """Read a span of a log and find how its IMU is mounted, and what unit or sign is wrong.
 
-    A recognised mapping is turned where the rotation is certain, with a note; a mapping file is only checked.
+    A recognised mapping is turned and scaled where that is certain, with a note; a mapping file is only checked.
+
+    Parameters
+    ----------
+    rescale : whether a wrong unit or sign is looked for.
     """
     triads = find_triads(log, mapping)
     extra: dict[str, SignalSource] = {}
@@ -350,7 +369,43 @@ def survey_log(
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         found = replace(found, named=found.rows)
-    return Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), triads, found)
+    survey = Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), triads, found)
+    if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
+        return survey_log(log, scaled, clocks, span_ns, truth_position_m, rescale=False)
+    return survey
+
+
+def _rescaled(survey: Survey) -> Mapping:
+    """Return a recognised mapping with the one unit or sign undone that alone contradicts all else, with a note.
+
+    Of the signals by themselves alone; of the truth by them and by itself.
+    """
+    mapping = survey.mapping
+    alone = replace(survey.channels, truth={})
+    found = explained_factors(alone, None, known_mounting=survey.is_mounted, most=1)
+    if not found and survey.truth is not None:
+        every = explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted, most=1)
+        found = every if all(n.startswith("truth.") for n in every) else {}
+    for subject, (factor, evidence) in found.items():
+        name = subject.removeprefix("truth.")
+        section = dict(mapping.truth if subject.startswith("truth.") else mapping.signals)
+        if name not in section:
+            continue
+        section[name] = scaled_source(section[name], factor)
+        mapping = replace(mapping, truth=section) if name != subject else replace(mapping, signals=section)
+        note = f"{subject} is read with {factor:.6g} times its scale: {evidence}"
+        mapping = replace(mapping, notes=(*mapping.notes, note))
+    return mapping
+
+
+def scaled_source(source: SignalSource, factor: float) -> SignalSource:
+    """Return a source whose values are multiplied by a factor."""
+
+    def times(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
+
+    # A range of wrong values would drop the right ones.
+    return replace(source, scale=times(source.scale), offset=times(source.offset), valid_min=None, valid_max=None)
 
 
 def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import LEVER_M, SURE, drive_columns, explained_factors, sensor_errors
-from pdhef_logtool.drive.mounting import Survey, turned_signals
+from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
 from pdhef_logtool.drive.truth import LATE_GYRO_S, LatencyEstimate, TruthTrack
 from pdhef_logtool.mapping.records import Mapping, SignalSource
 from pdhef_logtool.records.signals import Channel
@@ -78,7 +78,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
         section = truth if subject.startswith("truth.") else signals
         name = subject.removeprefix("truth.")
         if name in section:
-            section[name] = _scaled(section[name], factor)
+            section[name] = scaled_source(section[name], factor)
             found.append(Proposal("mapping", subject, evidence, section[name]))
     delay = 0.0 if survey.latency is None else survey.latency.gyro_delay_s
     gyro = signals.get("yaw_rate_rad_s")
@@ -86,14 +86,6 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
         late = replace(gyro, latency_s=round(gyro.latency_s + delay, 4))
         found.append(Proposal("mapping", gyro.name, survey.latency.reason, late))
     return tuple(found)
-
-
-def _scaled(source: SignalSource, factor: float) -> SignalSource:
-    def times(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
-        return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
-
-    # A range of wrong values would drop the right ones.
-    return replace(source, scale=times(source.scale), offset=times(source.offset), valid_min=None, valid_max=None)
 
 
 def car_proposals(

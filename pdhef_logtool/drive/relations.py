@@ -34,10 +34,12 @@ SIDESLIP_RANGE = (0.3, 3.0)
 #: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
 #: drifts. It tells a sign, no unit.
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
+#: Of the truth ahead of the rear axle. A truth that stands near that axle says nothing: its lever may be of any sign.
+REAR_LEVER_M = (1.0, 12.0)
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
-#: Rim speed over ground speed; and angular over rim speed: wheels of 4 cm to 80 cm radius.
-WHEEL_RANGE = (0.7, 1.4)
+#: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
+WHEEL_RANGE = (0.88, 1.14)
 WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
 #: Effective wheelbase L (1 + K v²) from road-wheel and from steering-wheel angles; m.
 ROAD_WHEEL_LENGTH_M = (0.15, 12.0)
@@ -243,10 +245,12 @@ def compare(
     expected: tuple[float, float],
     *,
     moves: float | None = None,
+    either: bool = True,
 ) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
     """Return the relation between two columns where ``use`` and both are known; none without driving.
 
-    ``moves``: both sides have one unit, and one that moves by more than this, 1-sigma, must move the other.
+    ``moves``: both sides have one unit, and one that moves by more than this, 1-sigma, must move the other; with
+    ``either`` False the reference must move the measured side only.
     """
     use = use & np.isfinite(reference) & np.isfinite(measured)
     samples = independent_samples(int(np.count_nonzero(use)))
@@ -256,7 +260,7 @@ def compare(
     spread_a, spread_b = float(a.std()), float(b.std())
     if max(spread_a, spread_b) <= 1e-12:
         return []
-    both = moves is not None and max(spread_a, spread_b) > moves
+    both = moves is not None and (max(spread_a, spread_b) if either else spread_a) > moves
     if min(spread_a, spread_b) <= 1e-12:
         return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
@@ -279,7 +283,9 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
         with np.errstate(invalid="ignore"):
             straight = moving if yaw is None else moving & (np.abs(yaw * pace) < STRAIGHT_M_S2)
-        found += compare(text, powers, derivative(pace), forward, straight, GAIN_RANGE, moves=MOVES_M_S2)
+        # A pitching body moves a_x without any change of the speed.
+        reference = derivative(pace)
+        found += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=MOVES_M_S2, either=False)
     return found
 
 
@@ -344,14 +350,18 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
 
 
 def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
-    """Return other measurements of the yaw rate than the gyro's, to any factor; steering only where nothing else is."""
+    """Return other measurements of the yaw rate than the gyro's, to any factor; steering has no certain sign."""
     found = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
     if speed_name is None:
         return found
     speed = columns[speed_name]
-    found += _axle_differences(columns, speed)
-    steers = [n for n in ("steer_rad", "steering_wheel_rad") if n in columns]
-    return found or [(f"{n} x speed", columns[n] * speed) for n in steers]
+    return found + _axle_differences(columns, speed)
+
+
+def steering_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
+    """Return the steering angles times the speed, to any factor: a yaw rate whose sign is often recorded wrong."""
+    steers = [] if speed_name is None else [n for n in ("steer_rad", "steering_wheel_rad") if n in columns]
+    return [(f"{n} x speed", columns[n] * columns[str(speed_name)]) for n in steers]
 
 
 def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[tuple[str, FloatArray]]:
@@ -417,7 +427,7 @@ def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: fl
 
 
 def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
-    """Relate the truth's sideslip to a_y in two ways: by kinematics where it moves fast, by the rear tyres else.
+    """Relate the truth's sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
 
     a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias stand beside
     it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
@@ -439,9 +449,13 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     text = f"{subject} against -ay_m_s2, apart from curvature"
     gentle = gentle_at(vx * rate, moving)
     handling = _partial(text, {subject: 1, "ay_m_s2": -1}, -ay, sideslip, [curvature, one], gentle)
+    text = f"{subject} against curvature, apart from a_y"
+    powers = {subject: 1, "truth.yaw_rate_rad_s": -1}
+    rolling = _partial(text, powers, curvature, sideslip, [ay, one], gentle)
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
+        *(replace(r, expected=REAR_LEVER_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]),
     ]
 
 

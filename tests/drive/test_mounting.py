@@ -155,3 +155,9 @@ def test_angles_are_those_of_the_sensor_in_the_car() -> None:
     mounting = Mounting(rotation(10, -20, 30), np.eye(3), "", confident=True)
     assert mounting.degrees == pytest.approx((10, -20, 30))
     assert mounting.text == "the IMU is mounted with roll 10, pitch -20, yaw 30 deg"
+
+
+@pytest.mark.parametrize("angles", [(0, 90, 30), (0, -90, -120), (170, 20, -30)])
+def test_angles_give_the_rotation_back(angles: tuple[float, float, float]) -> None:
+    mounting = Mounting(rotation(*angles), np.eye(3), "", confident=True)
+    assert np.allclose(rotation(*mounting.degrees), mounting.rotation, atol=1e-6)

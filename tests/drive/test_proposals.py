@@ -96,10 +96,12 @@ def test_each_error_is_taken_off_once_in_any_order(log, tmp_path: Path, order: s
     assert identified(log, mapping, vehicle) == vehicle
 
 
-def test_identify_alone_leaves_signs_to_the_mapping(log) -> None:
+def test_a_recognised_mapping_needs_no_command_for_a_sign(log) -> None:
     vehicle = identified(log, auto_map(log).mapping, CAR)
     plan = plan_drive(log, auto_map(log).mapping, vehicle, log.start_ns, log.end_ns)
-    assert {c.name for c in plan.checks if c.verdict == "failed"} == {"steer_rad.sign"}
+    assert not [c for c in plan.checks if c.verdict == "failed"]
+    assert plan.mapping.signals["steer_rad"].scale == -1.0
+    assert "steer_rad is read with -1 times its scale" in " ".join(plan.mapping.notes)
     assert plan.mapping.signals["yaw_rate_rad_s"].latency_s == vehicle.sensors.yaw_rate_delay_s
     assert "the car's gyro is" in " ".join(plan.mapping.notes)
 
@@ -107,7 +109,9 @@ def test_identify_alone_leaves_signs_to_the_mapping(log) -> None:
 def test_proposals_say_where_they_belong_and_why(log) -> None:
     found = inspect_drive_log(log)
     homes = {(p.subject, p.home) for p in found.proposals}
-    assert homes == {("steer_rad", "mapping"), ("yaw_rate_rad_s", "mapping")}
+    assert homes == {("yaw_rate_rad_s", "mapping")}, "a sign is corrected in a recognised mapping itself"
+    file = inspect_drive_log(log, replace(auto_map(log).mapping, origin="file"))
+    assert {(p.subject, p.home) for p in file.proposals} >= {("ay_m_s2", "mapping"), ("yaw_rate_rad_s", "mapping")}
     assert all(p.evidence for p in found.proposals)
     assert [p["subject"] for p in found.to_dict()["proposals"]] == [p.subject for p in found.proposals]
 
