@@ -18,6 +18,7 @@ from pdhef_logtool.drive.relations import (
     G,
     Mistake,
     Relation,
+    best_explanation,
     gentle_at,
     known_mistakes,
     measured_relations,
@@ -114,11 +115,12 @@ def explained_factors(
     relations = measured_relations(columns, speed_name)
     groups = _groups({} if known_mounting else channels.signals, columns)
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
-    if len(explanations) != 1 or len(explanations[0]) > most:
+    chosen = best_explanation(relations, explanations)
+    if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
         return {}
     bad = [r for r in relations if r.tells and not r.accepts()]
     found = {}
-    for mistake in explanations[0]:
+    for mistake in chosen:
         for name, factor in mistake.factors.items():
             evidence = next((r.evidence for r in bad if name in r.powers), "")
             found[name] = (factor, f"{mistake.words}: {evidence}")

@@ -52,6 +52,9 @@ STEERING_SHARE = 0.6
 #: Typical values that recognise one quantity recorded as another.
 TYPICAL_STEERING_RATIO = 16.0
 TYPICAL_WHEEL_RADIUS_M = 0.3
+_TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
+#: By so much in the logarithm must one unit fit better than another: km/h and mph are 0.48 apart.
+CLEARLY_NEARER = 0.25
 #: No more mistakes than this are looked for at once.
 MAX_MISTAKES = 2
 
@@ -117,6 +120,11 @@ class Mistake:
     words: str
     kind: str
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether the factors are those of units and signs, not a typical steering ratio or wheel radius."""
+        return not any(abs(f) in _TYPICAL for f in self.factors.values())
+
     def acts_on(self, relation: Relation) -> float:
         """Return what undoing it multiplies the relation's gain with."""
         return float(np.prod([f ** relation.powers.get(name, 0) for name, f in self.factors.items()]))
@@ -170,6 +178,25 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
             cheap = [chosen for chosen in found if _cost(chosen) == simplest]
             return [c for c in cheap if not any(_signals(other) < _signals(c) for other in cheap)]
     return []
+
+
+def best_explanation(
+    relations: Sequence[Relation], explanations: Sequence[tuple[Mistake, ...]]
+) -> tuple[Mistake, ...] | None:
+    """Return the one explanation, or of several for the same signals the one of gains near 1; None: neither."""
+    if not explanations or len({_signals(e) for e in explanations}) > 1:
+        return None
+
+    def misfit(chosen: tuple[Mistake, ...]) -> float:
+        near_one = [r for r in relations if r.tells and r.expected[0] < 1.0 < r.expected[1]]
+        touched = [r for r in near_one if _signals(chosen) & set(r.powers)]
+        gains = [abs(r.gain * float(np.prod([m.acts_on(r) for m in chosen]))) for r in touched]
+        return float(np.mean(np.abs(np.log(gains)))) if gains else np.inf
+
+    ordered = sorted(explanations, key=misfit)
+    if len(ordered) > 1 and not misfit(ordered[1]) - misfit(ordered[0]) > CLEARLY_NEARER:
+        return None
+    return ordered[0]
 
 
 def _signals(chosen: tuple[Mistake, ...]) -> frozenset[str]:
@@ -283,9 +310,10 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
         with np.errstate(invalid="ignore"):
             straight = moving if yaw is None else moving & (np.abs(yaw * pace) < STRAIGHT_M_S2)
-        # A pitching body moves a_x without any change of the speed.
+        # A pitching body moves a_x without any change of the speed, and noise the derivative of a satellite's.
+        moves = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
         reference = derivative(pace)
-        found += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=MOVES_M_S2, either=False)
+        found += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=moves, either=False)
     return found
 
 
