@@ -329,30 +329,44 @@ def _sideslip_checks(columns: Mapping[str, FloatArray]) -> list[Check]:
         remedy = "heading and velocity do not belong together: look at frames, signs and units of the truth"
         return [Check(f"{name}.frame", name, "failed", evidence, remedy)]
     checks = [Check(f"{name}.frame", name, "passed", evidence)]
-    offset = _sideslip_offset(columns, sideslip, known)
+    offset = _offset_check(columns)
     return checks if offset is None else [*checks, offset]
 
 
-def _sideslip_offset(columns: Mapping[str, FloatArray], sideslip: FloatArray, moving: BoolArray) -> Check | None:
-    """Return the check of the sideslip that is left at no curvature and no lateral force; None without IMU."""
+def sideslip_offset(columns: Mapping[str, FloatArray]) -> tuple[float, float] | None:
+    """Return the truth's sideslip at no curvature and no lateral force, with its standard error; None: too little."""
     rate, ay = (columns.get(n) for n in ("yaw_rate_rad_s", "ay_m_s2"))
-    if rate is None or ay is None:
+    vx, vy = (columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s"))
+    if rate is None or ay is None or vx is None or vy is None:
         return None
-    name = "truth.sideslip_rad"
-    vx = columns["truth.vx_m_s"]
+    moving = moving_at(np.hypot(vx, vy))
     with np.errstate(divide="ignore", invalid="ignore"):
         regressors = [np.ones_like(vx), rate / vx, ay]
-    found = fit(sideslip, regressors, gentle_at(rate * vx, moving))
+    found = fit(np.arctan2(vy, vx), regressors, gentle_at(rate * vx, moving))
+    return None if found is None else (float(found[0][0]), float(found[1][0]))
+
+
+def is_turned(offset_rad: float, error_rad: float) -> bool:
+    """Return whether an offset of the truth's sideslip is one, and not tyres, crossfall or chance."""
+    return abs(offset_rad) > max(SIDESLIP_OFFSET_RAD, SURE * error_rad)
+
+
+def _offset_check(columns: Mapping[str, FloatArray]) -> Check | None:
+    """Return the check of the truth's sideslip on straights; None without IMU."""
+    if "yaw_rate_rad_s" not in columns or "ay_m_s2" not in columns:
+        return None
+    name, lacks = "truth.sideslip_rad", "needs straights and bends"
+    found = sideslip_offset(columns)
     if found is None:
-        return Check(f"{name}.offset", name, "undecided", "too little gentle driving", "needs straights and bends")
-    offset, error = found[0][0], found[1][0]
+        return Check(f"{name}.offset", name, "undecided", "too little gentle driving", lacks)
+    offset, error = found
     evidence = f"{math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg are left where the car goes straight"
-    if abs(offset) > SIDESLIP_OFFSET_RAD and abs(offset) > SURE * error:
+    if is_turned(offset, error):
         remedy = "the truth's heading is turned: a tyre, a crossfall or a bias of a_y makes less of that"
         return Check(f"{name}.offset", name, "failed", evidence, remedy)
     if abs(offset) + 2.0 * error < 2.0 * SIDESLIP_OFFSET_RAD:
         return Check(f"{name}.offset", name, "passed", evidence)
-    return Check(f"{name}.offset", name, "undecided", evidence, "needs straights and bends")
+    return Check(f"{name}.offset", name, "undecided", evidence, lacks)
 
 
 def fit(

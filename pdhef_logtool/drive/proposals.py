@@ -1,19 +1,28 @@
 """What a drive shows to be wrong with its sensors and its truth: where each correction belongs, and its one use.
 
-Unit, sign, mounting and a recorder's delay belong in the mapping; the accelerometer's place, the gyro's gain and what
-is left of its delay in the car's fit. Each is measured on what mapping and car already take off, and a delay in the car
-is the whole one: applied in any order, each is taken off once.
+Unit, sign, mounting, a turned truth and a recorder's delay belong in the mapping; the accelerometer's place, the gyro's
+gain and what is left of its delay in the car's fit. Each is measured on what mapping and car already take off, and a
+delay in the car is the whole one: applied in any order, each is taken off once.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import LEVER_M, SURE, drive_columns, explained_factors, sensor_errors
+from pdhef_logtool.drive.checks import (
+    LEVER_M,
+    SURE,
+    drive_columns,
+    explained_factors,
+    is_turned,
+    sensor_errors,
+    sideslip_offset,
+)
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
 from pdhef_logtool.drive.truth import LATE_GYRO_S, LatencyEstimate, TruthTrack
 from pdhef_logtool.mapping.records import Mapping, SignalSource
@@ -67,25 +76,58 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
     found: list[Proposal] = []
     signals, truth = dict(mapping.signals), dict(mapping.truth)
     mounting = survey.mounting
-    is_turned = mounting is not None and mounting.confident and not mounting.is_as_named
-    if mounting is not None and is_turned:
+    is_turned_imu = mounting is not None and mounting.confident and not mounting.is_as_named
+    if mounting is not None and is_turned_imu:
         for name, source in turned_signals(mapping, mounting, survey.triads).items():
             if source != signals[name]:
                 signals[name] = source
                 found.append(Proposal("mapping", name, f"{mounting.text}: {mounting.evidence}", source))
-    factors = {} if is_turned else explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted)
+    factors = (
+        {} if is_turned_imu else explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted)
+    )
     for subject, (factor, evidence) in factors.items():
         section = truth if subject.startswith("truth.") else signals
         name = subject.removeprefix("truth.")
         if name in section:
             section[name] = scaled_source(section[name], factor)
             found.append(Proposal("mapping", subject, evidence, section[name]))
+    if not factors and not is_turned_imu:
+        found += _of_a_turned_truth(survey)
     delay = 0.0 if survey.latency is None else survey.latency.gyro_delay_s
     gyro = signals.get("yaw_rate_rad_s")
     if gyro is not None and delay >= LATE_GYRO_S and survey.latency is not None:
         late = replace(gyro, latency_s=round(gyro.latency_s + delay, 4))
         found.append(Proposal("mapping", gyro.name, survey.latency.reason, late))
     return tuple(found)
+
+
+def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
+    """Return the sources of a truth whose sideslip is off by a constant, as far as a mapping can turn them back."""
+    columns, _ = drive_columns(survey.channels.signals, survey.channels.truth, survey.truth)
+    found = sideslip_offset(columns)
+    if found is None or survey.truth is None or not is_turned(*found):
+        return []
+    offset, error = found
+    truth = survey.mapping.truth
+    evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg where the car goes straight"
+    vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")
+    changed: dict[str, SignalSource] = {}
+    if "sideslip_rad" in truth:
+        source = truth["sideslip_rad"]
+        changed["sideslip_rad"] = replace(source, offset=_single(source.offset) - offset)
+    elif vx is not None and vy is not None:
+        if (vx.topic, vx.stamp) == (vy.topic, vy.stamp) and isinstance(vx.field, str) and isinstance(vy.field, str):
+            c, s, fields = math.cos(offset), math.sin(offset), (vx.field, vy.field)
+            ahead, left = _single(vx.scale), _single(vy.scale)
+            changed["vx_m_s"] = replace(vx, field=fields, scale=(c * ahead, s * left))
+            changed["vy_m_s"] = replace(vy, field=fields, scale=(-s * ahead, c * left))
+    elif "yaw_rad" in truth:
+        changed["yaw_rad"] = replace(truth["yaw_rad"], offset=_single(truth["yaw_rad"].offset) + offset)
+    return [Proposal("mapping", f"truth.{n}", evidence, source, error=error) for n, source in changed.items()]
+
+
+def _single(value: float | tuple[float, ...]) -> float:
+    return value[0] if isinstance(value, tuple) else value
 
 
 def car_proposals(

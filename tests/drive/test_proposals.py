@@ -132,3 +132,31 @@ def test_a_part_of_a_drive_tells_what_its_sensors_are(log) -> None:
     assert entries["sensors.yaw_rate_delay_s"] == pytest.approx(DELAY_S, abs=0.003)
     assert entries["sensors.yaw_rate_gain"] == pytest.approx(GAIN, abs=0.01)
     assert entries["imu_position_m"][0] == pytest.approx(LEVER_M, abs=0.15)
+
+
+class TurnedTruth(TurnedLog):
+    """A truth whose body velocity is turned by 0.4 degrees."""
+
+    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int) -> dict[str, Any]:
+        found = dict(self._log.read(requests, start_ns, end_ns))
+        c, s = np.cos(np.radians(0.4)), np.sin(np.radians(0.4))
+        for topic, columns in found.items():
+            vx, vy = (columns.fields.get(f"twist.twist.linear.{a}") for a in "xy")
+            if vx is not None and vy is not None:
+                turned = {"twist.twist.linear.x": c * vx - s * vy, "twist.twist.linear.y": s * vx + c * vy}
+                found[topic] = replace(columns, fields={**columns.fields, **turned})
+        return found
+
+
+def test_a_turned_truth_is_turned_back_once(sample_logs_dir: Path, tmp_path: Path) -> None:
+    opened = open_log(sample_logs_dir / "road.mcap")
+    log = TurnedTruth(opened, np.eye(3))
+    found = inspect_drive_log(log)
+    assert {(p.subject, p.home) for p in found.proposals} == {("truth.vx_m_s", "mapping"), ("truth.vy_m_s", "mapping")}
+    write_mapping(found, tmp_path / "mapping.toml")
+    mapping = load_mapping(tmp_path / "mapping.toml")
+    again = inspect_drive_log(log, mapping)
+    opened.close()
+    assert again.proposals == ()
+    assert not [c for c in again.checks if c.verdict == "failed"]
+    assert mapping.truth["vy_m_s"].scale[0] == pytest.approx(-np.radians(0.4), abs=np.radians(0.06))
