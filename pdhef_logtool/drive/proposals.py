@@ -31,6 +31,9 @@ from pdhef_logtool.records.signals import Channel
 #: A gain or a lever that is smaller changes no estimate by what can be seen; it stays as it is.
 LEAST_GAIN = 0.01
 LEAST_LEVER_M = 0.3 * LEVER_M
+#: Beyond, it is no gain but a unit, and no place in a car.
+MOST_GAIN = 0.25
+MOST_LEVER_M = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,11 +154,13 @@ def car_proposals(
     errors = sensor_errors(columns)
     found: list[Proposal] = []
     x, *rest = vehicle.imu_position_m
-    if abs(errors.lever_m - x) > max(LEAST_LEVER_M, SURE * errors.lever_error_m):
+    off_m = abs(errors.lever_m - x)
+    if max(LEAST_LEVER_M, SURE * errors.lever_error_m) < off_m < MOST_LEVER_M:
         evidence = f"a_y goes with {errors.lever_m:.2f} +- {errors.lever_error_m:.2f} m of the yaw acceleration"
         place = {"imu_position_m": (round(errors.lever_m, 3), *rest)}
         found.append(Proposal("car", "ay_m_s2", evidence, entries=place, error=errors.lever_error_m))
-    if abs(errors.yaw_rate_gain - vehicle.sensors.yaw_rate_gain) > max(LEAST_GAIN, SURE * errors.gain_error):
+    off = abs(errors.yaw_rate_gain - vehicle.sensors.yaw_rate_gain)
+    if max(LEAST_GAIN, SURE * errors.gain_error) < off < MOST_GAIN:
         evidence = f"the gyro reads {errors.yaw_rate_gain:.3f} +- {errors.gain_error:.3f} of the truth's yaw rate"
         gain = {"sensors.yaw_rate_gain": round(errors.yaw_rate_gain, 4)}
         found.append(Proposal("car", "yaw_rate_rad_s", evidence, entries=gain, error=errors.gain_error))

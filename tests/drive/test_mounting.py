@@ -101,6 +101,7 @@ def test_windows_of_a_summed_signal_join_bit_for_bit(log) -> None:
     assert all(np.array_equal(getattr(whole, n), getattr(joined, n), equal_nan=True) for n in IMU)
 
 
+@pytest.mark.slow
 def test_a_written_mapping_turns_once_and_never_again(log, tmp_path: Path) -> None:
     turned = TurnedLog(log, rotation(0, 90, 25))
     found = inspect_drive_log(turned)
@@ -125,6 +126,7 @@ def test_a_mapping_file_is_checked_and_left_alone(log) -> None:
     assert "yaw 90 deg" in failed["ay_m_s2.mounting"].evidence
 
 
+@pytest.mark.slow
 def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log) -> None:
     class Compensated(TurnedLog):
         def read(self, requests, start_ns, end_ns):

@@ -74,7 +74,14 @@ def identified(log, mapping: Mapping, vehicle: VehicleParameters) -> VehiclePara
     return apply_proposals(proposals, found.mapping, vehicle)[1]
 
 
-@pytest.mark.parametrize("order", ["inspect identify", "identify inspect", "inspect inspect identify identify"])
+@pytest.mark.parametrize(
+    "order",
+    [
+        "identify inspect",
+        pytest.param("inspect identify", marks=pytest.mark.slow),
+        pytest.param("inspect inspect identify identify", marks=pytest.mark.slow),
+    ],
+)
 def test_each_error_is_taken_off_once_in_any_order(log, tmp_path: Path, order: str) -> None:
     mapping, vehicle = auto_map(log).mapping, CAR
     for number, command in enumerate(order.split()):
@@ -96,6 +103,7 @@ def test_each_error_is_taken_off_once_in_any_order(log, tmp_path: Path, order: s
     assert identified(log, mapping, vehicle) == vehicle
 
 
+@pytest.mark.slow
 def test_a_recognised_mapping_needs_no_command_for_a_sign(log) -> None:
     vehicle = identified(log, auto_map(log).mapping, CAR)
     plan = plan_drive(log, auto_map(log).mapping, vehicle, log.start_ns, log.end_ns)
@@ -148,6 +156,7 @@ class TurnedTruth(TurnedLog):
         return found
 
 
+@pytest.mark.slow
 def test_a_turned_truth_is_turned_back_once(sample_logs_dir: Path, tmp_path: Path) -> None:
     opened = open_log(sample_logs_dir / "road.mcap")
     log = TurnedTruth(opened, np.eye(3))
