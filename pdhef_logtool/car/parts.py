@@ -69,10 +69,12 @@ class LearntOn(Record):
 
 
 class FittedSensors(Record):
-    """Constant biases that identification found."""
+    """Constant errors that identification found."""
 
     ay_bias_m_s2: float
     yaw_rate_bias_rad_s: float
+    yaw_rate_gain: Positive = 1.0
+    yaw_rate_delay_s: NonNegative = 0.0
 
 
 class FittedValues(Record):

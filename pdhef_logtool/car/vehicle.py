@@ -86,11 +86,12 @@ class Tyres(Record):
 
 
 class Sensors(Record):
-    """1-sigma white noise of the sensors, which is R of the sensor-level filters, and their constant biases.
+    """1-sigma white noise of the sensors, which is R of the sensor-level filters, and their constant errors.
 
-    A bias is what the sensor reads too much; it is taken off before any estimator sees the signal. ``*_bias_std`` is
-    the 1-sigma of what is left of it from drive to drive, for the filters that estimate it. The defaults are METHOD
-    §9's for a production car's sensors.
+    A bias is what the sensor reads too much, ``yaw_rate_gain`` what the gyro reads of 1; both are taken off before any
+    estimator sees the signal. ``yaw_rate_delay_s`` is what the gyro's stamps are late by; unless it is 0 it stands in
+    place of the mapping's ``latency_s``. ``*_bias_std`` is the 1-sigma of what is left of a bias from drive to drive,
+    for the filters that estimate it. The defaults are METHOD §9's for a production car's sensors.
     """
 
     ax_std_m_s2: AccelerationStd = 0.12
@@ -101,6 +102,8 @@ class Sensors(Record):
     ax_bias_m_s2: AccelerationBias = 0.0
     ay_bias_m_s2: AccelerationBias = 0.0
     yaw_rate_bias_rad_s: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    yaw_rate_gain: Annotated[float, Field(ge=0.5, le=2.0)] = 1.0
+    yaw_rate_delay_s: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     ay_bias_std_m_s2: AccelerationStd = 0.08
     yaw_rate_bias_std_rad_s: AngleStd = 0.0015
     steer_bias_std_rad: AngleStd = 0.0008
@@ -254,14 +257,14 @@ class VehicleParameters(Record):
 
 
 def correct_signals(signals: Signals, vehicle: VehicleParameters) -> Signals:
-    """Take the vehicle's steering offset and sensor biases off the signals; all estimators get the result."""
+    """Take steering offset, sensor biases and gain off the signals; all estimators get the result."""
     sensors = vehicle.sensors
     return replace(
         signals,
         steer_rad=signals.steer_rad - vehicle.steer_offset_rad,
         ax_m_s2=signals.ax_m_s2 - sensors.ax_bias_m_s2,
         ay_m_s2=signals.ay_m_s2 - sensors.ay_bias_m_s2,
-        yaw_rate_rad_s=signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s,
+        yaw_rate_rad_s=(signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s) / sensors.yaw_rate_gain,
     )
 
 
@@ -275,7 +278,7 @@ def corrected_anew(signals: Signals, was: VehicleParameters, vehicle: VehiclePar
         steer_rad=(signals.steer_rad + was.steer_offset_rad) * (was.steering_ratio / vehicle.steering_ratio),
         ax_m_s2=signals.ax_m_s2 + before.ax_bias_m_s2,
         ay_m_s2=signals.ay_m_s2 + before.ay_bias_m_s2,
-        yaw_rate_rad_s=signals.yaw_rate_rad_s + before.yaw_rate_bias_rad_s,
+        yaw_rate_rad_s=signals.yaw_rate_rad_s * before.yaw_rate_gain + before.yaw_rate_bias_rad_s,
     )
     return correct_signals(raw, vehicle)
 

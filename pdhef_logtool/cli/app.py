@@ -32,7 +32,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 120},
     help="Estimate sideslip on recorded drives (MCAP, rosbag1, rosbag2), score it against truth, annotate the logs.",
-    epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost or some logs failed, "
+    epilog="Exit codes: 0 ok, 1 failure, 2 usage, 3 finished but some input was lost, a check or some logs failed, "
     "4 a threshold or regression gate failed, 130 interrupted (Ctrl-C), 141 nobody read the output to its end, "
     "143 terminated.",
 )

@@ -64,6 +64,9 @@ _OPTIONS: dict[str, Any] = {
     "calibrate": Annotated[
         _Text, Option(help="A car without evidence, without truth: each log for itself, the pool of all, or off.")
     ],
+    "waived": Annotated[
+        list[str] | None, Option("--waive", metavar="NAME", help="A failed check that does not count; repeatable.")
+    ],
     "vehicle": Annotated[_File, Option("--vehicle", "-v", hidden=True)],
     "model": Annotated[_File, Option(hidden=True)],
     "calibration": Annotated[_File, Option(hidden=True)],
@@ -126,7 +129,7 @@ def run_config(options: dict[str, Any]) -> RunConfig:
     """
     from pdhef_logtool.runs.config import load_config
 
-    flags = {key: value for key, value in options.items() if value is not None}
+    flags = {key: value for key, value in options.items() if value not in (None, [])}
     for alias in [a for a in _ALIASES if a in flags]:
         now = _ALIASES[alias]
         say(f"notice: --{alias.replace('_', '-')} is now --{now}")

@@ -27,6 +27,7 @@ class ReadOptions:
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
     budget : factor on what reading a log may cost.
+    waived : names of checks that do not count.
     """
 
     start: str | None = None
@@ -36,6 +37,7 @@ class ReadOptions:
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: float = WINDOW_S
     budget: float = 1.0
+    waived: tuple[str, ...] = ()
 
     @property
     def use_speed(self) -> bool:

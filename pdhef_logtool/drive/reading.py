@@ -17,6 +17,7 @@ from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import Mapping, check_mapping, choose_mapping, merge_losses
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
@@ -102,6 +103,11 @@ class Drive:
     def available(self) -> frozenset[str]:
         """Aligned signals that the log provides."""
         return self.plan.alignment.available
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """What physics says of signals, truth and vehicle file, with those that the options waive."""
+        return _checks_of(self.plan, self.options)
 
     @property
     def sha256(self) -> str:
@@ -247,7 +253,9 @@ def read_drive(
             raise no_samples(log_input.path)
         slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         plan = plan_drive(opened, chosen, car.vehicle, *slice_ns, require_imu=require_sensors)
-        _tell_doubts(plan, told)
+        for note in plan.mapping.notes[len(chosen.notes) :]:
+            told(note)
+        _tell_doubts(plan, options, told)
         friction = friction_of(plan, car.vehicle, options)
         if friction.note:
             remarks.append(friction.note)
@@ -290,11 +298,16 @@ def too_big(where: str) -> EstimatorError:
     )
 
 
-def _tell_doubts(plan: DrivePlan, tell: Tell) -> None:
-    from pdhef_logtool.drive.plausibility import plausibility_warnings
+def _checks_of(plan: DrivePlan, options: ReadOptions) -> tuple[Check, ...]:
+    return tuple(replace(c, waived=True) if c.name in options.waived else c for c in plan.checks)
 
-    for warning in plausibility_warnings(plan.survey_signals):
-        tell(warning.message)
+
+def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
+    for check in _checks_of(plan, options):
+        if check.verdict == "failed":
+            tell(f"check {check.name} failed{' (waived)' if check.waived else ''}: {check.evidence}; {check.remedy}")
+    for name in sorted(set(options.waived) - {c.name for c in plan.checks}):
+        tell(f"--waive {name}: no check of this log is called that")
     for name, reason in plan.alignment.unused:
         tell(f"{name} is not used: {reason}")
 

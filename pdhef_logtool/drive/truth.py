@@ -31,7 +31,7 @@ from pdhef_logtool.records.geometry import (
     shift_velocity_to_cg,
     wrap_angle,
 )
-from pdhef_logtool.records.signals import Channel, FloatArray, IntArray
+from pdhef_logtool.records.signals import TRUTH_UNITS, Channel, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 
 #: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
@@ -40,6 +40,8 @@ DIFFERENTIATION_HALF_S = 0.2
 GAP_PERIODS = 3.0
 #: Latency is searched for within this range.
 MAX_LATENCY_S = 0.5
+#: A truth that leads the gyro by more than this does not: the gyro's stamps are late.
+LATE_GYRO_S = 0.005
 #: Two channels are the same if this share of their samples agrees to ``SAME_RELATIVE``.
 SAME_SHARE = 0.99
 SAME_RELATIVE = 1e-6
@@ -135,6 +137,7 @@ class LatencyEstimate:
 
     ``latency_s`` is 0 unless ``reliable``. ``identical``: the truth's yaw rate is the gyro's own channel, so that the
     latency is 0 by construction and says nothing about the other truth channels. ``reason`` is for the report.
+    ``gyro_delay_s``: the gyro's stamps are late by so much; the truth's latency is then 0.
     """
 
     latency_s: float
@@ -143,6 +146,7 @@ class LatencyEstimate:
     reliable: bool
     identical: bool
     reason: str
+    gyro_delay_s: float = 0.0
 
 
 def plan_truth(
@@ -291,18 +295,41 @@ def valid_as_a_whole(truth: StateTrack, derivation: Mapping[str, str], standstil
     return replace(truth, valid=known)
 
 
+def channel_of(truth: TruthTrack, name: str) -> Channel:
+    """Return a column of the truth as a channel without NaN."""
+    values = getattr(truth.track, name)
+    known = np.isfinite(values)
+    stamps = truth.track.stamps_ns[known]
+    source = truth.derivation.get(name, "none")
+    return Channel(name, TRUTH_UNITS.get(name, ""), source, stamps, stamps, values[known])
+
+
 def yaw_rate_channel(truth: TruthTrack) -> Channel:
     """Return the truth's yaw rate, mapped or derived, as a channel without NaN, for :func:`estimate_truth_latency`."""
-    known = np.isfinite(truth.track.yaw_rate_rad_s)
-    stamps = truth.track.stamps_ns[known]
-    return Channel(
-        name="yaw_rate_rad_s",
-        unit="rad/s",
-        source=truth.derivation.get("yaw_rate_rad_s", "none"),
-        stamps_ns=stamps,
-        arrival_ns=stamps,
-        values=truth.track.yaw_rate_rad_s[known],
-    )
+    return channel_of(truth, "yaw_rate_rad_s")
+
+
+def booked_on_the_late(found: LatencyEstimate, speed: LatencyEstimate | None) -> LatencyEstimate:
+    """Return the latency with what is the gyro's taken from the truth.
+
+    No truth shows a motion before it happens: where it leads the gyro, the gyro's stamps are late. Only where a speed
+    sensor of another topic is late by as much do all sensors agree, and the truth's clock is early.
+
+    Parameters
+    ----------
+    found : gyro against truth yaw rate. speed : the speed sensor of another topic against the truth's v_x.
+    """
+    leads = -found.latency_s
+    if not found.reliable or leads <= max(LATE_GYRO_S, 3.0 * found.std_error_s):
+        return found
+    if (
+        speed is not None
+        and speed.reliable
+        and abs(speed.latency_s - found.latency_s) <= max(2.0 * LATE_GYRO_S, 3.0 * speed.std_error_s)
+    ):
+        return replace(found, reason=f"{found.reason}; the speed sensor is late by as much")
+    reason = f"the gyro is {leads * 1e3:.1f} ms late against the truth, which leads no motion"
+    return replace(found, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
 def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) -> LatencyEstimate:

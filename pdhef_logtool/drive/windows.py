@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from collections.abc import Mapping as Mapped
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,15 +19,13 @@ from pdhef_logtool.drive.alignment import (
     no_alignment,
     plan_alignment,
 )
+from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
     dependent_signals,
     derive_truth,
-    estimate_truth_latency,
-    plan_truth,
     truth_at,
-    yaw_rate_channel,
 )
 from pdhef_logtool.logs.drive_log import DriveLog, windows
 from pdhef_logtool.mapping import (
@@ -40,6 +38,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
 )
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
 from pdhef_logtool.records.signals import Channel, Loss, Signals, join_signals
@@ -65,6 +64,7 @@ class DrivePlan:
     latency : of the truth against the sensors; None without truth yaw rate or gyro.
     dependent : truth quantities that are an input of the estimators, with the reason.
     derivation : by truth quantity, how it is derived.
+    checks : of signals, truth and vehicle file.
     """
 
     mapping: Mapping
@@ -79,6 +79,7 @@ class DrivePlan:
     survey_truth: dict[str, Channel]
     start_ns: int
     end_ns: int
+    checks: tuple[Check, ...] = ()
 
     @property
     def truth_latency_s(self) -> float:
@@ -126,38 +127,46 @@ def plan_drive(
     ------
     MappingError : The log lacks what is mapped, or there is no IMU to set the stamps.
     """
+    mapping = with_gyro_delay(mapping, vehicle)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
-    survey = read_signals(log, mapping, clocks, start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
+    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle.truth_position_m)
+    mapping, survey = looked_at.mapping, looked_at.channels
     if require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
             survey.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
         )
     else:
         alignment = no_alignment(survey.signals)
-    truth = plan_truth(survey.truth, truth_position_m=vehicle.truth_position_m) if survey.truth else None
-    latency = None
+    truth, derived = looked_at.truth_plan, looked_at.truth
     derivation: dict[str, str] = {}
-    if truth is not None:
-        derived = derive_truth(survey.truth, plan=truth)
+    if derived is not None:
         derivation = dict(derived.derivation)
-        gyro = survey.signals.get("yaw_rate_rad_s")
-        rate = survey.truth.get("yaw_rate_rad_s") or yaw_rate_channel(derived)
-        if gyro is not None and len(gyro) and len(rate):
-            latency = estimate_truth_latency(gyro, rate)
     return DrivePlan(
         mapping=mapping,
         vehicle=vehicle,
         clocks=clocks,
         alignment=alignment,
         truth=truth,
-        latency=latency,
+        latency=looked_at.latency,
         dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
         derivation=derivation,
         survey_signals=survey.signals,
         survey_truth=survey.truth,
         start_ns=start_ns,
         end_ns=end_ns,
+        checks=looked_at.all_checks(vehicle),
     )
+
+
+def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
+    """Return the mapping with the gyro's delay that the car knows: all of it, in place of the mapping's own."""
+    delay_s, gyro = vehicle.sensors.yaw_rate_delay_s, mapping.signals.get("yaw_rate_rad_s")
+    if delay_s == 0.0 or gyro is None or gyro.latency_s == delay_s:
+        return mapping
+    note = f"the car's gyro is {delay_s * 1e3:.1f} ms late, in place of latency_s = {gyro.latency_s:g} of the mapping"
+    signals = {**mapping.signals, gyro.name: replace(gyro, latency_s=delay_s)}
+    return replace(mapping, signals=signals, notes=(*mapping.notes, note))
 
 
 @dataclass(slots=True)

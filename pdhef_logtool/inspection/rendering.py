@@ -128,7 +128,12 @@ def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
     if not inspection.truth:
         found.append(("missing", "yellow", "truth: nothing to score an estimate against"))
     found += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
-    found += [("warning", "red", str(w)) for w in inspection.warnings]
+    for verdict, style in (("failed", "red"), ("undecided", "yellow")):
+        checks = [c for c in inspection.checks if c.verdict == verdict]
+        found += [(verdict, style, f"{c.name}: {c.evidence}; {c.remedy}") for c in checks]
+    if passed := [c for c in inspection.checks if c.verdict == "passed"]:
+        subjects = ", ".join(dict.fromkeys(c.subject for c in passed))
+        found.append(("passed", "green", f"{len(passed)} checks of {subjects}"))
     for loss in inspection.lost:
         facts = [f"{loss.count} times"] if loss.count is not None and loss.count != 1 else []
         if loss.start_ns is not None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from pdhef_logtool.drive.plausibility import GRID_S, PlausibilityWarning, plausibility_warnings
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.mounting import survey_log
+from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
@@ -34,14 +34,13 @@ from pdhef_logtool.mapping import (
 )
 from pdhef_logtool.mapping.clocks import sources_by_clock
 from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Channel, Loss
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 
 WINDOW_NS = 600_000_000_000
-#: Signals are held against one another over so much of a log's beginning.
-PLAUSIBILITY_NS = 6 * WINDOW_NS
 #: Kinds of loss that are counted by topic and concern all its signals.
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.
@@ -119,7 +118,9 @@ class Inspection:
     ----------
     kind : of log. start_ns, end_ns : log time, [start, end).
     signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
-    ambiguities, notes : of the mapping. warnings : contradictions with physics. lost : every loss and note of reading.
+    ambiguities, notes : of the mapping. checks : what physics says of signals and truth.
+    proposals : corrections of the mapping that are certain. lost : every loss and note of
+        reading.
     """
 
     path: str
@@ -134,7 +135,8 @@ class Inspection:
     missing: tuple[str, ...]
     ambiguities: tuple[Ambiguity, ...]
     notes: tuple[str, ...]
-    warnings: tuple[PlausibilityWarning, ...]
+    checks: tuple[Check, ...]
+    proposals: tuple[Proposal, ...]
     lost: tuple[Loss, ...]
 
     @property
@@ -164,7 +166,8 @@ class Inspection:
             "missing": self.missing,
             "ambiguities": self.ambiguities,
             "notes": self.notes,
-            "warnings": self.warnings,
+            "checks": self.checks,
+            "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
         }
         return {key: jsonable(value) for key, value in document.items()}
@@ -204,10 +207,11 @@ def inspect_drive_log(
         mapping = given
     mapping = resolve_mapping(log, mapping)
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    looked_at = survey_log(log, mapping, clocks, (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS)))
+    mapping = looked_at.mapping
     steps = {t.name: StepStatistics() for t in log.topics}
     delays = {t.name: DelayStatistics() for t in log.topics}
     gathered: dict[tuple[str, str], _Gathered] = {}
-    thinned: dict[str, list[Channel]] = {name: [] for name in mapping.signals}
     losses: list[tuple[Loss, ...]] = []
     for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
         for name, columns in log.read_stamps(start, end).items():
@@ -216,8 +220,6 @@ def inspect_drive_log(
         channels = read_signals(log, mapping, clocks, start, end)
         losses.append(channels.losses)
         _gather(channels, gathered)
-        for name, channel in channels.signals.items() if start < log.start_ns + PLAUSIBILITY_NS else ():
-            thinned[name].append(_thin(channel))
     reading = merge_losses(losses)
     signals, truth = (
         {n: _signal_report(s, section, gathered, clocks, reading, log, mapping.quality) for n, s in sources.items()}
@@ -236,7 +238,8 @@ def inspect_drive_log(
         missing=missing_signals(mapping),
         ambiguities=ambiguities,
         notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
-        warnings=plausibility_warnings({n: _joined(parts) for n, parts in thinned.items() if parts}),
+        checks=looked_at.all_checks(),
+        proposals=mapping_proposals(looked_at),
         # Last, since a log knows all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),
     )
@@ -262,22 +265,6 @@ def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]
             entry.steps.add(stamps)
             if channel.values.ndim == 1:
                 entry.values.add(channel.values)
-
-
-def _thin(channel: Channel) -> Channel:
-    """Average a channel within the cells of the plausibility checks' grid, so that hours of it fit into memory."""
-    cell_ns = int(GRID_S * 1e9)
-    cells, first, count = np.unique(channel.stamps_ns // cell_ns, return_index=True, return_counts=True)
-    total = np.add.reduceat(channel.values, first, axis=0) if first.shape[0] else channel.values
-    stamps = cells * cell_ns + cell_ns // 2
-    return replace(channel, stamps_ns=stamps, arrival_ns=stamps, values=total / count if count.shape[0] else total)
-
-
-def _joined(parts: list[Channel]) -> Channel:
-    """Join thinned windows; the cell at a seam may come twice and is averaged later."""
-    stamps = np.concatenate([p.stamps_ns for p in parts])
-    values = np.concatenate([p.values for p in parts])
-    return replace(parts[0], stamps_ns=stamps, arrival_ns=stamps, values=values)
 
 
 # ------------------------------------------------------------------------------------------------ reports
@@ -384,8 +371,10 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
             text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
             if math.isfinite(report.minimum):
                 text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
-            warned = [w.message for w in inspection.warnings if name in (w.suspects or w.signals)]
-            lines = [f"WARNING: {w}" for w in warned] if section == "signals" else []
+            subject = name if section == "signals" else f"truth.{name}"
+            doubts = [c for c in inspection.checks if c.subject == subject and c.verdict != "passed"]
+            done = any(p.subject == subject for p in inspection.proposals)
+            lines = [] if done else [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
             comments[f"{section}.{name}"] = "\n".join([text, *lines])
     head = [f"Written from {Path(inspection.path).name}."]
     head += [f"Ambiguous: {a}" for a in inspection.ambiguities]
@@ -399,7 +388,7 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
 
 
 def write_mapping(inspection: Inspection, path: Path) -> None:
-    """Write the inspection's mapping as a TOML file that is ready to edit.
+    """Write the inspection's mapping, with the corrections that it proposes, as a TOML file that is ready to edit.
 
     Raises
     ------
@@ -409,7 +398,8 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
         raise OutputError(
             expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
         )
-    text = mapping_to_toml(inspection.mapping, comments=mapping_comments(inspection))
+    mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
+    text = mapping_to_toml(mapping, comments=mapping_comments(inspection))
     write_bytes(path, text.encode())
 
 

@@ -201,14 +201,21 @@ def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | N
 
 def _shape_problem(name: str, model: _SourceTable) -> str:
     columns = VECTOR_COLUMNS.get(name, 1)
-    for key, value in (("field", model.field), ("scale", model.scale), ("offset", model.offset)):
-        if isinstance(value, list) and columns == 1:
-            return f"{key} must be a single value, {name} is no vector"
-        if isinstance(value, list) and len(value) != columns:
-            return f"{key} must hold {columns} entries, got {len(value)}"
     fields = model.field if isinstance(model.field, list) else [model.field]
-    if columns > 1 and any(f.startswith(CAN_PREFIX) for f in fields):
-        return f"{name} is a vector: frames of several signals do not come together"
+    if columns == 1 and isinstance(model.offset, list):
+        return f"offset must be a single value, {name} is no vector"
+    if columns == 1 and (len(fields) > 1 or isinstance(model.scale, list)):
+        # A component of a sensor that is mounted askew.
+        scales = model.scale if isinstance(model.scale, list) else []
+        if len(fields) == 1:
+            return f"scale must be a single value, {name} is no vector and has one field"
+        if len(scales) != len(fields):
+            return f"{name} is the sum of its fields, each times its scale: scale must hold {len(fields)} entries"
+    for key, value in (("field", model.field), ("scale", model.scale), ("offset", model.offset)):
+        if isinstance(value, list) and columns > 1 and len(value) != columns:
+            return f"{key} must hold {columns} entries, got {len(value)}"
+    if len(fields) > 1 and any(f.startswith(CAN_PREFIX) for f in fields):
+        return f"{name} has several fields: frames of several signals do not come together"
     if any(f.startswith(CAN_PREFIX) and f.count(".") != 1 for f in fields):
         return f"field must be {CAN_PREFIX}<message>.<signal>"
     return ""
@@ -233,9 +240,10 @@ def _contradictions(mapping: Mapping) -> list[str]:
     ]
     estimates = [(f"estimates.{name}", sources) for name, sources in mapping.estimates.items()]
     for section, sources in (("signals", mapping.signals), ("truth", mapping.truth), *estimates):
-        first: dict[tuple[str, tuple[str, ...]], str] = {}
+        first: dict[tuple[object, ...], str] = {}
         for name, source in sources.items():
-            key = (source.topic, source.paths)
+            summed = len(source.paths) > source.columns
+            key = (source.topic, source.paths, source.scale if summed else None)
             if key in first:
                 problems.append(f"{section}.{name}: duplicates {section}.{first[key]} ({source.label})")
             first.setdefault(key, name)

@@ -34,13 +34,17 @@ AUTO_STAMP = "auto"
 class SignalSource:
     """Where one signal comes from: ``value_SI = scale * raw + offset``, measured at ``stamp - latency_s``.
 
+    A scalar signal of several fields is their sum, each times its own scale: a component of a sensor that is mounted
+    askew.
+
     Attributes
     ----------
     name : signal or truth name, a key of ``SIGNAL_UNITS`` or ``TRUTH_UNITS``.
     topic : topic name.
-    field : dotted path, ``[3]`` indexes an array; a tuple of paths gives a vector signal column by column.
+    field : dotted path, ``[3]`` indexes an array; a tuple of paths gives a vector signal column by column,
+        or the sum of a scalar one.
     stamp : dotted path of the measurement time, ``log_time``, ``publish_time``, or ``auto``.
-    scale, offset : raw unit to SI; a tuple holds one entry a column of a vector signal.
+    scale, offset : raw unit to SI; a tuple holds one entry a column of a vector signal, a scale also one a summand.
     latency_s : what the stamp is late by.
     valid_min, valid_max : SI values outside are dropped and counted.
     stamp_unit : ``ros`` (a struct of seconds and nanoseconds) or the unit of a number.
@@ -79,8 +83,10 @@ class SignalSource:
 
     @property
     def label(self) -> str:
-        """``/topic.field``, for people and for ``Channel.source``."""
-        return f"{self.topic}.{self.field if isinstance(self.field, str) else '{' + ','.join(self.field) + '}'}"
+        """``/topic.field``, for people and for ``Channel.source``; sums of the same fields are told apart by name."""
+        if isinstance(self.field, str):
+            return f"{self.topic}.{self.field}"
+        return f"{self.topic}.{'' if self.columns > 1 else self.name}{{{','.join(self.field)}}}"
 
     @property
     def columns(self) -> int:

@@ -66,6 +66,7 @@ class RunConfig:
     intervals : instead of the car's: a file of ``pdhef calibrate``, ``none`` (intervals as they are), ``unsure`` (wide
         ones, for a car that may have changed since its file was made).
     thresholds : limits that the figures are held against; None = no gate.
+    waived : names of checks whose failure does not count.
     calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.
     """
 
@@ -85,6 +86,7 @@ class RunConfig:
     network: Path | None = None
     intervals: Path | None = None
     calibrate: Literal["off", "log", "pool"] = "log"
+    waived: Names = ()
 
     @property
     def read_options(self) -> ReadOptions:
@@ -99,6 +101,7 @@ class RunConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
+        document["waived"] = list(self.waived)
         document["estimators"] = None if self.estimators is None else list(self.estimators)
         for key in _FILES:
             path = document[key]

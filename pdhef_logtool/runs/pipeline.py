@@ -18,6 +18,7 @@ from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, find_logs
 from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import (
     EXIT_FAILURE,
     EXIT_GATE,
@@ -79,7 +80,7 @@ _DERIVED_UNITS = {"position_m": "m"}
 class LogResult:
     """What came out of one log; ``report`` is the document of report.json, None if the log failed.
 
-    ``verdicts``: how its figures stand against the thresholds; None without thresholds.
+    ``verdicts``: how its figures stand against the thresholds; None without thresholds. ``checks``: those of the drive.
     """
 
     outcome: LogOutcome
@@ -87,6 +88,13 @@ class LogResult:
     report: dict[str, Any] | None
     rows: tuple[MetricRow, ...]
     verdicts: tuple[Verdict, ...] | None = None
+    checks: tuple[Check, ...] = ()
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether all of the log could be used and no check failed that counts."""
+        failed = any(c.verdict == "failed" and not c.waived for c in self.checks)
+        return self.outcome.outcome == "ok" and not failed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,12 +106,12 @@ class RunResult:
 
     @property
     def exit_code(self) -> int:
-        """0 if all is well, 4 if a threshold failed, 3 if input was lost or some logs failed, 1 if all failed."""
+        """0 if all is well, 4 if a threshold failed, 3 if input was lost, a check or some logs failed, 1 if all did."""
         if all(r.outcome.failed is not None for r in self.results):
             return EXIT_FAILURE
         if any(v.failed for v in self.verdicts):
             return EXIT_GATE
-        return EXIT_OK if all(r.outcome.outcome == "ok" for r in self.results) else EXIT_PARTIAL
+        return EXIT_OK if all(r.is_whole for r in self.results) else EXIT_PARTIAL
 
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
@@ -361,7 +369,7 @@ def _run_estimators(
     outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car))
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
-    return LogResult(outcome, change.target, report, tuple(rows))
+    return LogResult(outcome, change.target, report, tuple(rows), checks=drive.checks)
 
 
 def _car_facts(car: Car) -> CarFacts:
@@ -477,6 +485,8 @@ def report_facts(
         found = plan.latency
         measured = f"{found.latency_s * 1e3:.1f} ms ± {found.std_error_s * 1e3:.1f} ms" if found.reliable else "unknown"
         verdict = "applied" if plan.truth_latency_s else "not applied: it does not stand out of its own uncertainty"
+        if found.gyro_delay_s:
+            verdict = "so that the truth is not moved"
         notes.append(f"latency {measured} ({found.reason}), {verdict}")
     notes += [f"{signal} is not independent: {reason}" for signal, reason in plan.dependent.items()]
     if "cg" in plan.derivation:
@@ -517,6 +527,7 @@ def report_facts(
         samples=drive.sample_ledger if ledger is None else ledger,
         warnings=drive.notes,
         remarks=drive.remarks,
+        checks=drive.checks,
         versions=tool_versions(),
     )
 

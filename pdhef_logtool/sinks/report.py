@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.reasons import ReasonFacts
 from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.ledger import SampleCount
@@ -120,6 +121,7 @@ class ReportFacts:
     ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
     ``calibration``: what the drive said of its car without truth, None where it was not asked.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
+    ``checks``: what physics says of signals, truth and vehicle file.
     """
 
     log: LogFacts
@@ -141,6 +143,7 @@ class ReportFacts:
     warnings: Sequence[str] = ()
     remarks: Sequence[str] = ()
     main: MainFacts | None = None
+    checks: Sequence[Check] = ()
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -231,6 +234,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "ledger": {"bytes": list(facts.file_bytes), "samples": list(facts.samples)},
         "warnings": list(facts.warnings),
         "remarks": list(facts.remarks),
+        "checks": list(facts.checks),
         "versions": dict(facts.versions),
     }
     document = {key: jsonable(value) for key, value in document.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -9,10 +10,18 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
 from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.proposals import Proposal, car_proposals, surest
+from pdhef_logtool.drive.truth import (
+    GAP_PERIODS,
+    TruthTrack,
+    booked_on_the_late,
+    estimate_truth_latency,
+    yaw_rate_channel,
+)
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Between the fit part and the held-out part: filter states and slow disturbances must have forgotten the former.
@@ -25,7 +34,7 @@ class FitDrive:
 
     ``signals`` are as measured: no bias and no offset of a vehicle file is taken off.
     ``independent_yaw_rate`` tells that the truth's yaw rate is not the gyro itself, ``steering_wheel`` that the log
-    has the steering wheel's angle in place of the road wheels'.
+    has the steering wheel's angle in place of the road wheels'. ``gyro_latency_s`` was taken off the gyro's stamps.
     """
 
     name: str
@@ -34,6 +43,7 @@ class FitDrive:
     independent_yaw_rate: bool
     log_start_ns: int
     steering_wheel: bool = False
+    gyro_latency_s: float = 0.0
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -56,14 +66,39 @@ def load_fit_drive(
     The car gives geometry only (lever arms, steering ratio, wheel radius).
     """
     vehicle = car.vehicle
-    sensors = vehicle.sensors.model_copy(update={"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0})
+    none = {"ax_bias_m_s2": 0.0, "ay_bias_m_s2": 0.0, "yaw_rate_bias_rad_s": 0.0, "yaw_rate_gain": 1.0}
+    sensors = vehicle.sensors.model_copy(update=none)
     as_measured = vehicle.model_copy(update={"steer_offset_rad": 0.0, "sensors": sensors})
     record, whole = load_drive(log_input, car.with_vehicle(as_measured), mapping, replace(options, friction=None))
     if whole is None or whole.truth is None:
         return record, None
     independent = "yaw_rate_rad_s" not in whole.plan.dependent
     by_wheel = "steer_rad" not in whole.plan.mapping.signals
-    return record, FitDrive(record.name, whole.signals, whole.truth, independent, whole.log_start_ns, by_wheel)
+    gyro = whole.plan.mapping.signals.get("yaw_rate_rad_s")
+    latency_s = 0.0 if gyro is None else gyro.latency_s
+    return record, FitDrive(
+        record.name, whole.signals, whole.truth, independent, whole.log_start_ns, by_wheel, latency_s
+    )
+
+
+def sensors_of(drives: Sequence[FitDrive], vehicle: VehicleParameters) -> tuple[Proposal, ...]:
+    """Return place, gain and delay of the car's sensors by the drives' truth, beside what the vehicle knows."""
+    return surest(p for drive in drives for p in _sensors_of(drive, vehicle))
+
+
+def _sensors_of(drive: FitDrive, vehicle: VehicleParameters) -> tuple[Proposal, ...]:
+    channels = {}
+    for name in ("yaw_rate_rad_s", "ay_m_s2"):
+        values = getattr(drive.signals, name)
+        known = np.isfinite(values)
+        stamps = drive.signals.stamps_ns[known]
+        channels[name] = Channel(name, SIGNAL_UNITS[name], drive.name, stamps, stamps, values[known])
+    truth = TruthTrack(drive.truth, max_gap_s=GAP_PERIODS * period_s(drive))
+    latency = None
+    rate = yaw_rate_channel(truth)
+    if drive.independent_yaw_rate and len(rate) and len(channels["yaw_rate_rad_s"]):
+        latency = booked_on_the_late(estimate_truth_latency(channels["yaw_rate_rad_s"], rate), None)
+    return car_proposals(channels, truth, latency, drive.gyro_latency_s, vehicle)
 
 
 def period_s(drive: FitDrive) -> float:

@@ -11,9 +11,10 @@ from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import PHYSICS, Fit, FittedValues, LearntOn, physics_sha256
 from pdhef_logtool.car.store import Change, check_output, write_change
-from pdhef_logtool.car.vehicle import PhysicsParts
+from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
+from pdhef_logtool.drive.proposals import apply_proposals
 from pdhef_logtool.estimators.physics_tuned import NAME as TUNED
-from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, split_drive
+from pdhef_logtool.learning.car.fit_data import FitDrive, load_fit_drive, sensors_of, split_drive
 from pdhef_logtool.learning.car.identify import Identification, Identified, fit_car, understeer_deg_per_g
 from pdhef_logtool.learning.car.identify_plot import plot_identification
 from pdhef_logtool.learning.drives import (
@@ -26,6 +27,7 @@ from pdhef_logtool.learning.drives import (
     tell_drive,
 )
 from pdhef_logtool.logs.discovery import Logs, find_logs
+from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.runs.config import RunConfig
@@ -111,28 +113,38 @@ def identify(
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {start.name}")
     given = open_mapping(config)
-    fit: list[FitDrive] = []
-    held_out: list[FitDrive] = []
-    records: list[DriveRecord] = []
     logs = find_logs(arguments)
     check_file_output(logs, config, output)
-    for number, log_input in enumerate(logs):
-        progress(f"reading {log_input.stem}", 0.2 * number / len(logs))
-        record, drive = load_fit_drive(log_input, Car.of(start), given, config.read_options)
-        records.append(record)
+
+    def read(vehicle: VehicleParameters) -> tuple[list[DriveRecord], list[FitDrive], list[FitDrive]]:
+        records, fit, held_out = [], [], []
+        for number, log_input in enumerate(logs):
+            progress(f"reading {log_input.stem}", 0.2 * number / len(logs))
+            record, drive = load_fit_drive(log_input, Car.of(vehicle), given, config.read_options)
+            records.append(record)
+            if drive is None:
+                continue
+            kept, scored = split_drive(drive, holdout)
+            fit.append(kept)
+            held_out += [] if scored is None else [scored]
+        return records, fit, held_out
+
+    records, fit, held_out = read(start)
+    for record in records:
         tell_drive(record, warn)
-        if drive is None:
-            continue
-        kept, scored = split_drive(drive, holdout)
-        fit.append(kept)
-        if scored is not None:
-            held_out.append(scored)
     if not fit:
         raise no_drive("truth velocities", "identify")
+    # Of the parts that are fitted to alone: what is held out must not be seen.
+    proposals = sensors_of(fit, start)
+    for proposal in proposals:
+        warn(f"{proposal.subject}: {proposal.evidence}; the fit takes it off ({', '.join(proposal.entries)})")
+    _, with_sensors = apply_proposals(proposals, Mapping(), start)
+    if with_sensors.sensors.yaw_rate_delay_s != start.sensors.yaw_rate_delay_s:
+        records, fit, held_out = read(with_sensors)
     found = fit_car(
         fit,
         held_out,
-        start,
+        with_sensors,
         steering_wheel=any(drive.steering_wheel for drive in fit),
         parts=parts,
         progress=lambda text, share: progress(text, 0.2 + 0.8 * share),

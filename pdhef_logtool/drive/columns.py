@@ -1,0 +1,98 @@
+"""Channels on one even grid, low-passed: what relations between signals are looked at on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pdhef_logtool.records.signals import BoolArray, Channel, FloatArray
+
+GRID_S = 0.05
+#: −3 dB at 1 Hz: noise and vibration go, manoeuvres stay.
+LOW_PASS_HZ = 1.0
+#: Samples are interpolated onto the grid over gaps of at most this length, and of this many of their periods.
+MAX_GAP_S = 0.5
+MAX_GAP_PERIODS = 2.5
+#: No sensor that is slower says anything of manoeuvres.
+LONGEST_GAP_S = 2.5
+#: 21 hours about the middle of the drive; it keeps one wrong stamp from making a grid of decades.
+MAX_CELLS = 1_500_000
+#: Moving: faster than this share of the drive's fast speeds, and than a speed at which little can be told.
+MOVING_SHARE = 0.25
+MIN_MOVING_M_S = 0.5
+
+
+def columns_on_grid(channels: Mapping[str, Channel]) -> dict[str, FloatArray]:
+    """Return the scalar channels with two samples or more on one even grid of ``GRID_S``; NaN in gaps."""
+    used = {n: c for n, c in channels.items() if len(c) > 1 and c.values.ndim == 1}
+    if not used:
+        return {}
+    start = min(int(c.stamps_ns[0]) for c in used.values())
+    end = max(int(c.stamps_ns[-1]) for c in used.values())
+    reach = int(MAX_CELLS * GRID_S * 0.5e9)
+    middle = int(np.median([int(c.stamps_ns[len(c) // 2]) for c in used.values()]))
+    start, end = max(start, middle - reach), min(end, middle + reach)
+    cells = int((end - start) * 1e-9 / GRID_S) + 1
+    return {name: _on_grid(channel, start, cells) for name, channel in used.items()}
+
+
+def derivative(column: FloatArray) -> FloatArray:
+    """Differentiate a column of the grid by time, 1/s; NaN at its ends and beside gaps."""
+    out = np.full(column.shape[0], np.nan)
+    out[1:-1] = (column[2:] - column[:-2]) / (2.0 * GRID_S)
+    return out
+
+
+def moving_at(speed: FloatArray) -> BoolArray:
+    """Return where the car drives: by the drive's own fast speeds, so that a 1:10 car counts as a car does."""
+    finite = np.abs(speed[np.isfinite(speed)])
+    if finite.shape[0] == 0:
+        return np.zeros(speed.shape[0], np.bool_)
+    limit = max(MIN_MOVING_M_S, MOVING_SHARE * float(np.quantile(finite, 0.9)))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.abs(speed) > limit, dtype=np.bool_)
+
+
+def independent_samples(count: int) -> float:
+    """Return how many independent samples this many cells hold after the low pass."""
+    return 2.0 * LOW_PASS_HZ * GRID_S * count
+
+
+def _on_grid(channel: Channel, start_ns: int, cells: int) -> FloatArray:
+    """Average a channel into the grid's cells and low-pass it; NaN in gaps."""
+    nothing = np.full(cells, np.nan)
+    if cells < 2:
+        return nothing
+    at = np.rint((channel.stamps_ns - start_ns) * (1e-9 / GRID_S)).astype(np.int64)
+    inside = (at >= 0) & (at < cells)
+    count = np.bincount(at[inside], minlength=cells).astype(np.float64)
+    total = np.bincount(at[inside], weights=channel.values[inside], minlength=cells)
+    known = np.flatnonzero(count > 0.0)
+    if known.shape[0] < 2:
+        return nothing
+    cell = np.arange(cells)
+    filled = np.interp(cell, known, total[known] / count[known])
+    before = known[np.maximum(np.searchsorted(known, cell, side="right") - 1, 0)]
+    after = known[np.minimum(np.searchsorted(known, cell), known.shape[0] - 1)]
+    period_s = float(np.median(np.diff(channel.stamps_ns))) * 1e-9
+    good = (after - before) * GRID_S <= min(max(MAX_GAP_S, MAX_GAP_PERIODS * period_s), LONGEST_GAP_S)
+    good &= (cell >= known[0]) & (cell <= known[-1])
+    return _low_pass(filled, good)
+
+
+def _low_pass(values: FloatArray, good: BoolArray) -> FloatArray:
+    """Gaussian low pass of zero phase over the good cells; NaN where much of the kernel has none."""
+    sigma = np.sqrt(np.log(2.0)) / (2.0 * np.pi * LOW_PASS_HZ) / GRID_S
+    reach = int(np.ceil(4.0 * sigma))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    kernel /= kernel.sum()
+    n = values.shape[0]
+    # "same" gives the length of the longer of both, which may be the kernel.
+    weight, total = (
+        np.convolve(x, kernel)[reach : reach + n] for x in (good.astype(np.float64), np.where(good, values, 0.0))
+    )
+    out = np.full(n, np.nan)
+    enough = weight > 0.8
+    out[enough] = total[enough] / weight[enough]
+    return out

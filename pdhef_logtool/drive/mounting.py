@@ -1,0 +1,462 @@
+"""How an IMU is mounted in the car, from gravity, its speed and its turning.
+
+Gravity over the drive, less what driving explains of it, says which way is up; the rate about that axis is the yaw
+rate. Then what is left of the accelerations must be (v̇, v r) in the car's axes: one angle about the vertical makes it
+so, by complex regression, and its fit says whether all of it is believed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping as Mapped
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.checks import check_drive, drive_columns, explained_factors
+from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.relations import G, steering_references, yaw_references
+from pdhef_logtool.drive.truth import (
+    LatencyEstimate,
+    TruthPlan,
+    TruthTrack,
+    booked_on_the_late,
+    channel_of,
+    derive_truth,
+    estimate_truth_latency,
+    plan_truth,
+    yaw_rate_channel,
+)
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
+from pdhef_logtool.records.checks import Check, Verdict
+from pdhef_logtool.records.signals import Channel, FloatArray
+
+#: Mean accelerations between these are gravity; below the least, the sensor's software took it off.
+GRAVITY_M_S2 = (0.75 * G, 1.25 * G)
+COMPENSATED_M_S2 = 3.0
+#: How far speed and yaw rate explain the level accelerations once the axes are right; the rest is sideslip, roll,
+#: grade, crossfall and noise. Below, nothing is said.
+MIN_CORRELATION = 0.75
+#: Independent samples: 5 s of driving.
+MIN_SAMPLES = 10.0
+#: The regression's own gain: a unit is wrong beyond, and then no angle can be told from it.
+GAIN_RANGE = (0.5, 2.0)
+#: Of a multiple of 90 degrees: half of 45 degrees at three standard errors.
+MAX_ERROR_DEG = 7.5
+#: A mounting is a multiple of 90 degrees unless it is off by more than this, and than three standard errors. Grade,
+#: crossfall and bias are 0.5 m/s^2 over 20 s, 3 degrees of tilt; sideslip makes 2 degrees of yaw.
+TILT_DEG = 4.0
+YAW_DEG = 4.0
+ASKEW_SAMPLES = 40.0
+ASKEW_CORRELATION = 0.85
+ASKEW_ERROR_DEG = 1.5
+#: Correlation of the yaw rate with another measurement of it that settles its sign.
+SIGN_CORRELATION = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounting:
+    """Rotation [3, 3] from the sensor's axes to forward, left, up; what it was found from; whether it can be applied.
+
+    ``named`` are the rows [3, 3] that the mapping reads as it stands, 0 where it lacks one. ``hand``: -1 where the
+    sensor's rates turn to the left about its axes.
+    """
+
+    rotation: FloatArray
+    named: FloatArray
+    evidence: str
+    confident: bool
+    hand: float = 1.0
+
+    @property
+    def rows(self) -> FloatArray:
+        """Forward and left [3] of the accelerometer, up of the gyro: what a mapping should read."""
+        return np.concatenate([self.rotation[:2], self.hand * self.rotation[2:]])
+
+    @property
+    def is_as_named(self) -> bool:
+        """Whether the mapping reads the axes that it should."""
+        return all(np.allclose(r, n, atol=1e-3) for r, n in zip(self.rows, self.named, strict=True) if n.any())
+
+    @property
+    def degrees(self) -> tuple[float, float, float]:
+        """Roll, pitch and yaw of the sensor in the car: it is turned by yaw first, then pitch, then roll."""
+        m = self.rotation
+        pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
+        if abs(m[2, 0]) > 1.0 - 1e-6:  # straight up or down: roll and yaw are one angle
+            return 0.0, math.degrees(pitch), math.degrees(math.atan2(-m[0, 1], m[1, 1]))
+        roll, yaw = math.atan2(m[2, 1], m[2, 2]), math.atan2(m[1, 0], m[0, 0])
+        return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
+
+    @property
+    def text(self) -> str:
+        """The rotation in words."""
+        roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in self.degrees)
+        mirrored = "" if self.hand > 0.0 else ", its angular rates with the opposite sign"
+        return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg{mirrored}"
+
+
+def find_mounting(
+    signals: Mapped[str, Channel],
+    truth: Mapped[str, Channel],
+    derived: TruthTrack | None,
+    triads: tuple[Triad | None, Triad | None],
+    mapping: Mapping,
+) -> Mounting | None:
+    """Find the rotation of an IMU from its six components; None where there are none, or the drive says nothing.
+
+    Parameters
+    ----------
+    signals : as mapped, with the components of the triads beside them. derived : truth, for the sign of the yaw rate.
+    """
+    accelerations, rates = triads
+    if accelerations is None or rates is None:
+        return None
+    columns, speed_name = drive_columns(signals, truth, derived)
+    if not all(n in columns for n in (*ACCELERATIONS, *RATES)):
+        return None
+    f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
+    w = np.stack([columns[n] for n in RATES], axis=1)
+    named = np.zeros((3, 3))
+    for i, name in enumerate(MOUNTED):
+        if name in mapping.signals:
+            named[i] = (rates if i == 2 else accelerations).row(mapping.signals[name])
+    speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
+    references = yaw_references(columns, speed_name)
+    ups = _ups(f, w, named)
+    if len(ups) > 1 and not references:  # gravity does not say which way is up
+        references = steering_references(columns, speed_name)
+    found = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
+    hands = [1.0] * (len(found) // 2) + [-1.0] * (len(found) // 2)
+    # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
+    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and (m.sign > 0.0 or h + m.sign > 0.0)]
+    if not fitting:
+        return None
+    best, hand = max(fitting, key=lambda x: x[0].correlation + x[0].sign)
+    return Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    """A rotation for one choice of the vertical, and how well it explains the drive.
+
+    ``sign``: what other measurements say of the yaw rate's; ``along``: the speed alone says which way is forward.
+    """
+
+    rotation: FloatArray
+    correlation: float
+    error_deg: float
+    samples: float
+    sign: float
+    along: bool
+    fits: bool
+    evidence: str
+
+
+def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
+    """Return the directions [3] that may be up: gravity's, or any axis where the sensor takes gravity off."""
+    mean = np.nanmean(f, axis=0) if np.isfinite(f).all(axis=1).any() else np.zeros(3)
+    size = float(np.linalg.norm(mean))
+    if GRAVITY_M_S2[0] < size < GRAVITY_M_S2[1]:
+        return [mean / size]
+    if size > COMPENSATED_M_S2:
+        return []
+    whole = np.isfinite(w).all(axis=1)
+    spread = w[whole].std(axis=0) if whole.any() else np.zeros(3)
+    axis = int(np.argmax(spread))
+    if spread[axis] <= 0.0:
+        return []
+    sign = 1.0 if named[2, axis] >= 0.0 else -1.0
+    up = np.zeros(3)
+    up[axis] = sign
+    return [up, -up]
+
+
+def _turned(
+    f: FloatArray, w: FloatArray, speed: FloatArray, up: FloatArray, references: list[tuple[str, FloatArray]]
+) -> _Turn | None:
+    moving = moving_at(speed)
+    rotation, correlation, gain, error = np.zeros((3, 3)), 0.0, 0.0, math.inf
+    axis, mean = up, up
+    for _ in range(3):  # what driving makes of the mean tilts the vertical, a little
+        e1 = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+        e1 /= np.linalg.norm(e1)
+        e2 = np.cross(axis, e1)
+        rate = w @ axis
+        driven = derivative(speed) + 1j * speed * rate
+        level = f @ e1 + 1j * (f @ e2)
+        use = moving & np.isfinite(driven) & np.isfinite(level)
+        samples = independent_samples(int(np.count_nonzero(use)))
+        if samples < MIN_SAMPLES:
+            return None
+        # What a sensor off the CG reads beside them goes with the yaw acceleration.
+        turning = 1j * derivative(rate)
+        use &= np.isfinite(turning)
+        a = np.stack([driven[use] - driven[use].mean(), turning[use] - turning[use].mean()], axis=1)
+        z = level[use] - level[use].mean()
+        power = float(np.sum(np.abs(z) ** 2))
+        if np.linalg.matrix_rank(a) < 2 or power <= 0.0:
+            return None
+        factors = np.linalg.lstsq(a, z, rcond=None)[0]
+        factor, left_over = complex(factors[0]), z - a @ factors
+        spread = float(np.mean(np.abs(left_over) ** 2)) / 2.0
+        variance = float(np.linalg.inv((a.conj().T @ a).real / a.shape[0])[0, 0]) * spread / samples
+        gain = abs(factor)
+        error = math.degrees(math.sqrt(variance) / max(gain, 1e-9))
+        correlation = math.sqrt(max(0.0, 1.0 - float(np.sum(np.abs(left_over) ** 2)) / power))
+        angle = float(np.angle(factor))
+        forward = math.cos(angle) * e1 + math.sin(angle) * e2
+        rotation = np.stack([forward, np.cross(axis, forward), axis])
+        mean = np.mean(f[use], axis=0) - rotation.T @ np.array([driven[use].real.mean(), driven[use].imag.mean(), 0.0])
+        if np.linalg.norm(mean) > COMPENSATED_M_S2:
+            axis = mean / np.linalg.norm(mean)
+    sign, said = _sign_of(w @ axis, references)
+    evidence = (
+        f"speed and yaw rate explain the level accelerations with correlation {correlation:.2f} and gain {gain:.2f}, "
+        f"yaw known to {error:.1f} deg{said}"
+    )
+    fits = correlation >= MIN_CORRELATION and GAIN_RANGE[0] <= gain <= GAIN_RANGE[1] and error <= MAX_ERROR_DEG
+    along = _along(rotation[0] @ f[use].T, driven[use].real)
+    return _Turn(rotation, correlation, error, samples, sign, along, fits, evidence)
+
+
+def _along(measured: FloatArray, driven: FloatArray) -> bool:
+    """Return whether speeding up and braking alone say which way is forward."""
+    spread = float(measured.std() * driven.std())
+    return spread > 0.0 and float(np.mean((measured - measured.mean()) * (driven - driven.mean()))) / spread > 0.5
+
+
+def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
+    """Return +1, -1 or 0 for the sign of the yaw rate by the best of other measurements of it, and what that is."""
+    best, said = 0.0, ""
+    for text, reference in references:
+        use = np.isfinite(rate) & np.isfinite(reference)
+        if independent_samples(int(np.count_nonzero(use))) < MIN_SAMPLES:
+            continue
+        a, b = rate[use] - rate[use].mean(), reference[use] - reference[use].mean()
+        spread = float(a.std() * b.std())
+        correlation = float(np.mean(a * b)) / spread if spread > 0.0 else 0.0
+        if abs(correlation) > max(SIGN_CORRELATION, abs(best)):
+            best, said = correlation, f", yaw rate against {text} {correlation:.2f}"
+    return float(np.sign(best)), said
+
+
+def _snapped(turn: _Turn) -> FloatArray:
+    """Return the multiple of 90 degrees beside a rotation, with what of the rest is no grade, crossfall or sideslip."""
+    rotation = turn.rotation
+    step = max(_right_angles(), key=lambda p: float(np.sum(p * rotation)))
+    rest = rotation @ step.T
+    tilt = math.degrees(math.acos(float(np.clip(rest[2, 2], -1.0, 1.0))))
+    yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
+    known = turn.correlation >= ASKEW_CORRELATION and turn.error_deg <= ASKEW_ERROR_DEG
+    if not known or turn.samples < ASKEW_SAMPLES:
+        return step
+    is_turned = abs(yaw) > max(YAW_DEG, 3.0 * turn.error_deg)
+    if tilt > TILT_DEG:
+        return rotation if is_turned else _level_only(rest) @ step
+    if not is_turned:
+        return step
+    c, s = math.cos(math.radians(yaw)), math.sin(math.radians(yaw))
+    return np.asarray(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ step)
+
+
+def _level_only(rest: FloatArray) -> FloatArray:
+    """Return the smallest rotation that brings the vertical where ``rest`` brings it."""
+    up = rest[2]
+    axis = np.cross(up, np.array([0.0, 0.0, 1.0]))
+    sine, cosine = float(np.linalg.norm(axis)), float(up[2])
+    x, y, z = axis / sine
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + sine * cross + (1.0 - cosine) * cross @ cross)
+
+
+def _right_angles() -> list[FloatArray]:
+    """Return the 24 rotations by multiples of 90 degrees."""
+    found = []
+    for order in permutations(range(3)):
+        for signs in product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            for row, (column, sign) in enumerate(zip(order, signs, strict=True)):
+                matrix[row, column] = sign
+            if np.linalg.det(matrix) > 0.0:
+                found.append(matrix)
+    return found
+
+
+# ------------------------------------------------------------------------------------- into the mapping
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain."""
+
+    mapping: Mapping
+    channels: MappedChannels
+    truth: TruthTrack | None
+    truth_plan: TruthPlan | None
+    latency: LatencyEstimate | None
+    triads: tuple[Triad | None, Triad | None] = (None, None)
+    mounting: Mounting | None = None
+
+    @property
+    def checks(self) -> tuple[Check, ...]:
+        """Whether each of the IMU's signals is read from the axis that the drive says."""
+        return () if self.mounting is None else tuple(mounting_checks(self.mapping, self.mounting, self.triads))
+
+    @property
+    def is_mounted(self) -> bool:
+        """Whether the IMU is known to be read from the right axes."""
+        return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
+
+    def all_checks(self, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
+        """Return the checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
+        channels = self.channels
+        found = check_drive(
+            channels.signals,
+            channels.truth,
+            self.truth,
+            vehicle,
+            latency=self.latency,
+            mounting_is_known=self.is_mounted,
+        )
+        if self.mounting is None or not self.is_mounted:
+            return (*self.checks, *found)
+        # Right axes have right signs, and gravity says the unit.
+        evidence = self.mounting.evidence
+        settled = {f"{n}.sign" for n in MOUNTED}
+        known = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in found]
+        shown = [k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)]
+        return (*self.checks, *shown)
+
+
+def survey_log(
+    log: DriveLog,
+    mapping: Mapping,
+    clocks: dict[str, ClockModel],
+    span_ns: tuple[int, int],
+    truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    rescale: bool = True,
+) -> Survey:
+    """Read a span of a log and find how its IMU is mounted, and what unit or sign is wrong.
+
+    A recognised mapping is turned and scaled where that is certain, with a note; a mapping file is only checked.
+
+    Parameters
+    ----------
+    rescale : whether a wrong unit or sign is looked for.
+    """
+    triads = find_triads(log, mapping)
+    extra: dict[str, SignalSource] = {}
+    for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
+        extra |= {} if triad is None else triad.components(names)
+    channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
+    truth_plan = plan_truth(channels.truth, truth_position_m=truth_position_m) if channels.truth else None
+    truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
+    # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
+    found = find_mounting(channels.signals, {}, None, triads, mapping)
+    blind = found is not None and found.confident
+    if not blind and truth is not None:
+        found = find_mounting(channels.signals, channels.truth, truth, triads, mapping)
+    channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
+    if found is not None and mapping.origin == "auto" and blind and not found.is_as_named:
+        note = f"{found.text}, and is read so: {found.evidence}"
+        signals = turned_signals(mapping, found, triads)
+        mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
+        channels = read_signals(log, mapping, clocks, *span_ns)
+        found = replace(found, named=found.rows)
+    survey = Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), triads, found)
+    if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
+        return survey_log(log, scaled, clocks, span_ns, truth_position_m, rescale=False)
+    return survey
+
+
+def _rescaled(survey: Survey) -> Mapping:
+    """Return a recognised mapping with the one unit or sign undone that alone contradicts all else, with a note.
+
+    Of the signals by themselves alone; of the truth by them and by itself.
+    """
+    mapping = survey.mapping
+    alone = replace(survey.channels, truth={})
+    found = explained_factors(alone, None, known_mounting=survey.is_mounted, most=1)
+    if not found and survey.truth is not None:
+        every = explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted, most=1)
+        found = every if all(n.startswith("truth.") for n in every) else {}
+    for subject, (factor, evidence) in found.items():
+        name = subject.removeprefix("truth.")
+        section = dict(mapping.truth if subject.startswith("truth.") else mapping.signals)
+        if name not in section:
+            continue
+        section[name] = scaled_source(section[name], factor)
+        mapping = replace(mapping, truth=section) if name != subject else replace(mapping, signals=section)
+        note = f"{subject} is read with {factor:.6g} times its scale: {evidence}"
+        mapping = replace(mapping, notes=(*mapping.notes, note))
+    return mapping
+
+
+def scaled_source(source: SignalSource, factor: float) -> SignalSource:
+    """Return a source whose values are multiplied by a factor."""
+
+    def times(value: float | tuple[float, ...]) -> float | tuple[float, ...]:
+        return tuple(v * factor for v in value) if isinstance(value, tuple) else value * factor
+
+    # A range of wrong values would drop the right ones.
+    return replace(source, scale=times(source.scale), offset=times(source.offset), valid_min=None, valid_max=None)
+
+
+def truth_latency(channels: MappedChannels, truth: TruthTrack | None) -> LatencyEstimate | None:
+    """Return how late the truth is against the gyro, or the gyro against the truth; None where one is missing."""
+    gyro = channels.signals.get("yaw_rate_rad_s")
+    if truth is None or gyro is None or not len(gyro):
+        return None
+    rate = channels.truth.get("yaw_rate_rad_s") or yaw_rate_channel(truth)
+    if not len(rate):
+        return None
+    found = estimate_truth_latency(gyro, rate)
+    speed = channels.signals.get("speed_m_s")
+    other = None
+    if speed is not None and speed.source.split(".")[0] != gyro.source.split(".")[0]:
+        vx = channel_of(truth, "vx_m_s")
+        other = estimate_truth_latency(speed, vx) if min(len(speed), len(vx)) >= 2 else None
+    return booked_on_the_late(found, other)
+
+
+def turned_signals(
+    mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]
+) -> dict[str, SignalSource]:
+    """Return the mapping's signals with forward, left and up of the sensor as it is mounted."""
+    accelerations, rates = triads
+    assert accelerations is not None and rates is not None
+    signals = dict(mapping.signals)
+    for i, name in enumerate(MOUNTED):
+        if name in signals:
+            signals[name] = (rates if i == 2 else accelerations).turned(signals[name], mounting.rows[i])
+    return signals
+
+
+def mounting_checks(mapping: Mapping, mounting: Mounting, triads: tuple[Triad | None, Triad | None]) -> list[Check]:
+    """Return for each of the IMU's signals whether it is read from the axis that the drive says."""
+    turned = turned_signals(mapping, mounting, triads)
+    checks = []
+    for i, name in enumerate(MOUNTED):
+        if name not in mapping.signals:
+            continue
+        right = np.allclose(mounting.rows[i], mounting.named[i], atol=1e-3)
+        if right:
+            if mounting.confident:
+                checks.append(Check(f"{name}.mounting", name, "passed", mounting.evidence))
+            continue
+        source = turned[name]
+        remedy = f"in the mapping: field = {_shown(source.field)}, scale = {_shown(source.scale)}"
+        evidence = f"{mounting.text}: {mounting.evidence}"
+        verdict: Verdict = "failed" if mounting.confident else "undecided"
+        checks.append(Check(f"{name}.mounting", name, verdict, evidence, remedy))
+    return checks
+
+
+def _shown(value: object) -> str:
+    return repr(list(value)).replace("'", '"') if isinstance(value, tuple) else repr(value).replace("'", '"')

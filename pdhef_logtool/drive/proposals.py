@@ -1,0 +1,180 @@
+"""What a drive shows to be wrong with its sensors and its truth: where each correction belongs, and its one use.
+
+Unit, sign, mounting, a turned truth and a recorder's delay belong in the mapping; the accelerometer's place, the gyro's
+gain and what is left of its delay in the car's fit. Each is measured on what mapping and car already take off, and a
+delay in the car is the whole one: applied in any order, each is taken off once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from collections.abc import Mapping as Mapped
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.checks import (
+    LEVER_M,
+    SURE,
+    drive_columns,
+    explained_factors,
+    is_turned,
+    sensor_errors,
+    sideslip_offset,
+)
+from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
+from pdhef_logtool.drive.truth import LATE_GYRO_S, LatencyEstimate, TruthTrack
+from pdhef_logtool.mapping.records import Mapping, SignalSource
+from pdhef_logtool.records.signals import Channel
+
+#: A gain or a lever that is smaller changes no estimate by what can be seen; it stays as it is.
+LEAST_GAIN = 0.01
+LEAST_LEVER_M = 0.3 * LEVER_M
+#: Beyond, it is no gain but a unit, and no place in a car.
+MOST_GAIN = 0.25
+MOST_LEVER_M = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal:
+    """One correction.
+
+    Attributes
+    ----------
+    home : where it goes. subject : signal, or ``truth.QUANTITY``. evidence : one sentence with figures.
+    source : of the subject as it should be read, for the mapping.
+    entries : of the vehicle, ``sensors.NAME`` inside it, with their standard ``error``.
+    """
+
+    home: Literal["mapping", "car"]
+    subject: str
+    evidence: str
+    source: SignalSource | None = None
+    entries: dict[str, Any] = field(default_factory=dict)
+    error: float = 0.0
+
+
+def apply_proposals(
+    proposals: Iterable[Proposal], mapping: Mapping, vehicle: VehicleParameters
+) -> tuple[Mapping, VehicleParameters]:
+    """Return mapping and vehicle with the corrections in them, each with a note where the mapping has it."""
+    for proposal in proposals:
+        if proposal.source is not None:
+            is_truth = proposal.subject.startswith("truth.")
+            section = dict(mapping.truth if is_truth else mapping.signals)
+            section[proposal.subject.removeprefix("truth.")] = proposal.source
+            mapping = replace(mapping, truth=section) if is_truth else replace(mapping, signals=section)
+            mapping = replace(mapping, notes=(*mapping.notes, f"{proposal.subject}: {proposal.evidence}"))
+        for entry, value in proposal.entries.items():
+            part, _, name = entry.rpartition(".")
+            inner = vehicle.sensors.model_copy(update={name: value}) if part == "sensors" else value
+            vehicle = vehicle.model_copy(update={part or name: inner})
+    return mapping, vehicle
+
+
+def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
+    """Return the mountings, units, signs and delays that the first minutes of a drive ask for; no doubtful one."""
+    mapping = survey.mapping
+    found: list[Proposal] = []
+    signals, truth = dict(mapping.signals), dict(mapping.truth)
+    mounting = survey.mounting
+    is_turned_imu = mounting is not None and mounting.confident and not mounting.is_as_named
+    if mounting is not None and is_turned_imu:
+        for name, source in turned_signals(mapping, mounting, survey.triads).items():
+            if source != signals[name]:
+                signals[name] = source
+                found.append(Proposal("mapping", name, f"{mounting.text}: {mounting.evidence}", source))
+    factors = (
+        {} if is_turned_imu else explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted)
+    )
+    for subject, (factor, evidence) in factors.items():
+        section = truth if subject.startswith("truth.") else signals
+        name = subject.removeprefix("truth.")
+        if name in section:
+            section[name] = scaled_source(section[name], factor)
+            found.append(Proposal("mapping", subject, evidence, section[name]))
+    if not factors and not is_turned_imu:
+        found += _of_a_turned_truth(survey)
+    delay = 0.0 if survey.latency is None else survey.latency.gyro_delay_s
+    gyro = signals.get("yaw_rate_rad_s")
+    if gyro is not None and delay >= LATE_GYRO_S and survey.latency is not None:
+        late = replace(gyro, latency_s=round(gyro.latency_s + delay, 4))
+        found.append(Proposal("mapping", gyro.name, survey.latency.reason, late))
+    return tuple(found)
+
+
+def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
+    """Return the sources of a truth whose sideslip is off by a constant, as far as a mapping can turn them back."""
+    columns, _ = drive_columns(survey.channels.signals, survey.channels.truth, survey.truth)
+    found = sideslip_offset(columns)
+    if found is None or survey.truth is None or not is_turned(*found):
+        return []
+    offset, error = found
+    truth = survey.mapping.truth
+    evidence = f"sideslip is {math.degrees(offset):.2f} +- {math.degrees(error):.2f} deg where the car goes straight"
+    vx, vy = truth.get("vx_m_s"), truth.get("vy_m_s")
+    changed: dict[str, SignalSource] = {}
+    if "sideslip_rad" in truth:
+        source = truth["sideslip_rad"]
+        changed["sideslip_rad"] = replace(source, offset=_single(source.offset) - offset)
+    elif vx is not None and vy is not None:
+        if (vx.topic, vx.stamp) == (vy.topic, vy.stamp) and isinstance(vx.field, str) and isinstance(vy.field, str):
+            c, s, fields = math.cos(offset), math.sin(offset), (vx.field, vy.field)
+            ahead, left = _single(vx.scale), _single(vy.scale)
+            changed["vx_m_s"] = replace(vx, field=fields, scale=(c * ahead, s * left))
+            changed["vy_m_s"] = replace(vy, field=fields, scale=(-s * ahead, c * left))
+    elif "yaw_rad" in truth:
+        changed["yaw_rad"] = replace(truth["yaw_rad"], offset=_single(truth["yaw_rad"].offset) + offset)
+    return [Proposal("mapping", f"truth.{n}", evidence, source, error=error) for n, source in changed.items()]
+
+
+def _single(value: float | tuple[float, ...]) -> float:
+    return value[0] if isinstance(value, tuple) else value
+
+
+def car_proposals(
+    channels: Mapped[str, Channel],
+    truth: TruthTrack,
+    latency: LatencyEstimate | None,
+    gyro_latency_s: float,
+    vehicle: VehicleParameters,
+) -> tuple[Proposal, ...]:
+    """Return what regression on truth says of place, gain and delay of the sensors beside what the vehicle knows.
+
+    Parameters
+    ----------
+    channels : as measured, mapped right. gyro_latency_s : what was taken off the gyro's stamps already.
+    """
+    if latency is not None and "yaw_rate_rad_s" in channels:  # late, it would look smaller than it is
+        gyro = channels["yaw_rate_rad_s"]
+        early = replace(gyro, stamps_ns=gyro.stamps_ns - round(latency.gyro_delay_s * 1e9))
+        channels = {**channels, "yaw_rate_rad_s": early}
+    columns, _ = drive_columns(channels, {}, truth)
+    errors = sensor_errors(columns)
+    found: list[Proposal] = []
+    x, *rest = vehicle.imu_position_m
+    off_m = abs(errors.lever_m - x)
+    if max(LEAST_LEVER_M, SURE * errors.lever_error_m) < off_m < MOST_LEVER_M:
+        evidence = f"a_y goes with {errors.lever_m:.2f} +- {errors.lever_error_m:.2f} m of the yaw acceleration"
+        place = {"imu_position_m": (round(errors.lever_m, 3), *rest)}
+        found.append(Proposal("car", "ay_m_s2", evidence, entries=place, error=errors.lever_error_m))
+    off = abs(errors.yaw_rate_gain - vehicle.sensors.yaw_rate_gain)
+    if max(LEAST_GAIN, SURE * errors.gain_error) < off < MOST_GAIN:
+        evidence = f"the gyro reads {errors.yaw_rate_gain:.3f} +- {errors.gain_error:.3f} of the truth's yaw rate"
+        gain = {"sensors.yaw_rate_gain": round(errors.yaw_rate_gain, 4)}
+        found.append(Proposal("car", "yaw_rate_rad_s", evidence, entries=gain, error=errors.gain_error))
+    if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
+        delay = {"sensors.yaw_rate_delay_s": round(gyro_latency_s + latency.gyro_delay_s, 4)}
+        found.append(Proposal("car", "yaw_rate_rad_s", latency.reason, entries=delay, error=latency.std_error_s))
+    return tuple(found)
+
+
+def surest(proposals: Iterable[Proposal]) -> tuple[Proposal, ...]:
+    """Return of several drives' proposals for a car the best known one for each entry."""
+    best: dict[tuple[str, ...], Proposal] = {}
+    for proposal in proposals:
+        key = tuple(proposal.entries)
+        if key not in best or proposal.error < best[key].error:
+            best[key] = proposal
+    return tuple(best.values())

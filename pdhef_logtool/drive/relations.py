@@ -1,0 +1,508 @@
+"""What rigid-body kinematics wants of pairs of signals, and the mistakes that explain where a drive contradicts it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
+
+DEGREE = float(np.pi / 180.0)
+G = 9.80665
+
+#: Below this correlation a gain says nothing; above it, it is known to its reciprocal.
+MIN_CORRELATION = 0.6
+#: And it must stand so far out of chance, by Fisher's z of the independent samples.
+MIN_CHANCE_Z = 3.0
+#: Independent samples below which nothing is said: 3 s of driving.
+MIN_SAMPLES = 6.0
+#: Two sides that move, and not with one another: another field was mapped. Crossfall and grade alone move an
+#: accelerometer by less than this (5 % are 0.5 m/s^2), and noise of 1 Hz bandwidth moves a gyro by less.
+UNRELATED_CORRELATION = 0.25
+MOVES_M_S2 = 1.0
+MOVES_RAD_S = 0.06
+#: Gains between these are tyres, roll, bank, grade and noise; beyond them they are units.
+GAIN_RANGE = (0.55, 1.8)
+#: The same quantity measured twice.
+SAME_RANGE = (0.75, 1.33)
+#: a_y - v_x r over the derivative of v_y: small differences of large quantities, of a body that rolls.
+SIDESLIP_RANGE = (0.3, 3.0)
+#: Slip of a rear axle at 1 m/s^2: cornering stiffness over load is 4 to 40 per rad, and much less where a model car
+#: drifts. It tells a sign, no unit.
+COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
+#: Of the truth ahead of the rear axle. A truth that stands near that axle says nothing: its lever may be of any sign.
+REAR_LEVER_M = (1.0, 12.0)
+#: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
+STRAIGHT_M_S2 = 3.0
+#: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
+WHEEL_RANGE = (0.88, 1.14)
+WHEEL_PER_RADIAN_RANGE = (1.25, 25.0)
+#: Effective wheelbase L (1 + K v²) from road-wheel and from steering-wheel angles; m.
+ROAD_WHEEL_LENGTH_M = (0.15, 12.0)
+STEERING_WHEEL_LENGTH_M = (12.0, 240.0)
+#: Track from a 1:10 car to a truck.
+TRACK_M = (0.12, 3.0)
+#: Share of the drive's lateral acceleration up to which the steering angle is held against the curvature: beyond, the
+#: front tyres slip.
+STEERING_SHARE = 0.6
+#: Typical values that recognise one quantity recorded as another.
+TYPICAL_STEERING_RATIO = 16.0
+TYPICAL_WHEEL_RADIUS_M = 0.3
+_TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f in (t, 1.0 / t)),)
+#: By so much in the logarithm must one unit fit better than another: km/h and mph are 0.48 apart.
+CLEARLY_NEARER = 0.25
+#: No more mistakes than this are looked for at once.
+MAX_MISTAKES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """One relation with its measured gain; ``powers`` say how the gain grows with each signal's own scale.
+
+    Attributes
+    ----------
+    expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
+        together, move by more than what disturbs them. signless : a side is a size.
+    """
+
+    text: str
+    powers: dict[str, int]
+    correlation: float
+    gain: float
+    expected: tuple[float, float]
+    samples: float
+    moves: bool = False
+    signless: bool = False
+
+    @property
+    def tells(self) -> bool:
+        """Return whether the drive excites the relation enough for a verdict."""
+        return abs(self.correlation) >= MIN_CORRELATION and self._chance_z >= MIN_CHANCE_Z
+
+    @property
+    def unrelated(self) -> bool:
+        """Return whether the sides move, and not with one another."""
+        return self.moves and self.samples >= 4.0 * MIN_SAMPLES and abs(self.correlation) < UNRELATED_CORRELATION
+
+    @property
+    def _chance_z(self) -> float:
+        bounded = min(abs(self.correlation), 1.0 - 1e-9)
+        return float(np.arctanh(bounded) * np.sqrt(max(self.samples - 3.0, 0.0)))
+
+    def accepts(self, factor: float = 1.0) -> bool:
+        """Return whether the gain is plausible after multiplying it with ``factor``.
+
+        It lies between the two regressions, which are correlation x gain and gain / correlation.
+        """
+        gain, known = self.gain * factor, abs(self.correlation)
+        gain = abs(gain) if self.signless else gain
+        return gain / known >= self.expected[0] and gain * known <= self.expected[1]
+
+    @property
+    def evidence(self) -> str:
+        """What was measured, in words."""
+        low, high = self.expected
+        return (
+            f"{self.text}: gain {self.gain:.3g} where {low:.3g} to {high:.3g} is plausible, correlation "
+            f"{self.correlation:.2f}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """A mistake that mappings are known to make: ``factors`` by signal undo it. ``kind``: sign or unit."""
+
+    factors: dict[str, float]
+    words: str
+    kind: str
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the factors are those of units and signs, not a typical steering ratio or wheel radius."""
+        return not any(abs(f) in _TYPICAL for f in self.factors.values())
+
+    def acts_on(self, relation: Relation) -> float:
+        """Return what undoing it multiplies the relation's gain with."""
+        return float(np.prod([f ** relation.powers.get(name, 0) for name, f in self.factors.items()]))
+
+
+def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[Relation]:
+    """Return every relation that the columns allow, whether it tells or not.
+
+    Parameters
+    ----------
+    columns : on the grid, SI, by signal name; those of truth begin with ``truth.``.
+    speed_name : the column that stands for the speed.
+    """
+    found: list[Relation] = []
+    speed = None if speed_name is None else columns[speed_name]
+    for prefix in ("", "truth."):
+        pace_name = f"{prefix}vx_m_s" if f"{prefix}vx_m_s" in columns else speed_name
+        pace = None if pace_name is None else columns[pace_name]
+        if pace_name is not None and pace is not None:
+            found += _motion(columns, prefix, pace_name, pace)
+    if speed_name is not None and speed is not None:
+        found += _steering(columns, speed_name, speed)
+        found += _speeds(columns, speed_name, speed)
+        found += _wheel_differences(columns, speed_name, speed)
+        found += _courses(columns, moving_at(speed))
+    found += _twice(columns, "yaw_rate_rad_s", "truth.yaw_rate_rad_s", MOVES_RAD_S)
+    found += _twice(columns, "ay_m_s2", "truth.ay_m_s2", MOVES_M_S2)
+    return found + _sideslips(columns)
+
+
+def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mistake]) -> list[tuple[Mistake, ...]]:
+    """Return the smallest sets of mistakes that make every relation that tells plausible; ``[()]``: there is none.
+
+    Empty where no set of ``MAX_MISTAKES`` does. A sign explains without a unit, and either of them without the other.
+    """
+    telling = [r for r in relations if r.tells]
+    failed = [r for r in telling if not r.accepts()]
+    if not failed:
+        return [()]
+    names = {n for r in failed for n in r.powers}
+    useful = [m for m in mistakes if names & set(m.factors)]
+    for size in range(1, MAX_MISTAKES + 1):
+        found = [
+            chosen
+            for chosen in combinations(useful, size)
+            if len({n for m in chosen for n in m.factors}) == sum(len(m.factors) for m in chosen)
+            and all(r.accepts(float(np.prod([m.acts_on(r) for m in chosen]))) for r in telling)
+        ]
+        if found:
+            simplest = min(_cost(chosen) for chosen in found)
+            cheap = [chosen for chosen in found if _cost(chosen) == simplest]
+            return [c for c in cheap if not any(_signals(other) < _signals(c) for other in cheap)]
+    return []
+
+
+def best_explanation(
+    relations: Sequence[Relation], explanations: Sequence[tuple[Mistake, ...]]
+) -> tuple[Mistake, ...] | None:
+    """Return the one explanation, or of several for the same signals the one of gains near 1; None: neither."""
+    if not explanations or len({_signals(e) for e in explanations}) > 1:
+        return None
+
+    def misfit(chosen: tuple[Mistake, ...]) -> float:
+        near_one = [r for r in relations if r.tells and r.expected[0] < 1.0 < r.expected[1]]
+        touched = [r for r in near_one if _signals(chosen) & set(r.powers)]
+        gains = [abs(r.gain * float(np.prod([m.acts_on(r) for m in chosen]))) for r in touched]
+        return float(np.mean(np.abs(np.log(gains)))) if gains else np.inf
+
+    ordered = sorted(explanations, key=misfit)
+    if len(ordered) > 1 and not misfit(ordered[1]) - misfit(ordered[0]) > CLEARLY_NEARER:
+        return None
+    return ordered[0]
+
+
+def _signals(chosen: tuple[Mistake, ...]) -> frozenset[str]:
+    return frozenset(n for m in chosen for n in m.factors)
+
+
+def _cost(chosen: tuple[Mistake, ...]) -> int:
+    return sum(2 if m.kind == "sign and unit" else 1 for m in chosen)
+
+
+def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = ()) -> list[Mistake]:
+    """List the mistakes that mappings are known to make with these signals.
+
+    Parameters
+    ----------
+    together : signals of one sensor, whose signs are wrong together where it is mounted upside down or backwards.
+    """
+    out: list[Mistake] = []
+    for name in names:
+        bare = name.removeprefix("truth.")
+        units = _units(bare)
+        out += [Mistake({name: factor}, f"{name} {words}", "unit") for factor, words in units]
+        out.append(Mistake({name: -1.0}, f"{name} has the wrong sign", "sign"))
+        out += [
+            Mistake({name: -factor}, f"{name} {words} and has the wrong sign", "sign and unit")
+            for factor, words in units
+        ]
+    for group in together:
+        present = [n for n in group if n in names]
+        for size in range(2, len(present) + 1):
+            for part in combinations(present, size):
+                words = f"{' and '.join(part)} have the wrong sign"
+                out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
+                shared = dict(_units(part[0].removeprefix("truth.")))
+                for name in part[1:]:
+                    own = dict(_units(name.removeprefix("truth.")))
+                    shared = {f: text for f, text in shared.items() if f in own}
+                words = " and ".join(part)
+                out += [Mistake(dict.fromkeys(part, f), f"{words}: each {text}", "unit") for f, text in shared.items()]
+    return out
+
+
+def _units(name: str) -> list[tuple[float, str]]:
+    """Return by what a signal is off where its unit is taken for another, and how that is said."""
+    to_radians = [(DEGREE, "is in degrees"), (1.0 / DEGREE, "was converted from degrees twice")]
+    of_speeds = [(1.0 / 3.6, "is in km/h"), (3.6, "was converted from km/h twice"), (0.44704, "is in mph")]
+    if name == "yaw_rate_rad_s" or name == "sideslip_rad":
+        return to_radians
+    if name == "steer_rad":
+        return [*to_radians, (1.0 / TYPICAL_STEERING_RATIO, "is the steering-wheel angle")]
+    if name == "steering_wheel_rad":
+        return [*to_radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")]
+    if name in ("ax_m_s2", "ay_m_s2"):
+        return [(G, "is in g"), (1.0 / G, "was converted from g twice")]
+    if name in ("vx_m_s", "vy_m_s", "speed_m_s"):
+        return [*of_speeds, (1e-3, "is in mm/s")]
+    if name.startswith("wheel_speed") and name.endswith("_rad_s"):
+        return [(2.0 * np.pi / 60.0, "is in rpm"), (1.0 / TYPICAL_WHEEL_RADIUS_M, "is in m/s")]
+    if name.startswith("wheel_speed"):
+        return [*of_speeds, (TYPICAL_WHEEL_RADIUS_M, "is in rad/s")]
+    return []
+
+
+# ------------------------------------------------------------------------------------------- relations
+
+
+def compare(
+    text: str,
+    powers: dict[str, int],
+    reference: FloatArray,
+    measured: FloatArray,
+    use: BoolArray,
+    expected: tuple[float, float],
+    *,
+    moves: float | None = None,
+    either: bool = True,
+) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
+    """Return the relation between two columns where ``use`` and both are known; none without driving.
+
+    ``moves``: both sides have one unit, and one that moves by more than this, 1-sigma, must move the other; with
+    ``either`` False the reference must move the measured side only.
+    """
+    use = use & np.isfinite(reference) & np.isfinite(measured)
+    samples = independent_samples(int(np.count_nonzero(use)))
+    if samples < MIN_SAMPLES:
+        return []
+    a, b = reference[use] - reference[use].mean(), measured[use] - measured[use].mean()
+    spread_a, spread_b = float(a.std()), float(b.std())
+    if max(spread_a, spread_b) <= 1e-12:
+        return []
+    both = moves is not None and (max(spread_a, spread_b) if either else spread_a) > moves
+    if min(spread_a, spread_b) <= 1e-12:
+        return [Relation(text, powers, 0.0, float("nan"), expected, samples, both)]
+    correlation = float(np.mean(a * b) / (spread_a * spread_b))
+    # The ratio of the spreads lies between the two regressions, neither of which knows where the noise is.
+    gain = float(np.copysign(spread_b / spread_a, correlation))
+    return [Relation(text, powers, correlation, gain, expected, samples, both)]
+
+
+def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
+    """Relate the accelerations to speed and yaw rate, of the sensors or of the truth."""
+    found: list[Relation] = []
+    moving = moving_at(pace)
+    yaw, left, forward = (columns.get(f"{prefix}{n}") for n in ("yaw_rate_rad_s", "ay_m_s2", "ax_m_s2"))
+    if yaw is not None and left is not None:
+        powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
+        text = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed"
+        found += compare(text, powers, yaw * pace, left, moving, GAIN_RANGE, moves=MOVES_M_S2)
+    if forward is not None:
+        powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
+        text = f"{prefix}ax_m_s2 against the derivative of the speed"
+        with np.errstate(invalid="ignore"):
+            straight = moving if yaw is None else moving & (np.abs(yaw * pace) < STRAIGHT_M_S2)
+        # A pitching body moves a_x without any change of the speed, and noise the derivative of a satellite's.
+        moves = None if pace_name == "truth.vx_m_s" else MOVES_M_S2
+        reference = derivative(pace)
+        found += compare(text, powers, reference, forward, straight, GAIN_RANGE, moves=moves, either=False)
+    return found
+
+
+def gentle_at(lateral_m_s2: FloatArray, moving: BoolArray) -> BoolArray:
+    """Return where the car moves and corners gently by the drive's own measure."""
+    size = np.abs(lateral_m_s2)
+    known = moving & np.isfinite(size)
+    if not known.any():
+        return moving
+    with np.errstate(invalid="ignore"):
+        return np.asarray(moving & (size <= STEERING_SHARE * np.quantile(size[known], 0.95)))
+
+
+def _steering(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
+    found: list[Relation] = []
+    yaw = columns.get("yaw_rate_rad_s")
+    if yaw is None:
+        return found
+    moving = moving_at(speed)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curvature = yaw / speed
+    gentle = gentle_at(yaw * speed, moving)
+    for name, lengths in (("steer_rad", ROAD_WHEEL_LENGTH_M), ("steering_wheel_rad", STEERING_WHEEL_LENGTH_M)):
+        steer = columns.get(name)
+        if steer is None:
+            continue
+        powers = {name: 1, "yaw_rate_rad_s": -1, speed_name: 1}
+        either = [
+            r
+            for use in (moving, gentle)
+            for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
+        ]
+        # Sliding front tyres break the relation, and so does noise where there is little of it.
+        found += sorted(either, key=lambda r: abs(r.correlation))[-1:]
+        if "ay_m_s2" in columns:
+            powers = {"ay_m_s2": 1, name: -1, speed_name: -2}
+            text = f"ay_m_s2 against {name} x speed^2"
+            inverse = (1.0 / lengths[1], 1.0 / lengths[0])
+            found += compare(text, powers, steer * speed**2, columns["ay_m_s2"], gentle, inverse)
+    return found
+
+
+def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
+    """Relate wheel speeds and the truth's speeds to the speed: one quantity, so that the ratio tells at any driving."""
+    wanted = {f"wheel_speed_{w}_m_s": WHEEL_RANGE for w in WHEELS}
+    wanted |= {f"wheel_speed_{w}_rad_s": WHEEL_PER_RADIAN_RANGE for w in WHEELS}
+    wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
+    found = []
+    moving = moving_at(speed)
+    for name, expected in wanted.items():
+        column = columns.get(name)
+        if column is None or name == speed_name:
+            continue
+        use = moving & np.isfinite(column)
+        samples = independent_samples(int(np.count_nonzero(use)))
+        if samples < MIN_SAMPLES:
+            continue
+        ratio = float(np.median(column[use] / speed[use]))
+        relation = Relation(f"{name} over {speed_name}", {name: 1, speed_name: -1}, 1.0, ratio, expected, samples)
+        found.append(replace(relation, signless=name == "truth.position_speed_m_s"))
+    return found
+
+
+def yaw_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
+    """Return other measurements of the yaw rate than the gyro's, to any factor; steering has no certain sign."""
+    found = [(n, columns[n]) for n in ("truth.course_rate_rad_s", "truth.yaw_rate_rad_s") if n in columns]
+    if speed_name is None:
+        return found
+    speed = columns[speed_name]
+    return found + _axle_differences(columns, speed)
+
+
+def steering_references(columns: Mapping[str, FloatArray], speed_name: str | None) -> list[tuple[str, FloatArray]]:
+    """Return the steering angles times the speed, to any factor: a yaw rate whose sign is often recorded wrong."""
+    steers = [] if speed_name is None else [n for n in ("steer_rad", "steering_wheel_rad") if n in columns]
+    return [(f"{n} x speed", columns[n] * columns[str(speed_name)]) for n in steers]
+
+
+def _axle_differences(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[tuple[str, FloatArray]]:
+    """Return what the wheels of each axle turn faster on the right, scaled to the speed: radii and units aside."""
+    moving = moving_at(speed)
+    found = []
+    for unit in ("m_s", "rad_s"):
+        for axle in ("r", "f"):
+            pair = [columns.get(f"wheel_speed_{axle}{side}_{unit}") for side in "lr"]
+            scaled = [_scaled_to(w, speed, moving) for w in pair if w is not None]
+            if len(scaled) == 2:
+                found.append((f"wheel speeds {axle}r - {axle}l", scaled[1] - scaled[0]))
+    return found
+
+
+def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArray) -> list[Relation]:
+    """Relate yaw rate and a_y to what the wheels of an axle turn faster on the right: no wheel is mounted wrong."""
+    moving = moving_at(speed)
+    pairs = _axle_differences(columns, speed)
+    found = []
+    for name, factor, powers in (
+        ("yaw_rate_rad_s", np.ones_like(speed), {"yaw_rate_rad_s": -1, speed_name: 1}),
+        ("ay_m_s2", speed, {"ay_m_s2": -1, speed_name: 2}),
+    ):
+        if name in columns:
+            either = [
+                r
+                for text, difference in pairs
+                for r in compare(f"{text} against {name}", powers, columns[name], factor * difference, moving, TRACK_M)
+            ]
+            found += sorted(either, key=lambda r: abs(r.correlation))[-1:]
+    return found
+
+
+def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> FloatArray:
+    use = moving & np.isfinite(wheel) & np.isfinite(speed)
+    ratio = float(np.median(wheel[use] / speed[use])) if use.any() else 0.0
+    return wheel / ratio if ratio != 0.0 else np.full(wheel.shape[0], np.nan)
+
+
+def _courses(columns: Mapping[str, FloatArray], moving: BoolArray) -> list[Relation]:
+    """Relate the yaw rates to the rate of the truth's course over ground."""
+    course = columns.get("truth.course_rate_rad_s")
+    if course is None:
+        return []
+    found = []
+    for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
+        if name in columns:
+            text = f"{name} against the turning of the truth's path"
+            found += compare(text, {name: 1}, course, columns[name], moving, GAIN_RANGE, moves=MOVES_RAD_S)
+    return found
+
+
+def _twice(columns: Mapping[str, FloatArray], sensor: str, truth: str, moves: float) -> list[Relation]:
+    if sensor not in columns or truth not in columns:
+        return []
+    everywhere = np.ones(columns[sensor].shape[0], np.bool_)
+    powers = {truth: 1, sensor: -1}
+    expected = SAME_RANGE if sensor.startswith("yaw") else GAIN_RANGE
+    return compare(
+        f"{truth} against {sensor}", powers, columns[sensor], columns[truth], everywhere, expected, moves=moves
+    )
+
+
+def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
+    """Relate the truth's sideslip to a_y and curvature: by kinematics where it moves fast, by the rear axle else.
+
+    a_y - v_x r is the derivative of v_y; the lever of an accelerometer, the roll of the body and a bias stand beside
+    it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
+    curvature times a lever, less a_y times the compliance of the rear tyres.
+    """
+    names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s")
+    if not all(n in columns for n in names):
+        return []
+    ay, vx, vy, rate = (columns[n] for n in names)
+    subject = "truth.sideslip_rad" if "truth.sideslip_rad" in columns else "truth.vy_m_s"
+    sideslip = columns.get("truth.sideslip_rad", np.arctan2(vy, vx))
+    moving, one = moving_at(vx), np.ones_like(ay)
+    text = f"ay_m_s2 - v_x r against the derivative of {subject}"
+    kinematic = _partial(
+        text, {subject: -1, "ay_m_s2": 1}, derivative(vy), ay, [derivative(rate), vx * rate, one], moving
+    )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        curvature = rate / vx
+    text = f"{subject} against -ay_m_s2, apart from curvature"
+    gentle = gentle_at(vx * rate, moving)
+    handling = _partial(text, {subject: 1, "ay_m_s2": -1}, -ay, sideslip, [curvature, one], gentle)
+    text = f"{subject} against curvature, apart from a_y"
+    powers = {subject: 1, "truth.yaw_rate_rad_s": -1}
+    rolling = _partial(text, powers, curvature, sideslip, [ay, one], gentle)
+    return [
+        *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
+        *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
+        *(replace(r, expected=REAR_LEVER_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]),
+    ]
+
+
+def _partial(
+    text: str,
+    powers: dict[str, int],
+    reference: FloatArray,
+    measured: FloatArray,
+    others: list[FloatArray],
+    use: BoolArray,
+) -> list[Relation]:
+    """Return the relation between what regression on other columns leaves of two columns."""
+    known = use & np.isfinite(np.stack([reference, measured, *others])).all(axis=0)
+    if independent_samples(int(np.count_nonzero(known))) < 2.0 * MIN_SAMPLES:
+        return []
+    aside = np.stack(others, axis=1)[known]
+    left = []
+    for column in (reference, measured):
+        out = np.full(column.shape[0], np.nan)
+        out[known] = column[known] - aside @ np.linalg.lstsq(aside, column[known], rcond=None)[0]
+        left.append(out)
+    return compare(text, powers, left[0], left[1], known, (0.0, np.inf))

@@ -1,0 +1,165 @@
+"""An IMU in every mounting is read as if it were x forward, z up; what is doubtful is said and not applied."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.mounting import Mounting, find_mounting, survey_log
+from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
+from pdhef_logtool.inspection.report import inspect_drive_log, write_mapping
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import auto_map, fit_clocks, load_mapping, read_signals, resolve_mapping
+from pdhef_logtool.mapping.triads import ACCELERATIONS, RATES, find_triads
+from pdhef_logtool.records.signals import Signals, join_signals
+from tests.turned_log import TurnedLog, rotation
+
+ANGLES = [(r, p, y) for r, p, y in product((0, 90, 180, 270), (0, 90, 270), (0, 90, 180, 270)) if p == 0 or r == 0]
+assert len({np.rint(rotation(*a)).tobytes() for a in ANGLES}) == 24
+IMU = ("ax_m_s2", "ay_m_s2", "yaw_rate_rad_s")
+
+
+@pytest.fixture(scope="module")
+def log(sample_logs_dir: Path):
+    opened = open_log(sample_logs_dir / "faults.mcap")
+    yield opened
+    opened.close()
+
+
+def planned(log, mapping=None) -> DrivePlan:
+    mapping = auto_map(log).mapping if mapping is None else mapping
+    return plan_drive(log, mapping, default_vehicle(), log.start_ns, log.end_ns)
+
+
+def signals_of(log, plan: DrivePlan, window_s: float = 600.0) -> Signals:
+    windows = DriveReader(log, plan, window_s).windows()
+    return join_signals([w.signals for w in windows if len(w.signals)])
+
+
+def difference(a: Signals, b: Signals) -> float:
+    return max(float(np.nanmax(np.abs(getattr(a, n) - getattr(b, n)))) for n in IMU)
+
+
+@pytest.fixture(scope="module")
+def components(log):
+    """Channels of a log with the six components of its IMU, and what else finding a mounting takes."""
+    mapping = resolve_mapping(log, auto_map(log).mapping)
+    triads = find_triads(log, mapping)
+    extra = {**triads[0].components(ACCELERATIONS), **triads[1].components(RATES)}
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    sources = replace(mapping, signals={**mapping.signals, **extra})
+    return read_signals(log, sources, clocks, log.start_ns, log.end_ns), triads, mapping
+
+
+@pytest.mark.parametrize("angles", ANGLES)
+def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles: tuple[float, float, float]) -> None:
+    channels, triads, mapping = components
+    turn = rotation(*angles)
+    signals = dict(channels.signals)
+    for names in (ACCELERATIONS, RATES):
+        turned = np.stack([signals[n].values for n in names], axis=1) @ turn
+        signals |= {n: replace(signals[n], values=turned[:, i]) for i, n in enumerate(names)}
+    found = find_mounting(signals, {}, None, triads, mapping)
+    assert found is not None
+    assert found.confident
+    assert np.allclose(found.rotation, turn, atol=1e-9)
+    assert found.is_as_named == (angles == (0, 0, 0))
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (0, 90, 0), (180, 0, 270)])
+def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles: tuple[float, float, float]) -> None:
+    turned = TurnedLog(log, rotation(*angles))
+    plan = planned(turned)
+    upright = angles == (0, 0, 0)
+    assert (plan.mapping == auto_map(turned).mapping) == upright
+    assert not [c for c in plan.checks if c.verdict == "failed"]
+    assert difference(signals_of(turned, plan), signals_of(log, planned(log))) < 1e-9
+    if not upright:
+        assert "the IMU is mounted with" in plan.mapping.notes[-1]
+        assert all(isinstance(plan.mapping.signals[n].field, str) for n in IMU), "one field is enough"
+
+
+@pytest.mark.parametrize("angles", [(7, 0, 0), (180, 0, 30)])
+def test_a_mounting_askew_is_found_to_two_degrees(log, angles: tuple[float, float, float]) -> None:
+    turned = TurnedLog(log, rotation(*angles))
+    plan = planned(turned)
+    rest = difference(signals_of(turned, plan), signals_of(log, planned(log)))
+    assert rest < 0.5, "2 deg of gravity are 0.34 m/s^2"
+    assert not [c for c in plan.checks if c.verdict == "failed"]
+
+
+def test_windows_of_a_summed_signal_join_bit_for_bit(log) -> None:
+    turned = TurnedLog(log, rotation(3, -6, 40))
+    plan = planned(turned)
+    assert isinstance(plan.mapping.signals["ay_m_s2"].field, tuple)
+    whole, joined = signals_of(turned, plan), signals_of(turned, plan, window_s=7.0)
+    assert all(np.array_equal(getattr(whole, n), getattr(joined, n), equal_nan=True) for n in IMU)
+
+
+@pytest.mark.slow
+def test_a_written_mapping_turns_once_and_never_again(log, tmp_path: Path) -> None:
+    turned = TurnedLog(log, rotation(0, 90, 25))
+    found = inspect_drive_log(turned)
+    write_mapping(found, tmp_path / "mapping.toml")
+    mapping = load_mapping(tmp_path / "mapping.toml")
+    plan = planned(turned, mapping)
+    assert plan.mapping is mapping
+    assert {c.verdict for c in plan.checks if c.name.endswith(".mounting")} == {"passed"}
+    assert difference(signals_of(turned, plan), signals_of(turned, planned(turned))) < 1e-5
+    again = inspect_drive_log(turned, mapping)
+    assert {n: again.mapping.signals[n].scale for n in IMU} == {n: mapping.signals[n].scale for n in IMU}
+
+
+def test_a_mapping_file_is_checked_and_left_alone(log) -> None:
+    turned = TurnedLog(log, rotation(0, 0, 90))
+    mapping = replace(auto_map(turned).mapping, origin="file")
+    plan = planned(turned, mapping)
+    assert plan.mapping is mapping
+    failed = {c.name: c for c in plan.checks if c.verdict == "failed"}
+    assert {"ax_m_s2.mounting", "ay_m_s2.mounting"} <= set(failed)
+    assert failed["ay_m_s2.mounting"].remedy == 'in the mapping: field = "linear_acceleration.x", scale = 1.0'
+    assert "yaw 90 deg" in failed["ay_m_s2.mounting"].evidence
+
+
+@pytest.mark.slow
+def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log) -> None:
+    class Compensated(TurnedLog):
+        def read(self, requests, start_ns, end_ns):
+            found = super().read(requests, start_ns, end_ns)
+            for name, columns in found.items():
+                if name == "/imu/data":
+                    gravity = 9.81 * self._turn[2]
+                    for i, axis in enumerate("xyz"):
+                        columns.fields[f"linear_acceleration.{axis}"] -= gravity[i]
+            return found
+
+    for angles in ((90, 0, 0), (180, 0, 90)):
+        turned = Compensated(log, rotation(*angles))
+        assert difference(signals_of(turned, planned(turned)), signals_of(log, planned(log))) < 1e-9
+
+
+def test_a_drive_that_says_nothing_turns_nothing(sample_logs_dir: Path) -> None:
+    log = open_log(sample_logs_dir / "fishhook.mcap")
+    mapping = auto_map(log).mapping
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    found = survey_log(log, mapping, clocks, (log.start_ns, log.start_ns + 2_000_000_000))
+    log.close()
+    assert found.mapping is mapping
+    assert found.checks == ()
+
+
+def test_angles_are_those_of_the_sensor_in_the_car() -> None:
+    mounting = Mounting(rotation(10, -20, 30), np.eye(3), "", confident=True)
+    assert mounting.degrees == pytest.approx((10, -20, 30))
+    assert mounting.text == "the IMU is mounted with roll 10, pitch -20, yaw 30 deg"
+
+
+@pytest.mark.parametrize("angles", [(0, 90, 30), (0, -90, -120), (170, 20, -30)])
+def test_angles_give_the_rotation_back(angles: tuple[float, float, float]) -> None:
+    mounting = Mounting(rotation(*angles), np.eye(3), "", confident=True)
+    assert np.allclose(rotation(*mounting.degrees), mounting.rotation, atol=1e-6)

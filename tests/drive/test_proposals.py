@@ -1,0 +1,171 @@
+"""Each error is planted once and taken off once, whichever command comes first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.mounting import Survey, survey_log
+from pdhef_logtool.drive.proposals import Proposal, apply_proposals, car_proposals, mapping_proposals, surest
+from pdhef_logtool.drive.windows import DriveReader, plan_drive, with_gyro_delay
+from pdhef_logtool.inspection.report import inspect_drive_log, write_mapping
+from pdhef_logtool.learning.car.fit_data import FitDrive, sensors_of
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping
+from tests.turned_log import TurnedLog, rotation
+
+DELAY_S, LEVER_M, GAIN = 0.040, -1.45, 1.06
+CAR = default_vehicle().model_copy(update={"name": "other"})
+
+
+class WrongLog(TurnedLog):
+    """An IMU on its side and off the CG, its gyro late and with a gain, and a steering of the wrong sign."""
+
+    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int) -> dict[str, Any]:
+        found = super().read(requests, start_ns, end_ns)
+        if "/imu/data" in found:
+            columns = found["/imu/data"]
+            fields = dict(columns.fields)
+            time_s = (columns.log_time_ns - columns.log_time_ns[0]) * 1e-9
+            rates = np.stack([fields[f"angular_velocity.{a}"] for a in "xyz"], axis=1)
+            smooth = np.convolve(rates @ self._turn[2], np.ones(11) / 11.0, mode="same")
+            turning = np.gradient(smooth, time_s)
+            for i, axis in enumerate("xyz"):
+                name = f"angular_velocity.{axis}"
+                fields[name] = GAIN * np.interp(time_s - DELAY_S, time_s, fields[name])
+                # The lever acts along the car's left.
+                fields[f"linear_acceleration.{axis}"] = (
+                    fields[f"linear_acceleration.{axis}"] + LEVER_M * turning * self._turn[1, i]
+                )
+            found["/imu/data"] = replace(columns, fields=fields)
+        for columns in found.values():
+            if "steering_tire_angle" in columns.fields:
+                columns.fields["steering_tire_angle"] = -columns.fields["steering_tire_angle"]
+        return found
+
+
+@pytest.fixture(scope="module")
+def log(sample_logs_dir: Path):
+    opened = open_log(sample_logs_dir / "sweep.mcap")
+    yield WrongLog(opened, rotation(90, 0, 0))
+    opened.close()
+
+
+def surveyed(log, mapping: Mapping, vehicle: VehicleParameters) -> Survey:
+    mapping = with_gyro_delay(mapping, vehicle)
+    clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+    return survey_log(log, mapping, clocks, (log.start_ns, log.end_ns))
+
+
+def inspected(log, mapping: Mapping, path: Path) -> Mapping:
+    write_mapping(inspect_drive_log(log, mapping if mapping.origin == "file" else None), path)
+    return load_mapping(path)
+
+
+def identified(log, mapping: Mapping, vehicle: VehicleParameters) -> VehicleParameters:
+    found = surveyed(log, mapping, vehicle)
+    latency_s = found.mapping.signals["yaw_rate_rad_s"].latency_s
+    proposals = car_proposals(found.channels.signals, found.truth, found.latency, latency_s, vehicle)
+    return apply_proposals(proposals, found.mapping, vehicle)[1]
+
+
+@pytest.mark.parametrize(
+    "order",
+    [
+        "identify inspect",
+        pytest.param("inspect identify", marks=pytest.mark.slow),
+        pytest.param("inspect inspect identify identify", marks=pytest.mark.slow),
+    ],
+)
+def test_each_error_is_taken_off_once_in_any_order(log, tmp_path: Path, order: str) -> None:
+    mapping, vehicle = auto_map(log).mapping, CAR
+    for number, command in enumerate(order.split()):
+        if command == "inspect":
+            mapping = inspected(log, mapping, tmp_path / f"{number}.toml")
+        else:
+            vehicle = identified(log, mapping, vehicle)
+    plan = plan_drive(log, mapping, vehicle, log.start_ns, log.end_ns)
+    assert plan.mapping.signals["steer_rad"].scale == -1.0
+    assert plan.mapping.signals["ay_m_s2"].field == "linear_acceleration.z"
+    assert plan.mapping.signals["yaw_rate_rad_s"].field == "angular_velocity.y"
+    assert plan.mapping.signals["yaw_rate_rad_s"].latency_s == pytest.approx(DELAY_S, abs=0.003)
+    assert vehicle.imu_position_m[0] == pytest.approx(LEVER_M, abs=0.15)
+    assert vehicle.sensors.yaw_rate_gain == pytest.approx(GAIN, abs=0.01)
+    assert [c.name for c in plan.checks if c.verdict == "failed"] == []
+    assert abs(plan.truth_latency_s) < 0.003
+    again = surveyed(log, mapping, vehicle)
+    assert mapping_proposals(again) == ()
+    assert identified(log, mapping, vehicle) == vehicle
+
+
+@pytest.mark.slow
+def test_a_recognised_mapping_needs_no_command_for_a_sign(log) -> None:
+    vehicle = identified(log, auto_map(log).mapping, CAR)
+    plan = plan_drive(log, auto_map(log).mapping, vehicle, log.start_ns, log.end_ns)
+    assert not [c for c in plan.checks if c.verdict == "failed"]
+    assert plan.mapping.signals["steer_rad"].scale == -1.0
+    assert "steer_rad is read with -1 times its scale" in " ".join(plan.mapping.notes)
+    assert plan.mapping.signals["yaw_rate_rad_s"].latency_s == vehicle.sensors.yaw_rate_delay_s
+    assert "the car's gyro is" in " ".join(plan.mapping.notes)
+
+
+def test_proposals_say_where_they_belong_and_why(log) -> None:
+    found = inspect_drive_log(log)
+    homes = {(p.subject, p.home) for p in found.proposals}
+    assert homes == {("yaw_rate_rad_s", "mapping")}, "a sign is corrected in a recognised mapping itself"
+    file = inspect_drive_log(log, replace(auto_map(log).mapping, origin="file"))
+    assert {(p.subject, p.home) for p in file.proposals} >= {("ay_m_s2", "mapping"), ("yaw_rate_rad_s", "mapping")}
+    assert all(p.evidence for p in found.proposals)
+    assert [p["subject"] for p in found.to_dict()["proposals"]] == [p.subject for p in found.proposals]
+
+
+def test_of_several_drives_the_surest_counts() -> None:
+    one, other = (
+        Proposal("car", "ay_m_s2", "", entries={"imu_position_m": (x, 0, 0)}, error=e) for x, e in ((1, 2), (3, 1))
+    )
+    assert surest([one, other]) == (other,)
+
+
+def test_a_part_of_a_drive_tells_what_its_sensors_are(log) -> None:
+    mapping = auto_map(log).mapping
+    plan = plan_drive(log, mapping, CAR, log.start_ns, log.end_ns)
+    (window,) = (w for w in DriveReader(log, plan, 600.0).windows() if len(w.signals))
+    drive = FitDrive("sweep", window.signals, window.truth, True, log.start_ns)
+    entries = {k: v for p in sensors_of([drive], CAR) for k, v in p.entries.items()}
+    assert entries["sensors.yaw_rate_delay_s"] == pytest.approx(DELAY_S, abs=0.003)
+    assert entries["sensors.yaw_rate_gain"] == pytest.approx(GAIN, abs=0.01)
+    assert entries["imu_position_m"][0] == pytest.approx(LEVER_M, abs=0.15)
+
+
+class TurnedTruth(TurnedLog):
+    """A truth whose body velocity is turned by 0.4 degrees."""
+
+    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int) -> dict[str, Any]:
+        found = dict(self._log.read(requests, start_ns, end_ns))
+        c, s = np.cos(np.radians(0.4)), np.sin(np.radians(0.4))
+        for topic, columns in found.items():
+            vx, vy = (columns.fields.get(f"twist.twist.linear.{a}") for a in "xy")
+            if vx is not None and vy is not None:
+                turned = {"twist.twist.linear.x": c * vx - s * vy, "twist.twist.linear.y": s * vx + c * vy}
+                found[topic] = replace(columns, fields={**columns.fields, **turned})
+        return found
+
+
+@pytest.mark.slow
+def test_a_turned_truth_is_turned_back_once(sample_logs_dir: Path, tmp_path: Path) -> None:
+    opened = open_log(sample_logs_dir / "road.mcap")
+    log = TurnedTruth(opened, np.eye(3))
+    found = inspect_drive_log(log)
+    assert {(p.subject, p.home) for p in found.proposals} == {("truth.vx_m_s", "mapping"), ("truth.vy_m_s", "mapping")}
+    write_mapping(found, tmp_path / "mapping.toml")
+    mapping = load_mapping(tmp_path / "mapping.toml")
+    again = inspect_drive_log(log, mapping)
+    opened.close()
+    assert again.proposals == ()
+    assert not [c for c in again.checks if c.verdict == "failed"]
+    assert mapping.truth["vy_m_s"].scale[0] == pytest.approx(-np.radians(0.4), abs=np.radians(0.06))
