@@ -22,6 +22,7 @@ def _filled(mapping: Mapping, found: Mapping) -> Mapping:
         truth=mapping.truth or found.truth,
         quality=mapping.quality if mapping.truth else mapping.quality or found.quality,
         notes=(*mapping.notes, *found.notes),
+        checks=tuple(c for c in found.checks if c.subject not in mapping.signals),
     )
 
 
@@ -51,6 +52,8 @@ def choose_mapping(
         tell(str(ambiguity))
     for note in found.mapping.notes:
         tell(note)
+    for check in found.mapping.checks:
+        tell(f"{check.evidence}; {check.remedy}")
     if require_signals and not found.mapping.signals:
         raise MappingError(
             expected="topics of well-known message types",

@@ -10,9 +10,13 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.mapping.naming import is_command
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
+from pdhef_logtool.mapping.vendors import Vendors, load_vendors
+from pdhef_logtool.mapping.weighing import Weighed, weigh
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
 #: Words of a topic's name that make it a reference to score against; never an input.
@@ -115,11 +119,18 @@ class Ambiguity:
 
 @dataclass(frozen=True, slots=True)
 class AutoMapping:
-    """A recognised mapping, what was ambiguous in it, and the signals that no topic provides."""
+    """A recognised mapping, and what is to be said of it.
+
+    Attributes
+    ----------
+    ambiguities : what could be read in several ways. missing : signals that no topic provides.
+    candidates : fields that were weighed for what recognised types left open, those taken first.
+    """
 
     mapping: Mapping
     ambiguities: tuple[Ambiguity, ...]
     missing: tuple[str, ...]
+    candidates: tuple[Candidate, ...] = ()
 
 
 @dataclass(slots=True)
@@ -177,13 +188,16 @@ class _Finding:
         return ordered[0]
 
 
-def auto_map(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfect") -> AutoMapping:
-    """Map a log's topics to signals and truth by their types and names.
+def auto_map(
+    log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfect", vendors: Vendors | None = None
+) -> AutoMapping:
+    """Map a log's topics to signals and truth: by well-known types, and for what these leave open by candidates.
 
     Parameters
     ----------
     prefer_truth : which truth to take from a simulated log, the perfect one under ``/truth/perfect`` or the
         RTK-like one; a log with only one of them gets that.
+    vendors : documented types; None takes those that are shipped and the user's.
     """
     there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
     unlike = [t for t in there if not _has_its_fields(log, t)]
@@ -195,10 +209,82 @@ def auto_map(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfec
     _map_speed(found, topics)
     _map_wheel_speeds(found, topics)
     _map_truth(found, topics, prefer_truth)
+    vendors = load_vendors() if vendors is None else vendors
+    weighed = _weigh_the_rest(found, topics, vendors)
+    _fall_back(found, topics)
     mapping = Mapping(
-        signals=found.signals, truth=found.truth, quality=found.quality, origin="auto", notes=tuple(found.notes)
+        signals=found.signals,
+        truth=found.truth,
+        quality=found.quality,
+        origin="auto",
+        notes=tuple(found.notes),
+        checks=weighed.checks,
     )
-    return AutoMapping(mapping=mapping, ambiguities=tuple(found.ambiguities), missing=missing_signals(mapping))
+    return AutoMapping(mapping, tuple(found.ambiguities), missing_signals(mapping), weighed.candidates)
+
+
+# ------------------------------------------------------------------------------------------------ candidates
+
+
+def _weigh_the_rest(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
+    """Take candidates for what no well-known type gives."""
+    for topic in topics:
+        reason = vendors.why_left_out(topic.type_name)
+        if reason:
+            found.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
+    rest = [(t, _role(t)) for t in topics if not _is_well_known(t)]
+    weighed = weigh(found.log, rest, found.signals, found.truth, vendors)
+    found.signals.update(weighed.signals)
+    found.truth.update(weighed.truth)
+    found.notes += weighed.notes
+    for name, fields in weighed.rivals:
+        found.doubt(name, fields, fields[0], "the best score, then most messages")
+    return weighed
+
+
+def _is_well_known(topic: TopicInfo) -> bool:
+    """Return whether a topic was judged by its type already."""
+    tables = (TWIST_FIELDS, POSE_FIELDS, STEERING_FIELDS, SPEED_FIELDS, SEVERAL_POSITIONS)
+    kind = _type(topic)
+    return kind in IMU_TYPES | FIX_TYPES | WHEEL_SPEED_TYPES or any(kind in table for table in tables)
+
+
+def _role(topic: TopicInfo) -> Role:
+    """Return what a topic's name makes of its fields; the device of a navigation system is a sensor as well."""
+    words = _words(topic.name)
+    if is_command(topic.name, topic.type_name.rpartition("/")[2]):
+        return "command"
+    if words & TRUTH_WORDS:
+        return "truth"
+    if words & ESTIMATE_WORDS:
+        return "estimate"
+    if words & DEVICE_WORDS:
+        return "device"
+    return "navigation" if (words | _words(topic.type_name)) & NAVIGATION_WORDS else "sensor"
+
+
+def _fall_back(found: _Finding, topics: list[TopicInfo]) -> None:
+    """Stand in for an IMU's yaw rate by an odometry's, and for a speed sensor by a navigation system's; say so."""
+    twists = [t for t in topics if _type(t) in TWIST_FIELDS]
+    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | COMMAND_WORDS | ESTIMATE_WORDS)]
+    if "yaw_rate_rad_s" not in found.signals:
+        odometries = [t for t in twists if _type(t) in BODY_TWIST_TYPES and not _is_truth(t)]
+        odometries = [t for t in odometries if _words(t.name) & VEHICLE_WORDS]
+        odometries = [t for t in odometries if _span(found.values(t.name, _twist(t, "angular", "z"))) > 0.0]
+        chosen = found.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
+        if chosen is not None:
+            found.take(found.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
+            found.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
+    truth = found.truth.get("vx_m_s")
+    if truth is None or "speed_m_s" in found.signals or any(n.startswith("wheel_speed_") for n in found.signals):
+        return
+    source = next((t for t in twists if t.name == truth.topic), None)
+    if source is not None and _words(source.name) & NAVIGATION_WORDS and found.signals:
+        found.take(found.signals, "speed_m_s", source.name, truth.paths[0])
+        found.notes.append(
+            f"speed_m_s comes from {source.name}, which is the truth too, as nothing else gives a speed: "
+            "an estimator is told the true speed"
+        )
 
 
 def _type(topic: TopicInfo) -> str:

@@ -1,0 +1,315 @@
+"""Candidates: a drive under names, units, nestings and signs of strangers, and what is taken of it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+
+from pdhef_logtool.mapping import AutoMapping, auto_map
+from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.vendors import load_vendors
+from pdhef_logtool.records.errors import MappingFileError
+
+N = 3000
+START = 1_700_000_000_000_000_000
+T = START + np.arange(N, dtype=np.int64) * 10_000_000
+S = np.arange(N) * 0.01
+DEG = math.pi / 180.0
+G = 9.80665
+
+#: A car of 2.7 m wheelbase on a winding road: metres, seconds, radians.
+V = 15.0 + 3.0 * np.sin(0.3 * S)
+RATE = 0.25 * np.sin(0.9 * S)
+AY = V * RATE
+AX = np.gradient(V, 0.01)
+STEER = 2.7 * RATE / V
+HALF_TRACK = 0.75
+
+
+def topic(type_name: str = "car_msgs/msg/State", encoding: str = "cdr", **fields: np.ndarray) -> FakeTopic:
+    named = {k.replace("__", "."): np.asarray(v, dtype=np.float64) for k, v in fields.items()}
+    return FakeTopic(type_name, T + 2_000_000, {"header.stamp": T} | named, encoding=encoding)
+
+
+def found(**contents: FakeTopic) -> AutoMapping:
+    return auto_map(FakeLog({"/" + k.replace("__", "/"): v for k, v in contents.items()}))
+
+
+def taken(auto: AutoMapping) -> dict[str, tuple[str, float]]:
+    return {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.signals.items()}  # type: ignore[arg-type]
+
+
+def undecided(auto: AutoMapping) -> set[str]:
+    assert all(c.verdict == "undecided" and c.evidence and c.remedy for c in auto.mapping.checks)
+    return {c.name for c in auto.mapping.checks}
+
+
+def imu_fields(scale: float = 1.0, rate_scale: float = 1.0, prefix: str = "") -> dict[str, np.ndarray]:
+    return {
+        f"{prefix}linear_acceleration__x": AX / scale,
+        f"{prefix}linear_acceleration__y": AY / scale,
+        f"{prefix}linear_acceleration__z": (G + 0.0 * S) / scale,
+        f"{prefix}angular_velocity__x": 0.01 * np.sin(S) / rate_scale,
+        f"{prefix}angular_velocity__y": 0.01 * np.cos(S) / rate_scale,
+        f"{prefix}angular_velocity__z": RATE / rate_scale,
+    }
+
+
+SPEED = {"vehicle__speed": topic(speed_mps=V)}
+
+
+def test_an_imu_inside_of_a_vendors_message_is_in_si() -> None:
+    nested = topic("vn_msgs/msg/Vectornav", **imu_fields(prefix="imu__"))
+    nested.fields |= {"imu.linear_acceleration_covariance": np.zeros((N, 9)), "imu.header.stamp": T}
+    nested.fields |= {"imu.angular_velocity_covariance": np.zeros((N, 9))}
+    del nested.fields["header.stamp"]
+    auto = found(vectornav=nested, **SPEED)
+    assert taken(auto) == {
+        "ax_m_s2": ("/vectornav.imu.linear_acceleration.x", 1.0),
+        "ay_m_s2": ("/vectornav.imu.linear_acceleration.y", 1.0),
+        "yaw_rate_rad_s": ("/vectornav.imu.angular_velocity.z", 1.0),
+        "speed_m_s": ("/vehicle/speed.speed_mps", 1.0),
+    }
+    assert auto.mapping.signals["ay_m_s2"].stamp == "imu.header.stamp"
+    assert undecided(auto) == set()
+
+
+@pytest.mark.parametrize("acceleration", [1.0, G, G * 1e-3])
+@pytest.mark.parametrize("rate", [1.0, DEG])
+def test_units_that_no_name_tells_come_from_gravity_and_from_turning(acceleration: float, rate: float) -> None:
+    auto = found(sensors__core=topic(**imu_fields(acceleration, rate)), **SPEED)
+    got = taken(auto)
+    assert got["ay_m_s2"][1] == pytest.approx(acceleration, rel=1e-3)
+    assert got["yaw_rate_rad_s"][1] == pytest.approx(rate, rel=1e-3)
+    assert undecided(auto) == set()
+
+
+def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told() -> None:
+    still = {k: v * 0.001 for k, v in imu_fields().items() if "angular" in k}
+    auto = found(gyro=topic(**still))
+    assert taken(auto) == {"yaw_rate_rad_s": ("/gyro.angular_velocity.z", 1.0)}
+    assert undecided(auto) == {"yaw_rate_rad_s.candidate"}
+
+
+@pytest.mark.parametrize(
+    ("field", "raw", "signal", "scale"),
+    [
+        ("steering_wheel_angle", STEER * 16.0, "steering_wheel_rad", 1.0),
+        ("SteeringWheelAngle", STEER * 16.0 / DEG, "steering_wheel_rad", DEG),
+        ("steeringAngle", STEER, "steer_rad", 1.0),
+        ("steer_ang", STEER / DEG, "steer_rad", DEG),
+        ("steering_angle", STEER * 16.0 / DEG, "steering_wheel_rad", DEG),
+        ("front_tire_angle_deg", -STEER / DEG, "", 0.0),
+        ("roadwheel_angle_deg", STEER / DEG, "steer_rad", DEG),
+        ("steering_deg", -STEER * 16.0 / DEG, "steering_wheel_rad", -DEG),
+    ],
+)
+def test_a_steering_angle_is_told_by_the_paths_curvature(
+    field: str, raw: np.ndarray, signal: str, scale: float
+) -> None:
+    auto = found(imu__data=topic(**imu_fields()), chassis=topic(**{field: raw}), **SPEED)
+    steering = {n: v for n, v in taken(auto).items() if n.startswith("steer")}
+    assert steering == ({signal: (f"/chassis.{field}", round(scale, 6))} if signal else {})
+    assert undecided(auto) == set()
+
+
+def test_a_bare_float_on_a_topic_called_steering() -> None:
+    auto = found(imu__data=topic(**imu_fields()), car__steering=topic("std_msgs/msg/Float32", data=STEER), **SPEED)
+    assert taken(auto)["steer_rad"] == ("/car/steering.data", 1.0)
+    assert undecided(auto) == set()
+
+
+def test_what_does_not_follow_the_car_is_no_steering_angle() -> None:
+    noise = np.random.default_rng(0).normal(0.0, 0.2, N)
+    auto = found(imu__data=topic(**imu_fields()), a__steering=topic("std_msgs/msg/Float32", data=noise), **SPEED)
+    assert "steer_rad" not in auto.mapping.signals
+    (candidate,) = [c for c in auto.candidates if c.source.topic == "/a/steering"]
+    assert "does not follow" in candidate.doubt
+
+
+def test_commands_setpoints_and_estimates_are_no_sensors() -> None:
+    auto = found(
+        imu__data=topic(**imu_fields()),
+        steering_cmd=topic(steering_wheel_angle=STEER),
+        target__steering=topic(angle=STEER),
+        ekf__state=topic(speed=V, yaw_rate=RATE, sideslip=0.1 * STEER),
+    )
+    assert set(taken(auto)) == {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"}
+    assert auto.mapping.truth == {}
+
+
+@pytest.mark.parametrize(
+    ("names", "unit", "signal", "scale"),
+    [
+        (("front_left", "front_right", "rear_left", "rear_right"), 1.0 / 3.6, "m_s", 1.0 / 3.6),
+        (("WheelSpd_FL", "WheelSpd_FR", "WheelSpd_RL", "WheelSpd_RR"), 0.31, "rad_s", 1.0),
+        (("fl_rpm", "fr_rpm", "rl_rpm", "rr_rpm"), 0.31 * math.pi / 30.0, "rad_s", math.pi / 30.0),
+        (("lf", "rf", "lr", "rr"), 1.0, "m_s", 1.0),
+    ],
+)
+def test_wheel_speeds_by_the_speed(names: tuple[str, ...], unit: float, signal: str, scale: float) -> None:
+    sides = (-1.0, 1.0, -1.0, 1.0)
+    wheels = {n: (V + side * HALF_TRACK * RATE) / unit for n, side in zip(names, sides, strict=True)}
+    auto = found(imu__data=topic(**imu_fields()), can__wheel_speeds=topic("x/WheelSpeeds", **wheels), **SPEED)
+    for wheel, name in zip(("fl", "fr", "rl", "rr"), names, strict=True):
+        assert taken(auto)[f"wheel_speed_{wheel}_{signal}"] == (f"/can/wheel_speeds.{name}", round(scale, 6))
+    assert undecided(auto) == set()
+
+
+def test_the_odd_sign_of_three_is_turned_and_of_two_is_told() -> None:
+    lateral = {"lat_accel_mps2": AY, "long_accel_mps2": AX, "yaw_rate_dps": -RATE / DEG}
+    both = found(daq=topic(**lateral), chassis=topic(steering_angle_rad=STEER), **SPEED)
+    assert taken(both)["yaw_rate_rad_s"] == ("/daq.yaw_rate_dps", round(-DEG, 6))
+    assert undecided(both) == set()
+    two = found(daq=topic(**lateral), **SPEED)
+    assert taken(two)["yaw_rate_rad_s"][1] == round(DEG, 6)
+    assert undecided(two) == {"mapping.sign"}
+
+
+def test_truth_of_a_vendors_message_by_its_names() -> None:
+    slip = topic(lng_vel_kmh=V * 3.6, lat_vel_kmh=0.2 * RATE * 3.6, yaw_rate_dps=-RATE / DEG)
+    auto = found(imu__data=topic(**imu_fields()), ins__slip=slip, **SPEED)
+    truth = {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.truth.items()}  # type: ignore[arg-type]
+    assert truth == {
+        "vx_m_s": ("/ins/slip.lng_vel_kmh", round(1 / 3.6, 6)),
+        "vy_m_s": ("/ins/slip.lat_vel_kmh", round(1 / 3.6, 6)),
+        "yaw_rate_rad_s": ("/ins/slip.yaw_rate_dps", round(-DEG, 6)),
+    }
+
+
+def test_a_sideslip_that_does_not_say_what_it_is_is_told() -> None:
+    auto = found(imu__data=topic(**imu_fields()), esp=topic(sideslip_deg=RATE), **SPEED)
+    assert set(auto.mapping.truth) == {"sideslip_rad"}
+    assert "truth.source" in undecided(auto)
+
+
+def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed() -> None:
+    odometry = topic(
+        "nav_msgs/msg/Odometry",
+        twist__twist__linear__x=V,
+        twist__twist__linear__y=0.0 * V,
+        twist__twist__angular__z=RATE,
+        pose__pose__position__x=S,
+        pose__pose__position__y=S,
+    )
+    auto = found(wheel__odom=odometry)
+    assert taken(auto)["yaw_rate_rad_s"] == ("/wheel/odom.twist.twist.angular.z", 1.0)
+    assert any("no IMU gives it" in n for n in auto.mapping.notes)
+    ins = found(ins__odometry=odometry, imu__data=topic("sensor_msgs/msg/Imu", **imu_fields()))
+    assert taken(ins)["speed_m_s"] == ("/ins/odometry.twist.twist.linear.x", 1.0)
+    assert any("is told the true speed" in n for n in ins.mapping.notes)
+
+
+def test_documented_types_say_unit_sign_and_page() -> None:
+    raptor = topic("raptor_dbw_msgs/msg/SteeringReport", steering_wheel_angle=STEER * 16.0 / DEG)
+    px4 = topic("px4_msgs/msg/SensorCombined")
+    px4.fields |= {"gyro_rad": np.stack([0 * S, 0 * S, -RATE], axis=1)}
+    px4.fields |= {"accelerometer_m_s2": np.stack([AX, -AY, -G + 0 * S], axis=1)}
+    auto = found(vehicle__steering=raptor, fmu__out=px4)
+    assert taken(auto) == {
+        "steering_wheel_rad": ("/vehicle/steering.steering_wheel_angle", round(DEG, 6)),
+        "ax_m_s2": ("/fmu/out.accelerometer_m_s2[0]", 1.0),
+        "ay_m_s2": ("/fmu/out.accelerometer_m_s2[1]", -1.0),
+        "yaw_rate_rad_s": ("/fmu/out.gyro_rad[2]", -1.0),
+    }
+    assert all("https://" in c.reason for c in auto.candidates if c.taken)
+
+
+def test_a_documented_trap_is_left_out_with_its_reason() -> None:
+    auto = found(novatel__corrimu=topic("novatel_oem7_msgs/msg/CORRIMU", yaw_rate=RATE, lateral_acc=AY))
+    assert auto.mapping.signals == {}
+    assert any("per sample" in n for n in auto.mapping.notes)
+
+
+def test_every_shipped_entry_names_its_page() -> None:
+    vendors = load_vendors()
+    assert len(vendors.types) > 20
+    for fields in vendors.types.values():
+        assert all(
+            f.page.startswith("https://") and "read 20" in f.page and f.meaning.quantity for f in fields.values()
+        )
+
+
+def test_a_users_file_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = (
+        '[[types]]\ntype = ["car_msgs/State"]\nvendor = "me"\npage = "https://example.org"\nread = "2026-11-22"\n'
+        'fields = [{ field = "q7", signal = "yaw_rate_rad_s", scale = -0.5 }]\n'
+    )
+    (tmp_path / "mine.toml").write_text(entry)
+    monkeypatch.setenv("PDHEF_VENDORS", str(tmp_path / "mine.toml"))
+    assert taken(found(a=topic(q7=RATE))) == {"yaw_rate_rad_s": ("/a.q7", -0.5)}
+    (tmp_path / "mine.toml").write_text(entry.replace("yaw_rate_rad_s", "yaw"))
+    with pytest.raises(MappingFileError, match="no signal"):
+        load_vendors()
+
+
+def test_a_well_known_log_is_not_read_for_candidates() -> None:
+    log = FakeLog(
+        {
+            "/imu": topic("sensor_msgs/msg/Imu", **imu_fields()),
+            "/steer": topic("autoware_vehicle_msgs/msg/SteeringReport", steering_tire_angle=STEER),
+            "/speed": topic("autoware_vehicle_msgs/msg/VelocityReport", longitudinal_velocity=V),
+            "/truth/odometry": topic("nav_msgs/msg/Odometry", twist__twist__linear__x=V, twist__twist__linear__y=0 * V),
+            "/other": topic(speed_mps=V, yaw_rate=RATE),
+        }
+    )
+    auto_map(log)
+    assert not any("/other" in read for read in log.reads)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("SteeringWheelAngle", ("steering", "wheel", "angle")),
+        ("WheelSpd_FL", ("wheel", "spd", "fl")),
+        ("steeringangle", ("steering", "angle")),
+        ("latAccelG", ("lat", "accel", "g")),
+        ("/vehicle/yawrate", ("vehicle", "yaw", "rate")),
+    ],
+)
+def test_names_are_cut_into_words(name: str, words: tuple[str, ...]) -> None:
+    assert words_of(name) == words
+
+
+@pytest.mark.parametrize(
+    ("leaf", "kind", "unit"),
+    [
+        ("yaw_rate_deg_s", "rate", "degps"),
+        ("accel_m_s2", "acceleration", "mps2"),
+        ("velocity_kmh", "speed", "kmh"),
+        ("speed_km_h", "speed", "kmh"),
+        ("VehicleSpeedKph", "speed", "kph"),
+        ("x_accel_g", "acceleration", "g"),
+        ("gyro_z_rad_s", "rate", "radps"),
+        ("steer", "angle", ""),
+    ],
+)
+def test_units_of_names(leaf: str, kind: str, unit: str) -> None:
+    assert unit_of(leaf, kind)[0] == unit
+
+
+@pytest.mark.parametrize(
+    ("path", "quantity"),
+    [
+        ("steering_wheel_torque", ""),
+        ("engine_speed_rpm", ""),
+        ("yaw_rate_std", ""),
+        ("angular_velocity_covariance[0]", ""),
+        ("steering_angle_velocity", ""),
+        ("accelerator_pedal", ""),
+        ("gyro_bias.z", ""),
+        ("wind_speed", ""),
+        ("yaw_rate", "rate"),
+        ("vehicle_speed", "speed"),
+        ("angular_velocity.z", "rate"),
+        ("ay", "acceleration"),
+        ("imu.accel.y", "acceleration"),
+    ],
+)
+def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
+    meaning = meaning_of("/topic", "a/B", path)
+    assert (meaning.quantity if meaning else "") == quantity
