@@ -67,6 +67,9 @@ class FakeLog:
                 out.append(FieldInfo(path, "number"))
         return tuple(out)
 
+    def unreadable(self, topic: str) -> str:
+        return ""
+
     def read(
         self, requests: Mapping[str, Sequence[str]], start_ns: int | None = None, end_ns: int | None = None
     ) -> dict[str, Columns]:

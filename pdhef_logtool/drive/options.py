@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
@@ -27,6 +28,7 @@ class ReadOptions:
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
     budget : factor on what reading a log may cost.
+    msgs : folder with definitions of message types that a log does not define.
     """
 
     start: str | None = None
@@ -36,6 +38,7 @@ class ReadOptions:
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: float = WINDOW_S
     budget: float = 1.0
+    msgs: Path | None = None
 
     @property
     def use_speed(self) -> bool:

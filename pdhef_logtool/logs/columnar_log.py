@@ -20,8 +20,17 @@ from pdhef_logtool.logs.decoding import (
     empty_column,
     missing_column,
 )
+from pdhef_logtool.logs.definitions import SHIPPED
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
-from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, Selection, leaves, resolve
+from pdhef_logtool.logs.message_schema import (
+    MessageSchema,
+    MissingDefinitionError,
+    NoSchemaError,
+    SchemaError,
+    Selection,
+    leaves,
+    resolve,
+)
 from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
@@ -50,6 +59,7 @@ class ColumnarLog:
         self.containers = tuple(containers)
         self._opened_lost = tuple(lost)
         self.distro = distro
+        self.definitions = SHIPPED  # of types that the log does not define; set before anything is read
         self._damaged: dict[tuple[int, int], Loss] = {}
         # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
         self._undecodable: dict[tuple[int, int, int], IntArray] = {}
@@ -150,6 +160,20 @@ class ColumnarLog:
             if isinstance(schema, MessageSchema):
                 return tuple(leaves(schema.root))
         return ()
+
+    def unreadable(self, topic: str) -> str:
+        """Return why no field of a topic is known: a definition that is missing, an encoding; empty where one is."""
+        reasons = []
+        for c, channel in self._by_topic.get(topic, ()):
+            schema = self._schema(c, channel)
+            if isinstance(schema, MessageSchema):
+                return ""
+            if isinstance(schema, MissingDefinitionError):
+                missing = schema.type_name.replace("/msg/", "/")
+                reasons.append(f"the log holds no definition of {missing}; give --msgs DIR with its .msg file")
+            else:
+                reasons.append(str(schema))
+        return reasons[0] if reasons else ""
 
     def read(
         self,
@@ -265,7 +289,9 @@ class ColumnarLog:
             meter.budget.check("seconds", self._schemas_s, "the time for all schemas")
             with meter.running():
                 if definition not in self._parsed:
-                    self._parsed[definition] = channel_schema(channel, self.distro, example, meter.budget)
+                    self._parsed[definition] = channel_schema(
+                        channel, self.distro, example, meter.budget, self.definitions
+                    )
                 return self._parsed[definition]
         except SchemaError as error:
             return self._parsed.setdefault(definition, error)
@@ -305,7 +331,7 @@ class ColumnarLog:
                         expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
                         got=str(schema),
                         where=topic,
-                        remedy="map another topic",
+                        remedy="give its definition with --msgs DIR, or map another topic",
                     )
                 )
                 continue

@@ -97,6 +97,9 @@ class DriveLog(Protocol):
     def fields(self, topic: str) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
 
+    def unreadable(self, topic: str) -> str:
+        """Return why no field of a topic is known; empty where one is."""
+
     def read(
         self,
         requests: Mapping[str, Sequence[str]],

@@ -202,6 +202,11 @@ class CanSignalLog:
             return self._log.fields(topic)
         return (*self._log.fields(view.source.topic), *(FieldInfo(p, "number") for p in view.source.paths))
 
+    def unreadable(self, topic: str) -> str:
+        """Return why no field of a topic is known."""
+        view = self._views.get(topic)
+        return self._log.unreadable(topic if view is None else view.source.topic)
+
     def read(
         self, requests: Mapping[str, Sequence[str]], start_ns: int | None = None, end_ns: int | None = None
     ) -> dict[str, Columns]:

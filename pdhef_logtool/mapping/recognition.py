@@ -203,7 +203,11 @@ def auto_map(
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
     found = _Finding(log=log, samples=_probe(log, topics))
-    found.notes += [f"{t.name} is not used: its fields are not those of {t.type_name}" for t in unlike]
+    found.notes += [_why_unused(log, t) for t in unlike]
+    found.notes += _what_cannot_be_read(log, [t for t in topics if t not in unlike])
+    found.notes += [
+        f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
+    ]
     _map_imu(found, topics)
     _map_steering(found, topics)
     _map_speed(found, topics)
@@ -221,6 +225,22 @@ def auto_map(
         checks=weighed.checks,
     )
     return AutoMapping(mapping, tuple(found.ambiguities), missing_signals(mapping), weighed.candidates)
+
+
+def _why_unused(log: DriveLog, topic: TopicInfo) -> str:
+    """Say why a topic of a well-known type is not used: no definition, or another type's fields."""
+    reason = log.unreadable(topic.name)
+    return f"{topic.name} is not used: {reason or f'its fields are not those of {topic.type_name}'}"
+
+
+def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
+    """Say of which other topics no field is known, those of one reason together."""
+    by_reason: dict[str, list[str]] = {}
+    for topic in topics:
+        reason = "" if log.fields(topic.name) else log.unreadable(topic.name)
+        if reason:
+            by_reason.setdefault(reason, []).append(topic.name)
+    return [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]
 
 
 # ------------------------------------------------------------------------------------------------ candidates
