@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -30,11 +30,13 @@ class FieldInfo:
 
     ``path`` is dotted (``linear_acceleration.x``); fixed arrays appear as ``name[i]`` per element when they have at
     most 16 elements, sequences as ``name[]``. ``kind`` is ``number``, ``bool``, ``string`` or ``time`` (a ROS
-    builtin time, whose path names the whole struct, for example ``header.stamp``).
+    builtin time, whose path names the whole struct, for example ``header.stamp``). ``code`` is NumPy's of a number in a
+    binary message (``f4``), empty where the encoding has no such types.
     """
 
     path: str
     kind: str
+    code: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -411,7 +411,7 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
         else:
             yield from leaves(node.item, f"{path}[]")
     elif isinstance(node, Scalar):
-        yield FieldInfo(path, node.kind)
+        yield FieldInfo(path, node.kind, "" if node.kind == "string" else node.code)
 
 
 _PART = re.compile(r"([^.\[\]]+)|\[(\d*)\]|\.")

@@ -17,7 +17,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
-from pdhef_logtool.mapping.naming import UNITS, Meaning, meaning_of, words_of
+from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import WHEELS, FloatArray
@@ -240,7 +240,7 @@ def look(
                 _document(one, vendors.fields_of(topic.type_name)[info.path])
             elif its.scale is not None:
                 one.known = True
-                one.reasons.append(f"unit {its.unit}")
+                one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
             if one.factors:
                 found.append(one)
     return pieces, found + _anchors(log, sources, read)

@@ -126,6 +126,12 @@ class Pieces:
         return out.ravel()
 
 
+def spread(cells: FloatArray) -> float:
+    """Return the standard deviation of what is known; 0 without anything."""
+    known = cells[np.isfinite(cells)]
+    return float(known.std()) if known.shape[0] else 0.0
+
+
 def _usual(values: FloatArray) -> tuple[float, float]:
     """Return the range that a sensor's "invalid" lies outside of: it is no motion, however large."""
     finite = values[np.isfinite(values)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import Found
-from pdhef_logtool.mapping.evidence import Fit, Pieces, fit
+from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, spread
 from pdhef_logtool.records.signals import FloatArray
 
 #: A relation counts from this correlation on.
@@ -59,12 +59,14 @@ class Fields:
     def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
         """Fit a_y to v r; None where the drive does not turn."""
         expected = rate * speed
-        if not np.nanstd(expected) > EXCITED_A_M_S2:
+        if not spread(expected) > EXCITED_A_M_S2:
             return None
         return fit(self.pieces.smooth(ay), self.pieces.smooth(expected))
 
     def settle(self, one: Found, slope: float, by: str, tolerance: float) -> None:
         """Take the one unit that a slope is near to, if there is one."""
+        if one.known or one.fixed:
+            return
         near = [u for u, s in one.factors if abs(slope / s - 1.0) < tolerance]
         if len(near) == 1:
             one.use(near[0])

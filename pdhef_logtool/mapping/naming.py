@@ -34,6 +34,13 @@ UNITS: dict[str, dict[str, float]] = {
     "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3},
 }  # fmt: skip
 
+#: Units as a person reads them.
+UNIT_TEXTS = {
+    "mps2": "m/s²", "ms2": "m/s²", "mss": "m/s²", "radps": "rad/s", "rads": "rad/s", "rps": "rad/s", "degps": "deg/s",
+    "dps": "deg/s", "degs": "deg/s", "mps": "m/s", "ms": "m/s", "kmh": "km/h", "kph": "km/h", "kmph": "km/h",
+    "cmps": "cm/s", "mmps": "mm/s",
+}  # fmt: skip
+
 #: Several words that are one unit, in the order in which they are looked for.
 _UNIT_PHRASES = (
     ("m_s_2", "mps2"), ("m_s2", "mps2"), ("m_per_s2", "mps2"), ("m_sec2", "mps2"), ("m_per_sec_2", "mps2"),
@@ -167,6 +174,18 @@ def _is_bare(own: tuple[str, ...]) -> bool:
     return all(w in _BARE or not w.isalpha() for w in own)
 
 
+#: Words that leave a delta a steering angle; a delta of anything else is a difference.
+_OF_DELTA = _set(
+    """
+    delta rad deg degrees radians f front roadwheel roadwheels road wheel wheels steer steering measured actual mean
+    """
+)
+#: Devices whose numbers are named like a car's and are none.
+_OTHER_DEVICES = _set(
+    "joint joints arm camera lidar disparity image battery temperature esc gimbal turtle radar tracks"
+)
+
+
 def is_command(*names: str) -> bool:
     """Return whether a topic, type or field calls itself what somebody asks for, not what is measured."""
     return any(_COMMANDS & set(words_of(n)) for n in names)
@@ -197,6 +216,8 @@ def meaning_of(topic: str, type_name: str, path: str) -> Meaning | None:
     own = words_of(re.sub(r"\[\d*\]", "", leaf))
     inner = [w for p in parts[:-1] for w in words_of(p)]
     outer = [*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2])]
+    if _OTHER_DEVICES & set(outer):
+        return None
     index = re.search(r"\[(\d+)\]$", leaf)
     if _NOT_VALUES & set(own) or _NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None
@@ -236,7 +257,9 @@ def _quantity(
     accelerates = bool(have & {"accel", "acceleration", "accelerometer", "accelerations", "accels", "acc", "specific"})
     accelerates |= bool(set(own) & {"ax", "ay", "az"})
     steers = bool(have & {"steer", "steering", "swa", "handwheel", "roadwheel", "roadwheels"}) or (
-        "delta" in own or {"road", "wheel", "angle"} <= have or {"hand", "wheel", "angle"} <= have
+        ("delta" in own and set(own) <= _OF_DELTA)
+        or {"road", "wheel", "angle"} <= have
+        or {"hand", "wheel", "angle"} <= have
     )
     if have & _ROLLS & set(own) and not accelerates:
         return None
@@ -248,7 +271,7 @@ def _quantity(
             or have & {"column", "motor"} & set(own)
         ):
             return None
-        return "steering", _steering_kind(have, own), "angle"
+        return "steering", _steering_kind(have), "angle"
     if have & {"sideslip", "beta"} or ("slip" in have and "angle" in have) or {"side", "slip"} <= have:
         return None if rate else ("sideslip", "", "angle")
     if accelerates and not have & {"angular", "yaw", "pedal"}:
@@ -303,8 +326,8 @@ def _corner(words: tuple[str, ...], own: tuple[str, ...]) -> str:
     return ""
 
 
-def _steering_kind(have: set[str], own: tuple[str, ...]) -> str:
-    if have & {"road", "tire", "tyre", "tires", "tyres", "roadwheel", "roadwheels", "axle"} or "delta" in own:
+def _steering_kind(have: set[str]) -> str:
+    if have & {"road", "tire", "tyre", "tires", "tyres", "roadwheel", "roadwheels", "axle", "delta"}:
         return "road"
     if have & {"hand", "handwheel", "swa", "pinion"} or {"steering", "wheel"} <= have or {"steer", "wheel"} <= have:
         return "wheel"

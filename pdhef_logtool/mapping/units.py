@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import LEAST_SCORE, Found, leaf_group
-from pdhef_logtool.mapping.evidence import fit
+from pdhef_logtool.mapping.evidence import fit, spread
 from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields
 from pdhef_logtool.mapping.naming import G_M_S2
 
@@ -110,7 +110,7 @@ def _by_speeding_up(fields: Fields) -> None:
         return
     change = fields.pieces.rate_of(speed.si)
     for one in fields.open("acceleration", "x"):
-        if one.known or one.fixed or not np.nanstd(change) > EXCITED_A_M_S2:
+        if one.known or one.fixed or not spread(change) > EXCITED_A_M_S2:
             continue
         relation = fit(change, fields.pieces.smooth(one.seen.cells))
         if relation is not None and abs(relation.correlation) > CLEAR:

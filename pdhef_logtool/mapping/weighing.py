@@ -25,7 +25,7 @@ from pdhef_logtool.mapping.candidates import (
     names_of,
     source_found,
 )
-from pdhef_logtool.mapping.evidence import Fit, fit
+from pdhef_logtool.mapping.evidence import Fit, fit, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.units import decide_units
@@ -157,7 +157,7 @@ class _Weighing:
 
     def _follows_ax(self, one: Found) -> None:
         """Believe a speed with a weak name more where its rate of change is a_x."""
-        if one.score >= LEAST_SCORE:
+        if one.score >= LEAST_SCORE or one.meaning.strength >= 0.7:
             return
         for ax in self.fields.all("acceleration", "x")[:2]:
             relation = fit(self.fields.pieces.smooth(ax.si), self.fields.pieces.rate_of(one.seen.cells))
@@ -268,10 +268,11 @@ class _Weighing:
             name = kinds[0]
             if len(kinds) == 2 and one.seen.largest * one.factors[0][1] > 0.9:
                 name = kinds[1]
-            if not one.fixed and (not one.known or len(kinds) == 2):
-                what = "its unit" if not one.known else "whether it is the steering wheel or the road wheels"
+            if not one.fixed and len(kinds) == 2:
+                one.doubts.append(f"whether it is the steering wheel or the road wheels is not said; taken as {name}")
+            if not one.fixed and relation is not None:
                 one.doubts.append(
-                    f"{what} is not said, and the drive does not tell; taken as {one.factors[0][0]}, {name}"
+                    f"it follows the path's curvature with a correlation of {relation.correlation:.2f} only"
                 )
             hopeless = relation is not None and abs(relation.correlation) < 0.25 and not one.fixed
             return name, False if hopeless and one.meaning.strength < 0.9 else None
@@ -314,8 +315,9 @@ class _Weighing:
                     votes[a, b] = math.copysign(1.0, relation.correlation)
         wheels = self._wheels_turn()
         if rate is not None and wheels is not None:
-            relation = fit(wheels, rate.si)
+            relation = fit(wheels, self.fields.pieces.smooth(rate.si))
             if relation is not None and abs(relation.correlation) > CLEAR:
+                _rate_by_track(rate, abs(relation.slope))
                 votes["rate", "wheels"] = math.copysign(1.0, relation.correlation)
         self._turn(trio, votes)
 
@@ -474,6 +476,18 @@ def truth_topic(found: Sequence[Found]) -> str:
     return best[1]
 
 
+def _rate_by_track(rate: Found, slope_m: float) -> None:
+    """Tell the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
+    if rate.known or rate.fixed:
+        return
+    for unit, factor in rate.factors:
+        track_m = slope_m * rate.factors[0][1] / factor
+        if 0.1 < track_m < 3.0:
+            rate.use(unit)
+            rate.reasons.append(f"unit {unit} by the wheels' difference: a track of {track_m:.2f} m")
+            return
+
+
 def _may_turn(one: Found) -> bool:
     """Return whether the sign of a field is free: neither documented nor a matter of its mounting."""
     if one.anchor or one.fixed:
@@ -486,10 +500,12 @@ def _curvature(speed: Found | None, rate: Found | None, ay: Found | None) -> Flo
     if speed is None or (rate is None and ay is None):
         return None
     v = speed.si
+    if not np.isfinite(v).any():
+        return None
     with np.errstate(invalid="ignore", divide="ignore"):
         moving = v > max(SLOW_M_S, 0.25 * float(np.nanquantile(v, 0.95)))
         curve = np.where(moving, rate.si / v if rate is not None else ay.si / v**2 if ay is not None else v, np.nan)
-    return curve if np.nanstd(curve) > EXCITED_CURVATURE_1_M else None
+    return curve if spread(curve) > EXCITED_CURVATURE_1_M else None
 
 
 def _unlikely(name: str, metres: float) -> float:
