@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -214,6 +214,7 @@ def auto_map(
     _map_wheel_speeds(found, topics)
     _map_truth(found, topics, prefer_truth)
     vendors = load_vendors() if vendors is None else vendors
+    _map_documented_truth(found, topics, vendors)
     weighed = _weigh_the_rest(found, topics, vendors)
     _fall_back(found, topics)
     mapping = Mapping(
@@ -260,6 +261,33 @@ def _weigh_the_rest(found: _Finding, topics: list[TopicInfo], vendors: Vendors) 
     for name, fields in weighed.rivals:
         found.doubt(name, fields, fields[0], "the best score, then most messages")
     return weighed
+
+
+def _map_documented_truth(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> None:
+    """Take truth from an INS whose type is documented, where recognised types give a position at most."""
+    if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(found.truth):
+        return
+    whole: dict[str, dict[str, SignalSource]] = {}
+    for topic in topics:
+        fields = found.log.fields(topic.name)
+        sources = [
+            SignalSource(f.name, topic.name, path, stamp_path_of(fields), f.scale, f.offset)
+            for path, f in vendors.fields_of(topic.type_name).items()
+            if f.section == "truth" and has_path(fields, path)
+        ]
+        vectors = [v for v in vendors.vectors_of(topic.type_name) if all(has_path(fields, p) for p in v.paths)]
+        sources += [replace(v, topic=topic.name, stamp=stamp_path_of(fields)) for v in vectors]
+        if vectors:
+            whole[topic.name] = {s.name: s for s in sources}
+    candidates = [t for t in topics if t.name in whole]
+    chosen = found.choose("truth", candidates, lambda t: (-len(whole[t.name]),), "the one with most quantities")
+    if chosen is None:
+        return
+    if found.truth:
+        others = ", ".join(sorted({s.topic for s in found.truth.values()}))
+        found.notes = [n for n in found.notes if not n.startswith("truth is kept where")]
+        found.notes.append(f"truth is taken from {chosen.name}, which has a velocity too; {others} is not used")
+    found.truth, found.quality = whole[chosen.name], None
 
 
 def _is_well_known(topic: TopicInfo) -> bool:

@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pdhef_logtool.mapping.naming import Meaning
+from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
 from pdhef_logtool.records.documents import checked, read_toml
 from pdhef_logtool.records.errors import MappingFileError
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
@@ -31,10 +32,10 @@ _QUANTITIES = {
 class _FieldTable(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    field: Annotated[str, Field(min_length=1)]
+    field: Annotated[str, Field(min_length=1)] | list[str]
     signal: str = ""
     truth: str = ""
-    scale: float = 1.0
+    scale: float | list[float] = 1.0
     offset: float = 0.0
 
     @model_validator(mode="after")
@@ -45,8 +46,13 @@ class _FieldTable(BaseModel):
             raise ValueError(f"{self.signal!r} is no signal")
         if self.truth and self.truth not in TRUTH_UNITS:
             raise ValueError(f"{self.truth!r} is no truth quantity")
-        if self.scale == 0.0:
+        if 0.0 in (self.scale if isinstance(self.scale, list) else [self.scale]):
             raise ValueError("scale must not be 0")
+        if isinstance(self.scale, list) and not isinstance(self.field, list):
+            raise ValueError("one field has one scale")
+        columns = VECTOR_COLUMNS.get(self.truth, 1)
+        if isinstance(self.field, list) != (columns > 1) or (columns > 1 and len(self.field) != columns):
+            raise ValueError(f"{self.truth or self.signal} is made of {columns} fields")
         return self
 
 
@@ -96,14 +102,22 @@ def meaning_of_signal(name: str) -> Meaning:
 
 @dataclass(frozen=True, slots=True)
 class Vendors:
-    """Documented types by name, as ROS 2 spells it without ``/msg``, and why some are left out."""
+    """Documented types by name, as ROS 2 spells it without ``/msg``, and why some are left out.
+
+    ``vectors`` are truth quantities that several fields make, with an empty topic.
+    """
 
     types: Mapping[str, Mapping[str, VendorField]] = field(default_factory=dict)
+    vectors: Mapping[str, tuple[SignalSource, ...]] = field(default_factory=dict)
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     def fields_of(self, type_name: str) -> Mapping[str, VendorField]:
         """Return the documented fields of a type by path; empty for a type that is not documented here."""
         return self.types.get(_plain(type_name), {})
+
+    def vectors_of(self, type_name: str) -> tuple[SignalSource, ...]:
+        """Return the vectors of a type, with an empty topic."""
+        return self.vectors.get(_plain(type_name), ())
 
     def why_left_out(self, type_name: str) -> str:
         """Return why nothing of a documented type can be taken; empty where something can."""
@@ -126,7 +140,11 @@ def load_vendors(path: Path | None = None) -> Vendors:
         return _shipped()
     own = _read(given)
     kept = {name: why for name, why in _shipped().reasons.items() if name not in own.types}
-    return Vendors({**_shipped().types, **own.types}, {**kept, **own.reasons})
+    return Vendors(
+        {**_shipped().types, **own.types},
+        {**{n: v for n, v in _shipped().vectors.items() if n not in own.types}, **own.vectors},
+        {**kept, **own.reasons},
+    )
 
 
 @cache
@@ -139,13 +157,21 @@ def _read(path: Path) -> Vendors:
     problems = [f"{key}: not known, expected [[types]]" for key in raw if key != "types"]
     found: dict[str, dict[str, VendorField]] = {}
     reasons: dict[str, str] = {}
+    vectors: dict[str, tuple[SignalSource, ...]] = {}
     entries = raw.get("types", [])
     for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
         model = checked(_TypeTable, table, f"types[{number}]", problems)
         if model is None:
             continue
-        fields = {f.field: _field(f, f"{model.page}, read {model.read}") for f in model.fields}
+        page = f"{model.page}, read {model.read}"
+        fields = {
+            f.field: _field(f, f.scale, page)
+            for f in model.fields
+            if isinstance(f.field, str) and isinstance(f.scale, float)
+        }
         found.update({_plain(name): fields for name in model.type})
+        several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
+        vectors.update({_plain(name): several for name in model.type if several})
         reasons.update({_plain(name): model.leave_out for name in model.type if model.leave_out})
     if problems:
         raise MappingFileError(
@@ -154,11 +180,16 @@ def _read(path: Path) -> Vendors:
             where=str(path),
             remedy="see docs/vendors.md for every entry",
         )
-    return Vendors(found, reasons)
+    return Vendors(found, vectors, reasons)
 
 
-def _field(table: _FieldTable, page: str) -> VendorField:
+def _field(table: _FieldTable, scale: float, page: str) -> VendorField:
     name = table.signal or table.truth
     unit = (SIGNAL_UNITS | TRUTH_UNITS)[name]
-    text = unit if table.scale == 1.0 else f"{unit} / {table.scale:.6g}"
-    return VendorField("signals" if table.signal else "truth", name, table.scale, table.offset, text, page)
+    text = unit if scale == 1.0 else f"{unit} / {scale:.6g}"
+    return VendorField("signals" if table.signal else "truth", name, scale, table.offset, text, page)
+
+
+def _vector(table: _FieldTable) -> SignalSource:
+    scale = tuple(table.scale) if isinstance(table.scale, list) else table.scale
+    return SignalSource(table.truth, "", tuple(table.field), scale=scale, offset=table.offset)

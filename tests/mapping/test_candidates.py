@@ -219,6 +219,25 @@ def test_documented_types_say_unit_sign_and_page() -> None:
     assert all("https://" in c.reason for c in auto.candidates if c.taken)
 
 
+def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix() -> None:
+    ins = topic(
+        "novatel_oem7_msgs/msg/INSPVA",
+        latitude=48.0 + S * 1e-6,
+        longitude=11.0 + S * 1e-6,
+        north_velocity=V,
+        east_velocity=0 * V,
+        up_velocity=0 * V,
+        azimuth=S,
+    )
+    fix = topic("sensor_msgs/msg/NavSatFix", latitude=48.0 + S * 1e-6, longitude=11.0 + S * 1e-6, status__status=0 * S)
+    auto = found(novatel__inspva=ins, gps__fix=fix)
+    assert {s.topic for s in auto.mapping.truth.values()} == {"/novatel/inspva"}
+    assert set(auto.mapping.truth) == {"lat_deg", "lon_deg", "yaw_rad", "enu_velocity_m_s"}
+    assert auto.mapping.truth["enu_velocity_m_s"].paths == ("east_velocity", "north_velocity", "up_velocity")
+    assert auto.mapping.quality is None
+    assert any("/gps/fix is not used" in n for n in auto.mapping.notes)
+
+
 def test_a_documented_trap_is_left_out_with_its_reason() -> None:
     auto = found(novatel__corrimu=topic("novatel_oem7_msgs/msg/CORRIMU", yaw_rate=RATE, lateral_acc=AY))
     assert auto.mapping.signals == {}
