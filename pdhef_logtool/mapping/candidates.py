@@ -17,7 +17,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
-from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, meaning_of, words_of
+from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
 from pdhef_logtool.records.signals import WHEELS, FloatArray
@@ -27,6 +27,8 @@ Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command"
 #: A field whose name or documented type gives it a meaning; the last entry tells a documented one.
 Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
+#: Words of a field that a navigation system gives beside others' sensors.
+_NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
 #: A topic with more numeric fields than this is no sensor's; looking at its names alone would take long.
 MOST_FIELDS = 3000
 #: Fields that are read at most; the best names first.
@@ -191,7 +193,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
             continue
         known = vendors.fields_of(topic.type_name)
         for info in fields:
-            if info.kind != "number" or info.path.count("[]") > info.path.endswith("[]"):
+            if is_command(info.path) or info.kind != "number" or info.path.count("[]") > info.path.endswith("[]"):
                 continue
             if info.path in known:
                 found.append((topic, role, info, known[info.path].meaning, True))
@@ -232,6 +234,8 @@ def look(
             if seen is None or its is None or not np.isfinite(seen.values).any():
                 continue
             stamp = stamp_of(log.fields(topic.name), name)
+            if role == "sensor" and set(words_of(name)) & _NAVIGATION:
+                role = "navigation"
             one = Found(topic, name, its, role, stamp, seen, _factors(its, seen))
             if _is_nested_imu(topic, log.fields(topic.name), name):
                 one.known = True
@@ -303,6 +307,11 @@ def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
                 return ".".join([*parts, stamp])
         parts.pop()
     return stamp_path_of(fields)
+
+
+def triad_of(one: Found) -> str:
+    """Return what the three axes of one vector share: topic and struct, or name without the axis."""
+    return f"{one.topic.name}.{one.path.rpartition('.')[0] or one.path.rstrip('xyzXYZ0123[]_')}"
 
 
 def leaf_group(one: Found) -> tuple[str, str]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import Found
 from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, spread
+from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
 #: A relation counts from this correlation on.
@@ -19,11 +20,13 @@ EXCITED_A_M_S2 = 0.25
 
 @dataclass(slots=True)
 class Fields:
-    """Candidates and what is mapped already (``anchors``, by signal), on one grid of time."""
+    """Candidates, what is mapped already (``anchors``, by signal), and positions, on one grid of time."""
 
     pieces: Pieces
     anchors: dict[str, Found]
     found: list[Found]
+    positions: list[Found]
+    checks: list[Check] = field(default_factory=list)
 
     def all(self, quantity: str, part: str | None = None) -> list[Found]:
         """Return anchors and candidates of a quantity, the surest first."""

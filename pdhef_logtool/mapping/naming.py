@@ -157,6 +157,7 @@ _AXES = {
     "x": "x", "y": "y", "z": "z", "ax": "x", "ay": "y", "az": "z", "wx": "x", "wy": "y", "wz": "z", "long": "x",
     "lng": "x", "longitudinal": "x", "forward": "x", "lat": "y", "lateral": "y", "vert": "z", "vertical": "z",
 }  # fmt: skip
+_AXIS_LETTERS = frozenset("xyz")
 _ROLLS = frozenset({"roll", "pitch"})
 
 
@@ -297,10 +298,16 @@ def _motion(
         return None
     if have & {"lat", "lateral", "vy"} & set(own) and (speeds or "vy" in own):
         return "velocity", "y", "speed"
+    if own == ("vl",):
+        return "velocity", "y", "speed"
+    if own == ("vf",):
+        return "speed", "x", "speed"
     if set(own) & {"vx", "ux"} or (speeds and set(own) & {"long", "lng", "longitudinal", "forward"}):
         return "speed", "x", "speed"
     if speeds and have & {"heading", "course"} & set(own):
         return None
+    if speeds and set(own) <= _AXIS_LETTERS and own and not have & {"twist", "linear", "body"}:
+        return None  # north or forward: a vector of a velocity does not say
     if speeds:
         return {"y": ("velocity", "y", "speed"), "z": None}.get(axis, ("speed", axis, "speed"))
     if set(own) & {"latitude"}:

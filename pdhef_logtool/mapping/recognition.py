@@ -20,7 +20,9 @@ from pdhef_logtool.mapping.weighing import Weighed, weigh
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
 #: Words of a topic's name that make it a reference to score against; never an input.
-TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys"})
+TRUTH_WORDS = frozenset(
+    {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit"}
+)
 #: Words of satellite and inertial navigation: velocities and poses of such topics are truth, their IMU is a sensor.
 NAVIGATION_WORDS = frozenset(
     {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk"}
@@ -326,9 +328,9 @@ def _fall_back(found: _Finding, topics: list[TopicInfo]) -> None:
     truth = found.truth.get("vx_m_s")
     if truth is None or "speed_m_s" in found.signals or any(n.startswith("wheel_speed_") for n in found.signals):
         return
-    source = next((t for t in twists if t.name == truth.topic), None)
-    if source is not None and _words(source.name) & NAVIGATION_WORDS and found.signals:
-        found.take(found.signals, "speed_m_s", source.name, truth.paths[0])
+    source = next((t for t in topics if t.name == truth.topic), None)
+    if source is not None and _role(source) == "navigation" and found.signals:
+        found.signals["speed_m_s"] = replace(truth, name="speed_m_s")
         found.notes.append(
             f"speed_m_s comes from {source.name}, which is the truth too, as nothing else gives a speed: "
             "an estimator is told the true speed"

@@ -7,13 +7,19 @@ import math
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import LEAST_SCORE, Found, leaf_group
+from pdhef_logtool.mapping.candidates import LEAST_SCORE, Found, leaf_group, triad_of
 from pdhef_logtool.mapping.evidence import fit, spread
-from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields
+from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields, mean_of
 from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import FloatArray
 
 #: How near to 1 the slope of a_y over v r must be.
 SLOPES = (0.7, 1.4)
+#: Radii of wheels, of model cars to lorries.
+RADII_M = (0.02, 0.7)
+#: Share of gravity along +z of an upright sensor.
+MOST_TILTED = 0.9
 #: Names that tell a filtered or derived copy of a sensor from the sensor.
 _SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
 
@@ -24,21 +30,22 @@ def decide_units(fields: Fields) -> None:
     _rank(fields)
     _speeds(fields)
     _by_turning(fields)
+    _by_wheel_rates(fields)
     _by_speeding_up(fields)
+    _by_siblings(fields)
 
 
 def _by_gravity(fields: Fields) -> None:
-    groups: dict[tuple[str, str], dict[str, Found]] = {}
+    groups: dict[str, dict[str, Found]] = {}
     for one in fields.found:
         if one.meaning.quantity == "acceleration" and one.is_axis:
-            groups.setdefault((one.topic.name, one.path.rpartition(".")[0] or one.path.rstrip("xyzXYZ0123[]")), {})[
-                one.meaning.part
-            ] = one
+            groups.setdefault(triad_of(one), {})[one.meaning.part] = one
     for axes in groups.values():
         if set(axes) != set("xyz"):
             continue
         means = np.array([np.nanmean(axes[a].seen.values) for a in "xyz"])
         size = float(np.linalg.norm(means))
+        _say_mounting(fields, axes["z"], means / size if size > 0.0 else means)
         for one in axes.values():
             if one.known or one.fixed:
                 continue
@@ -46,6 +53,41 @@ def _by_gravity(fields: Fields) -> None:
             if near:
                 one.use(near[0])
                 one.reasons.append(f"gravity: the mean of its three axes is {size:.4g}, so it is in {near[0]}")
+
+
+def _say_mounting(fields: Fields, z: Found, gravity: FloatArray) -> None:
+    """Say where gravity is not along +z of an accelerometer that names its axes: its axes are not the car's."""
+    if z.fixed or gravity[2] > MOST_TILTED or z.role in ("command", "estimate", "truth"):
+        return
+    along = "xyz"[int(np.argmax(np.abs(gravity)))]
+    sense = "-" if gravity["xyz".index(along)] < 0.0 else "+"
+    fields.checks.append(
+        Check(
+            "imu.mounting",
+            "ay_m_s2",
+            "undecided",
+            f"gravity is along {sense}{along} of {triad_of(z)}, not along +z: its axes are not the car's",
+            'turn them in a mapping file, or --waive "imu.mounting"',
+        )
+    )
+
+
+def _by_wheel_rates(fields: Fields) -> None:
+    """Tell the unit of a gyro where wheels turn in rad/s and their radius is not known: only one gives a wheel's."""
+    wheels = [f for f in fields.found if f.meaning.quantity == "wheel rate" and f.known]
+    if not wheels:
+        return
+    turning = mean_of([f.si for f in wheels])
+    for rate in fields.open("rate", "z"):
+        for ay in fields.open("acceleration", "y")[:2]:
+            relation = fields.turning(ay.si, rate.seen.cells, turning)
+            if rate.known or relation is None or abs(relation.correlation) < CLEAR:
+                continue
+            radii = {unit: abs(relation.slope) / factor for unit, factor in rate.factors}
+            near = [unit for unit, radius_m in radii.items() if RADII_M[0] < radius_m < RADII_M[1]]
+            if len(near) == 1:
+                rate.use(near[0])
+                rate.reasons.append(f"unit {near[0]} by a_y ≈ v r, with wheels of {radii[near[0]]:.2f} m")
 
 
 def _rank(fields: Fields) -> None:
@@ -115,3 +157,15 @@ def _by_speeding_up(fields: Fields) -> None:
         relation = fit(change, fields.pieces.smooth(one.seen.cells))
         if relation is not None and abs(relation.correlation) > CLEAR:
             fields.settle(one, abs(relation.slope), "the speed's rate of change", 0.4)
+
+
+def _by_siblings(fields: Fields) -> None:
+    """Take the unit of the other accelerations of a message: nobody sends one in g and one in m/s²."""
+    known = {leaf_group(f): f for f in fields.found if f.meaning.quantity == "acceleration" and f.known}
+    for one in fields.found:
+        other = known.get(leaf_group(one))
+        if one.meaning.quantity == "acceleration" and not one.known and other is not None:
+            unit = next((u for u, s in one.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)), "")
+            if unit:
+                one.use(unit)
+                one.reasons.append(f"unit {unit} as of {other.path}")

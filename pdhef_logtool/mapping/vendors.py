@@ -26,6 +26,7 @@ _QUANTITIES = {
     "ay_m_s2": ("acceleration", "y"), "yaw_rate_rad_s": ("rate", "z"), "speed_m_s": ("speed", "x"),
     "vx_m_s": ("speed", "x"), "vy_m_s": ("velocity", "y"), "sideslip_rad": ("sideslip", ""),
     "lat_deg": ("latitude", ""), "lon_deg": ("longitude", ""), "course_rad": ("course", ""), "yaw_rad": ("heading", ""),
+    "x_m": ("position", "x"), "y_m": ("position", "y"),
 }  # fmt: skip
 
 

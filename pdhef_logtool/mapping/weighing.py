@@ -6,7 +6,6 @@ unit or a sign is said; what stays open becomes a check that is undecided, with 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,19 +23,21 @@ from pdhef_logtool.mapping.candidates import (
     named_fields,
     names_of,
     source_found,
+    triad_of,
 )
 from pdhef_logtool.mapping.evidence import Fit, fit, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
 from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.mapping.signs import SLOW_M_S, WORDS, judge_signs
 from pdhef_logtool.mapping.units import decide_units
 from pdhef_logtool.mapping.vendors import Vendors
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
+#: Truth quantities that show the path.
+_POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 #: Below (standard deviation) the path is straight.
 EXCITED_CURVATURE_1_M = 0.0001
-#: Speeds below tell nothing of curvature.
-SLOW_M_S = 1.0
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
 ROAD_WHEEL_M = (0.15, 8.0)
 STEERING_WHEEL_M = (12.0, 160.0)
@@ -73,9 +74,11 @@ def weigh(
     ]
     if not wanted or log.end_ns <= log.start_ns:
         return Weighed()
-    pieces, found = look(log, wanted, vendors, [*signals.values()])
+    positions = [s for n, s in truth.items() if n in _POSITIONS]
+    pieces, found = look(log, wanted, vendors, [*signals.values(), *positions])
     anchors = {n: f for n, s in signals.items() if (f := source_found(s, found)) is not None}
-    fields = Fields(pieces, anchors, [f for f in found if not f.anchor])
+    places = [f for f in found if f.meaning.quantity in ("latitude", "longitude", "position")]
+    fields = Fields(pieces, anchors, [f for f in found if not f.anchor], places)
     decide_units(fields)
     at_work = _Weighing(fields, "" if truth else truth_topic(fields.found))
     at_work.choose_signals(set(signals))
@@ -116,7 +119,7 @@ class _Weighing:
         usable = [f for f in self.fields.found if f.role in ("sensor", "navigation", "device") and f.seen.changes]
         for one in usable:
             # A message that holds the answer gives the sensors too only where no other one does.
-            one.bonus -= 0.3 if one.topic.name == self.truth_from else 0.0
+            one.bonus -= 0.2 if one.topic.name == self.truth_from else 0.0
         if "speed_m_s" not in have and not any(n.startswith("wheel_speed") for n in have):
             self._take("speed_m_s", [f for f in usable if f.meaning.quantity == "speed"])
         for name, part in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
@@ -169,7 +172,7 @@ class _Weighing:
 
     def _better(self, rivals: Sequence[Found]) -> Found:
         """Return the one that follows the others' physics best; the first where nothing tells."""
-        speed = self.taken.get("speed_m_s") or self.fields.anchor("speed_m_s") or self.fields.wheel_mean()
+        speed = self._chosen("speed_m_s") or self.fields.wheel_mean()
         if speed is None:
             return rivals[0]
         kind = rivals[0].meaning
@@ -191,7 +194,7 @@ class _Weighing:
 
     def _one_imu(self) -> None:
         """Take accelerations from the message of the yaw rate where it has them: they share stamps and mounting."""
-        rate = self.taken.get("yaw_rate_rad_s") or self.fields.anchor("yaw_rate_rad_s")
+        rate = self._chosen("yaw_rate_rad_s")
         if rate is None:
             return
         for name, part in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
@@ -215,7 +218,7 @@ class _Weighing:
         wheels = max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
         if len(wheels) < 2:
             return
-        reference = self.taken.get("speed_m_s") or self.fields.anchor("speed_m_s")
+        reference = self._chosen("speed_m_s")
         mean = mean_of([f.seen.cells for f in wheels.values()])
         first = next(iter(wheels.values()))
         kind, doubt, reason = first.meaning.quantity, "", ""
@@ -232,9 +235,9 @@ class _Weighing:
     # --------------------------------------------------------------------------------------------- steering
 
     def _steering(self, candidates: Sequence[Found]) -> None:
-        speed = self.taken.get("speed_m_s") or self.fields.anchor("speed_m_s") or self.fields.wheel_mean()
-        rate = self.taken.get("yaw_rate_rad_s") or self.fields.anchor("yaw_rate_rad_s")
-        ay = self.taken.get("ay_m_s2") or self.fields.anchor("ay_m_s2")
+        speed = self._chosen("speed_m_s") or self.fields.wheel_mean()
+        rate = self._chosen("yaw_rate_rad_s")
+        ay = self._chosen("ay_m_s2")
         curvature = _curvature(speed, rate, ay)
         judged: list[tuple[float, str, Found]] = []
         for one in candidates:
@@ -294,62 +297,42 @@ class _Weighing:
     # ------------------------------------------------------------------------------------------------ signs
 
     def _signs(self) -> None:
-        """Turn signs where three relations agree on which of them is the odd one."""
-        steer = self.taken.get("steer_rad") or self.taken.get("steering_wheel_rad")
-        steer = steer or self.fields.anchor("steer_rad") or self.fields.anchor("steering_wheel_rad")
-        rate = self.taken.get("yaw_rate_rad_s") or self.fields.anchor("yaw_rate_rad_s")
-        ay = self.taken.get("ay_m_s2") or self.fields.anchor("ay_m_s2")
-        speed = self.taken.get("speed_m_s") or self.fields.anchor("speed_m_s") or self.fields.wheel_mean()
-        trio = {"steer": steer, "rate": rate, "ay": ay}
-        votes: dict[tuple[str, str], float] = {}
-        if speed is not None:
-            fast = speed.si > SLOW_M_S
-            pairs: list[tuple[str, str, FloatArray | None, FloatArray | None]] = [
-                ("ay", "rate", None if ay is None else ay.si, None if rate is None else rate.si * speed.si),
-                ("steer", "rate", None if steer is None else steer.si, None if rate is None else rate.si / speed.si),
-                ("steer", "ay", None if steer is None else steer.si, None if ay is None else ay.si / speed.si**2),
-            ]
-            for a, b, y, x in pairs:
-                relation = None if y is None or x is None else fit(y, x, fast)
-                if relation is not None and abs(relation.correlation) > 0.6:
-                    votes[a, b] = math.copysign(1.0, relation.correlation)
-        wheels = self._wheels_turn()
-        if rate is not None and wheels is not None:
-            relation = fit(wheels, self.fields.pieces.smooth(rate.si))
-            if relation is not None and abs(relation.correlation) > CLEAR:
-                _rate_by_track(rate, abs(relation.slope))
-                votes["rate", "wheels"] = math.copysign(1.0, relation.correlation)
-        self._turn(trio, votes)
-
-    def _turn(self, trio: Mapping[str, Found | None], votes: Mapping[tuple[str, str], float]) -> None:
-        if not votes or all(v > 0.0 for v in votes.values()):
-            return
-        free = [n for n, f in trio.items() if f is not None and _may_turn(f)]
-        ways: list[tuple[str, ...]] = []
-        for size in range(1, len(free) + 1):
-            ways = [
-                chosen
-                for chosen in itertools.combinations(free, size)
-                if all(v * (-1.0) ** sum(n in chosen for n in pair) > 0.0 for pair, v in votes.items())
-            ]
-            if ways:
-                break
-        names = ", ".join(f"{a} and {b}" for (a, b), v in votes.items() if v < 0.0)
-        if len(ways) == 1 and (len(votes) > 1):
-            for one in (trio[n] for n in ways[0]):
-                if one is not None:
-                    one.sign = -one.sign
-                    one.reasons.append(f"sign turned: {names} contradict one another, and this one is the odd one out")
-            return
-        self.checks.append(
-            Check(
-                "mapping.sign",
-                "mapping",
-                "undecided",
-                f"the signs of {names} contradict one another, and nothing tells which of them is wrong",
-                'give scale = -1 (times the unit) to the wrong one in a mapping file, or --waive "mapping.sign"',
+        """Turn signs where one way alone settles what contradicts, and say what stays open."""
+        trio = {
+            "steer": self._chosen("steer_rad", "steering_wheel_rad"),
+            "rate": self._chosen("yaw_rate_rad_s"),
+            "ay": self._chosen("ay_m_s2"),
+        }
+        rate, wheels = trio["rate"], self._wheels_turn()
+        relation = None if rate is None or wheels is None else fit(wheels, self.fields.pieces.smooth(rate.si))
+        if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
+            _rate_by_track(rate, abs(relation.slope))
+        signs = judge_signs(self.fields, trio, self._chosen("speed_m_s") or self.fields.wheel_mean(), wheels)
+        for one in (trio[n] for n in signs.turned):
+            if one is not None:
+                one.sign = -one.sign
+                one.reasons.append(f"sign turned: {signs.contradiction} contradict one another")
+        if signs.contradiction and not (signs.decided and signs.absolute):
+            turned = ", ".join(WORDS[n] for n in signs.turned)
+            taken = f"{turned} was turned as the odd one" if turned else "nothing tells which of them is wrong"
+            self.checks.append(
+                Check(
+                    "mapping.sign",
+                    "mapping",
+                    "undecided",
+                    f"the signs of {signs.contradiction} contradict one another; {taken}",
+                    'give the wrong one a negative scale in a mapping file, or --waive "mapping.sign"',
+                )
             )
-        )
+
+    def _is_of_ours(self, check: Check) -> bool:
+        """Return whether a check is of an accelerometer that is taken."""
+        one = self.taken.get(check.subject)
+        return one is not None and f" of {triad_of(one)}, " in check.evidence
+
+    def _chosen(self, *names: str) -> Found | None:
+        """Return what is taken for the first of these signals that there is, or mapped already."""
+        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchor(n)) is not None), None)
 
     def _wheels_turn(self) -> FloatArray | None:
         """Return right minus left wheel speed, positive in a turn to the left; None without two of an axle."""
@@ -402,7 +385,7 @@ class _Weighing:
 
     def _truth_turns(self) -> bool:
         """Give the truth's yaw rate the sign of the sensor's; return whether the two are one motion."""
-        sensor = self.taken.get("yaw_rate_rad_s") or self.fields.anchor("yaw_rate_rad_s")
+        sensor = self._chosen("yaw_rate_rad_s")
         true = self.truth.get("yaw_rate_rad_s")
         relation = None if sensor is None or true is None else fit(sensor.si, true.si)
         if true is None or relation is None or abs(relation.correlation) < CLEAR:
@@ -453,7 +436,7 @@ class _Weighing:
             candidates=tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score))),
             notes=tuple(self.notes),
             rivals=tuple(self.rivals),
-            checks=tuple(self.checks),
+            checks=(*(c for c in self.fields.checks if self._is_of_ours(c)), *self.checks),
         )
 
 
@@ -486,13 +469,6 @@ def _rate_by_track(rate: Found, slope_m: float) -> None:
             rate.use(unit)
             rate.reasons.append(f"unit {unit} by the wheels' difference: a track of {track_m:.2f} m")
             return
-
-
-def _may_turn(one: Found) -> bool:
-    """Return whether the sign of a field is free: neither documented nor a matter of its mounting."""
-    if one.anchor or one.fixed:
-        return False
-    return one.meaning.quantity == "steering" or not one.is_axis
 
 
 def _curvature(speed: Found | None, rate: Found | None, ay: Found | None) -> FloatArray | None:

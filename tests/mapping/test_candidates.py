@@ -114,7 +114,8 @@ def test_a_steering_angle_is_told_by_the_paths_curvature(
     auto = found(imu__data=topic(**imu_fields()), chassis=topic(**{field: raw}), **SPEED)
     steering = {n: v for n, v in taken(auto).items() if n.startswith("steer")}
     assert steering == ({signal: (f"/chassis.{field}", round(scale, 6))} if signal else {})
-    assert undecided(auto) == set()
+    # Which of two ways is left nothing here tells: a turned sign is said.
+    assert undecided(auto) == ({"mapping.sign"} if scale < 0.0 else set())
 
 
 def test_a_bare_float_on_a_topic_called_steering() -> None:
@@ -164,10 +165,52 @@ def test_the_odd_sign_of_three_is_turned_and_of_two_is_told() -> None:
     lateral = {"lat_accel_mps2": AY, "long_accel_mps2": AX, "yaw_rate_dps": -RATE / DEG}
     both = found(daq=topic(**lateral), chassis=topic(steering_angle_rad=STEER), **SPEED)
     assert taken(both)["yaw_rate_rad_s"] == ("/daq.yaw_rate_dps", round(-DEG, 6))
-    assert undecided(both) == set()
+    assert undecided(both) == {"mapping.sign"}
     two = found(daq=topic(**lateral), **SPEED)
     assert taken(two)["yaw_rate_rad_s"][1] == round(DEG, 6)
     assert undecided(two) == {"mapping.sign"}
+
+
+PATH_YAW = np.cumsum(RATE) * 0.01
+WHERE = {
+    "latitude": 48.0 + np.cumsum(V * np.sin(PATH_YAW)) * 0.01 / 111_000.0,
+    "longitude": 11.0 + np.cumsum(V * np.cos(PATH_YAW)) * 0.01 / 111_000.0 / math.cos(math.radians(48.0)),
+}
+WHEELS = {"fl_kph": 3.6 * (V - HALF_TRACK * RATE), "fr_kph": 3.6 * (V + HALF_TRACK * RATE)}
+
+
+@pytest.mark.parametrize(
+    "witness",
+    [
+        {"gps__fix": topic("sensor_msgs/msg/NavSatFix", **WHERE)},
+        {"can__wheels": topic("x/WheelSpeeds", **WHEELS)},
+        {"ins__attitude": topic(heading_deg=np.mod(-PATH_YAW / DEG + 90.0, 360.0))},
+    ],
+    ids=["path", "wheels", "heading"],
+)
+def test_what_is_all_positive_to_the_right_is_turned_by_the_way_the_car_turned(witness: dict[str, FakeTopic]) -> None:
+    right = {"lat_accel_mps2": -AY, "long_accel_mps2": AX, "yaw_rate_dps": -RATE / DEG}
+    auto = found(daq=topic(**right), chassis=topic(roadwheel_angle_rad=-STEER), **SPEED, **witness)
+    got = {n: v[1] for n, v in taken(auto).items() if not n.startswith("wheel")}
+    assert got == {"ax_m_s2": 1, "ay_m_s2": -1, "yaw_rate_rad_s": round(-DEG, 6), "steer_rad": -1, "speed_m_s": 1}
+    assert undecided(auto) == set()
+
+
+def test_an_accelerometer_whose_gravity_is_not_upward_is_said_to_be_mounted_otherwise() -> None:
+    down = imu_fields()
+    down["linear_acceleration__z"] = -down["linear_acceleration__z"]
+    assert "imu.mounting" in undecided(found(vn__common=topic(**down), **SPEED))
+    assert undecided(found(vn__common=topic(**imu_fields()), **SPEED)) == set()
+
+
+def test_a_velocity_vector_without_a_frame_is_no_speed() -> None:
+    auto = found(vn__common=topic(velocity__x=V, velocity__y=0.0 * V, velocity__z=0.0 * V, **imu_fields()))
+    assert "speed_m_s" not in auto.mapping.signals
+
+
+def test_a_target_beside_a_sensor_is_not_taken() -> None:
+    auto = found(bus=topic(target_speed=V, vehicle_speed=3.6 * V, **imu_fields()))
+    assert taken(auto)["speed_m_s"] == ("/bus.vehicle_speed", round(1 / 3.6, 6))
 
 
 def test_truth_of_a_vendors_message_by_its_names() -> None:

@@ -1,0 +1,155 @@
+"""Signs: which of steering, yaw rate and a_y contradict one another, and the way the car really turned.
+
+Three signals that agree may all be positive to the right. What cannot be is told by what needs no convention: the path
+that positions show, right minus left wheel, and a navigation system's heading, which counts clockwise.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.mapping.candidates import Found
+from pdhef_logtool.mapping.evidence import CELL_NS, fit
+from pdhef_logtool.mapping.fields import CLEAR, Fields
+from pdhef_logtool.records.signals import FloatArray
+
+#: Speeds below tell nothing of the path.
+SLOW_M_S = 1.0
+#: Correlations from here on tell a sign.
+TELLS = 0.6
+#: Half of the time over which a course is taken from positions, in cells.
+_HALF = 5
+#: What a person calls the signals.
+WORDS = {"steer": "steering", "rate": "yaw rate", "ay": "a_y"}
+
+
+@dataclass(frozen=True, slots=True)
+class Signs:
+    """What the signs say.
+
+    Attributes
+    ----------
+    turned : signals (``steer``, ``rate``, ``ay``) whose sign is to be turned.
+    absolute : the way the car turned is known.
+    contradiction : which pairs contradict one another, empty if none. decided : ``turned`` is the one way to mend it.
+    """
+
+    turned: tuple[str, ...] = ()
+    absolute: bool = False
+    contradiction: str = ""
+    decided: bool = True
+
+
+def judge_signs(
+    fields: Fields, trio: Mapping[str, Found | None], speed: Found | None, wheels: FloatArray | None
+) -> Signs:
+    """Hold the signs of steering, yaw rate and a_y against one another and against the way the car turned.
+
+    Parameters
+    ----------
+    trio : by ``steer``, ``rate``, ``ay``. wheels : right minus left wheel speed on the grid [M].
+    """
+    si = {name: None if one is None else one.si for name, one in trio.items()}
+    turns: dict[str, FloatArray] = {}
+    if speed is not None:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            v = np.where(speed.si > SLOW_M_S, speed.si, np.nan)
+            # Each as a yaw rate, but for its scale.
+            turns |= {"steer": si["steer"] * v} if si["steer"] is not None else {}
+            turns |= {"ay": si["ay"] / v} if si["ay"] is not None else {}
+    turns |= {"rate": si["rate"]} if si["rate"] is not None else {}
+    turns = {name: fields.pieces.smooth(values) for name, values in turns.items()}
+    votes = {pair: _sign(turns[pair[0]], turns[pair[1]], TELLS) for pair in itertools.combinations(turns, 2)}
+    truly = {"wheels": wheels, "path": path_turn(fields), "heading": heading_turn(fields)}
+    for source, values in truly.items():
+        if values is not None:
+            votes |= {(n, source): _sign(x, values, CLEAR if source == "wheels" else TELLS) for n, x in turns.items()}
+    votes = {pair: vote for pair, vote in votes.items() if vote}
+    absolute = any(source in truly for _, source in votes)
+    against = [f"{_word(a)} and {_word(b)}" for (a, b), vote in votes.items() if vote < 0.0]
+    if not against:
+        return Signs(absolute=absolute)
+    free = [n for n in turns if (one := trio[n]) is not None and may_turn(one)]
+    ways = _ways(free, votes)
+    decided = len(ways) == 1 and (absolute or len(votes) > 1)
+    return Signs(ways[0] if decided else (), absolute, ", ".join(against), decided)
+
+
+def may_turn(one: Found) -> bool:
+    """Return whether the sign of a field is free: neither documented nor a matter of its mounting."""
+    if one.anchor or one.fixed:
+        return False
+    return one.meaning.quantity == "steering" or not one.is_axis
+
+
+def _ways(free: Sequence[str], votes: Mapping[tuple[str, str], float]) -> list[tuple[str, ...]]:
+    """Return the smallest sets of signals whose turning settles every vote."""
+    for size in range(1, len(free) + 1):
+        ways = [
+            chosen
+            for chosen in itertools.combinations(free, size)
+            if all(v * (-1.0) ** sum(n in chosen for n in pair) > 0.0 for pair, v in votes.items())
+        ]
+        if ways:
+            return ways
+    return []
+
+
+def _sign(y: FloatArray, x: FloatArray, clear: float) -> float:
+    relation = fit(y, x)
+    if relation is None or abs(relation.correlation) < clear:
+        return 0.0
+    return math.copysign(1.0, relation.correlation)
+
+
+def _word(name: str) -> str:
+    words = {"wheels": "the wheels' difference", "path": "the path of the positions", "heading": "the heading"}
+    return (WORDS | words)[name]
+
+
+def path_turn(fields: Fields) -> FloatArray | None:
+    """Return how fast the direction of the positions' path turns to the left, rad/s [M]; None without positions."""
+    pairs = {"latitude": "longitude", "position": "position"}
+    for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
+        wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
+        east = next(
+            (f for f in fields.positions if (f.meaning.quantity, f.meaning.part) == wanted and f.topic == north.topic),
+            None,
+        )
+        if east is None:
+            continue
+        narrowed = math.cos(math.radians(float(np.nanmean(north.si)))) if north.meaning.quantity == "latitude" else 1.0
+        d_north, d_east = _step(fields, north.si), _step(fields, east.si) * narrowed
+        moved = np.hypot(d_north, d_east)
+        usual = float(np.nanquantile(moved, 0.9)) if np.isfinite(moved).any() else 0.0
+        if usual > 0.0:
+            with np.errstate(invalid="ignore"):
+                return _turn_rate(fields, np.where(moved > 0.3 * usual, np.arctan2(d_north, d_east), np.nan))
+    return None
+
+
+def heading_turn(fields: Fields) -> FloatArray | None:
+    """Return how fast a navigation system's heading turns to the left, rad/s but for its scale; None without one."""
+    for one in fields.found:
+        if one.meaning.quantity == "heading" and one.role == "navigation" and one.seen.changes:
+            degrees = one.seen.largest > 7.0
+            return -_turn_rate(fields, np.radians(one.seen.cells) if degrees else one.seen.cells)
+    return None
+
+
+def _step(fields: Fields, cells: FloatArray) -> FloatArray:
+    rows = cells.reshape(len(fields.pieces.starts), -1)
+    out = np.full_like(rows, np.nan)
+    out[:, _HALF:-_HALF] = rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]
+    return out.ravel()
+
+
+def _turn_rate(fields: Fields, angle_rad: FloatArray) -> FloatArray:
+    """Return the change of an angle a second [M], the short way round."""
+    change = _step(fields, angle_rad)
+    return np.asarray(np.angle(np.exp(1j * change)) / (2 * _HALF * CELL_NS * 1e-9))
