@@ -126,6 +126,17 @@ class Pieces:
         return out.ravel()
 
 
+def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
+    """Return how many times x goes into y where x is above ``slow``; None where this is not one number."""
+    use = np.isfinite(y) & np.isfinite(x)
+    use[use] &= x[use] > slow
+    if np.count_nonzero(use) < FEWEST_CELLS:
+        return None
+    times = y[use] / x[use]
+    low, middle, high = np.quantile(times, [0.2, 0.5, 0.8])
+    return float(middle) if high - low < 0.1 * abs(middle) else None
+
+
 def spread(cells: FloatArray) -> float:
     """Return the standard deviation of what is known; 0 without anything."""
     known = cells[np.isfinite(cells)]

@@ -1,7 +1,8 @@
 """Signs: which of steering, yaw rate and a_y contradict one another, and the way the car really turned.
 
 Three signals that agree may all be positive to the right. What cannot be is told by what needs no convention: the path
-that positions show, right minus left wheel, and a navigation system's heading, which counts clockwise.
+that positions show, right minus left wheel, a navigation system's heading, which counts clockwise, and gravity, which the
+accelerometer of an upright IMU has along +z.
 """
 
 from __future__ import annotations
@@ -13,19 +14,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.mapping.candidates import Found
-from pdhef_logtool.mapping.evidence import CELL_NS, fit
+from pdhef_logtool.mapping.candidates import Found, leaf_group
+from pdhef_logtool.mapping.evidence import fit
 from pdhef_logtool.mapping.fields import CLEAR, Fields
+from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.mapping.path import heading_turn, path_turn
 from pdhef_logtool.records.signals import FloatArray
 
 #: Speeds below tell nothing of the path.
 SLOW_M_S = 1.0
 #: Correlations from here on tell a sign.
 TELLS = 0.6
-#: Half of the time over which a course is taken from positions, in cells.
-_HALF = 5
 #: What a person calls the signals.
 WORDS = {"steer": "steering", "rate": "yaw rate", "ay": "a_y"}
+WITNESSES = {
+    "wheels": "the wheels' difference",
+    "path": "the path of the positions",
+    "heading": "the heading",
+    "gravity": "gravity",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,14 +76,18 @@ def judge_signs(
     for source, values in truly.items():
         if values is not None:
             votes |= {(n, source): _sign(x, values, CLEAR if source == "wheels" else TELLS) for n, x in turns.items()}
+    rate = trio["rate"]
+    if rate is not None and rate.is_axis:
+        votes["rate", "gravity"] = upright(fields, rate) * rate.sign
     votes = {pair: vote for pair, vote in votes.items() if vote}
-    absolute = any(source in truly for _, source in votes)
+    absolute = any(source in {*truly, "gravity"} for _, source in votes)
     against = [f"{_word(a)} and {_word(b)}" for (a, b), vote in votes.items() if vote < 0.0]
     if not against:
         return Signs(absolute=absolute)
     free = [n for n in turns if (one := trio[n]) is not None and may_turn(one)]
     ways = _ways(free, votes)
-    decided = len(ways) == 1 and (absolute or len(votes) > 1)
+    # An IMU that cannot be turned here may be the odd one, too.
+    decided = len(ways) == 1 and (absolute or (len(votes) > 1 and len(free) == len(turns)))
     return Signs(ways[0] if decided else (), absolute, ", ".join(against), decided)
 
 
@@ -85,6 +96,16 @@ def may_turn(one: Found) -> bool:
     if one.anchor or one.fixed:
         return False
     return one.meaning.quantity == "steering" or not one.is_axis
+
+
+def upright(fields: Fields, rate: Found) -> float:
+    """Return 1 where gravity is along +z of the sensor that a rate about z comes from, -1 along -z, 0 if unknown."""
+    for one in (*fields.found, *fields.anchors.values()):
+        if (one.meaning.quantity, one.meaning.part) == ("acceleration", "z") and leaf_group(one) == leaf_group(rate):
+            mean = float(np.nanmean(one.si))
+            # Gravity alone is that large for so long, but in a sensor that takes it away.
+            return math.copysign(1.0, mean) if abs(mean) > 0.9 * G_M_S2 else 0.0
+    return 0.0
 
 
 def _ways(free: Sequence[str], votes: Mapping[tuple[str, str], float]) -> list[tuple[str, ...]]:
@@ -108,48 +129,10 @@ def _sign(y: FloatArray, x: FloatArray, clear: float) -> float:
 
 
 def _word(name: str) -> str:
-    words = {"wheels": "the wheels' difference", "path": "the path of the positions", "heading": "the heading"}
+    words = {
+        "wheels": "the wheels' difference",
+        "path": "the path of the positions",
+        "heading": "the heading",
+        "gravity": "gravity",
+    }
     return (WORDS | words)[name]
-
-
-def path_turn(fields: Fields) -> FloatArray | None:
-    """Return how fast the direction of the positions' path turns to the left, rad/s [M]; None without positions."""
-    pairs = {"latitude": "longitude", "position": "position"}
-    for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
-        wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
-        east = next(
-            (f for f in fields.positions if (f.meaning.quantity, f.meaning.part) == wanted and f.topic == north.topic),
-            None,
-        )
-        if east is None:
-            continue
-        narrowed = math.cos(math.radians(float(np.nanmean(north.si)))) if north.meaning.quantity == "latitude" else 1.0
-        d_north, d_east = _step(fields, north.si), _step(fields, east.si) * narrowed
-        moved = np.hypot(d_north, d_east)
-        usual = float(np.nanquantile(moved, 0.9)) if np.isfinite(moved).any() else 0.0
-        if usual > 0.0:
-            with np.errstate(invalid="ignore"):
-                return _turn_rate(fields, np.where(moved > 0.3 * usual, np.arctan2(d_north, d_east), np.nan))
-    return None
-
-
-def heading_turn(fields: Fields) -> FloatArray | None:
-    """Return how fast a navigation system's heading turns to the left, rad/s but for its scale; None without one."""
-    for one in fields.found:
-        if one.meaning.quantity == "heading" and one.role == "navigation" and one.seen.changes:
-            degrees = one.seen.largest > 7.0
-            return -_turn_rate(fields, np.radians(one.seen.cells) if degrees else one.seen.cells)
-    return None
-
-
-def _step(fields: Fields, cells: FloatArray) -> FloatArray:
-    rows = cells.reshape(len(fields.pieces.starts), -1)
-    out = np.full_like(rows, np.nan)
-    out[:, _HALF:-_HALF] = rows[:, 2 * _HALF :] - rows[:, : -2 * _HALF]
-    return out.ravel()
-
-
-def _turn_rate(fields: Fields, angle_rad: FloatArray) -> FloatArray:
-    """Return the change of an angle a second [M], the short way round."""
-    change = _step(fields, angle_rad)
-    return np.asarray(np.angle(np.exp(1j * change)) / (2 * _HALF * CELL_NS * 1e-9))

@@ -8,9 +8,10 @@ import math
 import numpy as np
 
 from pdhef_logtool.mapping.candidates import LEAST_SCORE, Found, leaf_group, triad_of
-from pdhef_logtool.mapping.evidence import fit, spread
+from pdhef_logtool.mapping.evidence import fit, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields, mean_of
 from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.mapping.path import path_speed
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
@@ -18,6 +19,8 @@ from pdhef_logtool.records.signals import FloatArray
 SLOPES = (0.7, 1.4)
 #: Radii of wheels, of model cars to lorries.
 RADII_M = (0.02, 0.7)
+#: Raw speeds below tell no unit, whichever it is.
+SLOWEST = 1.0
 #: Share of gravity along +z of an upright sensor.
 MOST_TILTED = 0.9
 #: Names that tell a filtered or derived copy of a sensor from the sensor.
@@ -106,12 +109,13 @@ def _speeds(fields: Fields) -> None:
     """Tell units of speeds by one another: what is known, then a_x, then the least assuming."""
     known = [f for f in fields.all("speed") if f.known or f.fixed]
     reference = max(known, key=lambda f: f.score, default=None)
-    for one in [*fields.all("speed"), *fields.all("velocity")]:
-        if one.known or one.fixed or reference is None:
-            continue
-        relation = fit(reference.si, one.seen.cells)
-        if one.meaning.quantity == "speed" and relation is not None and abs(relation.correlation) > 0.95:
-            fields.settle(one, relation.slope, f"{reference.path} of {reference.topic.name}", 0.08)
+    path = path_speed(fields)
+    for one in fields.all("speed"):
+        if reference is not None and one is not reference:
+            times = ratio(reference.si, one.seen.cells, SLOWEST)
+            fields.settle(one, times or 0.0, f"{reference.path} of {reference.topic.name}", 0.08)
+        if path is not None:
+            fields.settle(one, ratio(path, one.seen.cells, SLOWEST) or 0.0, "the positions' speed", 0.12)
     for one in fields.all("speed"):
         if one.known or one.fixed:
             continue
@@ -160,12 +164,13 @@ def _by_speeding_up(fields: Fields) -> None:
 
 
 def _by_siblings(fields: Fields) -> None:
-    """Take the unit of the other accelerations of a message: nobody sends one in g and one in m/s²."""
-    known = {leaf_group(f): f for f in fields.found if f.meaning.quantity == "acceleration" and f.known}
-    for one in fields.found:
-        other = known.get(leaf_group(one))
-        if one.meaning.quantity == "acceleration" and not one.known and other is not None:
-            unit = next((u for u, s in one.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)), "")
-            if unit:
-                one.use(unit)
-                one.reasons.append(f"unit {unit} as of {other.path}")
+    """Take the unit of the other accelerations, or velocities, of a message: nobody mixes them."""
+    for kinds in ({"acceleration"}, {"speed", "velocity"}):
+        known = {leaf_group(f): f for f in fields.found if f.meaning.quantity in kinds and f.known}
+        for one in fields.found:
+            other = known.get(leaf_group(one))
+            if one.meaning.quantity in kinds and not one.known and other is not None:
+                same = [u for u, s in one.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
+                if same:
+                    one.use(same[0])
+                    one.reasons.append(f"unit {same[0]} as of {other.path}")

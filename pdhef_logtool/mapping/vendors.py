@@ -23,7 +23,8 @@ USERS_FILE = "PDHEF_VENDORS"
 
 _QUANTITIES = {
     "steer_rad": ("steering", "road"), "steering_wheel_rad": ("steering", "wheel"), "ax_m_s2": ("acceleration", "x"),
-    "ay_m_s2": ("acceleration", "y"), "yaw_rate_rad_s": ("rate", "z"), "speed_m_s": ("speed", "x"),
+    "ay_m_s2": ("acceleration", "y"), "az_m_s2": ("acceleration", "z"),
+    "yaw_rate_rad_s": ("rate", "z"), "speed_m_s": ("speed", "x"),
     "vx_m_s": ("speed", "x"), "vy_m_s": ("velocity", "y"), "sideslip_rad": ("sideslip", ""),
     "lat_deg": ("latitude", ""), "lon_deg": ("longitude", ""), "course_rad": ("course", ""), "yaw_rad": ("heading", ""),
     "x_m": ("position", "x"), "y_m": ("position", "y"),

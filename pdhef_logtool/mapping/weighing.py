@@ -25,11 +25,12 @@ from pdhef_logtool.mapping.candidates import (
     source_found,
     triad_of,
 )
-from pdhef_logtool.mapping.evidence import Fit, fit, spread
+from pdhef_logtool.mapping.checking import has_path
+from pdhef_logtool.mapping.evidence import Fit, fit, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
 from pdhef_logtool.mapping.records import SignalSource
-from pdhef_logtool.mapping.signs import SLOW_M_S, WORDS, judge_signs
-from pdhef_logtool.mapping.units import decide_units
+from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
+from pdhef_logtool.mapping.units import RADII_M, decide_units
 from pdhef_logtool.mapping.vendors import Vendors
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, FloatArray
@@ -38,6 +39,11 @@ from pdhef_logtool.records.signals import WHEELS, FloatArray
 _POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
 #: Below (standard deviation) the path is straight.
 EXCITED_CURVATURE_1_M = 0.0001
+#: An acceleration (standard deviation) from which on a sensor must follow it, and the correlation that it must have.
+MOVING_M_S2 = 0.6
+FOLLOWS = 0.5
+#: How near wheels must be to a speed in a unit of speed; beyond they turn in rad/s.
+WHEEL_UNIT = 0.04
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
 ROAD_WHEEL_M = (0.15, 8.0)
 STEERING_WHEEL_M = (12.0, 160.0)
@@ -75,8 +81,9 @@ def weigh(
     if not wanted or log.end_ns <= log.start_ns:
         return Weighed()
     positions = [s for n, s in truth.items() if n in _POSITIONS]
-    pieces, found = look(log, wanted, vendors, [*signals.values(), *positions])
-    anchors = {n: f for n, s in signals.items() if (f := source_found(s, found)) is not None}
+    known = {**signals, **_upward(log, signals)}
+    pieces, found = look(log, wanted, vendors, [*known.values(), *positions])
+    anchors = {n: f for n, s in known.items() if (f := source_found(s, found)) is not None}
     places = [f for f in found if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in found if not f.anchor], places)
     decide_units(fields)
@@ -85,6 +92,15 @@ def weigh(
     if not truth:
         at_work.choose_truth()
     return at_work.result()
+
+
+def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
+    """Return the third axis of a mapped accelerometer, which tells where gravity is."""
+    lateral = signals.get("ay_m_s2")
+    path = "" if lateral is None else f"{lateral.paths[0].removesuffix('.y')}.z"
+    if lateral is None or not has_path(log.fields(lateral.topic), path):
+        return {}
+    return {"az_m_s2": SignalSource("az_m_s2", lateral.topic, path, lateral.stamp)}
 
 
 def _is_wanted(
@@ -133,6 +149,7 @@ class _Weighing:
         if not have & {"steer_rad", "steering_wheel_rad"}:
             self._steering([f for f in usable if f.meaning.quantity == "steering"])
         self._signs()
+        self._follow()
         for name, one in self.taken.items():
             self._tell(name, one)
 
@@ -172,7 +189,7 @@ class _Weighing:
 
     def _better(self, rivals: Sequence[Found]) -> Found:
         """Return the one that follows the others' physics best; the first where nothing tells."""
-        speed = self._chosen("speed_m_s") or self.fields.wheel_mean()
+        speed = self._speed()
         if speed is None:
             return rivals[0]
         kind = rivals[0].meaning
@@ -235,7 +252,7 @@ class _Weighing:
     # --------------------------------------------------------------------------------------------- steering
 
     def _steering(self, candidates: Sequence[Found]) -> None:
-        speed = self._chosen("speed_m_s") or self.fields.wheel_mean()
+        speed = self._speed()
         rate = self._chosen("yaw_rate_rad_s")
         ay = self._chosen("ay_m_s2")
         curvature = _curvature(speed, rate, ay)
@@ -307,12 +324,13 @@ class _Weighing:
         relation = None if rate is None or wheels is None else fit(wheels, self.fields.pieces.smooth(rate.si))
         if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
             _rate_by_track(rate, abs(relation.slope))
-        signs = judge_signs(self.fields, trio, self._chosen("speed_m_s") or self.fields.wheel_mean(), wheels)
+        signs = judge_signs(self.fields, trio, self._speed(), wheels)
         for one in (trio[n] for n in signs.turned):
             if one is not None:
                 one.sign = -one.sign
                 one.reasons.append(f"sign turned: {signs.contradiction} contradict one another")
-        if signs.contradiction and not (signs.decided and signs.absolute):
+        hangs = signs.contradiction == f"{WORDS['rate']} and {WITNESSES['gravity']}"  # imu.mounting says so
+        if signs.contradiction and not hangs and not (signs.decided and signs.absolute):
             turned = ", ".join(WORDS[n] for n in signs.turned)
             taken = f"{turned} was turned as the odd one" if turned else "nothing tells which of them is wrong"
             self.checks.append(
@@ -329,6 +347,25 @@ class _Weighing:
         """Return whether a check is of an accelerometer that is taken."""
         one = self.taken.get(check.subject)
         return one is not None and f" of {triad_of(one)}, " in check.evidence
+
+    def _speed(self) -> Found | None:
+        """Return what tells others best how fast the car was, taken or not."""
+        return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
+
+    def _follow(self) -> None:
+        """Say what does not follow the car's motion although the drive excites it: a name may be wrong, or an axis."""
+        speed, rate = self._speed(), self._chosen("yaw_rate_rad_s")
+        if speed is None:
+            return
+        smooth = self.fields.pieces.smooth
+        expected = {"ax_m_s2": (self.fields.pieces.rate_of(speed.si), "the speed's rate of change")}
+        if rate is not None:
+            expected["ay_m_s2"] = (smooth(rate.si * speed.si), "v r")
+        for name, (motion, words) in expected.items():
+            one = self.taken.get(name)
+            relation = None if one is None or spread(motion) < MOVING_M_S2 else fit(smooth(one.si), motion)
+            if one is not None and relation is not None and abs(relation.correlation) < FOLLOWS:
+                one.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
 
     def _chosen(self, *names: str) -> Found | None:
         """Return what is taken for the first of these signals that there is, or mapped already."""
@@ -492,19 +529,23 @@ def _unlikely(name: str, metres: float) -> float:
 def _wheel_unit(mean: FloatArray, reference: Found | None) -> tuple[str, tuple[str, float], str, str]:
     """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit, by the speed if there is one."""
     rpm = 2.0 * math.pi / 60.0
-    relation = None if reference is None else fit(mean, reference.si)
-    if relation is None or relation.correlation < 0.9:
-        doubt = "the unit of the wheel speeds is not said, and there is no speed to hold them against; taken as m/s"
+    times = None if reference is None else ratio(mean, reference.si, SLOW_M_S)
+    if times is None or reference is None:
+        doubt = "the unit of the wheel speeds is not said, and no speed tells it; taken as m/s"
         return "wheel speed", ("m/s", 1.0), "", doubt
-    ratio = relation.slope
-    said = f"{ratio:.4g} of it is 1 m/s of speed"
+    unsure = "" if reference.known else "the unit of the speed that tells theirs is unsure itself"
+    said = f"{times:.4g} of it is 1 m/s of speed"
     for unit, factor in (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)):
-        if abs(ratio * factor - 1.0) < 0.04:
-            return "wheel speed", (unit, factor), said, ""
-    if 1 / 0.6 < ratio < 1 / 0.04:
-        return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / ratio:.3f} m", ""
-    if 1 / 0.6 < ratio * rpm < 1 / 0.04:
-        return "wheel rate", ("rpm", rpm), f"{said}: a radius of {1 / (ratio * rpm):.3f} m in rpm", ""
+        off = abs(times * factor - 1.0)
+        if off < WHEEL_UNIT:
+            also = (
+                f"it could be rad/s with a radius of {1 / times:.3f} m as well" if factor < 1.0 and off > 0.01 else ""
+            )
+            return "wheel speed", (unit, factor), said, unsure or also
+    if RADII_M[0] < 1 / times < RADII_M[1]:
+        return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", unsure
+    if RADII_M[0] < 1 / (times * rpm) < RADII_M[1]:
+        return "wheel rate", ("rpm", rpm), f"{said}: a radius of {1 / (times * rpm):.3f} m in rpm", unsure
     return "wheel speed", ("m/s", 1.0), "", f"{said}, which is no unit of wheel speeds; taken as m/s"
 
 

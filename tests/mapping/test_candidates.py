@@ -114,8 +114,16 @@ def test_a_steering_angle_is_told_by_the_paths_curvature(
     auto = found(imu__data=topic(**imu_fields()), chassis=topic(**{field: raw}), **SPEED)
     steering = {n: v for n, v in taken(auto).items() if n.startswith("steer")}
     assert steering == ({signal: (f"/chassis.{field}", round(scale, 6))} if signal else {})
-    # Which of two ways is left nothing here tells: a turned sign is said.
-    assert undecided(auto) == ({"mapping.sign"} if scale < 0.0 else set())
+    # Gravity is upward in the IMU, so that its yaw rate counts to the left, and steering has to.
+    assert undecided(auto) == set()
+
+
+def test_steering_is_not_turned_after_an_imu_that_may_hang_upside_down() -> None:
+    down = imu_fields()
+    down |= {k: -down[k] for k in ("linear_acceleration__y", "linear_acceleration__z", "angular_velocity__z")}
+    auto = found(vn__common=topic(**down), chassis=topic(steering_wheel_angle_deg=STEER * 16.0 / DEG), **SPEED)
+    assert taken(auto)["steering_wheel_rad"][1] == round(DEG, 6)
+    assert {"mapping.sign", "imu.mounting"} <= undecided(auto)
 
 
 def test_a_bare_float_on_a_topic_called_steering() -> None:
@@ -201,6 +209,19 @@ def test_an_accelerometer_whose_gravity_is_not_upward_is_said_to_be_mounted_othe
     down["linear_acceleration__z"] = -down["linear_acceleration__z"]
     assert "imu.mounting" in undecided(found(vn__common=topic(**down), **SPEED))
     assert undecided(found(vn__common=topic(**imu_fields()), **SPEED)) == set()
+
+
+def test_axes_that_are_not_the_cars_do_not_follow_its_motion() -> None:
+    turned = imu_fields()
+    turned["linear_acceleration__x"], turned["linear_acceleration__y"] = -AY, AX
+    turned["angular_velocity__z"] = RATE
+    assert "ay_m_s2.candidate" in undecided(found(vn__common=topic(**turned), **SPEED))
+
+
+def test_the_unit_of_a_speed_by_positions() -> None:
+    auto = found(gps__fix=topic("sensor_msgs/msg/NavSatFix", **WHERE), bus=topic(vehicle_speed=3.6 * V))
+    assert taken(auto) == {"speed_m_s": ("/bus.vehicle_speed", round(1 / 3.6, 6))}
+    assert undecided(auto) == set()
 
 
 def test_a_velocity_vector_without_a_frame_is_no_speed() -> None:
