@@ -166,7 +166,8 @@ class Found:
         if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
             source = replace(source, valid_min=-most, valid_max=most)
         reason = "; ".join([self.meaning.why, *self.reasons])
-        return Candidate(section, source, round(self.score, 2), reason, "; ".join(self.doubts), taken)
+        doubts = [*self.doubts, *([] if self.seen.changes else ["it does not change in what was read of the log"])]
+        return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
 
 
 def names_of(quantity: str, part: str) -> tuple[str, ...]:

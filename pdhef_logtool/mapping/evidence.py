@@ -16,6 +16,8 @@ PIECES = 8
 PIECE_NS = 10_000_000_000
 #: Cells of the grid; slower than this, a car's motion does not change much.
 CELL_NS = 100_000_000
+#: Beyond, a number is no measurement of a car.
+LARGEST = 1e12
 #: A sensor of a few samples a second is joined up over so many cells.
 BRIDGED_CELLS = 5
 #: Columns of an array of unknown length that are looked at.
@@ -79,6 +81,7 @@ class Pieces:
                 at = (columns.log_time_ns - start) // CELL_NS
                 for path in requests[topic]:
                     values = np.asarray(columns.fields[path], dtype=np.float64)
+                    values = np.where(np.abs(values) < LARGEST, values, np.nan)
                     if values.ndim == 1:
                         parts.setdefault((topic, path), []).append((number, at, values))
                         continue

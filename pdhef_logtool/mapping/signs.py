@@ -1,8 +1,8 @@
 """Signs: which of steering, yaw rate and a_y contradict one another, and the way the car really turned.
 
 Three signals that agree may all be positive to the right. What cannot be is told by what needs no convention: the path
-that positions show, right minus left wheel, a navigation system's heading, which counts clockwise, and gravity, which the
-accelerometer of an upright IMU has along +z.
+that positions show, right minus left wheel, a navigation system's heading, which counts clockwise, and gravity,
+which the accelerometer of an upright IMU has along +z.
 """
 
 from __future__ import annotations
@@ -129,10 +129,4 @@ def _sign(y: FloatArray, x: FloatArray, clear: float) -> float:
 
 
 def _word(name: str) -> str:
-    words = {
-        "wheels": "the wheels' difference",
-        "path": "the path of the positions",
-        "heading": "the heading",
-        "gravity": "gravity",
-    }
-    return (WORDS | words)[name]
+    return (WORDS | WITNESSES)[name]

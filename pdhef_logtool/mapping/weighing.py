@@ -132,7 +132,8 @@ class _Weighing:
 
     def choose_signals(self, have: set[str]) -> None:
         """Take the best candidate of each signal that is missing."""
-        usable = [f for f in self.fields.found if f.role in ("sensor", "navigation", "device") and f.seen.changes]
+        usable = [f for f in self.fields.found if f.role in ("sensor", "navigation", "device")]
+        usable = [f for f in usable if f.seen.changes or f.fixed]
         for one in usable:
             # A message that holds the answer gives the sensors too only where no other one does.
             one.bonus -= 0.2 if one.topic.name == self.truth_from else 0.0
