@@ -14,6 +14,7 @@ from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import is_command
+from pdhef_logtool.mapping.navigation import navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
 from pdhef_logtool.mapping.vendors import Vendors, load_vendors
 from pdhef_logtool.mapping.weighing import Weighed, weigh
@@ -218,6 +219,7 @@ def auto_map(
     vendors = load_vendors() if vendors is None else vendors
     _map_documented_truth(found, topics, vendors)
     weighed = _weigh_the_rest(found, topics, vendors)
+    _map_navigation(found, topics, vendors)
     _fall_back(found, topics)
     mapping = Mapping(
         signals=found.signals,
@@ -290,6 +292,19 @@ def _map_documented_truth(found: _Finding, topics: list[TopicInfo], vendors: Ven
         found.notes = [n for n in found.notes if not n.startswith("truth is kept where")]
         found.notes.append(f"truth is taken from {chosen.name}, which has a velocity too; {others} is not used")
     found.truth, found.quality = whole[chosen.name], None
+
+
+def _map_navigation(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> None:
+    """Take truth from a navigation system by the names of its vectors, where there is a position at most."""
+    if set(found.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
+        return
+    unknown = [t for t in topics if not _is_well_known(t) and not vendors.fields_of(t.type_name)]
+    truth = navigation_truth(found.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
+    if truth is None or (found.truth and len(truth.truth) <= len(found.truth)):
+        return
+    found.truth, found.quality = truth.truth, None
+    found.notes = [n for n in found.notes if not n.startswith("truth is kept where")]
+    found.notes.append(truth.note)
 
 
 def _is_well_known(topic: TopicInfo) -> bool:

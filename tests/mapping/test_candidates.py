@@ -234,6 +234,34 @@ def test_a_target_beside_a_sensor_is_not_taken() -> None:
     assert taken(auto)["speed_m_s"] == ("/bus.vehicle_speed", round(1 / 3.6, 6))
 
 
+@pytest.mark.parametrize(
+    ("raw", "scale", "offset"),
+    [
+        (np.mod(90.0 - PATH_YAW / DEG, 360.0), -DEG, math.pi / 2.0),
+        (np.mod(math.pi / 2.0 - PATH_YAW, 2.0 * math.pi), -1.0, math.pi / 2.0),
+        (np.angle(np.exp(1j * PATH_YAW)), 1.0, 0.0),
+        (np.angle(np.exp(1j * PATH_YAW)) / DEG, DEG, 0.0),
+        (np.mod(200.0 - PATH_YAW / DEG, 360.0), None, None),
+    ],
+    ids=["compass deg", "compass rad", "east rad", "east deg", "turned away"],
+)
+@pytest.mark.parametrize("names", [("vel_n", "vel_e", "vel_d"), ("north_velocity", "east_velocity", "up_velocity"), ()])
+def test_the_path_shows_how_a_heading_counts(
+    raw: np.ndarray, scale: float | None, offset: float | None, names: tuple[str, ...]
+) -> None:
+    north, east = V * np.sin(PATH_YAW), V * np.cos(PATH_YAW)
+    velocity = dict(zip(names, (north, east, 0.01 * np.sin(S)), strict=False))
+    auto = found(ins__solution=topic(heading=raw, **WHERE, **velocity), imu__data=topic(**imu_fields()), **SPEED)
+    yaw = auto.mapping.truth.get("yaw_rad")
+    assert (scale, offset) == (None, None) if yaw is None else (yaw.scale, yaw.offset) == (scale, offset)
+    expected = {"lat_deg", "lon_deg"} | ({"enu_velocity_m_s"} if names else set()) | ({"yaw_rad"} if scale else set())
+    assert set(auto.mapping.truth) == expected
+    if names:
+        source = auto.mapping.truth["enu_velocity_m_s"]
+        assert source.paths == (names[1], names[0], names[2])
+        assert source.scale == (1.0, 1.0, -1.0 if names[2] == "vel_d" else 1.0)
+
+
 def test_truth_of_a_vendors_message_by_its_names() -> None:
     slip = topic(lng_vel_kmh=V * 3.6, lat_vel_kmh=0.2 * RATE * 3.6, yaw_rate_dps=-RATE / DEG)
     auto = found(imu__data=topic(**imu_fields()), ins__slip=slip, **SPEED)
