@@ -15,6 +15,6 @@ setup(
             "mapping/*.toml",
         ],
         "truthsim": ["py.typed", "vehicles/*.toml"],
-        "pdhef_logtool.schemas": ["*.json", "*/msg/*.msg"],
+        "pdhef_logtool.schemas": ["*.json", "*.md", "*/msg/*.msg"],
     },
 )

@@ -39,7 +39,8 @@ def ask_mapping(inspection: Inspection, ask: Callable[[str], str], tell: Callabl
         others = [c for c in inspection.candidates if c.section == section and c.source.name in names and not c.taken]
         if section == "truth" and taken is None and not others:
             continue
-        answer = _answer(title, names, taken, others, ask, tell)
+        topics = frozenset(t.name for t in inspection.topics)
+        answer = _answer(title, names, taken, others, topics, ask, tell)
         for name in names:
             sources.pop(name, None)
         if answer is not None:
@@ -55,6 +56,7 @@ def _answer(
     names: tuple[str, ...],
     taken: SignalSource | None,
     others: Sequence[Candidate],
+    topics: frozenset[str],
     ask: Callable[[str], str],
     tell: Callable[[str], None],
 ) -> SignalSource | None:
@@ -73,6 +75,9 @@ def _answer(
         if text.isdigit() and 1 <= int(text) <= len(others):
             return others[int(text) - 1].source
         words = text.split()
+        if len(words) in (2, 3) and words[0] not in topics:
+            tell(f"no topic {words[0]}; pdhef inspect lists them")
+            continue
         if len(words) in (2, 3) and _is_number(words[2:]):
             scale = float(words[2]) if len(words) == 3 else 1.0
             name = names[0] if len(names) == 1 or taken is None else taken.name

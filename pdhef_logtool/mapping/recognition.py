@@ -39,6 +39,8 @@ DEVICE_WORDS = frozenset(
     {"camera", "lidar", "realsense", "zed", "ouster", "livox", "velodyne", "phone", "os1", "radar"}
 )
 
+#: Start of the note on a steering angle that nobody measured.
+FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
@@ -258,7 +260,15 @@ def _weigh_the_rest(found: _Finding, topics: list[TopicInfo], vendors: Vendors) 
         if reason:
             found.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
     rest = [(t, _role(t)) for t in topics if not _is_well_known(t)]
+    # A measured steering angle goes before a command, whatever its type.
+    command = found.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in found.notes) else None
     weighed = weigh(found.log, rest, found.signals, found.truth, vendors)
+    if command is not None and not {"steer_rad", "steering_wheel_rad"} & set(weighed.signals):
+        found.signals["steer_rad"] = command
+    elif command is not None:
+        found.notes = [n for n in found.notes if not n.startswith(FROM_COMMAND)]
+        measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
+        found.doubt("steering", (measured, command.label), measured, "a measured angle before a command")
     found.signals.update(weighed.signals)
     found.truth.update(weighed.truth)
     found.notes += weighed.notes
@@ -476,9 +486,7 @@ def _map_steering(found: _Finding, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     if not measured:
-        found.notes.append(
-            f"steer_rad comes from the command {chosen.name}, not from a measured angle: no lag, no slack"
-        )
+        found.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: no lag, no slack")
     found.take(found.signals, "steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
 
 

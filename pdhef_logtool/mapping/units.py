@@ -169,7 +169,7 @@ def _by_siblings(fields: Fields) -> None:
         known = {leaf_group(f): f for f in fields.found if f.meaning.quantity in kinds and f.known}
         for one in fields.found:
             other = known.get(leaf_group(one))
-            if one.meaning.quantity in kinds and not one.known and other is not None:
+            if one.meaning.quantity in kinds and not one.known and other is not None and one.meaning.strength > 0.6:
                 same = [u for u, s in one.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
                 if same:
                     one.use(same[0])

@@ -334,3 +334,17 @@ def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tm
     assert "no truth in this log" in result.stdout
     assert "sideslip of open-loop and phy-ukf: rms difference" in result.stdout
     assert "RMSE" not in result.stdout
+
+
+def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp_path: Path) -> None:
+    result = _pdhef("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
+    assert result.returncode == 0
+    assert "[signals.steer" in (tmp_path / "m.toml").read_text()
+    again = _pdhef("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
+    assert "one that exists" in _one_line_error(again)
+
+
+def test_a_topic_goes_with_fields(sample_logs_dir: Path) -> None:
+    log = str(sample_logs_dir / "dlc.mcap")
+    assert "angular_velocity.z" in _pdhef("inspect", log, "--fields", "/imu/data").stdout
+    assert "--fields" in _one_line_error(_pdhef("inspect", log, "/imu/data"))

@@ -93,7 +93,9 @@ def test_doubtful_candidates_stand_in_the_file_as_comments(shared_dir: Path, tmp
 def test_a_mapping_by_question_and_answer(shared_dir: Path) -> None:
     found = inspect_log(shared_dir / "data" / "drives" / "lunda_v40")
     said: list[str] = []
-    answers = iter(["", "1", "nonsense", "/vbox/sample y_accel_g -9.81", "-", "", "", "", "", "", ""])
+    answers = iter(
+        ["", "1", "nonsense", "/vbox y_accel_g", "/vbox/sample y_accel_g -9.81", "-", "", "", "", "", "", ""]
+    )
     mapping = ask_mapping(found, lambda _: next(answers), said.append)
     assert mapping.signals["steering_wheel_rad"] == found.mapping.signals["steering_wheel_rad"]
     assert mapping.signals["yaw_rate_rad_s"].field == "yaw_rate_gnss_deg_s"

@@ -132,6 +132,19 @@ def test_a_bare_float_on_a_topic_called_steering() -> None:
     assert undecided(auto) == set()
 
 
+def test_a_measured_angle_of_any_type_goes_before_a_command() -> None:
+    drive = topic("ackermann_msgs/msg/AckermannDriveStamped", drive__steering_angle=STEER)
+    imu = {"imu__data": topic("sensor_msgs/msg/Imu", **imu_fields())}
+    alone = found(drive=drive, chassis=topic(torque=STEER), **imu, **SPEED)
+    assert taken(alone)["steer_rad"] == ("/drive.drive.steering_angle", 1.0)
+    assert any("not from a measured angle" in n for n in alone.mapping.notes)
+    both = found(drive=drive, chassis=topic(steering_wheel_angle_deg=STEER * 16.0 / DEG), **imu, **SPEED)
+    assert "steer_rad" not in taken(both)
+    assert taken(both)["steering_wheel_rad"] == ("/chassis.steering_wheel_angle_deg", round(DEG, 6))
+    assert not any("not from a measured angle" in n for n in both.mapping.notes)
+    assert [a.chosen for a in both.ambiguities] == ["/chassis.steering_wheel_angle_deg"]
+
+
 def test_what_does_not_follow_the_car_is_no_steering_angle() -> None:
     noise = np.random.default_rng(0).normal(0.0, 0.2, N)
     auto = found(imu__data=topic(**imu_fields()), a__steering=topic("std_msgs/msg/Float32", data=noise), **SPEED)
