@@ -76,13 +76,30 @@ _CAMEL = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 def words_of(name: str) -> tuple[str, ...]:
     """Cut a name into lower-case words: at signs, at capitals, and where known words are written as one."""
     found: list[str] = []
+    for letter, latin in (("ä", "ae"), ("ö", "oe"), ("ü", "ue"), ("Ä", "Ae"), ("Ö", "Oe"), ("Ü", "Ue")):
+        name = name.replace(letter, latin)
     for part in re.split(r"[^A-Za-z0-9]+", name):
+        if part.lower() in _SYNONYMS:
+            found += _SYNONYMS[part.lower()].split()
+            continue
         if part.lower() in _LEXICON or part.lower() in _WHOLE:
             found.append(part.lower())
             continue
         for piece in _CAMEL.findall(part):
-            found += _unglued(piece.lower())
+            found += _SYNONYMS[piece.lower()].split() if piece.lower() in _SYNONYMS else _unglued(piece.lower())
     return tuple(found)
+
+
+#: Words of other languages and of data bases of CAN, as those that stand for them here.
+_SYNONYMS = {
+    "lenkradwinkel": "steering wheel angle", "lenkwinkel": "steering angle", "gierrate": "yaw rate",
+    "giergeschwindigkeit": "yaw rate", "querbeschleunigung": "lateral acceleration",
+    "laengsbeschleunigung": "longitudinal acceleration", "schwimmwinkel": "sideslip angle",
+    "quergeschwindigkeit": "lateral velocity", "laengsgeschwindigkeit": "longitudinal velocity",
+    "geschwindigkeit": "speed", "fahrzeuggeschwindigkeit": "vehicle speed", "raddrehzahl": "wheel speed",
+    "radgeschwindigkeit": "wheel speed", "radgeschw": "wheel speed", "strg": "steering", "stwhl": "steering wheel",
+    "strwhl": "steering wheel", "psidot": "yaw rate", "yawdot": "yaw rate", "sog": "ground speed",
+}  # fmt: skip
 
 
 #: Short names that capitals would cut in a wrong place.
@@ -140,7 +157,7 @@ _NOT_VALUES = _set(
     jerk threshold rms noise throttle brake pedal accelerator integral sum residual stiffness percent pct
     driver duration period rsrvd reserved mag magnetic magnetometer quaternion orientation calibration
     resolution size width height num number engine motor wind air fan pump gear shaft eng transmission cruise
-    obstacle object lead relative ambient rack mast display max_speed tow
+    obstacle object lead relative ambient rack mast display max_speed tow ratio
     """
 )
 _COMMANDS = _set(
@@ -153,6 +170,8 @@ _CORNERS = {
     "fl": "fl", "lf": "fl", "fr": "fr", "rf": "fr", "rl": "rl", "lr": "rl", "rr": "rr", "bl": "rl", "br": "rr",
     "frontleft": "fl", "frontright": "fr", "rearleft": "rl", "rearright": "rr",
 }  # fmt: skip
+#: Front and rear as German data bases write them; too short to say it of anything but wheels.
+_GERMAN = {"vl": "fl", "vr": "fr", "hl": "rl", "hr": "rr"}
 _AXES = {
     "x": "x", "y": "y", "z": "z", "ax": "x", "ay": "y", "az": "z", "wx": "x", "wy": "y", "wz": "z", "long": "x",
     "lng": "x", "longitudinal": "x", "forward": "x", "lat": "y", "lateral": "y", "vert": "z", "vertical": "z",
@@ -229,6 +248,11 @@ def meaning_of(topic: str, type_name: str, path: str) -> Meaning | None:
         if found is None:
             continue
         quantity, part, kind = found
+        corner = _corner(tuple(inner), ())
+        if quantity == "speed" and corner:  # of the wheel that the struct around it is
+            quantity, part = "wheel speed", corner
+        if quantity == "speed" and unit_of(leaf, "wheel rate")[0]:
+            return None  # of something that turns
         unit, scale = unit_of(leaf, kind)
         if not unit and len(parts) > 1:
             unit, scale = unit_of(parts[-2], kind)
@@ -253,10 +277,13 @@ def _quantity(
     corner = _corner(words, own)
     wheel = bool(have & {"wheel", "wheels", "whl", "tire", "tyre", "tires", "tyres", "corner"})
     rate = bool(have & {"rate", "gyro", "gyroscope", "omega", "gyr"}) or (
-        "angular" in have and bool(have & {"velocity", "vel", "velocities", "speed"})
+        bool(have & {"angular", "ang"}) and bool(have & {"velocity", "vel", "velocities"})
+    )
+    rate |= own[-2:] in (("psi", "dot"), ("yaw", "dot"), ("w", "z")) or (
+        "angular" in have and bool(have & {"speed", "twist"})
     )
     accelerates = bool(have & {"accel", "acceleration", "accelerometer", "accelerations", "accels", "acc", "specific"})
-    accelerates |= bool(set(own) & {"ax", "ay", "az"})
+    accelerates |= bool(set(own) & {"ax", "ay", "az"}) or bool({"a", "g"} & set(own) and {"lat", "long"} & set(own))
     steers = bool(have & {"steer", "steering", "swa", "handwheel", "roadwheel", "roadwheels"}) or (
         ("delta" in own and set(own) <= _OF_DELTA)
         or {"road", "wheel", "angle"} <= have
@@ -278,12 +305,14 @@ def _quantity(
     if accelerates and not have & {"angular", "yaw", "pedal"}:
         return ("acceleration", axis, "acceleration") if axis else None
     if rate or (have & {"yaw"} and have & {"vel", "velocity", "speed"}) or have & {"yawrate", "wz"} & set(own):
-        if wheel and corner:
+        if corner and (wheel or "omega" in own):
             return "wheel rate", corner, "wheel rate"
-        if have & {"yaw", "yawrate", "turn", "wz"} or axis == "z":
+        if have & {"yaw", "yawrate", "turn", "wz", "psi"} or axis == "z":
             return "rate", "z", "rate"
         return ("rate", axis, "rate") if axis else None
     speeds = bool(have & {"speed", "speeds", "velocity", "velocities", "vel", "spd", "kmh", "kph", "mph", "ux", "vx"})
+    speeds |= {"twist", "linear"} <= have
+    speeds |= own[:1] == ("v",) and len(own) > 1 and own[1] in _AXES
     if corner and (wheel or speeds):
         return ("wheel speed", corner, "speed") if speeds or strength < 1.0 else None
     return _motion(have, own, axis, speeds, index)
@@ -292,6 +321,9 @@ def _quantity(
 def _motion(
     have: set[str], own: tuple[str, ...], axis: str, speeds: bool, index: int | None
 ) -> tuple[str, str, str] | None:
+    place = own[-1] if set(own[:-1]) <= {"gps", "gnss", "ins", "pos", "position", "abs"} else ""
+    if place in ("lat", "lon", "lng", "long") and not speeds:
+        return "latitude" if place == "lat" else "longitude", "", "position"
     if have & {"wheel", "wheels", "whl"} and index is not None:
         return None  # which wheel it is does not stand there
     if have & {"ecef", "enu", "ned", "east", "north", "up", "down"} and speeds:
@@ -326,6 +358,8 @@ def _corner(words: tuple[str, ...], own: tuple[str, ...]) -> str:
         for word in group:
             if word in _CORNERS:
                 return _CORNERS[word]
+            if word in _GERMAN and {"wheel", "whl"} & set(words):
+                return _GERMAN[word]
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
         found = ["".join({e[w] for w in group if w in e}) for e in ends]
         if all(len(f) == 1 for f in found):
