@@ -238,6 +238,8 @@ def meaning_of(topic: str, type_name: str, path: str) -> Meaning | None:
     outer = [*words_of(topic), *words_of(type_name.rpartition("/")[2].rpartition(".")[2])]
     if _OTHER_DEVICES & set(outer):
         return None
+    if not own:
+        return None
     index = re.search(r"\[(\d+)\]$", leaf)
     if _NOT_VALUES & set(own) or _NOT_VALUES & set(inner) - {"state", "status", "orientation"}:
         return None

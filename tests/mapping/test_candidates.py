@@ -458,3 +458,23 @@ def test_units_of_names(leaf: str, kind: str, unit: str) -> None:
 def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
     meaning = meaning_of("/topic", "a/B", path)
     assert (meaning.quantity if meaning else "") == quantity
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("values", ["nan", "inf", "huge", "zero", "noise", "few"])
+def test_values_that_are_no_drive_break_nothing(values: str) -> None:
+    noise = np.random.default_rng(0).normal(size=N)
+    made = {"nan": S * np.nan, "inf": S + np.inf, "huge": 1e300 * noise, "zero": 0.0 * S}.get(values, noise)
+    names = ("speed", "yaw_rate", "accel_x", "accel_y", "accel_z", "steering_angle", "fl_speed", "fr_speed")
+    fields = dict.fromkeys((*names, "latitude", "longitude", "heading", "sideslip", "", ".", "a..b"), made)
+    message = topic()
+    message.fields |= fields
+    if values == "few":
+        message.log_time_ns = T[:2]
+        message.fields = {k: v[:2] for k, v in message.fields.items()}
+    auto = found(ins__car=message, gps__fix=topic("sensor_msgs/msg/NavSatFix", latitude=made, longitude=made))
+    # What is no measurement is not taken; noise is told to follow nothing, or what it is not.
+    if values in ("nan", "inf", "huge", "zero"):
+        assert taken(auto) == {}
+    else:
+        assert undecided(auto)
