@@ -73,6 +73,7 @@ class ColumnarLog:
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
+        self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -134,7 +135,8 @@ class ColumnarLog:
                 found.append(_out_of_time(container, list(self._late[c].values())))
             found.extend(self._undecodable_losses(c, container))
             for (of, channel), schema in schemas:
-                if of == c and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
+                wanted = of == c and (of, channel) in self._asked
+                if wanted and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
                     what = f"its messages cannot be decoded: {schema}"
                     found.append(Loss("bad-schema", what, container.channels[channel].topic))
         return tuple(found)
@@ -147,15 +149,20 @@ class ColumnarLog:
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
         for (of, channel, _), rows in self._undecodable.items():
-            if of == c:
+            if of == c and (of, channel) in self._asked:
                 counts[channel] += len(rows)
         for channel, n in sorted(counts.items()):
             what = f"{n} messages do not fit the type of their topic"
             yield Loss("undecodable", what, container.channels[channel].topic, count=n)
 
-    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
+        """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
+
+        ``quiet`` only looks: a schema that does not parse is no loss of whoever wants nothing of the topic.
+        """
         for c, channel in self._by_topic.get(topic, ()):
+            if not quiet:
+                self._asked.add((c, channel.id))
             schema = self._schema(c, channel)
             if isinstance(schema, MessageSchema):
                 return tuple(leaves(schema.root))
@@ -180,14 +187,20 @@ class ColumnarLog:
         requests: Mapping[str, Sequence[str]],
         start_ns: int | None = None,
         end_ns: int | None = None,
+        *,
+        quiet: bool = False,
     ) -> dict[str, Columns]:
         """Read the fields asked for of messages with log time in [start, end).
+
+        ``quiet`` only looks: messages that do not decode are no loss of whoever wants nothing of the topic.
 
         Raises
         ------
         MappingError : the log has no such topic, no such field, or cannot decode the topic.
         """
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
+        if not quiet:
+            self._asked |= {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
         return self._collect(plans, start_ns, end_ns)
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:

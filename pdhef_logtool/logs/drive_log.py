@@ -96,8 +96,11 @@ class DriveLog(Protocol):
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
         """Where the bytes of each file went, as far as is known by now."""
 
-    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
+        """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
+
+        ``quiet`` only looks: a schema that does not parse is no loss then.
+        """
 
     def unreadable(self, topic: str) -> str:
         """Return why no field of a topic is known; empty where one is."""
@@ -107,8 +110,13 @@ class DriveLog(Protocol):
         requests: Mapping[str, Sequence[str]],
         start_ns: int | None = None,
         end_ns: int | None = None,
+        *,
+        quiet: bool = False,
     ) -> dict[str, Columns]:
-        """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded."""
+        """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded.
+
+        ``quiet`` only looks: messages that do not decode are no loss then.
+        """
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
         """Read only log and publish times of every topic (``fields`` empty); payloads are not decoded."""

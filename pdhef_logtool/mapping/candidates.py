@@ -189,7 +189,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
     """Return the fields whose name or documented type gives them a meaning; the last entry tells a documented one."""
     found = []
     for topic, role in topics:
-        fields = log.fields(topic.name)
+        fields = log.fields(topic.name, quiet=True)
         if len(fields) > MOST_FIELDS or vendors.why_left_out(topic.type_name):
             continue
         known = vendors.fields_of(topic.type_name)
@@ -234,11 +234,11 @@ def look(
                 its = replace(meaning, strength=0.5)
             if seen is None or its is None or not np.isfinite(seen.values).any():
                 continue
-            stamp = stamp_of(log.fields(topic.name), name)
+            stamp = stamp_of(log.fields(topic.name, quiet=True), name)
             if role == "sensor" and set(words_of(name)) & _NAVIGATION:
                 role = "navigation"
             one = Found(topic, name, its, role, stamp, seen, _factors(its, seen))
-            if _is_nested_imu(topic, log.fields(topic.name), name):
+            if _is_nested_imu(topic, log.fields(topic.name, quiet=True), name):
                 one.known = True
                 one.reasons.append("a nested sensor_msgs/Imu, in SI units")
             if documented:

@@ -91,7 +91,7 @@ class Pieces:
 
     def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
         try:
-            return self.log.read(requests, start, start + PIECE_NS)
+            return self.log.read(requests, start, start + PIECE_NS, quiet=True)
         except PdhefError:
             if len(requests) == 1:
                 return {}

@@ -66,7 +66,7 @@ def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTr
 
 
 def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
-    fields = log.fields(topic.name)
+    fields = log.fields(topic.name, quiet=True)
     stamp = stamp_path_of(fields)
     truth = {s.name: s for s in _vectors(topic, fields, stamp)}
     meanings = {f.path: meaning_of(topic.name, topic.type_name, f.path) for f in fields if f.kind == "number"}

@@ -39,6 +39,12 @@ DEVICE_WORDS = frozenset(
     {"camera", "lidar", "realsense", "zed", "ouster", "livox", "velodyne", "phone", "os1", "radar"}
 )
 
+#: Starts of types that hold no signal of a car, and much else.
+NO_SENSORS = (
+    "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud", "sensor_msgs/LaserScan",
+    "sensor_msgs/CameraInfo", "visualization_msgs/", "tf2_msgs/", "tf/", "rosgraph_msgs/", "rcl_interfaces/",
+    "diagnostic_msgs/", "nav_msgs/Path", "nav_msgs/OccupancyGrid", "foxglove.CompressedImage", "foxglove.PointCloud",
+)  # fmt: skip
 #: Start of the note on a steering angle that nobody measured.
 FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
@@ -209,7 +215,7 @@ def auto_map(
     topics = [t for t in there if t not in unlike]
     found = _Finding(log=log, samples=_probe(log, topics))
     found.notes += [_why_unused(log, t) for t in unlike]
-    found.notes += _what_cannot_be_read(log, [t for t in topics if t not in unlike])
+    found.notes += _what_cannot_be_read(log, [t for t in topics if not _type(t).startswith(NO_SENSORS)])
     found.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
     ]
@@ -244,7 +250,7 @@ def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
     """Say of which other topics no field is known, those of one reason together."""
     by_reason: dict[str, list[str]] = {}
     for topic in topics:
-        reason = "" if log.fields(topic.name) else log.unreadable(topic.name)
+        reason = "" if log.fields(topic.name, quiet=True) else log.unreadable(topic.name)
         if reason:
             by_reason.setdefault(reason, []).append(topic.name)
     return [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]
@@ -259,7 +265,7 @@ def _weigh_the_rest(found: _Finding, topics: list[TopicInfo], vendors: Vendors) 
         reason = vendors.why_left_out(topic.type_name)
         if reason:
             found.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
-    rest = [(t, _role(t)) for t in topics if not _is_well_known(t)]
+    rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
     # A measured steering angle goes before a command, whatever its type.
     command = found.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in found.notes) else None
     weighed = weigh(found.log, rest, found.signals, found.truth, vendors)
@@ -283,7 +289,7 @@ def _map_documented_truth(found: _Finding, topics: list[TopicInfo], vendors: Ven
         return
     whole: dict[str, dict[str, SignalSource]] = {}
     for topic in topics:
-        fields = found.log.fields(topic.name)
+        fields = found.log.fields(topic.name, quiet=True)
         sources = [
             SignalSource(f.name, topic.name, path, stamp_path_of(fields), f.scale, f.offset)
             for path, f in vendors.fields_of(topic.type_name).items()

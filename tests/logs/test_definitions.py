@@ -116,3 +116,15 @@ def test_a_folder_without_definitions_is_refused(tmp_path: Path) -> None:
         read_definitions(tmp_path)
     with pytest.raises(UsageError, match="no folder"):
         read_definitions(tmp_path / "none")
+
+
+def test_looking_makes_no_losses(tmp_path: Path) -> None:
+    path = bag(tmp_path / "b", {"/steer": ("dbw_msgs/msg/Steer", {"dbw_msgs/msg/Steer": STEER})})
+    (tmp_path / "defs").mkdir()
+    (tmp_path / "defs" / "Steer.msg").write_text("float32 steering_wheel_angle\nstring more\nfloat64[4] and_more\n")
+    log = open_log(path, msgs=tmp_path / "defs")
+    paths = {"/steer": ["steering_wheel_angle"]}
+    log.read(paths, quiet=True)
+    assert log.lost == ()
+    log.read(paths)
+    assert [x.kind for x in log.lost] == ["undecodable"]
