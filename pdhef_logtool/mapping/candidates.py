@@ -91,6 +91,7 @@ class Found:
     Attributes
     ----------
     factors : units that it may be in, the likeliest first. fixed : unit and sign are documented.
+    section : ``signals`` or ``truth`` if its documentation says which.
     known : its unit is sure. anchor : it is mapped already. sign : that it is taken with.
     """
 
@@ -102,6 +103,7 @@ class Found:
     seen: Seen
     factors: tuple[tuple[str, float], ...]
     fixed: bool = False
+    section: str = ""
     known: bool = False
     anchor: bool = False
     sign: float = 1.0
@@ -261,6 +263,7 @@ def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -
 
 def _document(one: Found, entry: VendorField) -> None:
     one.fixed = one.known = True
+    one.section = entry.section
     one.factors = ((entry.unit, abs(entry.scale)),)
     one.sign, one.offset = math.copysign(1.0, entry.scale), entry.offset
     one.reasons.append(f"documented: {entry.page}")

@@ -140,6 +140,21 @@ def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
     return float(middle) if high - low < 0.1 * abs(middle) else None
 
 
+def is_of_one_sign(values: FloatArray) -> bool:
+    """Return whether no value is negative."""
+    finite = values[np.isfinite(values)]
+    return finite.shape[0] > 0 and bool(finite.min() >= 0.0)
+
+
+def is_of_both_signs(values: FloatArray) -> bool:
+    """Return whether a good share of the values is on either side of zero, far beyond noise about it."""
+    finite = values[np.isfinite(values)]
+    if finite.shape[0] == 0:
+        return False
+    low, high = np.quantile(finite, [0.05, 0.95])
+    return bool(low < 0.0 < high and min(-low, high) > 0.3 * max(-low, high))
+
+
 def spread(cells: FloatArray) -> float:
     """Return the standard deviation of what is known; 0 without anything."""
     known = cells[np.isfinite(cells)]

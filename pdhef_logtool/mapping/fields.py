@@ -59,6 +59,11 @@ class Fields:
             return None
         return wheels[0].standing_for(mean_of([f.si for f in wheels]))
 
+    def wheel_turns(self) -> Found | None:
+        """Return how fast the wheels turn, which is a speed but for their radius."""
+        wheels = [f for f in (*self.found, *self.anchors.values()) if f.meaning.quantity == "wheel rate" and f.known]
+        return wheels[0].standing_for(mean_of([f.si for f in wheels])) if wheels else None
+
     def turning(self, ay: FloatArray, rate: FloatArray, speed: FloatArray) -> Fit | None:
         """Fit a_y to v r; None where the drive does not turn."""
         expected = rate * speed

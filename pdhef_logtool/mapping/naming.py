@@ -94,6 +94,7 @@ def words_of(name: str) -> tuple[str, ...]:
 _SYNONYMS = {
     "lenkradwinkel": "steering wheel angle", "lenkwinkel": "steering angle", "gierrate": "yaw rate",
     "giergeschwindigkeit": "yaw rate", "querbeschleunigung": "lateral acceleration",
+    "querbeschl": "lateral acceleration", "laengsbeschl": "longitudinal acceleration",
     "laengsbeschleunigung": "longitudinal acceleration", "schwimmwinkel": "sideslip angle",
     "quergeschwindigkeit": "lateral velocity", "laengsgeschwindigkeit": "longitudinal velocity",
     "geschwindigkeit": "speed", "fahrzeuggeschwindigkeit": "vehicle speed", "raddrehzahl": "wheel speed",

@@ -26,7 +26,7 @@ TRUTH_WORDS = frozenset(
 )
 #: Words of satellite and inertial navigation: velocities and poses of such topics are truth, their IMU is a sensor.
 NAVIGATION_WORDS = frozenset(
-    {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk"}
+    {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk", "adma"}
 )
 #: Words of measured vehicle speed.
 VEHICLE_WORDS = frozenset({"wheel", "wheels", "odom", "odometry", "can", "vehicle", "encoder", "encoders", "speed"})

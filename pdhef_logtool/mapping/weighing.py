@@ -26,7 +26,7 @@ from pdhef_logtool.mapping.candidates import (
     triad_of,
 )
 from pdhef_logtool.mapping.checking import has_path
-from pdhef_logtool.mapping.evidence import Fit, fit, ratio, spread
+from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
@@ -133,7 +133,7 @@ class _Weighing:
     def choose_signals(self, have: set[str]) -> None:
         """Take the best candidate of each signal that is missing."""
         usable = [f for f in self.fields.found if f.role in ("sensor", "navigation", "device")]
-        usable = [f for f in usable if f.seen.changes or f.fixed]
+        usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
         for one in usable:
             # A message that holds the answer gives the sensors too only where no other one does.
             one.bonus -= 0.2 if one.topic.name == self.truth_from else 0.0
@@ -325,7 +325,7 @@ class _Weighing:
         relation = None if rate is None or wheels is None else fit(wheels, self.fields.pieces.smooth(rate.si))
         if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
             _rate_by_track(rate, abs(relation.slope))
-        signs = judge_signs(self.fields, trio, self._speed(), wheels)
+        signs = judge_signs(self.fields, trio, self._speed() or self.fields.wheel_turns(), wheels)
         for one in (trio[n] for n in signs.turned):
             if one is not None:
                 one.sign = -one.sign
@@ -355,7 +355,8 @@ class _Weighing:
 
     def _follow(self) -> None:
         """Say what does not follow the car's motion although the drive excites it: a name may be wrong, or an axis."""
-        speed, rate = self._speed(), self._chosen("yaw_rate_rad_s")
+        speed, rate = self._speed() or self.fields.wheel_turns(), self._chosen("yaw_rate_rad_s")
+        self._both_signs()
         if speed is None:
             return
         smooth = self.fields.pieces.smooth
@@ -367,6 +368,16 @@ class _Weighing:
             relation = None if one is None or spread(motion) < MOVING_M_S2 else fit(smooth(one.si), motion)
             if one is not None and relation is not None and abs(relation.correlation) < FOLLOWS:
                 one.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
+
+    def _both_signs(self) -> None:
+        """Say what is never negative although the car turns both ways: its sign stands in another field."""
+        names = ("yaw_rate_rad_s", "ay_m_s2", "steer_rad", "steering_wheel_rad")
+        there = {n: f for n in names if (f := self._chosen(n)) is not None and f.seen.changes}
+        if not any(is_of_both_signs(f.seen.values) for f in there.values()):
+            return
+        for one in there.values():
+            if is_of_one_sign(one.seen.values) and not one.anchor:
+                one.doubts.append("it is never negative although the car turns both ways: its sign may stand elsewhere")
 
     def _chosen(self, *names: str) -> Found | None:
         """Return what is taken for the first of these signals that there is, or mapped already."""
@@ -388,7 +399,10 @@ class _Weighing:
         """Take truth from the one topic that has sideslip or a lateral velocity, and calls itself truth if any does."""
         if not self.truth_from:
             return
-        its = [f for f in self.fields.found if f.topic.name == self.truth_from]
+        its = [f for f in self.fields.found if f.topic.name == self.truth_from and f.section != "signals"]
+        its = [f for f in its if f.fixed] or its  # what is documented goes before names
+        if not its:
+            return
         for one in sorted(its, key=lambda f: -f.score):
             name = _truth_name(one)
             if name and one.seen.changes:

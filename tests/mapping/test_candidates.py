@@ -275,6 +275,36 @@ def test_the_path_shows_how_a_heading_counts(
         assert source.scale == (1.0, 1.0, -1.0 if names[2] == "vel_d" else 1.0)
 
 
+def test_a_magnitude_without_its_sign_is_said() -> None:
+    bus = topic(yaw_rate_dps=np.abs(RATE) / DEG, lat_accel_mps2=AY, long_accel_mps2=AX)
+    checks = {c.name: c.evidence for c in found(bus=bus, **SPEED).mapping.checks}
+    assert "never negative" in checks["yaw_rate_rad_s.candidate"]
+
+
+def test_axes_are_held_against_wheels_of_unknown_radius_too() -> None:
+    turned = imu_fields()
+    turned["linear_acceleration__x"], turned["linear_acceleration__y"] = -AY, AX
+    wheels = topic("raptor_dbw_msgs/msg/WheelSpeedReport", **dict.fromkeys(("front_left", "rear_right"), V / 0.3))
+    assert "ay_m_s2.candidate" in undecided(found(vn__common=topic(**turned), wheels=wheels))
+
+
+def test_an_adma_is_sensor_and_truth() -> None:
+    adma = topic(
+        "adma_ros_driver_msgs/msg/AdmaDataScaled",
+        acc_hor__x=AX / G,
+        acc_hor__y=AY / G,
+        rate_hor__z=RATE / DEG,
+        rate_body__z=RATE / DEG,
+        side_slip_angle=RATE,
+        ins_lat_abs=WHERE["latitude"],
+        ins_long_abs=WHERE["longitude"],
+    )
+    auto = found(genesys__adma__data_scaled=adma)
+    assert taken(auto)["yaw_rate_rad_s"] == ("/genesys/adma/data_scaled.rate_hor.z", round(DEG, 6))
+    assert {"sideslip_rad", "lat_deg", "lon_deg"} <= set(auto.mapping.truth)
+    assert undecided(auto) == set()
+
+
 def test_truth_of_a_vendors_message_by_its_names() -> None:
     slip = topic(lng_vel_kmh=V * 3.6, lat_vel_kmh=0.2 * RATE * 3.6, yaw_rate_dps=-RATE / DEG)
     auto = found(imu__data=topic(**imu_fields()), ins__slip=slip, **SPEED)
