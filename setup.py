@@ -6,8 +6,15 @@ setup(
     packages=[*find_packages(include=["pdhef_logtool*", "truthsim*"]), "pdhef_logtool.schemas"],
     package_dir={"pdhef_logtool.schemas": "schemas"},
     package_data={
-        "pdhef_logtool": ["py.typed", "models/*/*", "models/*/*/*", "models/*/*/*/*", "models/*/*/*/*/*"],
+        "pdhef_logtool": [
+            "py.typed",
+            "models/*/*",
+            "models/*/*/*",
+            "models/*/*/*/*",
+            "models/*/*/*/*/*",
+            "mapping/*.toml",
+        ],
         "truthsim": ["py.typed", "vehicles/*.toml"],
-        "pdhef_logtool.schemas": ["*.json", "*/msg/*.msg"],
+        "pdhef_logtool.schemas": ["*.json", "*.md", "*/msg/*.msg"],
     },
 )

@@ -54,7 +54,7 @@ class FakeLog:
     def occupied(self) -> OccupiedTime:
         return OccupiedTime(((self.start_ns, self.end_ns),) if self.end_ns else ())
 
-    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         out = []
         for path, values in self.contents[topic].fields.items():
             if values.dtype == object:
@@ -67,8 +67,16 @@ class FakeLog:
                 out.append(FieldInfo(path, "number"))
         return tuple(out)
 
+    def unreadable(self, topic: str) -> str:
+        return ""
+
     def read(
-        self, requests: Mapping[str, Sequence[str]], start_ns: int | None = None, end_ns: int | None = None
+        self,
+        requests: Mapping[str, Sequence[str]],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        quiet: bool = False,
     ) -> dict[str, Columns]:
         self.reads.append({t: list(p) for t, p in requests.items()})
         return {name: self._columns(name, paths, start_ns, end_ns) for name, paths in requests.items()}

@@ -54,6 +54,7 @@ _OPTIONS: dict[str, Any] = {
         _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/friction.md")
     ],
     "prefer_truth": Annotated[_Text, Option(help="perfect or rtk: which truth of a simulated log counts.")],
+    "msgs": Annotated[_File, Option(metavar="DIR", help="Folder of .msg files or workspace: types a log lacks.")],
     "budget": Annotated[
         float | None, Option(metavar="FACTOR", help="Raise what a log may cost in memory and time: docs/formats.md.")
     ],
@@ -86,10 +87,10 @@ def command(
     group : commands to add it to.
     examples, notes : what stands below the options: lines as they are typed, and paragraphs.
     name : that of the command; None = the function's.
-    shared : shared options beside --mapping, --prefer-truth and --budget, which every ``config`` takes.
+    shared : shared options beside --mapping, --prefer-truth, --msgs and --budget, which every ``config`` takes.
     car : what --car means to the command, which then has --start and --end too; empty = it has no car.
     """
-    wanted = f"mapping prefer_truth budget {shared} {'car vehicle start end' if car else ''}".split()
+    wanted = f"mapping prefer_truth budget msgs {shared} {'car vehicle start end' if car else ''}".split()
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:
         taken["car"] = Annotated[_File, Option(help=f"{car}: a folder, or a bare vehicle.toml.")]

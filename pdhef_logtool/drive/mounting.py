@@ -8,6 +8,7 @@ so, by complex regression, and its fit says whether all of it is believed.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
 from itertools import permutations, product
@@ -323,14 +324,27 @@ class Survey:
             latency=self.latency,
             mounting_is_known=self.is_mounted,
         )
-        if self.mounting is None or not self.is_mounted:
-            return (*self.checks, *found)
-        # Right axes have right signs, and gravity says the unit.
-        evidence = self.mounting.evidence
-        settled = {f"{n}.sign" for n in MOUNTED}
-        known = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in found]
-        shown = [k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)]
-        return (*self.checks, *shown)
+        if self.mounting is not None and self.is_mounted:
+            # Right axes have right signs, and gravity says the unit.
+            settled = {f"{n}.sign" for n in MOUNTED}
+            evidence = self.mounting.evidence
+            known = [replace(c, verdict="passed", evidence=evidence, remedy="") for c in found]
+            found = tuple(
+                k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)
+            )
+        return (*self.checks, *self._of_names(found), *found)
+
+    def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
+        """Yield what the mapping's names left undecided and the drive has not settled since."""
+        passed = {c.name for c in found if c.verdict == "passed"} - {
+            f"{c.subject}.sign" for c in found if c.verdict != "passed"
+        }
+        for check in self.mapping.checks:
+            signal = check.name.removesuffix(".candidate")
+            if check.name in ("imu.mounting", "mapping.sign") and self.is_mounted:
+                continue
+            if f"{signal}.sign" not in passed:
+                yield check
 
 
 def survey_log(

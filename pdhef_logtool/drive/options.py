@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
@@ -28,6 +29,7 @@ class ReadOptions:
     window_s : length of the windows that the log is processed in; changes no number.
     budget : factor on what reading a log may cost.
     waived : names of checks that do not count.
+    msgs : folder with definitions of message types that a log does not define.
     """
 
     start: str | None = None
@@ -38,6 +40,7 @@ class ReadOptions:
     window_s: float = WINDOW_S
     budget: float = 1.0
     waived: tuple[str, ...] = ()
+    msgs: Path | None = None
 
     @property
     def use_speed(self) -> bool:

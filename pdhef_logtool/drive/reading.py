@@ -241,7 +241,7 @@ def read_drive(
         notes.append(text)
         tell(f"{log_input.stem}: {text}")
 
-    opened = open_log(log_input.path, options.limits)
+    opened = open_log(log_input.path, options.limits, options.msgs)
     try:
         chosen, missing = choose_mapping(
             opened, mapping, told, remarks.append, prefer_truth=options.prefer_truth, require_signals=require_sensors

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pdhef_logtool.inspection.asking import ask_mapping as ask_mapping
+from pdhef_logtool.inspection.fields import fields_of_log as fields_of_log
+from pdhef_logtool.inspection.fields import render_fields as render_fields
 from pdhef_logtool.inspection.rendering import render_inspection as render_inspection
 from pdhef_logtool.inspection.report import inspect_drive_log as inspect_drive_log
 from pdhef_logtool.inspection.report import inspect_log as inspect_log

@@ -11,9 +11,14 @@ from rich.text import Text
 
 from pdhef_logtool.inspection.report import Inspection, SignalReport, TopicReport
 from pdhef_logtool.logs.occupied_time import shown_time
+from pdhef_logtool.mapping.candidates import Candidate
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+#: Candidates of a signal that are shown beside the one that was taken.
+CANDIDATES_SHOWN = 2
 
 
 def render_inspection(inspection: Inspection, console: Console) -> None:
@@ -29,7 +34,9 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
     if inspection.signals or inspection.truth:
         console.print(_sources_table(inspection))
         console.print(_statistics_table(inspection))
-    for head, style, text in _findings(inspection):
+    if inspection.candidates:
+        console.print(_candidates_table(inspection.candidates))
+    for head, style, text in (*_findings(inspection), *_uses(inspection)):
         line = Table.grid(padding=(0, 1))
         line.add_column(width=9)
         line.add_column(overflow="fold")
@@ -37,7 +44,7 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         console.print(line)
 
 
-def _table(title: str, *headings: str | Text, words: int) -> Table:
+def empty_table(title: str, *headings: str | Text, words: int) -> Table:
     """Return an empty table whose first ``words`` columns hold text and the others numbers."""
     table = Table(
         title=Text(title),
@@ -66,18 +73,18 @@ def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
         "longest gap\ns @ s",
         "delay\nms",
     )
-    table = _table(f"Topics ({', '.join(encodings)})", *headings, words=1)
+    table = empty_table(f"Topics ({', '.join(encodings)})", *headings, words=1)
     for topic in topics:
         gap = "-"
         if math.isfinite(topic.largest_gap_s):
-            gap = f"{_text(topic.largest_gap_s)} @ {topic.largest_gap_at_s:.1f}"
-        delay, late = _text(topic.delay_median_s * 1e3), _text(topic.delay_p95_s * 1e3)
+            gap = f"{number_text(topic.largest_gap_s)} @ {topic.largest_gap_at_s:.1f}"
+        delay, late = number_text(topic.delay_median_s * 1e3), number_text(topic.delay_p95_s * 1e3)
         kind = topic.type.replace("/msg/", "/") + (f" ({topic.encoding})" if len(encodings) > 1 else "")
         table.add_row(
             Text.assemble(f"{topic.name}\n", (kind, "dim")),
             str(topic.messages),
-            _text(topic.rate_hz),
-            _text(topic.jitter_p95_s * 1e3),
+            number_text(topic.rate_hz),
+            number_text(topic.jitter_p95_s * 1e3),
             gap,
             delay if delay == late else f"{delay} to {late}",
         )
@@ -85,8 +92,9 @@ def _topics_table(topics: tuple[TopicReport, ...]) -> Table:
 
 
 def _sources_table(inspection: Inspection) -> Table:
-    origin = "recognised types" if inspection.mapping.origin == "auto" else "mapping file"
-    table = _table(f"Mapping ({origin})", "signal", "topic", "field", words=3)
+    found = "recognised types and candidates" if any(c.taken for c in inspection.candidates) else "recognised types"
+    origin = found if inspection.mapping.origin == "auto" else "mapping file"
+    table = empty_table(f"Mapping ({origin})", "signal", "topic", "field", words=3)
     for section in (inspection.signals, inspection.truth):
         for report in section.values():
             table.add_row(report.name, Text(report.topic), Text(_short(report.field)))
@@ -95,9 +103,37 @@ def _sources_table(inspection: Inspection) -> Table:
     return table
 
 
+def _candidates_table(candidates: tuple[Candidate, ...]) -> Table:
+    """Return what was weighed beside recognised types: what was taken, and the best others of each signal."""
+    table = empty_table("Candidates by name and physics (* taken)", "signal", "field and reason", "score", words=2)
+    shown: dict[str, int] = {}
+    order = [*SIGNAL_UNITS, *TRUTH_UNITS]
+    for one in sorted(candidates, key=lambda c: (c.section, order.index(c.source.name), not c.taken, -c.score)):
+        name = f"{'truth ' if one.section == 'truth' else ''}{one.source.name}"
+        shown[name] = shown.get(name, 0) + 1
+        if shown[name] <= (1 + CANDIDATES_SHOWN):
+            doubt = Text(f"\nunsure: {one.doubt}", "yellow") if one.doubt else ""
+            text = Text.assemble(one.source.label, Text(f"\n{one.reason}", "dim"), doubt)
+            table.add_row(f"{'* ' if one.taken else '  '}{name}", text, f"{one.score:.2f}")
+    return table
+
+
+def _uses(inspection: Inspection) -> list[tuple[str, str, str]]:
+    """Return the last lines: what the log is good for, and what it lacks."""
+    uses = inspection.uses
+    lines = [("can", "green", f"What you can do with this log: {uses['can']}")]
+    if uses["sideslip_needs"]:
+        lines.append(("needs", "yellow", f"to get sideslip you still need: {uses['sideslip_needs']}"))
+        if any(not c.taken for c in inspection.candidates):
+            lines.append(("next", "cyan", "pdhef map LOG asks its way through the candidates to a mapping.toml"))
+        else:
+            lines.append(("next", "cyan", "pdhef inspect LOG --fields shows every number that the log holds"))
+    return lines
+
+
 def _statistics_table(inspection: Inspection) -> Table:
     headings = ("signal", "Hz", "delay\nms", "min", "mean", "max", "std", "gaps", "drop")
-    table = _table("Values in SI units", *headings, words=1)
+    table = empty_table("Values in SI units", *headings, words=1)
     for section in (inspection.signals, inspection.truth):
         for report in section.values():
             table.add_row(*_statistics_row(report))
@@ -109,12 +145,12 @@ def _statistics_table(inspection: Inspection) -> Table:
 def _statistics_row(report: SignalReport) -> tuple[str, ...]:
     return (
         report.name,
-        _text(report.rate_hz),
-        _text(report.latency_s * 1e3),
-        _text(report.minimum),
-        _text(report.mean),
-        _text(report.maximum),
-        _text(report.std),
+        number_text(report.rate_hz),
+        number_text(report.latency_s * 1e3),
+        number_text(report.minimum),
+        number_text(report.mean),
+        number_text(report.maximum),
+        number_text(report.std),
         str(report.gaps) if report.gaps else "-",
         str(sum(report.dropped.values())) if any(report.dropped.values()) else "-",
     )
@@ -127,6 +163,7 @@ def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
         found.append(("missing", "yellow", ", ".join(inspection.missing)))
     if not inspection.truth:
         found.append(("missing", "yellow", "truth: nothing to score an estimate against"))
+    found += [("unsure", "yellow", f"{c.evidence}; {c.remedy}") for c in inspection.mapping.checks]
     found += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
     for verdict, style in (("failed", "red"), ("undecided", "yellow")):
         checks = [c for c in inspection.checks if c.verdict == verdict]
@@ -153,7 +190,8 @@ def _short(field: str) -> str:
     return f"{stems[0]}.{{{','.join(leaves)}}}" if len(leaves) > 1 and stems[0] and len(set(stems)) == 1 else field
 
 
-def _text(value: float) -> str:
+def number_text(value: float) -> str:
+    """Return a number in few digits, a dash without one."""
     if not math.isfinite(value):
         return "-"
     if value == 0.0:

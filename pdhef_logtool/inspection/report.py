@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
+from collections.abc import Mapping as MappingABC
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_proposals
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
+from pdhef_logtool.inspection.uses import uses_of
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
-from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo, windows
+from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import (
     Ambiguity,
@@ -32,6 +37,7 @@ from pdhef_logtool.mapping import (
     read_signals,
     resolve_mapping,
 )
+from pdhef_logtool.mapping.candidates import Candidate
 from pdhef_logtool.mapping.clocks import sources_by_clock
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.records.checks import Check
@@ -45,6 +51,9 @@ WINDOW_NS = 600_000_000_000
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.
 MAX_LISTED_FIELDS = 40
+#: Arrays that no signal comes from stand in one line.
+COVARIANCE = re.compile(r"cov(ariance)?(\[\d*\])?$", re.IGNORECASE)
+INDEX = re.compile(r"\[\d+\]$")
 #: A device clock whose envelope leaves the fitted line by more has stepped or bent.
 CLOCK_RESIDUAL_S = 0.02
 
@@ -118,9 +127,9 @@ class Inspection:
     ----------
     kind : of log. start_ns, end_ns : log time, [start, end).
     signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
-    ambiguities, notes : of the mapping. checks : what physics says of signals and truth.
-    proposals : corrections of the mapping that are certain. lost : every loss and note of
-        reading.
+    ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
+    checks : what physics says of signals and truth. proposals : corrections of the mapping that are certain.
+    lost : every loss and note of reading.
     """
 
     path: str
@@ -138,6 +147,12 @@ class Inspection:
     checks: tuple[Check, ...]
     proposals: tuple[Proposal, ...]
     lost: tuple[Loss, ...]
+    candidates: tuple[Candidate, ...] = ()
+
+    @property
+    def uses(self) -> MappingABC[str, str]:
+        """What the log is good for (``can``), and what it lacks for sideslip (``sideslip_needs``, may be empty)."""
+        return uses_of(self.mapping)
 
     @property
     def duration_s(self) -> float:
@@ -169,6 +184,9 @@ class Inspection:
             "checks": self.checks,
             "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
+            "candidates": self.candidates,
+            "unsure": self.mapping.checks,
+            **self.uses,
         }
         return {key: jsonable(value) for key, value in document.items()}
 
@@ -179,18 +197,20 @@ def inspect_log(
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
     budget: Budget = DEFAULT_BUDGET,
+    msgs: Path | None = None,
 ) -> Inspection:
     """Read a log once through and report on it; without a mapping the well-known types are recognised.
 
     Memory is bounded by windows of ten minutes, whatever the log's length. ``prefer_truth`` is the choice of
-    :func:`pdhef_logtool.mapping.auto_map`; ``budget`` is what reading may cost.
+    :func:`pdhef_logtool.mapping.auto_map`; ``budget`` is what reading may cost, ``msgs`` a folder with
+    definitions of types that the log does not define.
 
     Raises
     ------
     LogError : The file is no log.
     MappingError : The mapping names what the log does not hold.
     """
-    with closing(open_log(path, budget)) as log:
+    with closing(open_log(path, budget, msgs)) as log:
         return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
 
 
@@ -199,9 +219,10 @@ def inspect_drive_log(
 ) -> Inspection:
     """Do what :func:`inspect_log` does with a log that is open already."""
     ambiguities: tuple[Ambiguity, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
     if given is None:
         auto = auto_map(log, prefer_truth=prefer_truth)
-        mapping, ambiguities = auto.mapping, auto.ambiguities
+        mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
     else:
         check_mapping(given, log)
         mapping = given
@@ -242,6 +263,7 @@ def inspect_drive_log(
         proposals=mapping_proposals(looked_at),
         # Last, since a log knows all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),
+        candidates=candidates,
     )
 
 
@@ -270,9 +292,21 @@ def _gather(channels: MappedChannels, gathered: dict[tuple[str, str], _Gathered]
 # ------------------------------------------------------------------------------------------------ reports
 
 
+def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
+    """Return name, type and paths of what stands in a line each: covariances are one, with all their elements."""
+    lines: dict[str, tuple[str, list[str]]] = {}
+    for info in fields:
+        if info.kind not in ("number", "bool"):
+            continue
+        name = INDEX.sub("[]", info.path) if COVARIANCE.search(info.path) else info.path
+        kind = np.dtype(info.code).name if info.code and info.kind == "number" else info.kind
+        lines.setdefault(name, (kind, []))[1].append(info.path)
+    return [(name, kind, paths) for name, (kind, paths) in lines.items()]
+
+
 def _topic_report(topic: TopicInfo, steps: StepStatistics, delays: DelayStatistics, log: DriveLog) -> TopicReport:
     largest = steps.largest
-    numbers = tuple(f.path for f in log.fields(topic.name) if f.kind in ("number", "bool"))
+    numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
     return TopicReport(
         name=topic.name,
         type=topic.type_name,
@@ -367,6 +401,7 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
     types = {t.name: t.type for t in inspection.topics}
     comments: dict[str, str] = {}
     for section, reports in (("signals", inspection.signals), ("truth", inspection.truth)):
+        prefix = "truth." if section == "truth" else ""
         for name, report in reports.items():
             text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
             if math.isfinite(report.minimum):
@@ -375,6 +410,9 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
             doubts = [c for c in inspection.checks if c.subject == subject and c.verdict != "passed"]
             done = any(p.subject == subject for p in inspection.proposals)
             lines = [] if done else [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
+            lines += [
+                f"UNSURE: {c.evidence}" for c in inspection.mapping.checks if c.name == f"{prefix}{name}.candidate"
+            ]
             comments[f"{section}.{name}"] = "\n".join([text, *lines])
     head = [f"Written from {Path(inspection.path).name}."]
     head += [f"Ambiguous: {a}" for a in inspection.ambiguities]
@@ -399,7 +437,8 @@ def write_mapping(inspection: Inspection, path: Path) -> None:
             expected="a new file", got="one that exists", where=str(path), remedy="give another name or remove it"
         )
     mapping, _ = apply_proposals(inspection.proposals, inspection.mapping, default_vehicle())
-    text = mapping_to_toml(mapping, comments=mapping_comments(inspection))
+    comments = mapping_comments(inspection)
+    text = mapping_to_toml(mapping, comments=comments, alternatives=inspection.candidates)
     write_bytes(path, text.encode())
 
 

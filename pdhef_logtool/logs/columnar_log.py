@@ -20,8 +20,17 @@ from pdhef_logtool.logs.decoding import (
     empty_column,
     missing_column,
 )
+from pdhef_logtool.logs.definitions import SHIPPED
 from pdhef_logtool.logs.drive_log import Columns, FieldInfo, TopicInfo
-from pdhef_logtool.logs.message_schema import MessageSchema, NoSchemaError, SchemaError, Selection, leaves, resolve
+from pdhef_logtool.logs.message_schema import (
+    MessageSchema,
+    MissingDefinitionError,
+    NoSchemaError,
+    SchemaError,
+    Selection,
+    leaves,
+    resolve,
+)
 from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
@@ -50,6 +59,7 @@ class ColumnarLog:
         self.containers = tuple(containers)
         self._opened_lost = tuple(lost)
         self.distro = distro
+        self.definitions = SHIPPED  # of types that the log does not define; set before anything is read
         self._damaged: dict[tuple[int, int], Loss] = {}
         # Messages that do not decode, by container, channel and span: a repeated read must not count them again.
         self._undecodable: dict[tuple[int, int, int], IntArray] = {}
@@ -63,6 +73,7 @@ class ColumnarLog:
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
+        self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -124,7 +135,8 @@ class ColumnarLog:
                 found.append(_out_of_time(container, list(self._late[c].values())))
             found.extend(self._undecodable_losses(c, container))
             for (of, channel), schema in schemas:
-                if of == c and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
+                wanted = of == c and (of, channel) in self._asked
+                if wanted and isinstance(schema, SchemaError) and not isinstance(schema, NoSchemaError):
                     what = f"its messages cannot be decoded: {schema}"
                     found.append(Loss("bad-schema", what, container.channels[channel].topic))
         return tuple(found)
@@ -137,33 +149,58 @@ class ColumnarLog:
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
         for (of, channel, _), rows in self._undecodable.items():
-            if of == c:
+            if of == c and (of, channel) in self._asked:
                 counts[channel] += len(rows)
         for channel, n in sorted(counts.items()):
             what = f"{n} messages do not fit the type of their topic"
             yield Loss("undecodable", what, container.channels[channel].topic, count=n)
 
-    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
+        """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
+
+        ``quiet`` only looks: a schema that does not parse is no loss of whoever wants nothing of the topic.
+        """
         for c, channel in self._by_topic.get(topic, ()):
+            if not quiet:
+                self._asked.add((c, channel.id))
             schema = self._schema(c, channel)
             if isinstance(schema, MessageSchema):
                 return tuple(leaves(schema.root))
         return ()
+
+    def unreadable(self, topic: str) -> str:
+        """Return why no field of a topic is known: a definition that is missing, an encoding; empty where one is."""
+        reasons = []
+        for c, channel in self._by_topic.get(topic, ()):
+            schema = self._schema(c, channel)
+            if isinstance(schema, MessageSchema):
+                return ""
+            if isinstance(schema, MissingDefinitionError):
+                missing = schema.type_name.replace("/msg/", "/")
+                reasons.append(f"the log holds no definition of {missing}; give --msgs DIR with its .msg file")
+            else:
+                reasons.append(str(schema))
+        return reasons[0] if reasons else ""
 
     def read(
         self,
         requests: Mapping[str, Sequence[str]],
         start_ns: int | None = None,
         end_ns: int | None = None,
+        *,
+        quiet: bool = False,
     ) -> dict[str, Columns]:
         """Read the fields asked for of messages with log time in [start, end).
+
+        ``quiet`` only looks: messages that do not decode are no loss of whoever wants nothing of the topic.
 
         Raises
         ------
         MappingError : the log has no such topic, no such field, or cannot decode the topic.
         """
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
+        if not quiet:
+            self._asked |= {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
         return self._collect(plans, start_ns, end_ns)
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
@@ -265,7 +302,9 @@ class ColumnarLog:
             meter.budget.check("seconds", self._schemas_s, "the time for all schemas")
             with meter.running():
                 if definition not in self._parsed:
-                    self._parsed[definition] = channel_schema(channel, self.distro, example, meter.budget)
+                    self._parsed[definition] = channel_schema(
+                        channel, self.distro, example, meter.budget, self.definitions
+                    )
                 return self._parsed[definition]
         except SchemaError as error:
             return self._parsed.setdefault(definition, error)
@@ -305,7 +344,7 @@ class ColumnarLog:
                         expected="messages as ROS 2 CDR, ROS 1, JSON or protobuf with a schema that parses",
                         got=str(schema),
                         where=topic,
-                        remedy="map another topic",
+                        remedy="give its definition with --msgs DIR, or map another topic",
                     )
                 )
                 continue

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget, BudgetError
 from pdhef_logtool.logs.container import Block, ChannelRecord
+from pdhef_logtool.logs.definitions import SHIPPED, Definitions
 from pdhef_logtool.logs.message_schema import (
     TIME_MEMBERS,
     VECTOR_ORDERS,
@@ -50,7 +51,11 @@ _COLUMNS = 64
 
 
 def channel_schema(
-    channel: ChannelRecord, distro: str = "", example: bytes | None = None, budget: Budget = DEFAULT_BUDGET
+    channel: ChannelRecord,
+    distro: str = "",
+    example: bytes | None = None,
+    budget: Budget = DEFAULT_BUDGET,
+    definitions: Definitions = SHIPPED,
 ) -> MessageSchema:
     """Parse the schema of a channel.
 
@@ -60,6 +65,7 @@ def channel_schema(
     distro : ROS distribution for types without a definition.
     example : first message, for JSON without a schema.
     budget : what the schema may cost.
+    definitions : of ROS types that neither the channel nor the distribution has.
 
     Raises
     ------
@@ -72,7 +78,9 @@ def channel_schema(
         text = channel.schema_data.decode("utf-8", errors="replace")
         if not channel.type_name:
             raise NoSchemaError("no type name")
-        return ros_schema(channel.type_name, channel.schema_encoding, text, channel.encoding, distro, budget)
+        return ros_schema(
+            channel.type_name, channel.schema_encoding, text, channel.encoding, distro, budget, definitions
+        )
     if channel.encoding == "json":
         if channel.schema_encoding == "jsonschema" and channel.schema_data.strip():
             return json_schema(channel.type_name, channel.schema_data.decode("utf-8", errors="replace"), budget)

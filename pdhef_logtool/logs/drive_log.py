@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -30,11 +30,13 @@ class FieldInfo:
 
     ``path`` is dotted (``linear_acceleration.x``); fixed arrays appear as ``name[i]`` per element when they have at
     most 16 elements, sequences as ``name[]``. ``kind`` is ``number``, ``bool``, ``string`` or ``time`` (a ROS
-    builtin time, whose path names the whole struct, for example ``header.stamp``).
+    builtin time, whose path names the whole struct, for example ``header.stamp``). ``code`` is NumPy's of a number in a
+    binary message (``f4``), empty where the encoding has no such types.
     """
 
     path: str
     kind: str
+    code: str = field(default="", compare=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,16 +96,27 @@ class DriveLog(Protocol):
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
         """Where the bytes of each file went, as far as is known by now."""
 
-    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
-        """Return the scalar leaves of a topic's schema; empty when the encoding carries none."""
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
+        """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
+
+        ``quiet`` only looks: a schema that does not parse is no loss then.
+        """
+
+    def unreadable(self, topic: str) -> str:
+        """Return why no field of a topic is known; empty where one is."""
 
     def read(
         self,
         requests: Mapping[str, Sequence[str]],
         start_ns: int | None = None,
         end_ns: int | None = None,
+        *,
+        quiet: bool = False,
     ) -> dict[str, Columns]:
-        """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded."""
+        """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded.
+
+        ``quiet`` only looks: messages that do not decode are no loss then.
+        """
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
         """Read only log and publish times of every topic (``fields`` empty); payloads are not decoded."""

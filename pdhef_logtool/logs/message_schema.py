@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.definitions import SHIPPED, Definitions
 from pdhef_logtool.logs.drive_log import FieldInfo
 from pdhef_logtool.records.errors import MappingError, PdhefError
 
@@ -126,6 +127,14 @@ class NoSchemaError(SchemaError):
     """A channel brings no schema of a kind that is read here; nothing of the recording is lost by that."""
 
 
+class MissingDefinitionError(NoSchemaError):
+    """Neither the log nor what is known beside it defines a type."""
+
+    def __init__(self, type_name: str) -> None:
+        super().__init__(f"no definition of {type_name}")
+        self.type_name = type_name
+
+
 @contextmanager
 def parsing(what: str) -> Iterator[None]:
     """Turn whatever escapes the parser of somebody else's text into a :class:`SchemaError`."""
@@ -176,7 +185,13 @@ _PLACES_AN_ELEMENT = 8
 
 @lru_cache(maxsize=256)
 def ros_schema(
-    type_name: str, encoding: str, text: str, wire: str, distro: str = "", budget: Budget = DEFAULT_BUDGET
+    type_name: str,
+    encoding: str,
+    text: str,
+    wire: str,
+    distro: str = "",
+    budget: Budget = DEFAULT_BUDGET,
+    definitions: Definitions = SHIPPED,
 ) -> MessageSchema:
     """Parse a ROS message definition.
 
@@ -184,10 +199,11 @@ def ros_schema(
     ----------
     type_name : in ROS 2 form.
     encoding : ``ros2msg``, ``ros2idl``, ``ros1msg`` or empty.
-    text : concatenated definitions; empty takes the type from the distribution's own packages.
+    text : concatenated definitions; empty takes the type from the distribution's own packages, else from definitions.
     wire : ``cdr`` or ``ros1``.
     distro : ROS distribution for a type without a text; the latest one if empty or unknown.
     budget : what the schema may cost.
+    definitions : of types that neither the text nor the distribution has.
 
     Raises
     ------
@@ -205,16 +221,17 @@ def ros_schema(
             text = _SEPARATOR.sub("=" * 80, text)
             types = idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
             store = get_typestore(Stores.EMPTY)
-            missing = _referenced(types) - set(types)
-            if missing:
-                default = get_typestore(base)
-                types = {**_closure(default.fielddefs, missing), **types}
+            try:
+                types = _completed(types, get_typestore(base).fielddefs, definitions, budget)
+            except MissingDefinitionError as error:  # the log's own text is not whole: its messages are lost
+                raise SchemaError(str(error)) from error
             root = _ros_root(types, type_name, budget)
             store.register(types)
         else:
             store = get_typestore(base)
             if type_name not in store.fielddefs:
-                raise NoSchemaError(f"no definition of {type_name}")
+                types = _completed({}, store.fielddefs, definitions, budget, type_name)
+                store.register(types)
             root = _ros_root(store.fielddefs, type_name, budget)
     return MessageSchema(type_name, wire, root, store, budget=budget)
 
@@ -225,7 +242,8 @@ def _store_of(distro: str) -> Any:
     return getattr(Stores, f"ROS2_{distro.upper()}", Stores.LATEST) if distro else Stores.LATEST
 
 
-def _referenced(types: Mapping[str, Any]) -> set[str]:
+def referenced(types: Mapping[str, Any]) -> set[str]:
+    """Return the names of the types that types contain directly."""
     from rosbags.interfaces import Nodetype
 
     names: set[str] = set()
@@ -237,15 +255,25 @@ def _referenced(types: Mapping[str, Any]) -> set[str]:
     return names
 
 
-def _closure(defs: Mapping[str, Any], names: set[str]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    todo = set(names)
+def _completed(
+    types: Mapping[str, Any], known: Mapping[str, Any], definitions: Definitions, budget: Budget, wanted: str = ""
+) -> dict[str, Any]:
+    """Return the types with all that they contain: of the distribution, else of definitions; ``wanted`` is one more."""
+    from rosbags.typesys import get_types_from_msg
+
+    found = dict(types)
+    todo = ({wanted} if wanted else set()) | (referenced(types) - set(types))
     while todo:
         name = todo.pop()
-        if name not in defs:
-            raise SchemaError(f"no definition of {name}")
-        found[name] = defs[name]
-        todo |= _referenced({name: defs[name]}) - set(found)
+        if name in known:
+            found[name] = known[name]
+        else:
+            text = definitions.text_of(name)
+            budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, f"the definition of {name}")
+            if not text.strip():
+                raise MissingDefinitionError(name)
+            found |= get_types_from_msg(text, name)
+        todo |= referenced({name: found[name]}) - set(found)
     return found
 
 
@@ -383,7 +411,7 @@ def leaves(node: Node, path: str = "") -> Iterator[FieldInfo]:
         else:
             yield from leaves(node.item, f"{path}[]")
     elif isinstance(node, Scalar):
-        yield FieldInfo(path, node.kind)
+        yield FieldInfo(path, node.kind, "" if node.kind == "string" else node.code)
 
 
 _PART = re.compile(r"([^.\[\]]+)|\[(\d*)\]|\.")

@@ -25,6 +25,7 @@ from pdhef_logtool.logs.container import (
     Span,
     told,
 )
+from pdhef_logtool.logs.definitions import read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError, PdhefError
@@ -37,7 +38,7 @@ _WHAT_IS_A_LOG = "an MCAP file, a ROS 1 bag, a rosbag2 database or a rosbag2 fol
 _REMEDY = "give the recording itself"
 
 
-def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET) -> DriveLog:
+def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None) -> DriveLog:
     """Open a log, detected by its content.
 
     MCAP, ROS 1 bag (2.0), rosbag2 SQLite database, each also as a zstd-compressed file; a rosbag2 folder with its
@@ -46,12 +47,20 @@ def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET) -> DriveLog:
     Parameters
     ----------
     budget : what reading it may cost; what claims more is among the log's losses.
+    msgs : folder with definitions of types that the log does not define (:func:`read_definitions`).
 
     Raises
     ------
     LogError : the path is missing, no regular file, or no log.
+    UsageError : ``msgs`` holds no definitions.
     """
-    path, meter = Path(path), Meter(budget)
+    definitions = read_definitions(msgs)
+    log = _opened(Path(path), Meter(budget))
+    log.definitions = definitions
+    return log
+
+
+def _opened(path: Path, meter: Meter) -> ColumnarLog:
     try:
         if path.is_dir():
             return _open_folder(path, meter)

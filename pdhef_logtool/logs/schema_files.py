@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 _MESSAGE_SEPARATOR = "=" * 80
 #: A type name in ROS 2 form: it may come from a log, and becomes a path.
@@ -17,6 +19,15 @@ def schema_file(name: str) -> Traversable:
     """Return a file of ``schemas/`` by its relative name, in an installed package or in a source tree."""
     shipped = files("pdhef_logtool").joinpath("schemas", name)
     return shipped if shipped.is_file() else Path(__file__).parents[2] / "schemas" / name
+
+
+@cache
+def shipped_definition(type_name: str) -> str:
+    """Return the text of a type that is shipped, without the types it contains; empty where it is not."""
+    if not _TYPE_NAME.fullmatch(type_name):
+        return ""
+    file = schema_file(f"{type_name}.msg")
+    return file.read_text(encoding="utf-8") if file.is_file() else ""
 
 
 @cache
@@ -42,7 +53,7 @@ def message_definition(type_name: str) -> str:
     if own.is_file():
         text = own.read_text(encoding="utf-8")
         types = get_types_from_msg(text, type_name)
-        store.register(types)
+        store.register({**types, **_shipped_parts(types, set(store.fielddefs))})
         generated = store.generate_msgdef(type_name, ros_version=2)[0]
         # Keep the comments of the own text: units stand there.
         _, separator, rest = generated.partition(_MESSAGE_SEPARATOR)
@@ -50,3 +61,18 @@ def message_definition(type_name: str) -> str:
     if type_name not in store.fielddefs:
         raise KeyError(type_name)
     return store.generate_msgdef(type_name, ros_version=2)[0]
+
+
+def _shipped_parts(types: Mapping[str, Any], known: set[str]) -> dict[str, Any]:
+    """Return the shipped types that others contain and nobody knows, at any depth."""
+    from rosbags.typesys import get_types_from_msg
+
+    from pdhef_logtool.logs.message_schema import referenced
+
+    found: dict[str, Any] = {}
+    todo = referenced(types) - known - set(types)
+    while todo:
+        name = todo.pop()
+        found |= get_types_from_msg(shipped_definition(name), name)
+        todo |= referenced(found) - known - set(types) - set(found)
+    return found

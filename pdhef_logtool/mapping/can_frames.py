@@ -195,15 +195,25 @@ class CanSignalLog:
         """What the log could not read."""
         return self._log.lost
 
-    def fields(self, topic: str) -> tuple[FieldInfo, ...]:
+    def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return a topic's leaves; of a view those of its topic and the signal."""
         view = self._views.get(topic)
         if view is None:
-            return self._log.fields(topic)
-        return (*self._log.fields(view.source.topic), *(FieldInfo(p, "number") for p in view.source.paths))
+            return self._log.fields(topic, quiet=quiet)
+        return (*self._log.fields(view.source.topic, quiet=quiet), *(FieldInfo(p, "number") for p in view.source.paths))
+
+    def unreadable(self, topic: str) -> str:
+        """Return why no field of a topic is known."""
+        view = self._views.get(topic)
+        return self._log.unreadable(topic if view is None else view.source.topic)
 
     def read(
-        self, requests: Mapping[str, Sequence[str]], start_ns: int | None = None, end_ns: int | None = None
+        self,
+        requests: Mapping[str, Sequence[str]],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        *,
+        quiet: bool = False,
     ) -> dict[str, Columns]:
         """Read fields; each topic of frames is read once, however many signals are taken from it."""
         raw: dict[str, list[str]] = {}
@@ -212,7 +222,7 @@ class CanSignalLog:
             own = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.source.paths))
             merged = raw.setdefault(topic if view is None else view.source.topic, [])
             merged += [p for p in own if p not in merged]
-        read = self._log.read(raw, start_ns, end_ns) if raw else {}
+        read = self._log.read(raw, start_ns, end_ns, quiet=quiet) if raw else {}
         short: dict[str, Loss] = {}
         found = {}
         for topic, paths in requests.items():

@@ -22,6 +22,7 @@ def _filled(mapping: Mapping, found: Mapping) -> Mapping:
         truth=mapping.truth or found.truth,
         quality=mapping.quality if mapping.truth else mapping.quality or found.quality,
         notes=(*mapping.notes, *found.notes),
+        checks=tuple(c for c in found.checks if c.subject not in mapping.signals),
     )
 
 
@@ -56,9 +57,18 @@ def choose_mapping(
         remark(note)
     if require_signals and not found.mapping.signals:
         raise MappingError(
-            expected="topics of well-known message types",
-            got=", ".join(sorted({t.type_name for t in log.topics})) or "no topics",
+            expected="fields that are a car's sensors",
+            got="; ".join(found.mapping.notes) or _topics_there_are(log),
             where=str(log.path),
-            remedy="write a mapping.toml (pdhef inspect LOG --write-mapping mapping.toml) and give it with --mapping",
+            remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
         )
     return found.mapping, found.missing
+
+
+def _topics_there_are(log: DriveLog) -> str:
+    """Return what a log without sensors has instead: its types, and whether they have messages."""
+    if not log.topics:
+        return "no topics"
+    types = ", ".join(sorted({t.type_name.replace("/msg/", "/") for t in log.topics}))
+    empty = [t.name for t in log.topics if not t.messages]
+    return types + (f"; {', '.join(empty)} without messages" if empty else "")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping as MappingABC
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -28,6 +29,12 @@ from pdhef_logtool.records.documents import checked, read_toml, unknown
 from pdhef_logtool.records.errors import MappingError, MappingFileError
 from pdhef_logtool.records.signals import ESTIMATE_UNITS, SIGNAL_UNITS, TRUTH_UNITS, WHEELS
 
+if TYPE_CHECKING:
+    from pdhef_logtool.mapping.candidates import Candidate
+
+#: Alternatives of one signal that a written file shows, and the two signals that are each other's.
+ALTERNATIVES = 3
+_STEERING = ("steer_rad", "steering_wheel_rad")
 #: Names in the tables that are no estimator's.
 RESERVED_NAMES = ("truth", "sensors")
 
@@ -260,13 +267,16 @@ def _contradictions(mapping: Mapping) -> list[str]:
 # ------------------------------------------------------------------------------------------------ writing
 
 
-def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = None) -> str:
+def mapping_to_toml(
+    mapping: Mapping, comments: MappingABC[str, str] | None = None, alternatives: Sequence[Candidate] = ()
+) -> str:
     """Write a mapping as TOML that is ready to edit; ``load_mapping`` gives the same sources back.
 
     Parameters
     ----------
     comments : text by name (``steer_rad``) or table (``truth.yaw_rate_rad_s``), by ``truth_quality``, or under ``""``
         for the head of the file; it stands above the entry as a comment.
+    alternatives : candidates; those that are not taken follow as comments, with score and reason.
 
     Signals that the mapping lacks appear as commented examples, so that they only need a topic and a field.
     """
@@ -287,6 +297,7 @@ def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = No
             lines += _comment(notes.get(f"{section}.{name}", notes.get(name, "")))
             lines.append(f"[{section}.{name}]{' ' * max(1, 30 - len(section) - len(name))}# {units[name]}")
             lines += _source_lines(source)
+            lines += _alternative_lines(section, name, alternatives)
     for estimator, sources in mapping.estimates.items():
         for name in (n for n in ESTIMATE_UNITS if n in sources):
             lines += ["", f"[estimates.{_toml(estimator)}.{name}]  # {ESTIMATE_UNITS[name]}"]
@@ -300,15 +311,34 @@ def mapping_to_toml(mapping: Mapping, comments: MappingABC[str, str] | None = No
     if missing:
         lines += ["", "# Not mapped. To add one, remove the # and name its topic and field:"]
         for name in missing:
+            others = _alternative_lines("signals", name, alternatives)
+            if others:
+                lines += others
+                continue
             lines += ["#", f"# [signals.{name}]{' ' * max(1, 21 - len(name))}# {SIGNAL_UNITS[name]}"]
             lines += [f"# {text}" for text in _example_lines()]
             lines += _comment(notes.get(name, ""))
     if not mapping.truth:
         lines += ["", "# No truth is mapped. For a comparison name at least a body velocity, for example:"]
-        for name in ("vx_m_s", "vy_m_s"):
+        others = [line for name in TRUTH_UNITS for line in _alternative_lines("truth", name, alternatives)]
+        lines += others
+        for name in ("vx_m_s", "vy_m_s") if not others else ():
             lines += ["#", f"# [truth.{name}]{' ' * max(1, 23 - len(name))}# {TRUTH_UNITS[name]}"]
             lines += [f"# {text}" for text in _example_lines()]
     return "\n".join(lines) + "\n"
+
+
+def _alternative_lines(section: str, name: str, candidates: Sequence[Candidate]) -> list[str]:
+    """Return commented tables of the best candidates of a signal that are not taken."""
+    names = {"steer_rad": _STEERING, "steering_wheel_rad": _STEERING}.get(name, (name,))
+    mine = [c for c in candidates if c.section == section and c.source.name in names and not c.taken]
+    lines: list[str] = []
+    for one in mine[:ALTERNATIVES]:
+        unit = (SIGNAL_UNITS | TRUTH_UNITS)[one.source.name]
+        doubt = f"; unsure: {one.doubt}" if one.doubt else ""
+        lines += ["#", *_comment(f"Instead, score {one.score:.2f}: {one.reason}{doubt}")]
+        lines += [f"# [{section}.{one.source.name}]  # {unit}", *(f"# {x}" for x in _source_lines(one.source))]
+    return lines
 
 
 def missing_signals(mapping: Mapping) -> tuple[str, ...]:

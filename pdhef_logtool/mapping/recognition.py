@@ -4,22 +4,29 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.mapping_file import missing_signals
+from pdhef_logtool.mapping.naming import is_command
+from pdhef_logtool.mapping.navigation import navigation_truth
 from pdhef_logtool.mapping.records import Mapping, QualityGate, SignalSource
+from pdhef_logtool.mapping.vendors import Vendors, load_vendors
+from pdhef_logtool.mapping.weighing import Weighed, weigh
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 
 #: Words of a topic's name that make it a reference to score against; never an input.
-TRUTH_WORDS = frozenset({"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys"})
+TRUTH_WORDS = frozenset(
+    {"truth", "groundtruth", "gt", "perfect", "mocap", "optitrack", "vicon", "qualisys", "correvit"}
+)
 #: Words of satellite and inertial navigation: velocities and poses of such topics are truth, their IMU is a sensor.
 NAVIGATION_WORDS = frozenset(
-    {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk"}
+    {"ins", "gnss", "gps", "rtk", "oxts", "novatel", "applanix", "vbox", "sbg", "span", "navsat", "dgps", "ppk", "adma"}
 )
 #: Words of measured vehicle speed.
 VEHICLE_WORDS = frozenset({"wheel", "wheels", "odom", "odometry", "can", "vehicle", "encoder", "encoders", "speed"})
@@ -32,6 +39,14 @@ DEVICE_WORDS = frozenset(
     {"camera", "lidar", "realsense", "zed", "ouster", "livox", "velodyne", "phone", "os1", "radar"}
 )
 
+#: Starts of types that hold no signal of a car, and much else.
+NO_SENSORS = (
+    "sensor_msgs/Image", "sensor_msgs/CompressedImage", "sensor_msgs/PointCloud", "sensor_msgs/LaserScan",
+    "sensor_msgs/CameraInfo", "visualization_msgs/", "tf2_msgs/", "tf/", "rosgraph_msgs/", "rcl_interfaces/",
+    "diagnostic_msgs/", "nav_msgs/Path", "nav_msgs/OccupancyGrid", "foxglove.CompressedImage", "foxglove.PointCloud",
+)  # fmt: skip
+#: Start of the note on a steering angle that nobody measured.
+FROM_COMMAND = "steer_rad comes from the command"
 PERFECT_PREFIX = "/truth/perfect"
 OWN_PREFIX = "/pdhef/"
 
@@ -115,11 +130,18 @@ class Ambiguity:
 
 @dataclass(frozen=True, slots=True)
 class AutoMapping:
-    """A recognised mapping, what was ambiguous in it, and the signals that no topic provides."""
+    """A recognised mapping, and what is to be said of it.
+
+    Attributes
+    ----------
+    ambiguities : what could be read in several ways. missing : signals that no topic provides.
+    candidates : fields that were weighed for what recognised types left open, those taken first.
+    """
 
     mapping: Mapping
     ambiguities: tuple[Ambiguity, ...]
     missing: tuple[str, ...]
+    candidates: tuple[Candidate, ...] = ()
 
 
 @dataclass(slots=True)
@@ -177,28 +199,173 @@ class _Finding:
         return ordered[0]
 
 
-def auto_map(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfect") -> AutoMapping:
-    """Map a log's topics to signals and truth by their types and names.
+def auto_map(
+    log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"] = "perfect", vendors: Vendors | None = None
+) -> AutoMapping:
+    """Map a log's topics to signals and truth: by well-known types, and for what these leave open by candidates.
 
     Parameters
     ----------
     prefer_truth : which truth to take from a simulated log, the perfect one under ``/truth/perfect`` or the
         RTK-like one; a log with only one of them gets that.
+    vendors : documented types; None takes those that are shipped and the user's.
     """
     there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
     found = _Finding(log=log, samples=_probe(log, topics))
-    found.notes += [f"{t.name} is not used: its fields are not those of {t.type_name}" for t in unlike]
+    found.notes += [_why_unused(log, t) for t in unlike]
+    found.notes += _what_cannot_be_read(log, [t for t in topics if not _type(t).startswith(NO_SENSORS)])
+    found.notes += [
+        f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
+    ]
     _map_imu(found, topics)
     _map_steering(found, topics)
     _map_speed(found, topics)
     _map_wheel_speeds(found, topics)
     _map_truth(found, topics, prefer_truth)
+    vendors = load_vendors() if vendors is None else vendors
+    _map_documented_truth(found, topics, vendors)
+    weighed = _weigh_the_rest(found, topics, vendors)
+    _map_navigation(found, topics, vendors)
+    _fall_back(found, topics)
     mapping = Mapping(
-        signals=found.signals, truth=found.truth, quality=found.quality, origin="auto", notes=tuple(found.notes)
+        signals=found.signals,
+        truth=found.truth,
+        quality=found.quality,
+        origin="auto",
+        notes=tuple(found.notes),
+        checks=weighed.checks,
     )
-    return AutoMapping(mapping=mapping, ambiguities=tuple(found.ambiguities), missing=missing_signals(mapping))
+    return AutoMapping(mapping, tuple(found.ambiguities), missing_signals(mapping), weighed.candidates)
+
+
+def _why_unused(log: DriveLog, topic: TopicInfo) -> str:
+    """Say why a topic of a well-known type is not used: no definition, or another type's fields."""
+    reason = log.unreadable(topic.name)
+    return f"{topic.name} is not used: {reason or f'its fields are not those of {topic.type_name}'}"
+
+
+def _what_cannot_be_read(log: DriveLog, topics: list[TopicInfo]) -> list[str]:
+    """Say of which other topics no field is known, those of one reason together."""
+    by_reason: dict[str, list[str]] = {}
+    for topic in topics:
+        reason = "" if log.fields(topic.name, quiet=True) else log.unreadable(topic.name)
+        if reason:
+            by_reason.setdefault(reason, []).append(topic.name)
+    return [f"{', '.join(names)}: {reason}" for reason, names in by_reason.items()]
+
+
+# ------------------------------------------------------------------------------------------------ candidates
+
+
+def _weigh_the_rest(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> Weighed:
+    """Take candidates for what no well-known type gives."""
+    for topic in topics:
+        reason = vendors.why_left_out(topic.type_name)
+        if reason:
+            found.notes.append(f"{topic.name} ({topic.type_name.replace('/msg/', '/')}) is left out: {reason}")
+    rest = [(t, _role(t)) for t in topics if not _is_well_known(t) and not _type(t).startswith(NO_SENSORS)]
+    # A measured steering angle goes before a command, whatever its type.
+    command = found.signals.pop("steer_rad", None) if any(n.startswith(FROM_COMMAND) for n in found.notes) else None
+    weighed = weigh(found.log, rest, found.signals, found.truth, vendors)
+    if command is not None and not {"steer_rad", "steering_wheel_rad"} & set(weighed.signals):
+        found.signals["steer_rad"] = command
+    elif command is not None:
+        found.notes = [n for n in found.notes if not n.startswith(FROM_COMMAND)]
+        measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
+        found.doubt("steering", (measured, command.label), measured, "a measured angle before a command")
+    found.signals.update(weighed.signals)
+    found.truth.update(weighed.truth)
+    found.notes += weighed.notes
+    for name, fields in weighed.rivals:
+        found.doubt(name, fields, fields[0], "the best score, then most messages")
+    return weighed
+
+
+def _map_documented_truth(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> None:
+    """Take truth from an INS whose type is documented, where recognised types give a position at most."""
+    if {"vx_m_s", "enu_velocity_m_s", "quat_wxyz", "yaw_rad", "x_m"} & set(found.truth):
+        return
+    whole: dict[str, dict[str, SignalSource]] = {}
+    for topic in topics:
+        fields = found.log.fields(topic.name, quiet=True)
+        sources = [
+            SignalSource(f.name, topic.name, path, stamp_path_of(fields), f.scale, f.offset)
+            for path, f in vendors.fields_of(topic.type_name).items()
+            if f.section == "truth" and has_path(fields, path)
+        ]
+        vectors = [v for v in vendors.vectors_of(topic.type_name) if all(has_path(fields, p) for p in v.paths)]
+        sources += [replace(v, topic=topic.name, stamp=stamp_path_of(fields)) for v in vectors]
+        if vectors:
+            whole[topic.name] = {s.name: s for s in sources}
+    candidates = [t for t in topics if t.name in whole]
+    chosen = found.choose("truth", candidates, lambda t: (-len(whole[t.name]),), "the one with most quantities")
+    if chosen is None:
+        return
+    if found.truth:
+        others = ", ".join(sorted({s.topic for s in found.truth.values()}))
+        found.notes = [n for n in found.notes if not n.startswith("truth is kept where")]
+        found.notes.append(f"truth is taken from {chosen.name}, which has a velocity too; {others} is not used")
+    found.truth, found.quality = whole[chosen.name], None
+
+
+def _map_navigation(found: _Finding, topics: list[TopicInfo], vendors: Vendors) -> None:
+    """Take truth from a navigation system by the names of its vectors, where there is a position at most."""
+    if set(found.truth) - {"lat_deg", "lon_deg", "alt_m", "course_rad"}:
+        return
+    unknown = [t for t in topics if not _is_well_known(t) and not vendors.fields_of(t.type_name)]
+    truth = navigation_truth(found.log, [t for t in unknown if _role(t) in ("navigation", "truth")])
+    if truth is None or (found.truth and len(truth.truth) <= len(found.truth)):
+        return
+    found.truth, found.quality = truth.truth, None
+    found.notes = [n for n in found.notes if not n.startswith("truth is kept where")]
+    found.notes.append(truth.note)
+
+
+def _is_well_known(topic: TopicInfo) -> bool:
+    """Return whether a topic was judged by its type already."""
+    tables = (TWIST_FIELDS, POSE_FIELDS, STEERING_FIELDS, SPEED_FIELDS, SEVERAL_POSITIONS)
+    kind = _type(topic)
+    return kind in IMU_TYPES | FIX_TYPES | WHEEL_SPEED_TYPES or any(kind in table for table in tables)
+
+
+def _role(topic: TopicInfo) -> Role:
+    """Return what a topic's name makes of its fields; the device of a navigation system is a sensor as well."""
+    words = _words(topic.name)
+    if is_command(topic.name, topic.type_name.rpartition("/")[2]):
+        return "command"
+    if words & TRUTH_WORDS:
+        return "truth"
+    if words & ESTIMATE_WORDS:
+        return "estimate"
+    if words & DEVICE_WORDS:
+        return "device"
+    return "navigation" if (words | _words(topic.type_name)) & NAVIGATION_WORDS else "sensor"
+
+
+def _fall_back(found: _Finding, topics: list[TopicInfo]) -> None:
+    """Stand in for an IMU's yaw rate by an odometry's, and for a speed sensor by a navigation system's; say so."""
+    twists = [t for t in topics if _type(t) in TWIST_FIELDS]
+    twists = [t for t in twists if not _words(t.name) & (TRUTH_WORDS | COMMAND_WORDS | ESTIMATE_WORDS)]
+    if "yaw_rate_rad_s" not in found.signals:
+        odometries = [t for t in twists if _type(t) in BODY_TWIST_TYPES and not _is_truth(t)]
+        odometries = [t for t in odometries if _words(t.name) & VEHICLE_WORDS]
+        odometries = [t for t in odometries if _span(found.values(t.name, _twist(t, "angular", "z"))) > 0.0]
+        chosen = found.choose("yaw rate", odometries, lambda _: (), "the first of its kind")
+        if chosen is not None:
+            found.take(found.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
+            found.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
+    truth = found.truth.get("vx_m_s")
+    if truth is None or "speed_m_s" in found.signals or any(n.startswith("wheel_speed_") for n in found.signals):
+        return
+    source = next((t for t in topics if t.name == truth.topic), None)
+    if source is not None and _role(source) == "navigation" and found.signals:
+        found.signals["speed_m_s"] = replace(truth, name="speed_m_s")
+        found.notes.append(
+            f"speed_m_s comes from {source.name}, which is the truth too, as nothing else gives a speed: "
+            "an estimator is told the true speed"
+        )
 
 
 def _type(topic: TopicInfo) -> str:
@@ -325,9 +492,7 @@ def _map_steering(found: _Finding, topics: list[TopicInfo]) -> None:
     if chosen is None:
         return
     if not measured:
-        found.notes.append(
-            f"steer_rad comes from the command {chosen.name}, not from a measured angle: no lag, no slack"
-        )
+        found.notes.append(f"{FROM_COMMAND} {chosen.name}, not from a measured angle: no lag, no slack")
     found.take(found.signals, "steer_rad", chosen.name, STEERING_FIELDS[_type(chosen)])
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from pdhef_logtool.records.checks import Check
+
 #: Number of columns of the truth channels that are vectors; all other signals are scalars.
 VECTOR_COLUMNS: dict[str, int] = {
     "ecef_position_m": 3,
@@ -170,6 +172,7 @@ class Mapping:
     estimates : estimates that somebody else recorded in the log, by estimator and quantity (``ESTIMATE_UNITS``). They
         are no part of :meth:`sources`: only ``pdhef metrics`` reads them.
     fill_recognised : what the file does not name is taken from recognised types.
+    checks : what stays undecided of fields that were taken by their names.
     """
 
     signals: dict[str, SignalSource] = field(default_factory=dict)
@@ -180,6 +183,7 @@ class Mapping:
     can: CanSettings | None = None
     estimates: dict[str, dict[str, SignalSource]] = field(default_factory=dict)
     fill_recognised: bool = False
+    checks: tuple[Check, ...] = ()
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, truth, the gate."""

@@ -19,7 +19,7 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 
-_FILES = ("car", "cars", "mapping", "thresholds", "network", "intervals")
+_FILES = ("car", "cars", "mapping", "msgs", "thresholds", "network", "intervals")
 #: What may stand in place of a file.
 _KEYWORDS = {
     "car": tuple(SHIPPED_CARS),
@@ -62,6 +62,7 @@ class RunConfig:
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
     budget : factor on what reading a log may cost before its claims count as damage.
+    msgs : folder with definitions of message types that a log does not define.
     network : instead of the car's: a folder, ``default``, ``many-cars`` (the shipped one for any car), ``none``.
     intervals : instead of the car's: a file of ``pdhef calibrate``, ``none`` (intervals as they are), ``unsure`` (wide
         ones, for a car that may have changed since its file was made).
@@ -82,6 +83,7 @@ class RunConfig:
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
+    msgs: Path | None = None
     thresholds: Path | None = None
     network: Path | None = None
     intervals: Path | None = None

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
-    *("inspect", "estimators", "run", "metrics", "view", "simulate", "simulate suite", "simulate conditions"),
+    *("inspect", "map", "estimators", "run", "metrics", "view", "simulate", "simulate suite", "simulate conditions"),
     *("identify", "extract", "train", "tune", "trust", "calibrate", "learn"),
 )
 
@@ -336,3 +336,17 @@ def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tm
     assert "Consistency" in result.stdout
     assert "from phy-ukf °" in result.stdout
     assert "RMSE" not in result.stdout
+
+
+def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp_path: Path) -> None:
+    result = _pdhef("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
+    assert result.returncode == 0
+    assert "[signals.steer" in (tmp_path / "m.toml").read_text()
+    again = _pdhef("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
+    assert "one that exists" in _one_line_error(again)
+
+
+def test_a_topic_goes_with_fields(sample_logs_dir: Path) -> None:
+    log = str(sample_logs_dir / "dlc.mcap")
+    assert "angular_velocity.z" in _pdhef("inspect", log, "--fields", "/imu/data").stdout
+    assert "--fields" in _one_line_error(_pdhef("inspect", log, "/imu/data"))

@@ -1,0 +1,135 @@
+"""Every number that a log holds: its type, how often it comes, and its least, mean and largest value."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.text import Text
+
+from pdhef_logtool.inspection.rendering import empty_table, number_text
+from pdhef_logtool.inspection.report import COVARIANCE, INDEX, collapsed
+from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces
+from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.errors import UsageError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+#: Fields of one topic that are read.
+MOST_FIELDS = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class FieldReport:
+    """One field: float64 statistics in raw units over what was read, NaN without a finite value."""
+
+    path: str
+    type: str
+    minimum: float
+    mean: float
+    maximum: float
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFields:
+    """The fields of a topic; ``reason`` says why none is known."""
+
+    name: str
+    type: str
+    messages: int
+    rate_hz: float
+    fields: tuple[FieldReport, ...]
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FieldsOfLog:
+    """What :func:`fields_of_log` found; ``seconds`` of the log were read for it, ``whole`` if that is all of it."""
+
+    path: str
+    topics: tuple[TopicFields, ...]
+    seconds: float
+    whole: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``pdhef inspect --fields --json`` prints."""
+        return {"path": self.path, "seconds": self.seconds, "whole": self.whole, "topics": jsonable(self.topics)}
+
+
+def fields_of_log(
+    path: Path, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None
+) -> FieldsOfLog:
+    """Read the numbers of a topic, or of all, in a few pieces of the log.
+
+    Raises
+    ------
+    LogError : The file is no log.
+    UsageError : It has no such topic.
+    """
+    with closing(open_log(path, budget, msgs)) as log:
+        topics = [t for t in log.topics if topic in (None, t.name)]
+        if topic is not None and not topics:
+            names = ", ".join(t.name for t in log.topics) or "none"
+            raise UsageError(expected="a topic of the log", got=repr(topic), where=str(path), remedy=f"topics: {names}")
+        pieces = Pieces(log)
+        seconds = min(log.end_ns - log.start_ns, len(pieces.starts) * PIECE_NS) * 1e-9
+        reports = tuple(_topic_fields(log, pieces, t) for t in topics)
+        return FieldsOfLog(str(path), reports, seconds, log.end_ns - log.start_ns <= seconds * 1e9 + 1)
+
+
+def _topic_fields(log: DriveLog, pieces: Pieces, topic: TopicInfo) -> TopicFields:
+    known = log.fields(topic.name)
+    name = topic.type_name.replace("/msg/", "/")
+    nothing = "it has no messages" if not topic.messages else log.unreadable(topic.name) or "it holds no numbers"
+    lines = [line for line in collapsed(known) if all(p.count("[]") == p.endswith("[]") for p in line[2])][:MOST_FIELDS]
+    paths = [p.removesuffix("[]") for _, _, every in lines for p in every]
+    read = pieces.read({topic.name: paths}) if paths and topic.messages else {}
+    by_path: dict[str, list[np.ndarray[Any, Any]]] = {}
+    for (_, path), seen in read.items():
+        by_path.setdefault(path, []).append(seen.values)
+        if path not in paths:
+            by_path.setdefault(INDEX.sub("", path), []).append(seen.values)
+    rate = max((seen.rate_hz for seen in read.values()), default=float("nan"))
+    reports = []
+    for line, kind, every in lines:
+        one = [v for p in every for v in by_path.get(p.removesuffix("[]"), [])]
+        reports.append(_report(line, kind, one))
+        if line.endswith("[]") and len(one) > 1 and not COVARIANCE.search(line):
+            columns = [p for p in by_path if INDEX.sub("", p) == line.removesuffix("[]") and p not in paths]
+            reports += [_report(p, kind, by_path[p]) for p in columns]
+    reason = "" if reports and topic.messages else nothing
+    return TopicFields(topic.name, name, topic.messages, rate, tuple(reports), reason)
+
+
+def _report(path: str, kind: str, values: Sequence[np.ndarray[Any, Any]]) -> FieldReport:
+    every = np.concatenate([np.empty(0), *values])
+    every = every[np.isfinite(every)]
+    if every.shape[0] == 0:
+        return FieldReport(path, kind, float("nan"), float("nan"), float("nan"))
+    with np.errstate(over="ignore"):
+        return FieldReport(path, kind, float(every.min()), float(every.mean()), float(every.max()))
+
+
+def render_fields(found: FieldsOfLog, console: Console) -> None:
+    """Print a table a topic, for a terminal of 80 columns or more."""
+    console.print(Text(found.path, "bold"), soft_wrap=True)
+    part = "all" if found.whole else "pieces"
+    console.print(f"values over {part} of the log, {found.seconds:.0f} s, in the units that it holds them in")
+    for topic in found.topics:
+        title = f"{topic.name} ({topic.type}), {number_text(topic.rate_hz)} Hz"
+        table = empty_table(title, "field", "type", "min", "mean", "max", words=2)
+        for one in topic.fields:
+            numbers = (number_text(v) for v in (one.minimum, one.mean, one.maximum))
+            table.add_row(Text(one.path), one.type, *numbers)
+        if topic.fields and not topic.reason:
+            console.print(table)
+        else:
+            console.print(Text(f"{topic.name} ({topic.type}): {topic.reason}"))

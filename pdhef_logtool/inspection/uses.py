@@ -1,0 +1,68 @@
+"""What a log is good for, and what it still lacks for sideslip, in a sentence each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as MappingABC
+
+from pdhef_logtool.estimators.table import SPECS, spec_of
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.records.signals import WHEELS
+
+#: What a person calls the signals that the estimator of sideslip needs.
+_WORDS = {
+    "steer_rad": "a steering angle",
+    "ax_m_s2": "a longitudinal acceleration",
+    "ay_m_s2": "a lateral acceleration",
+    "yaw_rate_rad_s": "a yaw rate",
+    "speed_m_s": "a speed or wheel speeds",
+}
+#: The estimator that the sentence is about.
+_MAIN = "physics"
+
+
+def usable_signals(mapping: Mapping) -> frozenset[str]:
+    """Return the aligned signals that a mapping gives: a steering wheel steers, and wheels have a speed."""
+    have = set(mapping.signals)
+    if "steering_wheel_rad" in have:
+        have.add("steer_rad")
+    if any(f"wheel_speed_{w}_{unit}" in have for w in WHEELS for unit in ("m_s", "rad_s")):
+        have.add("speed_m_s")
+    return frozenset(have)
+
+
+def what_it_is_good_for(mapping: Mapping) -> str:
+    """Return what can be done with a log that is mapped so."""
+    have = usable_signals(mapping)
+    names = [s.name for s in SPECS if s.needs <= have and not s.network and not s.needs_noise]
+    uses = []
+    if spec_of(_MAIN).needs <= have:
+        against = _scored(mapping)
+        uses.append(f"estimate sideslip ({_MAIN} and others){against}")
+    elif names and have:
+        uses.append(f"run {', '.join(names[:3])}{_scored(mapping)}")
+    if mapping.truth and not (names and have):
+        uses.append("look at the truth")
+    if have:
+        uses.append("look at its signals in Rerun or MCAP")
+    return "; ".join(uses) or "look at its topics and fields (--fields)"
+
+
+def what_it_lacks(mapping: Mapping) -> str:
+    """Return what sideslip still needs; empty where nothing is missing."""
+    lacking = sorted(spec_of(_MAIN).needs - usable_signals(mapping), key=list(_WORDS).index)
+    return ", ".join(_WORDS.get(n, n) for n in lacking)
+
+
+def uses_of(mapping: Mapping) -> MappingABC[str, str]:
+    """Return both sentences by name, as ``pdhef inspect --json`` prints them."""
+    return {"can": what_it_is_good_for(mapping), "sideslip_needs": what_it_lacks(mapping)}
+
+
+def _scored(mapping: Mapping) -> str:
+    truth = set(mapping.truth)
+    place = {"x_m", "lat_deg", "ecef_position_m", "enu_velocity_m_s", "ecef_velocity_m_s"} & truth
+    if {"vx_m_s", "vy_m_s"} <= truth or "sideslip_rad" in truth or (place and {"quat_wxyz", "yaw_rad"} & truth):
+        return " and score it against the truth"
+    if place or {"course_rad", "vx_m_s"} & truth:
+        return ", and compare speed or course with the truth, which holds no sideslip"
+    return "; there is no truth to score it against"

@@ -1,0 +1,324 @@
+"""Candidates for signals and truth among all numeric fields of a log: names first, then what the values say.
+
+Recognised message types come before (``recognition.py``); what they leave open is looked for here. A candidate is
+*taken* when its name or a documented type says what it is and nothing speaks against it; what remains unsure about a
+taken one (its unit, its sign) becomes a check that is undecided. Other candidates stand in the mapping as comments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
+from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
+from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
+from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
+from pdhef_logtool.records.signals import WHEELS, FloatArray
+
+#: What the names around a field make of it.
+Role: TypeAlias = Literal["sensor", "navigation", "truth", "estimate", "command", "device"]
+#: A field whose name or documented type gives it a meaning; the last entry tells a documented one.
+Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
+
+#: Words of a field that a navigation system gives beside others' sensors.
+_NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
+#: A topic with more numeric fields than this is no sensor's; looking at its names alone would take long.
+MOST_FIELDS = 3000
+#: Fields that are read at most; the best names first.
+MOST_READ = 160
+#: A candidate below is no more than a comment.
+LEAST_SCORE = 0.45
+
+#: Factors that a field without a unit may have, the first one by convention, and the kind of unit by quantity.
+HYPOTHESES: dict[str, tuple[tuple[str, float], ...]] = {
+    "acceleration": (("m/s²", 1.0), ("g", UNITS["acceleration"]["g"]), ("mg", UNITS["acceleration"]["mg"])),
+    "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
+    "steering": (("rad", 1.0), ("deg", math.radians(1.0))),
+    "sideslip": (("rad", 1.0), ("deg", math.radians(1.0))),
+    "speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
+    "velocity": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
+    "wheel speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
+    "wheel rate": (("rad/s", 1.0), ("rpm", 2.0 * math.pi / 60.0)),
+    "latitude": (("deg", 1.0),),
+    "longitude": (("deg", 1.0),),
+}
+#: What a car can do, in SI, by quantity: a value beyond is of another unit, or no such quantity.
+MOST = {
+    "acceleration": 80.0, "rate": 9.0, "steering": 16.0, "sideslip": math.pi, "speed": 110.0, "velocity": 60.0,
+    "wheel speed": 130.0, "wheel rate": 400.0, "latitude": 90.0, "longitude": 180.0,
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A field that may be a signal or a truth quantity.
+
+    Attributes
+    ----------
+    section : ``signals`` or ``truth``. source : the field, with scale and offset as they are believed to be.
+    score : 0 to 1. reason : what speaks for it. doubt : what is unsure of it, empty if nothing is.
+    taken : it stands in the mapping.
+    """
+
+    section: Literal["signals", "truth"]
+    source: SignalSource
+    score: float
+    reason: str
+    doubt: str = ""
+    taken: bool = False
+
+    def __str__(self) -> str:
+        """One line for a report or a comment."""
+        doubt = f"; unsure: {self.doubt}" if self.doubt else ""
+        return f"{self.source.label}, scale {_short(self.source.scale)}: score {self.score:.2f}, {self.reason}{doubt}"
+
+
+def _short(scale: float | tuple[float, ...]) -> str:
+    return f"{scale:.6g}" if isinstance(scale, float) else ", ".join(f"{s:.6g}" for s in scale)
+
+
+@dataclass(slots=True)
+class Found:
+    """A field with a meaning, while it is being judged.
+
+    Attributes
+    ----------
+    factors : units that it may be in, the likeliest first. fixed : unit and sign are documented.
+    section : ``signals`` or ``truth`` if its documentation says which.
+    known : its unit is sure. anchor : it is mapped already. sign : that it is taken with.
+    """
+
+    topic: TopicInfo
+    path: str
+    meaning: Meaning
+    role: Role
+    stamp: str
+    seen: Seen
+    factors: tuple[tuple[str, float], ...]
+    fixed: bool = False
+    section: str = ""
+    known: bool = False
+    anchor: bool = False
+    sign: float = 1.0
+    bonus: float = 0.0
+    reasons: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
+    offset: float = 0.0
+
+    @property
+    def scale(self) -> float:
+        """Raw to SI, with the sign that it is taken with."""
+        return self.sign * self.factors[0][1]
+
+    @property
+    def si(self) -> FloatArray:
+        """Values on the grid in SI [M]."""
+        return np.asarray(self.seen.cells * self.scale + self.offset)
+
+    @property
+    def unit_doubt(self) -> list[str]:
+        """What is to be said of a unit that neither the name nor the drive tells."""
+        if self.known or self.fixed:
+            return []
+        unit = self.factors[0][0]
+        if unit != HYPOTHESES[self.meaning.quantity][0][0]:
+            return [f"its unit is not said; taken as {unit}, the others are out of any car's range"]
+        return [f"its unit is not said and the drive does not tell; taken as {unit}"]
+
+    @property
+    def is_axis(self) -> bool:
+        """Return whether an axis letter names it: where its axes point is a question of its mounting."""
+        own = words_of(self.path.rpartition(".")[2])
+        return "yaw" not in own and not {"lat", "lateral", "long", "longitudinal", "lng"} & set(own)
+
+    @property
+    def score(self) -> float:
+        """How far to believe that the field is what its name says, 0 to 1."""
+        if self.fixed:
+            return 0.95
+        score = 0.45 * self.meaning.strength + 0.1 + self.bonus
+        score += 0.15 if self.meaning.unit else 0.0
+        score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
+        score -= {"device": 0.2, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
+        return min(0.94, max(0.0, score))
+
+    def standing_for(self, speed: FloatArray) -> Found:
+        """Return a known speed on the grid [M], m/s, that is made of this field and others like it."""
+        meaning = Meaning("speed", "x", 1.0, "m/s", 1.0, "mean of wheel speeds")
+        seen = Seen(speed, speed, self.seen.rate_hz)
+        return replace(self, meaning=meaning, seen=seen, factors=(("m/s", 1.0),), sign=1.0, offset=0.0, known=True)
+
+    def use(self, unit: str) -> None:
+        """Take the field in a unit."""
+        self.factors = tuple(sorted(self.factors, key=lambda f: f[0] != unit))
+        self.known = True
+
+    def candidate(self, name: str, section: Literal["signals", "truth"], *, taken: bool) -> Candidate:
+        """Return the record of what was found."""
+        source = SignalSource(name, self.topic.name, self.path, self.stamp, self.scale, self.offset)
+        most = MOST.get(self.meaning.quantity)
+        finite = self.seen.values[np.isfinite(self.seen.values)] * self.scale + self.offset
+        if most is not None and finite.shape[0] and float(np.abs(finite).max()) > most:
+            source = replace(source, valid_min=-most, valid_max=most)
+        reason = "; ".join([self.meaning.why, *self.reasons])
+        doubts = [*self.doubts, *([] if self.seen.changes else ["it does not change in what was read of the log"])]
+        return Candidate(section, source, round(self.score, 2), reason, "; ".join(doubts), taken)
+
+
+def names_of(quantity: str, part: str) -> tuple[str, ...]:
+    """Return the signals that a quantity may be."""
+    if quantity == "acceleration":
+        return {"x": ("ax_m_s2",), "y": ("ay_m_s2",)}.get(part, ())
+    if quantity == "rate":
+        return ("yaw_rate_rad_s",) if part == "z" else ()
+    if quantity == "steering":
+        return {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(part, ("steer_rad", "steering_wheel_rad"))
+    if quantity == "speed":
+        return ("speed_m_s",)
+    if quantity in ("wheel speed", "wheel rate") and part in WHEELS:
+        return (f"wheel_speed_{part}_{'m_s' if quantity == 'wheel speed' else 'rad_s'}",)
+    return ()
+
+
+def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendors: Vendors) -> list[Named]:
+    """Return the fields whose name or documented type gives them a meaning; the last entry tells a documented one."""
+    found = []
+    for topic, role in topics:
+        fields = log.fields(topic.name, quiet=True)
+        if len(fields) > MOST_FIELDS or vendors.why_left_out(topic.type_name):
+            continue
+        known = vendors.fields_of(topic.type_name)
+        for info in fields:
+            if is_command(info.path) or info.kind != "number" or info.path.count("[]") > info.path.endswith("[]"):
+                continue
+            if info.path in known:
+                found.append((topic, role, info, known[info.path].meaning, True))
+            elif not known or info.path.count("."):
+                meaning = meaning_of(topic.name, topic.type_name, info.path)
+                if meaning is not None:
+                    found.append((topic, role, info, meaning, False))
+    return found
+
+
+def look(
+    log: DriveLog, named: Sequence[Named], vendors: Vendors, sources: Sequence[SignalSource]
+) -> tuple[Pieces, list[Found]]:
+    """Read what has a meaning, and what is mapped already, in a few pieces of the log.
+
+    Fields without a number and those that no unit brings into a car's range are left out.
+    """
+    named = sorted(named, key=lambda n: (not n[4], -n[3].strength))[:MOST_READ]
+    requests: dict[str, list[str]] = {}
+    for topic, _, info, _, _ in named:
+        requests.setdefault(topic.name, []).append(info.path.removesuffix("[]"))
+    for source in sources:
+        if source.can_signal is None:
+            paths = requests.setdefault(source.topic, [])
+            paths += [p for p in source.paths if p not in paths]
+    pieces = Pieces(log)
+    read = pieces.read(requests)
+    found: list[Found] = []
+    for topic, role, info, meaning, documented in named:
+        path = info.path.removesuffix("[]")
+        names = [path] if (topic.name, path) in read else [f"{path}[{i}]" for i in range(MOST_COLUMNS)]
+        for name in names:
+            seen = read.get((topic.name, name))
+            its = meaning if name == path else meaning_of(topic.name, topic.type_name, name)
+            if its is None and meaning.quantity == "speed":
+                # One number of several under a name of one: which of them it is, values alone can tell.
+                its = replace(meaning, strength=0.5)
+            if seen is None or its is None or not np.isfinite(seen.values).any():
+                continue
+            stamp = stamp_of(log.fields(topic.name, quiet=True), name)
+            if role == "sensor" and set(words_of(name)) & _NAVIGATION:
+                role = "navigation"
+            one = Found(topic, name, its, role, stamp, seen, _factors(its, seen))
+            if _is_nested_imu(topic, log.fields(topic.name, quiet=True), name):
+                one.known = True
+                one.reasons.append("a nested sensor_msgs/Imu, in SI units")
+            if documented:
+                _document(one, vendors.fields_of(topic.type_name)[info.path])
+            elif its.scale is not None:
+                one.known = True
+                one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+            if one.factors:
+                found.append(one)
+    return pieces, found + _anchors(log, sources, read)
+
+
+def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
+    """Return whether a field is one of a ``sensor_msgs/Imu`` inside of another ROS message."""
+    struct = path.rpartition(".")[0]
+    if topic.encoding not in ("cdr", "ros1") or not struct.endswith(("linear_acceleration", "angular_velocity")):
+        return False
+    return any(f.path.startswith(f"{struct}_covariance[") for f in fields)
+
+
+def _document(one: Found, entry: VendorField) -> None:
+    one.fixed = one.known = True
+    one.section = entry.section
+    one.factors = ((entry.unit, abs(entry.scale)),)
+    one.sign, one.offset = math.copysign(1.0, entry.scale), entry.offset
+    one.reasons.append(f"documented: {entry.page}")
+
+
+def _anchors(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Found]:
+    """Return what is mapped already, as fields that nothing here changes."""
+    topics = {t.name: t for t in log.topics}
+    found = []
+    for source in sources:
+        seen = read.get((source.topic, source.paths[0]))
+        if seen is None or not isinstance(source.scale, float) or not isinstance(source.offset, float):
+            continue
+        meaning = meaning_of_signal(source.name)
+        one = Found(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))
+        one.factors, one.sign = (("", abs(source.scale)),), math.copysign(1.0, source.scale)
+        one.offset, one.fixed, one.known, one.anchor = source.offset, True, True, True
+        found.append(one)
+    return found
+
+
+def source_found(source: SignalSource, found: Sequence[Found]) -> Found | None:
+    """Return the anchor that a mapped source became."""
+    meaning = meaning_of_signal(source.name)
+    return next((f for f in found if f.anchor and f.meaning == meaning), None)
+
+
+def _factors(meaning: Meaning, seen: Seen) -> tuple[tuple[str, float], ...]:
+    """Return the units that a field can be in by its range; one that its name says comes alone."""
+    most = MOST.get(meaning.quantity)
+    if meaning.scale is not None:
+        return ((meaning.unit, meaning.scale),)
+    every = HYPOTHESES.get(meaning.quantity, ())
+    largest = seen.largest
+    return tuple(u for u in every if most is None or not largest * u[1] > most)
+
+
+def stamp_of(fields: tuple[FieldInfo, ...], path: str) -> str:
+    """Return the stamp of a field: that of the innermost message around it that has one."""
+    times = {f.path for f in fields if f.kind == "time"}
+    parts = path.split(".")[:-1]
+    while parts:
+        for stamp in STAMP_PATHS:
+            if ".".join([*parts, stamp]) in times:
+                return ".".join([*parts, stamp])
+        parts.pop()
+    return stamp_path_of(fields)
+
+
+def triad_of(one: Found) -> str:
+    """Return what the three axes of one vector share: topic and struct, or name without the axis."""
+    return f"{one.topic.name}.{one.path.rpartition('.')[0] or one.path.rstrip('xyzXYZ0123[]_')}"
+
+
+def leaf_group(one: Found) -> tuple[str, str]:
+    """Return topic and innermost-but-one struct: accelerations and rates of one IMU share it."""
+    parts = one.path.split(".")
+    return one.topic.name, ".".join(parts[: max(0, len(parts) - 2)])

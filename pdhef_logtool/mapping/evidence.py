@@ -1,0 +1,207 @@
+"""What short pieces of a log say of its fields: values on one grid of time, and how one follows another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import Columns, DriveLog
+from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+
+#: Pieces of the log that are read, and how long each is; a shorter log is read whole.
+PIECES = 8
+PIECE_NS = 10_000_000_000
+#: Cells of the grid; slower than this, a car's motion does not change much.
+CELL_NS = 100_000_000
+#: Beyond, a number is no measurement of a car.
+LARGEST = 1e12
+#: A sensor of a few samples a second is joined up over so many cells.
+BRIDGED_CELLS = 5
+#: Columns of an array of unknown length that are looked at.
+MOST_COLUMNS = 8
+#: Fewer cells than this tell nothing.
+FEWEST_CELLS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """``y = slope * x + a`` over ``cells`` cells of 0.1 s, and the correlation of the two."""
+
+    slope: float
+    correlation: float
+    cells: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """A field in the pieces that were read.
+
+    Attributes
+    ----------
+    values : float64 [N], raw. cells : float64 [M], their means on the grid, NaN where there is none.
+    rate_hz : samples a second where it is sent.
+    """
+
+    values: FloatArray
+    cells: FloatArray
+    rate_hz: float
+
+    @property
+    def largest(self) -> float:
+        """Largest magnitude that is not one of a few stray samples; NaN without a number."""
+        finite = np.abs(self.values[np.isfinite(self.values)])
+        return float(np.quantile(finite, 0.995)) if finite.shape[0] else float("nan")
+
+    @property
+    def changes(self) -> bool:
+        """Return whether it takes more than one value."""
+        finite = self.values[np.isfinite(self.values)]
+        return finite.shape[0] > 1 and bool(np.ptp(finite) > 0.0)
+
+
+class Pieces:
+    """A few pieces of a log, and a grid of 0.1 s over them."""
+
+    def __init__(self, log: DriveLog) -> None:
+        self.log = log
+        span = log.end_ns - log.start_ns
+        count = max(1, min(PIECES, -(-span // PIECE_NS)))
+        step = max(PIECE_NS, (span - PIECE_NS) // max(1, count - 1))
+        self.starts = [log.start_ns + i * step for i in range(count)]
+        self.cells_a_piece = PIECE_NS // CELL_NS
+
+    def read(self, requests: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], Seen]:
+        """Read fields by topic; arrays come as one entry a column, ``name[i]``. What cannot be read is left out."""
+        parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
+        for number, start in enumerate(self.starts):
+            for topic, columns in self._columns(requests, start).items():
+                at = (columns.log_time_ns - start) // CELL_NS
+                for path in requests[topic]:
+                    values = np.asarray(columns.fields[path], dtype=np.float64)
+                    values = np.where(np.abs(values) < LARGEST, values, np.nan)
+                    if values.ndim == 1:
+                        parts.setdefault((topic, path), []).append((number, at, values))
+                        continue
+                    for i, column in enumerate(values.T[:MOST_COLUMNS]):
+                        parts.setdefault((topic, f"{path}[{i}]"), []).append((number, at, column))
+        return {key: self._seen(found) for key, found in parts.items()}
+
+    def _columns(self, requests: Mapping[str, Sequence[str]], start: int) -> dict[str, Columns]:
+        try:
+            return self.log.read(requests, start, start + PIECE_NS, quiet=True)
+        except PdhefError:
+            if len(requests) == 1:
+                return {}
+            one_by_one = (self._columns({t: p}, start) for t, p in requests.items())
+            return {t: c for found in one_by_one for t, c in found.items()}
+
+    def _seen(self, found: list[tuple[int, IntArray, FloatArray]]) -> Seen:
+        total = np.zeros(len(self.starts) * self.cells_a_piece)
+        count = np.zeros_like(total)
+        values = np.concatenate([c for _, _, c in found])
+        low, high = _usual(values)
+        for number, at, column in found:
+            use = (column >= low) & (column <= high)
+            use &= (at >= 0) & (at < self.cells_a_piece)
+            where = number * self.cells_a_piece + at[use]
+            np.add.at(total, where, column[use])
+            np.add.at(count, where, 1.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            cells = _filled((total / count).reshape(len(self.starts), -1)).ravel()
+        busy = max(1, int(np.count_nonzero(count)))
+        return Seen(values, cells, float(values.shape[0]) / (busy * CELL_NS * 1e-9))
+
+    def rate_of(self, cells: FloatArray) -> FloatArray:
+        """Return the change a second of what stands on the grid [M]; nothing crosses from one piece to the next."""
+        rows = cells.reshape(len(self.starts), self.cells_a_piece)
+        out = np.full_like(rows, np.nan)
+        out[:, 2:-2] = (rows[:, 4:] - rows[:, :-4]) / (4.0 * CELL_NS * 1e-9)
+        return out.ravel()
+
+    def smooth(self, cells: FloatArray) -> FloatArray:
+        """Return the mean of five neighbouring cells [M], as :meth:`rate_of` sees them."""
+        rows = cells.reshape(len(self.starts), self.cells_a_piece)
+        out = np.full_like(rows, np.nan)
+        out[:, 2:-2] = sum(rows[:, i : rows.shape[1] - 4 + i] for i in range(5)) / 5.0
+        return out.ravel()
+
+
+def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:
+    """Return how many times x goes into y where x is above ``slow``; None where this is not one number."""
+    use = np.isfinite(y) & np.isfinite(x)
+    use[use] &= x[use] > slow
+    if np.count_nonzero(use) < FEWEST_CELLS:
+        return None
+    times = y[use] / x[use]
+    low, middle, high = np.quantile(times, [0.2, 0.5, 0.8])
+    return float(middle) if high - low < 0.1 * abs(middle) else None
+
+
+def is_of_one_sign(values: FloatArray) -> bool:
+    """Return whether no value is negative."""
+    finite = values[np.isfinite(values)]
+    return finite.shape[0] > 0 and bool(finite.min() >= 0.0)
+
+
+def is_of_both_signs(values: FloatArray) -> bool:
+    """Return whether a good share of the values is on either side of zero, far beyond noise about it."""
+    finite = values[np.isfinite(values)]
+    if finite.shape[0] == 0:
+        return False
+    low, high = np.quantile(finite, [0.05, 0.95])
+    return bool(low < 0.0 < high and min(-low, high) > 0.3 * max(-low, high))
+
+
+def spread(cells: FloatArray) -> float:
+    """Return the standard deviation of what is known; 0 without anything."""
+    known = cells[np.isfinite(cells)]
+    return float(known.std()) if known.shape[0] else 0.0
+
+
+def _usual(values: FloatArray) -> tuple[float, float]:
+    """Return the range that a sensor's "invalid" lies outside of: it is no motion, however large."""
+    finite = values[np.isfinite(values)]
+    if finite.shape[0] == 0:
+        return 0.0, 0.0
+    low, high = np.quantile(finite, [0.005, 0.995])
+    room = 3.0 * max(float(high - low), 1e-9)
+    return float(low) - room, float(high) + room
+
+
+def _filled(rows: FloatArray) -> FloatArray:
+    """Join the neighbours of an empty cell by a line where one is at most ``BRIDGED_CELLS`` away [pieces, cells]."""
+    at = np.arange(rows.shape[1])
+    for row in rows:
+        known = np.flatnonzero(np.isfinite(row))
+        if known.shape[0] < 2 or known.shape[0] == row.shape[0]:
+            continue
+        after = np.minimum(np.searchsorted(known, at), known.shape[0] - 1)
+        away = np.minimum(np.abs(at - known[after]), np.abs(at - known[np.maximum(after - 1, 0)]))
+        inside = (at >= known[0]) & (at <= known[-1]) & (away <= BRIDGED_CELLS)
+        row[inside] = np.interp(at[inside], known, row[known])
+    return rows
+
+
+def fit(y: FloatArray, x: FloatArray, where: BoolArray | None = None) -> Fit | None:
+    """Fit a line through cells [M] where both are known; None where they are too few or one does not move."""
+    use = np.isfinite(y) & np.isfinite(x)
+    if where is not None:
+        use &= where
+    n = int(np.count_nonzero(use))
+    if n < FEWEST_CELLS:
+        return None
+    a, b = y[use], x[use]
+    # A few wild samples (a sensor's "invalid") must not decide.
+    low, high = np.quantile(a, [0.005, 0.995])
+    a = np.clip(a, low, high)
+    low, high = np.quantile(b, [0.005, 0.995])
+    b = np.clip(b, low, high)
+    da, db = a - a.mean(), b - b.mean()
+    sa, sb = float(np.sqrt(np.mean(da * da))), float(np.sqrt(np.mean(db * db)))
+    if not (sa > 1e-12 and sb > 1e-12):
+        return None
+    both = float(np.mean(da * db))
+    return Fit(both / (sb * sb), both / (sa * sb), n)

@@ -1,0 +1,180 @@
+"""Truth of a navigation system whose type nobody documents: vectors by their names, a heading by the path it drives.
+
+North, east and up, or ECEF, stand in names; that a heading counts clockwise from north, or counter-clockwise from east,
+in degrees or radians, hardly ever does. The path shows it: a car mostly drives where it points.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
+from pdhef_logtool.mapping.checking import stamp_path_of
+from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
+from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.records.signals import FloatArray
+
+#: Slower, a course is no direction of the car.
+MOVING_M_S = 3.0
+#: A heading of the right convention is this near to the course (median), and every other one this far away.
+NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
+#: Nobody drives farther in a log.
+WIDEST_DEG = 10.0
+#: Metres of a degree of latitude.
+_DEGREE_M = 111_200.0
+_SIDES = {
+    "north": "n", "n": "n", "vn": "n", "veln": "n", "east": "e", "e": "e", "ve": "e", "vele": "e",
+    "up": "u", "u": "u", "vu": "u", "velu": "u", "down": "d", "d": "d", "vd": "d", "veld": "d",
+}  # fmt: skip
+#: Unit of a heading, and its angle counter-clockwise from east: ``sign * unit * raw + offset``.
+_CONVENTIONS = (
+    ("degrees clockwise from north", -math.radians(1.0), math.pi / 2.0),
+    ("radians clockwise from north", -1.0, math.pi / 2.0),
+    ("degrees counter-clockwise from east", math.radians(1.0), 0.0),
+    ("radians counter-clockwise from east", 1.0, 0.0),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationTruth:
+    """Truth quantities of one topic, and what is to be said of them."""
+
+    topic: str
+    truth: dict[str, SignalSource]
+    note: str
+
+
+def navigation_truth(log: DriveLog, topics: Sequence[TopicInfo]) -> NavigationTruth | None:
+    """Return the truth of the topic that says most of where the car goes and points; None without any.
+
+    Parameters
+    ----------
+    topics : of navigation systems and references, whose types are not known.
+    """
+    best: NavigationTruth | None = None
+    for topic in topics:
+        found = _of_topic(log, topic)
+        if found is not None and (best is None or len(found.truth) > len(best.truth)):
+            best = found
+    return best
+
+
+def _of_topic(log: DriveLog, topic: TopicInfo) -> NavigationTruth | None:
+    fields = log.fields(topic.name, quiet=True)
+    stamp = stamp_path_of(fields)
+    truth = {s.name: s for s in _vectors(topic, fields, stamp)}
+    meanings = {f.path: meaning_of(topic.name, topic.type_name, f.path) for f in fields if f.kind == "number"}
+    for quantity, name in (("latitude", "lat_deg"), ("longitude", "lon_deg")):
+        path = next((p for p, m in meanings.items() if m is not None and m.quantity == quantity), "")
+        if path:
+            truth[name] = SignalSource(name, topic.name, path, stamp)
+    headings = [p for p, m in meanings.items() if m is not None and m.quantity == "heading"]
+    pieces = Pieces(log)
+    paths = [p for s in truth.values() for p in s.paths if "ecef" not in p.lower()]
+    read = pieces.read({topic.name: [*dict.fromkeys([*paths, *headings])]}) if paths or headings else {}
+    places = [read.get((topic.name, truth[n].paths[0])) for n in ("lat_deg", "lon_deg") if n in truth]
+    if len(places) < 2 or not all(_is_place(p, most) for p, most in zip(places, (90.0, 180.0), strict=True)):
+        truth.pop("lat_deg", None)
+        truth.pop("lon_deg", None)
+    note = f"truth is taken from {topic.name}, by the names of its fields"
+    course = _course(truth, read, topic.name, pieces)
+    for path in headings if course is not None else ():
+        meaning = meanings[path]
+        convention = _convention(read.get((topic.name, path)), course, None if meaning is None else meaning.scale)
+        if convention is not None:
+            words, scale, offset = convention
+            truth["yaw_rad"] = SignalSource("yaw_rad", topic.name, path, stamp, scale, offset)
+            note += f"; {path} counts in {words}, as the path shows"
+            break
+    useful = {"enu_velocity_m_s", "ecef_velocity_m_s", "ecef_position_m", "lat_deg"} & set(truth)
+    return NavigationTruth(topic.name, truth, note) if useful else None
+
+
+def _vectors(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> list[SignalSource]:
+    """Return velocities east, north, up and vectors in ECEF that the names of a topic's fields make up."""
+    found = []
+    sides: dict[str, dict[str, str]] = {}
+    for info in fields:
+        prefix, _, leaf = info.path.rpartition(".")
+        words = words_of(leaf)
+        if info.kind != "number" or "ecef" in info.path.lower():
+            continue
+        short = "".join(words)
+        side = next((_SIDES[w] for w in (*words, short) if w in _SIDES and len(w) > 1), "")
+        side = side or (_SIDES[words[-1]] if len(words) > 1 and words[-1] in "neud" else "")
+        speeds = {"velocity", "vel", "speed"} & {*words, *words_of(prefix)} or re.fullmatch("(v|vel)[neud]", short)
+        if side and speeds and not {"std", "stddev", "stdev", "var", "cov", "accuracy", "sigma", "acc"} & set(words):
+            sides.setdefault(prefix, {}).setdefault(side, info.path)
+    for by_side in sides.values():
+        vertical = next((s for s in "ud" if s in by_side), "")
+        if {"n", "e"} <= set(by_side) and vertical:
+            paths = (by_side["e"], by_side["n"], by_side[vertical])
+            factor = unit_of(paths[0].rpartition(".")[2], "speed")[1] or 1.0
+            scale = (factor, factor, factor if vertical == "u" else -factor)
+            found.append(SignalSource("enu_velocity_m_s", topic.name, paths, stamp, scale))
+            break
+    elements = {f.path for f in fields}
+    for base in dict.fromkeys(p.removesuffix("[0]") for p in elements if p.endswith("[0]") and "ecef" in p.lower()):
+        if f"{base}[2]" not in elements or f"{base}[3]" in elements:
+            continue
+        said = set(words_of(base))
+        kind = "velocity" if said & {"velocity", "vel"} else "position" if said & {"position", "pos"} else ""
+        if kind:
+            name = "ecef_velocity_m_s" if kind == "velocity" else "ecef_position_m"
+            found.append(SignalSource(name, topic.name, tuple(f"{base}[{i}]" for i in range(3)), stamp))
+    return found
+
+
+def _is_place(seen: Seen | None, most: float) -> bool:
+    """Return whether values can be degrees of a place that the car drives about."""
+    if seen is None or not seen.changes or not 0.01 < seen.largest <= most:
+        return False
+    return float(np.nanmax(seen.cells) - np.nanmin(seen.cells)) < WIDEST_DEG
+
+
+def _course(
+    truth: dict[str, SignalSource], read: dict[tuple[str, str], Seen], topic: str, pieces: Pieces
+) -> FloatArray | None:
+    """Return the direction of travel counter-clockwise from east where the car moves, rad [M]."""
+    if "enu_velocity_m_s" in truth:
+        columns = [read.get((topic, p)) for p in truth["enu_velocity_m_s"].paths[:2]]
+        if any(c is None for c in columns):
+            return None
+        east, north = (c.cells for c in columns if c is not None)
+    elif {"lat_deg", "lon_deg"} <= set(truth):
+        latitude, longitude = (read[topic, truth[n].paths[0]].cells for n in ("lat_deg", "lon_deg"))
+        narrowed = math.cos(math.radians(float(np.nanmean(latitude))))
+        north, east = (pieces.rate_of(c) * _DEGREE_M for c in (latitude, longitude))
+        east = east * narrowed
+    else:
+        return None
+    return np.where(np.hypot(north, east) > MOVING_M_S, np.arctan2(north, east), np.nan)
+
+
+def _convention(seen: Seen | None, course: FloatArray | None, unit: float | None) -> tuple[str, float, float] | None:
+    """Return the convention of a heading that the course shows, if there is one that is near alone.
+
+    Parameters
+    ----------
+    unit : radians of its unit if its name says it; else more than one turn in radians is degrees.
+    """
+    if seen is None or course is None:
+        return None
+    unit = unit or (math.radians(1.0) if seen.largest > 2.1 * math.pi else 1.0)
+    off: list[float] = []
+    conventions = [c for c in _CONVENTIONS if math.isclose(abs(c[1]), unit)]
+    for _, scale, angle in conventions:
+        away = np.abs(np.angle(np.exp(1j * (scale * seen.cells + angle - course))))
+        away = away[np.isfinite(away)]
+        if away.shape[0] < FEWEST_CELLS:
+            return None
+        off.append(float(np.median(away)))
+    if len(off) < 2 or not (min(off) < NEAR_RAD and max(off) > FAR_RAD):
+        return None
+    return conventions[int(np.argmin(off))]

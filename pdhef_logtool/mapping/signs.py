@@ -1,0 +1,132 @@
+"""Signs: which of steering, yaw rate and a_y contradict one another, and the way the car really turned.
+
+Three signals that agree may all be positive to the right. What cannot be is told by what needs no convention: the path
+that positions show, right minus left wheel, a navigation system's heading, which counts clockwise, and gravity,
+which the accelerometer of an upright IMU has along +z.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.mapping.candidates import Found, leaf_group
+from pdhef_logtool.mapping.evidence import fit
+from pdhef_logtool.mapping.fields import CLEAR, Fields
+from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.mapping.path import heading_turn, path_turn
+from pdhef_logtool.records.signals import FloatArray
+
+#: Speeds below tell nothing of the path.
+SLOW_M_S = 1.0
+#: Correlations from here on tell a sign.
+TELLS = 0.6
+#: What a person calls the signals.
+WORDS = {"steer": "steering", "rate": "yaw rate", "ay": "a_y"}
+WITNESSES = {
+    "wheels": "the wheels' difference",
+    "path": "the path of the positions",
+    "heading": "the heading",
+    "gravity": "gravity",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Signs:
+    """What the signs say.
+
+    Attributes
+    ----------
+    turned : signals (``steer``, ``rate``, ``ay``) whose sign is to be turned.
+    absolute : the way the car turned is known.
+    contradiction : which pairs contradict one another, empty if none. decided : ``turned`` is the one way to mend it.
+    """
+
+    turned: tuple[str, ...] = ()
+    absolute: bool = False
+    contradiction: str = ""
+    decided: bool = True
+
+
+def judge_signs(
+    fields: Fields, trio: Mapping[str, Found | None], speed: Found | None, wheels: FloatArray | None
+) -> Signs:
+    """Hold the signs of steering, yaw rate and a_y against one another and against the way the car turned.
+
+    Parameters
+    ----------
+    trio : by ``steer``, ``rate``, ``ay``. wheels : right minus left wheel speed on the grid [M].
+    """
+    si = {name: None if one is None else one.si for name, one in trio.items()}
+    turns: dict[str, FloatArray] = {}
+    if speed is not None:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            v = np.where(speed.si > SLOW_M_S, speed.si, np.nan)
+            # Each as a yaw rate, but for its scale.
+            turns |= {"steer": si["steer"] * v} if si["steer"] is not None else {}
+            turns |= {"ay": si["ay"] / v} if si["ay"] is not None else {}
+    turns |= {"rate": si["rate"]} if si["rate"] is not None else {}
+    turns = {name: fields.pieces.smooth(values) for name, values in turns.items()}
+    votes = {pair: _sign(turns[pair[0]], turns[pair[1]], TELLS) for pair in itertools.combinations(turns, 2)}
+    truly = {"wheels": wheels, "path": path_turn(fields), "heading": heading_turn(fields)}
+    for source, values in truly.items():
+        if values is not None:
+            votes |= {(n, source): _sign(x, values, CLEAR if source == "wheels" else TELLS) for n, x in turns.items()}
+    rate = trio["rate"]
+    if rate is not None and rate.is_axis:
+        votes["rate", "gravity"] = upright(fields, rate) * rate.sign
+    votes = {pair: vote for pair, vote in votes.items() if vote}
+    absolute = any(source in {*truly, "gravity"} for _, source in votes)
+    against = [f"{_word(a)} and {_word(b)}" for (a, b), vote in votes.items() if vote < 0.0]
+    if not against:
+        return Signs(absolute=absolute)
+    free = [n for n in turns if (one := trio[n]) is not None and may_turn(one)]
+    ways = _ways(free, votes)
+    # An IMU that may be mounted in any way may be the odd one: its axes are found later, and signs with them.
+    decided = len(ways) == 1 and len(free) == len(turns) and (absolute or len(votes) > 1)
+    return Signs(ways[0] if decided else (), absolute, ", ".join(against), decided)
+
+
+def may_turn(one: Found) -> bool:
+    """Return whether the sign of a field is free: neither documented nor a matter of its mounting."""
+    if one.anchor or one.fixed:
+        return False
+    return one.meaning.quantity == "steering" or not one.is_axis
+
+
+def upright(fields: Fields, rate: Found) -> float:
+    """Return 1 where gravity is along +z of the sensor that a rate about z comes from, -1 along -z, 0 if unknown."""
+    for one in (*fields.found, *fields.anchors.values()):
+        if (one.meaning.quantity, one.meaning.part) == ("acceleration", "z") and leaf_group(one) == leaf_group(rate):
+            mean = float(np.nanmean(one.si))
+            # Gravity alone is that large for so long, but in a sensor that takes it away.
+            return math.copysign(1.0, mean) if abs(mean) > 0.9 * G_M_S2 else 0.0
+    return 0.0
+
+
+def _ways(free: Sequence[str], votes: Mapping[tuple[str, str], float]) -> list[tuple[str, ...]]:
+    """Return the smallest sets of signals whose turning settles every vote."""
+    for size in range(1, len(free) + 1):
+        ways = [
+            chosen
+            for chosen in itertools.combinations(free, size)
+            if all(v * (-1.0) ** sum(n in chosen for n in pair) > 0.0 for pair, v in votes.items())
+        ]
+        if ways:
+            return ways
+    return []
+
+
+def _sign(y: FloatArray, x: FloatArray, clear: float) -> float:
+    relation = fit(y, x)
+    if relation is None or abs(relation.correlation) < clear:
+        return 0.0
+    return math.copysign(1.0, relation.correlation)
+
+
+def _word(name: str) -> str:
+    return (WORDS | WITNESSES)[name]

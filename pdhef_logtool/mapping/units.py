@@ -1,0 +1,176 @@
+"""Units that no name tells: by gravity, by other speeds, by a_y ≈ v r and by a_x ≈ v̇."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+
+from pdhef_logtool.mapping.candidates import LEAST_SCORE, Found, leaf_group, triad_of
+from pdhef_logtool.mapping.evidence import fit, ratio, spread
+from pdhef_logtool.mapping.fields import CLEAR, EXCITED_A_M_S2, Fields, mean_of
+from pdhef_logtool.mapping.naming import G_M_S2
+from pdhef_logtool.mapping.path import path_speed
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import FloatArray
+
+#: How near to 1 the slope of a_y over v r must be.
+SLOPES = (0.7, 1.4)
+#: Radii of wheels, of model cars to lorries.
+RADII_M = (0.02, 0.7)
+#: Raw speeds below tell no unit, whichever it is.
+SLOWEST = 1.0
+#: Share of gravity along +z of an upright sensor.
+MOST_TILTED = 0.9
+#: Names that tell a filtered or derived copy of a sensor from the sensor.
+_SECOND_CHOICE = ("raw", "uncomp", "delta", "error", "offset", "relative")
+
+
+def decide_units(fields: Fields) -> None:
+    """Decide units that no name tells: gravity first, then one quantity against another."""
+    _by_gravity(fields)
+    _rank(fields)
+    _speeds(fields)
+    _by_turning(fields)
+    _by_wheel_rates(fields)
+    _by_speeding_up(fields)
+    _by_siblings(fields)
+
+
+def _by_gravity(fields: Fields) -> None:
+    groups: dict[str, dict[str, Found]] = {}
+    for one in fields.found:
+        if one.meaning.quantity == "acceleration" and one.is_axis:
+            groups.setdefault(triad_of(one), {})[one.meaning.part] = one
+    for axes in groups.values():
+        if set(axes) != set("xyz"):
+            continue
+        means = np.array([np.nanmean(axes[a].seen.values) for a in "xyz"])
+        size = float(np.linalg.norm(means))
+        _say_mounting(fields, axes["z"], means / size if size > 0.0 else means)
+        for one in axes.values():
+            if one.known or one.fixed:
+                continue
+            near = [u for u, s in one.factors if abs(size * s / G_M_S2 - 1.0) < 0.08]
+            if near:
+                one.use(near[0])
+                one.reasons.append(f"gravity: the mean of its three axes is {size:.4g}, so it is in {near[0]}")
+
+
+def _say_mounting(fields: Fields, z: Found, gravity: FloatArray) -> None:
+    """Say where gravity is not along +z of an accelerometer that names its axes: its axes are not the car's."""
+    if z.fixed or gravity[2] > MOST_TILTED or z.role in ("command", "estimate", "truth"):
+        return
+    along = "xyz"[int(np.argmax(np.abs(gravity)))]
+    sense = "-" if gravity["xyz".index(along)] < 0.0 else "+"
+    fields.checks.append(
+        Check(
+            "imu.mounting",
+            "ay_m_s2",
+            "undecided",
+            f"gravity is along {sense}{along} of {triad_of(z)}, not along +z: its axes are not the car's",
+            'turn them in a mapping file, or --waive "imu.mounting"',
+        )
+    )
+
+
+def _by_wheel_rates(fields: Fields) -> None:
+    """Tell the unit of a gyro where wheels turn in rad/s and their radius is not known: only one gives a wheel's."""
+    wheels = [f for f in fields.found if f.meaning.quantity == "wheel rate" and f.known]
+    if not wheels:
+        return
+    turning = mean_of([f.si for f in wheels])
+    for rate in fields.open("rate", "z"):
+        for ay in fields.open("acceleration", "y")[:2]:
+            relation = fields.turning(ay.si, rate.seen.cells, turning)
+            if rate.known or relation is None or abs(relation.correlation) < CLEAR:
+                continue
+            radii = {unit: abs(relation.slope) / factor for unit, factor in rate.factors}
+            near = [unit for unit, radius_m in radii.items() if RADII_M[0] < radius_m < RADII_M[1]]
+            if len(near) == 1:
+                rate.use(near[0])
+                rate.reasons.append(f"unit {near[0]} by a_y ≈ v r, with wheels of {radii[near[0]]:.2f} m")
+
+
+def _rank(fields: Fields) -> None:
+    """Prefer fields of a message that has both accelerations and rates, and the sensor to its copies."""
+    kinds: dict[tuple[str, str], set[str]] = {}
+    for one in fields.found:
+        kinds.setdefault(leaf_group(one), set()).add(one.meaning.quantity)
+    for one in fields.found:
+        if one.meaning.quantity in ("acceleration", "rate") and kinds[leaf_group(one)] >= {"acceleration", "rate"}:
+            one.bonus += 0.1
+        if any(w in one.path.lower() for w in _SECOND_CHOICE):
+            one.bonus -= 0.15
+
+
+def _speeds(fields: Fields) -> None:
+    """Tell units of speeds by one another: what is known, then a_x, then the least assuming."""
+    known = [f for f in fields.all("speed") if f.known or f.fixed]
+    reference = max(known, key=lambda f: f.score, default=None)
+    path = path_speed(fields)
+    for one in fields.all("speed"):
+        if reference is not None and one is not reference:
+            times = ratio(reference.si, one.seen.cells, SLOWEST)
+            fields.settle(one, times or 0.0, f"{reference.path} of {reference.topic.name}", 0.08)
+        if path is not None:
+            fields.settle(one, ratio(path, one.seen.cells, SLOWEST) or 0.0, "the positions' speed", 0.12)
+    for one in fields.all("speed"):
+        if one.known or one.fixed:
+            continue
+        for ax in fields.all("acceleration", "x"):
+            relation = fit(fields.pieces.smooth(ax.si), fields.pieces.rate_of(one.seen.cells))
+            if relation is not None and relation.correlation > CLEAR:
+                fields.settle(one, relation.slope, "its rate of change against a_x", 0.25)
+                break
+
+
+def _by_turning(fields: Fields) -> None:
+    """Tell units of a_y, yaw rate and speed by a_y ≈ v r, where one combination alone gives it."""
+    speed = fields.best("speed") or fields.wheel_mean()
+    for rate in fields.open("rate", "z")[:4]:
+        for ay in fields.open("acceleration", "y")[:4]:
+            if speed is None or (rate.known and ay.known and speed.known):
+                continue
+            fits = []
+            units = [f.factors[:1] if f.known or f.fixed else f.factors for f in (ay, rate, speed)]
+            for combination in itertools.product(*units):
+                a, r, v = (c[1] for c in combination)
+                relation = fields.turning(ay.seen.cells * a, rate.seen.cells * r, speed.seen.cells * v)
+                if relation is not None and abs(relation.correlation) > CLEAR:
+                    size = abs(relation.slope)
+                    if SLOPES[0] < size < SLOPES[1]:
+                        fits.append((abs(math.log(size)), combination))
+            if len(fits) == 1 or (fits and all(f[1][1:] == fits[0][1][1:] for f in fits)):
+                for one, (unit, _) in zip((ay, rate, speed), fits[0][1], strict=True):
+                    if not one.known and not one.fixed:
+                        one.use(unit)
+                        one.reasons.append(f"unit {unit} by a_y ≈ v r")
+                        one.bonus += 0.3 if one.score < LEAST_SCORE else 0.0
+
+
+def _by_speeding_up(fields: Fields) -> None:
+    speed = fields.best("speed")
+    if speed is None or not (speed.known or speed.fixed):
+        return
+    change = fields.pieces.rate_of(speed.si)
+    for one in fields.open("acceleration", "x"):
+        if one.known or one.fixed or not spread(change) > EXCITED_A_M_S2:
+            continue
+        relation = fit(change, fields.pieces.smooth(one.seen.cells))
+        if relation is not None and abs(relation.correlation) > CLEAR:
+            fields.settle(one, abs(relation.slope), "the speed's rate of change", 0.4)
+
+
+def _by_siblings(fields: Fields) -> None:
+    """Take the unit of the other accelerations, or velocities, of a message: nobody mixes them."""
+    for kinds in ({"acceleration"}, {"speed", "velocity"}):
+        known = {leaf_group(f): f for f in fields.found if f.meaning.quantity in kinds and f.known}
+        for one in fields.found:
+            other = known.get(leaf_group(one))
+            if one.meaning.quantity in kinds and not one.known and other is not None and one.meaning.strength > 0.6:
+                same = [u for u, s in one.factors if math.isclose(s, other.factors[0][1], rel_tol=1e-6)]
+                if same:
+                    one.use(same[0])
+                    one.reasons.append(f"unit {same[0]} as of {other.path}")

@@ -1,0 +1,197 @@
+"""Message types of vendors whose documentation says what their fields are: ``vendors.toml`` and files like it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pdhef_logtool.mapping.naming import Meaning
+from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
+from pdhef_logtool.records.documents import checked, read_toml
+from pdhef_logtool.records.errors import MappingFileError
+from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS
+
+#: Names a file like ``vendors.toml`` whose entries come before those that are shipped.
+USERS_FILE = "PDHEF_VENDORS"
+
+_QUANTITIES = {
+    "steer_rad": ("steering", "road"), "steering_wheel_rad": ("steering", "wheel"), "ax_m_s2": ("acceleration", "x"),
+    "ay_m_s2": ("acceleration", "y"), "az_m_s2": ("acceleration", "z"),
+    "yaw_rate_rad_s": ("rate", "z"), "speed_m_s": ("speed", "x"),
+    "vx_m_s": ("speed", "x"), "vy_m_s": ("velocity", "y"), "sideslip_rad": ("sideslip", ""),
+    "lat_deg": ("latitude", ""), "lon_deg": ("longitude", ""), "course_rad": ("course", ""), "yaw_rad": ("heading", ""),
+    "x_m": ("position", "x"), "y_m": ("position", "y"),
+}  # fmt: skip
+
+
+class _FieldTable(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    field: Annotated[str, Field(min_length=1)] | list[str]
+    signal: str = ""
+    truth: str = ""
+    scale: float | list[float] = 1.0
+    offset: float = 0.0
+
+    @model_validator(mode="after")
+    def _is_one_quantity(self) -> _FieldTable:
+        if bool(self.signal) == bool(self.truth):
+            raise ValueError("give signal or truth")
+        if self.signal and self.signal not in SIGNAL_UNITS:
+            raise ValueError(f"{self.signal!r} is no signal")
+        if self.truth and self.truth not in TRUTH_UNITS:
+            raise ValueError(f"{self.truth!r} is no truth quantity")
+        if 0.0 in (self.scale if isinstance(self.scale, list) else [self.scale]):
+            raise ValueError("scale must not be 0")
+        if isinstance(self.scale, list) and not isinstance(self.field, list):
+            raise ValueError("one field has one scale")
+        columns = VECTOR_COLUMNS.get(self.truth, 1)
+        if isinstance(self.field, list) != (columns > 1) or (columns > 1 and len(self.field) != columns):
+            raise ValueError(f"{self.truth or self.signal} is made of {columns} fields")
+        return self
+
+
+class _TypeTable(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    type: list[str]
+    vendor: str
+    page: str
+    read: str
+    note: str = ""
+    leave_out: str = ""
+    fields: list[_FieldTable]
+
+
+@dataclass(frozen=True, slots=True)
+class VendorField:
+    """A documented field: ``value_SI = scale * raw + offset``.
+
+    Attributes
+    ----------
+    section, name : ``signals`` or ``truth``, and the quantity there.
+    unit : of the raw value in words, for reports. page : where it is documented.
+    """
+
+    section: Literal["signals", "truth"]
+    name: str
+    scale: float
+    offset: float
+    unit: str
+    page: str
+
+    @property
+    def meaning(self) -> Meaning:
+        """What a name would have to say to mean the same."""
+        return replace(meaning_of_signal(self.name), unit=self.unit, scale=abs(self.scale))
+
+
+def meaning_of_signal(name: str) -> Meaning:
+    """Return what a name would have to say for a field to be a signal or truth quantity."""
+    quantity, part = _QUANTITIES.get(name, ("", ""))
+    if name.startswith("wheel_speed_"):
+        quantity = "wheel rate" if name.endswith("rad_s") else "wheel speed"
+        part = name.removeprefix("wheel_speed_")[:2]
+    return Meaning(quantity, part, 1.0, "", 1.0, "its type is documented")
+
+
+@dataclass(frozen=True, slots=True)
+class Vendors:
+    """Documented types by name, as ROS 2 spells it without ``/msg``, and why some are left out.
+
+    ``vectors`` are truth quantities that several fields make, with an empty topic.
+    """
+
+    types: Mapping[str, Mapping[str, VendorField]] = field(default_factory=dict)
+    vectors: Mapping[str, tuple[SignalSource, ...]] = field(default_factory=dict)
+    reasons: Mapping[str, str] = field(default_factory=dict)
+
+    def fields_of(self, type_name: str) -> Mapping[str, VendorField]:
+        """Return the documented fields of a type by path; empty for a type that is not documented here."""
+        return self.types.get(_plain(type_name), {})
+
+    def vectors_of(self, type_name: str) -> tuple[SignalSource, ...]:
+        """Return the vectors of a type, with an empty topic."""
+        return self.vectors.get(_plain(type_name), ())
+
+    def why_left_out(self, type_name: str) -> str:
+        """Return why nothing of a documented type can be taken; empty where something can."""
+        return self.reasons.get(_plain(type_name), "")
+
+
+def _plain(type_name: str) -> str:
+    return type_name.replace("/msg/", "/").replace("::", "/")
+
+
+def load_vendors(path: Path | None = None) -> Vendors:
+    """Return the shipped types, and before them those of a user's file, which ``PDHEF_VENDORS`` may name as well.
+
+    Raises
+    ------
+    MappingFileError : A file is missing, is no TOML or holds wrong entries; all are named.
+    """
+    given = path or (Path(os.environ[USERS_FILE]) if os.environ.get(USERS_FILE) else None)
+    if given is None:
+        return _shipped()
+    own = _read(given)
+    kept = {name: why for name, why in _shipped().reasons.items() if name not in own.types}
+    return Vendors(
+        {**_shipped().types, **own.types},
+        {**{n: v for n, v in _shipped().vectors.items() if n not in own.types}, **own.vectors},
+        {**kept, **own.reasons},
+    )
+
+
+@cache
+def _shipped() -> Vendors:
+    return _read(Path(str(files("pdhef_logtool").joinpath("mapping", "vendors.toml"))))
+
+
+def _read(path: Path) -> Vendors:
+    raw = read_toml(path, "a TOML file of vendors' types", MappingFileError)
+    problems = [f"{key}: not known, expected [[types]]" for key in raw if key != "types"]
+    found: dict[str, dict[str, VendorField]] = {}
+    reasons: dict[str, str] = {}
+    vectors: dict[str, tuple[SignalSource, ...]] = {}
+    entries = raw.get("types", [])
+    for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
+        model = checked(_TypeTable, table, f"types[{number}]", problems)
+        if model is None:
+            continue
+        page = f"{model.page}, read {model.read}"
+        fields = {
+            f.field: _field(f, f.scale, page)
+            for f in model.fields
+            if isinstance(f.field, str) and isinstance(f.scale, float)
+        }
+        found.update({_plain(name): fields for name in model.type})
+        several = tuple(_vector(f) for f in model.fields if isinstance(f.field, list))
+        vectors.update({_plain(name): several for name in model.type if several})
+        reasons.update({_plain(name): model.leave_out for name in model.type if model.leave_out})
+    if problems:
+        raise MappingFileError(
+            expected="entries as in docs/vendors.md",
+            got="; ".join(problems),
+            where=str(path),
+            remedy="see docs/vendors.md for every entry",
+        )
+    return Vendors(found, vectors, reasons)
+
+
+def _field(table: _FieldTable, scale: float, page: str) -> VendorField:
+    name = table.signal or table.truth
+    unit = (SIGNAL_UNITS | TRUTH_UNITS)[name]
+    text = unit if scale == 1.0 else f"{unit} / {scale:.6g}"
+    return VendorField("signals" if table.signal else "truth", name, scale, table.offset, text, page)
+
+
+def _vector(table: _FieldTable) -> SignalSource:
+    scale = tuple(table.scale) if isinstance(table.scale, list) else table.scale
+    return SignalSource(table.truth, "", tuple(table.field), scale=scale, offset=table.offset)

@@ -1,0 +1,580 @@
+"""Choosing among candidates by physics: gravity, a_y ≈ v r, a_x ≈ v̇, steering against curvature, wheels against yaw.
+
+What a recognised type already gives is an anchor: it is held against the candidates and never changed. What decides a
+unit or a sign is said; what stays open becomes a check that is undecided, with what to do about it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.candidates import (
+    LEAST_SCORE,
+    Candidate,
+    Found,
+    Role,
+    leaf_group,
+    look,
+    named_fields,
+    names_of,
+    source_found,
+    triad_of,
+)
+from pdhef_logtool.mapping.checking import has_path
+from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
+from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
+from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
+from pdhef_logtool.mapping.units import RADII_M, decide_units
+from pdhef_logtool.mapping.vendors import Vendors
+from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.signals import WHEELS, FloatArray
+
+#: Truth quantities that show the path.
+_POSITIONS = ("lat_deg", "lon_deg", "x_m", "y_m")
+#: Below (standard deviation) the path is straight.
+EXCITED_CURVATURE_1_M = 0.0001
+#: An acceleration (standard deviation) from which on a sensor must follow it, and the correlation that it must have.
+MOVING_M_S2 = 0.6
+FOLLOWS = 0.5
+#: How near wheels must be to a speed in a unit of speed; beyond they turn in rad/s.
+WHEEL_UNIT = 0.04
+#: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
+ROAD_WHEEL_M = (0.15, 8.0)
+STEERING_WHEEL_M = (12.0, 160.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Weighed:
+    """What the candidates give: sources to take, all candidates, notes, and checks that are undecided."""
+
+    signals: dict[str, SignalSource] = field(default_factory=dict)
+    truth: dict[str, SignalSource] = field(default_factory=dict)
+    candidates: tuple[Candidate, ...] = ()
+    notes: tuple[str, ...] = ()
+    rivals: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    checks: tuple[Check, ...] = ()
+
+
+def weigh(
+    log: DriveLog,
+    topics: Sequence[tuple[TopicInfo, Role]],
+    signals: Mapping[str, SignalSource],
+    truth: Mapping[str, SignalSource],
+    vendors: Vendors,
+) -> Weighed:
+    """Look for the signals that are not mapped, and for truth if there is none.
+
+    Parameters
+    ----------
+    topics : those that may hold candidates, with what their names make of them.
+    signals, truth : what recognised types give already.
+    """
+    wanted = [
+        n for n in named_fields(log, topics, vendors) if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)
+    ]
+    if not wanted or log.end_ns <= log.start_ns:
+        return Weighed()
+    positions = [s for n, s in truth.items() if n in _POSITIONS]
+    known = {**signals, **_upward(log, signals)}
+    pieces, found = look(log, wanted, vendors, [*known.values(), *positions])
+    anchors = {n: f for n, s in known.items() if (f := source_found(s, found)) is not None}
+    places = [f for f in found if f.meaning.quantity in ("latitude", "longitude", "position")]
+    fields = Fields(pieces, anchors, [f for f in found if not f.anchor], places)
+    decide_units(fields)
+    at_work = _Weighing(fields, "" if truth else truth_topic(fields.found))
+    at_work.choose_signals(set(signals))
+    if not truth:
+        at_work.choose_truth()
+    return at_work.result()
+
+
+def _upward(log: DriveLog, signals: Mapping[str, SignalSource]) -> dict[str, SignalSource]:
+    """Return the third axis of a mapped accelerometer, which tells where gravity is."""
+    lateral = signals.get("ay_m_s2")
+    path = "" if lateral is None else f"{lateral.paths[0].removesuffix('.y')}.z"
+    if lateral is None or not has_path(log.fields(lateral.topic), path):
+        return {}
+    return {"az_m_s2": SignalSource("az_m_s2", lateral.topic, path, lateral.stamp)}
+
+
+def _is_wanted(
+    quantity: str, part: str, role: Role, signals: Mapping[str, SignalSource], truth: Mapping[str, SignalSource]
+) -> bool:
+    """Return whether a field can fill a gap, or tell something of one that does."""
+    if quantity == "acceleration" and part == "z":  # tells gravity
+        return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
+    names = names_of(quantity, part)
+    steered = {"steer_rad", "steering_wheel_rad"} & set(signals)
+    open_ = any(n not in signals and not (n.startswith("steer") and steered) for n in names)
+    if open_ and quantity == "speed" and "speed_m_s" not in signals and any(n.startswith("wheel") for n in signals):
+        open_ = role in ("sensor", "truth", "estimate", "command")
+    for_truth = not truth and (role in ("truth", "navigation") or quantity in ("sideslip", "velocity"))
+    return open_ or for_truth
+
+
+@dataclass(slots=True)
+class _Weighing:
+    fields: Fields
+    truth_from: str
+    taken: dict[str, Found] = field(default_factory=dict)
+    truth: dict[str, Found] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    rivals: list[tuple[str, tuple[str, ...]]] = field(default_factory=list)
+    checks: list[Check] = field(default_factory=list)
+
+    # ---------------------------------------------------------------------------------------------- signals
+
+    def choose_signals(self, have: set[str]) -> None:
+        """Take the best candidate of each signal that is missing."""
+        usable = [f for f in self.fields.found if f.role in ("sensor", "navigation", "device")]
+        usable = [f for f in usable if (f.seen.changes or f.fixed) and f.section != "truth"]
+        for one in usable:
+            # A message that holds the answer gives the sensors too only where no other one does.
+            one.bonus -= 0.2 if one.topic.name == self.truth_from else 0.0
+        if "speed_m_s" not in have and not any(n.startswith("wheel_speed") for n in have):
+            self._take("speed_m_s", [f for f in usable if f.meaning.quantity == "speed"])
+        for name, part in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
+            if name not in have:
+                self._take(name, [f for f in usable if f.meaning.quantity == "acceleration" and f.meaning.part == part])
+        if "yaw_rate_rad_s" not in have:
+            self._take("yaw_rate_rad_s", [f for f in usable if f.meaning.quantity == "rate" and f.meaning.part == "z"])
+        self._one_imu()
+        if not any(n.startswith("wheel_speed") for n in have):
+            self._wheels(usable)
+        if not have & {"steer_rad", "steering_wheel_rad"}:
+            self._steering([f for f in usable if f.meaning.quantity == "steering"])
+        self._signs()
+        self._follow()
+        for name, one in self.taken.items():
+            self._tell(name, one)
+
+    def _take(self, name: str, candidates: Sequence[Found]) -> None:
+        if name == "speed_m_s":
+            for one in candidates:
+                self._follows_ax(one)
+        ordered = sorted(candidates, key=lambda f: (-f.score, -f.topic.messages, f.topic.name, f.path))
+        good = [f for f in ordered if f.score >= LEAST_SCORE]
+        if not good:
+            return
+        best = good[0]
+        if best.meaning.strength < 0.6:
+            best.doubts.append("which number of its array it is was told by values alone")
+        near = [f for f in good[1:] if f.score > best.score - 0.1 and not self.fields.agree(best, f)]
+        if near:
+            best = self._better([best, *near])
+            self.rivals.append(
+                (
+                    name,
+                    tuple(f"{f.topic.name}.{f.path}" for f in [best, *(x for x in [good[0], *near] if x is not best)]),
+                )
+            )
+        self.taken[name] = best
+
+    def _follows_ax(self, one: Found) -> None:
+        """Believe a speed with a weak name more where its rate of change is a_x."""
+        if one.score >= LEAST_SCORE or one.meaning.strength >= 0.7:
+            return
+        for ax in self.fields.all("acceleration", "x")[:2]:
+            relation = fit(self.fields.pieces.smooth(ax.si), self.fields.pieces.rate_of(one.seen.cells))
+            if relation is not None and relation.correlation > 0.6:
+                one.bonus += 0.3
+                one.reasons.append(f"its rate of change follows a_x (correlation {relation.correlation:.2f})")
+                self.fields.settle(one, relation.slope, "its rate of change against a_x", 0.4)
+                return
+
+    def _better(self, rivals: Sequence[Found]) -> Found:
+        """Return the one that follows the others' physics best; the first where nothing tells."""
+        speed = self._speed()
+        if speed is None:
+            return rivals[0]
+        kind = rivals[0].meaning
+        best: tuple[float, Found] = (0.0, rivals[0])
+        for one in rivals:
+            if kind.quantity == "rate":
+                others = self.fields.all("acceleration", "y")
+                relations = [self.fields.turning(a.si, one.si, speed.si) for a in others[:3]]
+            elif kind.quantity == "acceleration" and kind.part == "y":
+                relations = [self.fields.turning(one.si, r.si, speed.si) for r in self.fields.all("rate", "z")[:3]]
+            elif kind.quantity == "acceleration":
+                relations = [fit(self.fields.pieces.rate_of(speed.si), self.fields.pieces.smooth(one.si))]
+            else:
+                continue
+            value = max((abs(r.correlation) for r in relations if r is not None), default=0.0)
+            if value > best[0] + 0.1:
+                best = (value, one)
+        return best[1]
+
+    def _one_imu(self) -> None:
+        """Take accelerations from the message of the yaw rate where it has them: they share stamps and mounting."""
+        rate = self._chosen("yaw_rate_rad_s")
+        if rate is None:
+            return
+        for name, part in (("ax_m_s2", "x"), ("ay_m_s2", "y")):
+            if name in self.taken and leaf_group(self.taken[name]) != leaf_group(rate):
+                same = [f for f in self.fields.found if f.meaning.quantity == "acceleration" and f.meaning.part == part]
+                same = [f for f in same if leaf_group(f) == leaf_group(rate) and f.score > self.taken[name].score - 0.2]
+                if same:
+                    self.taken[name] = max(same, key=lambda f: f.score)
+
+    def _wheels(self, usable: Sequence[Found]) -> None:
+        sets: dict[tuple[str, str, str], dict[str, Found]] = {}
+        for one in usable:
+            if one.meaning.quantity in ("wheel speed", "wheel rate") and one.meaning.part in WHEELS:
+                key = (one.topic.name, one.path.rpartition(".")[0], one.meaning.quantity)
+                sets.setdefault(key, {}).setdefault(one.meaning.part, one)
+        apart: dict[str, Found] = {}
+        for group in sets.values():
+            if len(group) == 1:
+                apart.update({c: f for c, f in group.items() if c not in apart})
+        complete = [g for g in sets.values() if len(g) >= 2]
+        wheels = max(complete, key=lambda g: (len(g), sum(f.score for f in g.values())), default=apart)
+        if len(wheels) < 2:
+            return
+        reference = self._chosen("speed_m_s")
+        mean = mean_of([f.seen.cells for f in wheels.values()])
+        first = next(iter(wheels.values()))
+        kind, doubt, reason = first.meaning.quantity, "", ""
+        if not (first.known or first.fixed):
+            kind, unit, reason, doubt = _wheel_unit(mean, reference)
+            for one in wheels.values():
+                one.factors = ((unit[0], unit[1]),)
+                one.known = not doubt
+        for corner, one in wheels.items():
+            one.reasons += [reason] if reason else []
+            one.doubts += [doubt] if doubt else []
+            self.taken[f"wheel_speed_{corner}_{'rad_s' if kind == 'wheel rate' else 'm_s'}"] = one
+
+    # --------------------------------------------------------------------------------------------- steering
+
+    def _steering(self, candidates: Sequence[Found]) -> None:
+        speed = self._speed()
+        rate = self._chosen("yaw_rate_rad_s")
+        ay = self._chosen("ay_m_s2")
+        curvature = _curvature(speed, rate, ay)
+        judged: list[tuple[float, str, Found]] = []
+        for one in candidates:
+            relation = None
+            if curvature is not None:
+                relation = fit(self.fields.pieces.smooth(one.seen.cells), self.fields.pieces.smooth(curvature))
+            name, follows = self._steering_kind(one, relation)
+            if follows is False:
+                one.doubts.append("it does not follow the car's turning")
+                continue
+            if one.score + (0.3 if follows else 0.0) >= LEAST_SCORE:
+                judged.append((one.score + (0.3 if follows else 0.0), name, one))
+        if not judged:
+            return
+        judged.sort(key=lambda j: (-j[0], -j[2].topic.messages, j[2].topic.name, j[2].path))
+        _, name, best = judged[0]
+        rivals = [
+            o for s, n, o in judged[1:] if s > judged[0][0] - 0.1 and n == name and not self.fields.agree(best, o)
+        ]
+        if rivals:
+            self.rivals.append((name, tuple(f"{f.topic.name}.{f.path}" for f in [best, *rivals])))
+        self.taken[name] = best
+
+    def _steering_kind(self, one: Found, relation: Fit | None) -> tuple[str, bool | None]:
+        """Return the signal that a steering angle is, and whether it follows the car's turning (None: cannot tell)."""
+        part, units = one.meaning.part, one.factors[:1] if one.known or one.fixed else one.factors
+        kinds = {"road": ("steer_rad",), "wheel": ("steering_wheel_rad",)}.get(
+            part, ("steer_rad", "steering_wheel_rad")
+        )
+        if relation is None or abs(relation.correlation) < CLEAR:
+            name = kinds[0]
+            if len(kinds) == 2 and one.seen.largest * one.factors[0][1] > 0.9:
+                name = kinds[1]
+            if not one.fixed and len(kinds) == 2:
+                one.doubts.append(f"whether it is the steering wheel or the road wheels is not said; taken as {name}")
+            if not one.fixed and relation is not None:
+                one.doubts.append(
+                    f"it follows the path's curvature with a correlation of {relation.correlation:.2f} only"
+                )
+            hopeless = relation is not None and abs(relation.correlation) < 0.25 and not one.fixed
+            return name, False if hopeless and one.meaning.strength < 0.9 else None
+        length = abs(relation.slope)
+        limits = {"steer_rad": ROAD_WHEEL_M, "steering_wheel_rad": STEERING_WHEEL_M}
+        fits = [(k, u) for k in kinds for u in units if limits[k][0] <= length * u[1] <= limits[k][1]]
+        if not fits:
+            metres = length * one.factors[0][1]
+            one.doubts.append(f"against the path's curvature it is {metres:.3g} m, no car's in its unit")
+            return kinds[0], None
+        name, (unit, factor) = min(fits, key=lambda f: _unlikely(f[0], length * f[1][1]))
+        one.use(unit)
+        one.reasons.append(f"against the path's curvature it is {length * factor:.3g} m: {name} in {unit}")
+        rest = [f for f in fits if f != (name, (unit, factor)) and _unlikely(f[0], length * f[1][1]) < 1.0]
+        if rest and not one.fixed:
+            one.doubts.append(f"it could be {rest[0][0]} in {rest[0][1][0]} as well")
+        return name, True
+
+    # ------------------------------------------------------------------------------------------------ signs
+
+    def _signs(self) -> None:
+        """Turn signs where one way alone settles what contradicts, and say what stays open."""
+        trio = {
+            "steer": self._chosen("steer_rad", "steering_wheel_rad"),
+            "rate": self._chosen("yaw_rate_rad_s"),
+            "ay": self._chosen("ay_m_s2"),
+        }
+        rate, wheels = trio["rate"], self._wheels_turn()
+        relation = None if rate is None or wheels is None else fit(wheels, self.fields.pieces.smooth(rate.si))
+        if rate is not None and relation is not None and abs(relation.correlation) > CLEAR:
+            _rate_by_track(rate, abs(relation.slope))
+        signs = judge_signs(self.fields, trio, self._speed() or self.fields.wheel_turns(), wheels)
+        for one in (trio[n] for n in signs.turned):
+            if one is not None:
+                one.sign = -one.sign
+                one.reasons.append(f"sign turned: {signs.contradiction} contradict one another")
+        hangs = signs.contradiction == f"{WORDS['rate']} and {WITNESSES['gravity']}"  # imu.mounting says so
+        if signs.contradiction and not hangs and not (signs.decided and signs.absolute):
+            turned = ", ".join(WORDS[n] for n in signs.turned)
+            taken = f"{turned} was turned as the odd one" if turned else "nothing tells which of them is wrong"
+            self.checks.append(
+                Check(
+                    "mapping.sign",
+                    "mapping",
+                    "undecided",
+                    f"the signs of {signs.contradiction} contradict one another; {taken}",
+                    'give the wrong one a negative scale in a mapping file, or --waive "mapping.sign"',
+                )
+            )
+
+    def _is_of_ours(self, check: Check) -> bool:
+        """Return whether a check is of an accelerometer that is taken."""
+        one = self.taken.get(check.subject)
+        return one is not None and f" of {triad_of(one)}, " in check.evidence
+
+    def _speed(self) -> Found | None:
+        """Return what tells others best how fast the car was, taken or not."""
+        return self._chosen("speed_m_s") or self.fields.wheel_mean() or self.fields.best("speed")
+
+    def _follow(self) -> None:
+        """Say what does not follow the car's motion although the drive excites it: a name may be wrong, or an axis."""
+        speed, rate = self._speed() or self.fields.wheel_turns(), self._chosen("yaw_rate_rad_s")
+        self._both_signs()
+        if speed is None:
+            return
+        smooth = self.fields.pieces.smooth
+        expected = {"ax_m_s2": (self.fields.pieces.rate_of(speed.si), "the speed's rate of change")}
+        if rate is not None:
+            expected["ay_m_s2"] = (smooth(rate.si * speed.si), "v r")
+        for name, (motion, words) in expected.items():
+            one = self.taken.get(name)
+            relation = None if one is None or spread(motion) < MOVING_M_S2 else fit(smooth(one.si), motion)
+            if one is not None and relation is not None and abs(relation.correlation) < FOLLOWS:
+                one.doubts.append(f"its correlation with {words} is only {relation.correlation:.2f}")
+
+    def _both_signs(self) -> None:
+        """Say what is never negative although the car turns both ways: its sign stands in another field."""
+        names = ("yaw_rate_rad_s", "ay_m_s2", "steer_rad", "steering_wheel_rad")
+        there = {n: f for n in names if (f := self._chosen(n)) is not None and f.seen.changes}
+        if not any(is_of_both_signs(f.seen.values) for f in there.values()):
+            return
+        for one in there.values():
+            if is_of_one_sign(one.seen.values) and not one.anchor:
+                one.doubts.append("it is never negative although the car turns both ways: its sign may stand elsewhere")
+
+    def _chosen(self, *names: str) -> Found | None:
+        """Return what is taken for the first of these signals that there is, or mapped already."""
+        return next((f for n in names if (f := self.taken.get(n) or self.fields.anchor(n)) is not None), None)
+
+    def _wheels_turn(self) -> FloatArray | None:
+        """Return right minus left wheel speed, positive in a turn to the left; None without two of an axle."""
+        every = {**self.fields.anchors, **self.taken}
+        for unit in ("m_s", "rad_s"):
+            for axle in ("r", "f"):
+                left, right = (every.get(f"wheel_speed_{axle}{side}_{unit}") for side in "lr")
+                if left is not None and right is not None:
+                    return self.fields.pieces.smooth(right.si - left.si)
+        return None
+
+    # ------------------------------------------------------------------------------------------------ truth
+
+    def choose_truth(self) -> None:
+        """Take truth from the one topic that has sideslip or a lateral velocity, and calls itself truth if any does."""
+        if not self.truth_from:
+            return
+        its = [f for f in self.fields.found if f.topic.name == self.truth_from and f.section != "signals"]
+        its = [f for f in its if f.fixed] or its  # what is documented goes before names
+        if not its:
+            return
+        for one in sorted(its, key=lambda f: -f.score):
+            name = _truth_name(one)
+            if name and one.seen.changes:
+                self.truth.setdefault(name, one)
+        if "vy_m_s" not in self.truth and "sideslip_rad" not in self.truth and "lat_deg" not in self.truth:
+            self.truth.clear()
+            return
+        if "vx_m_s" in self.truth and "vy_m_s" not in self.truth and "sideslip_rad" not in self.truth:
+            del self.truth["vx_m_s"]
+        if {"vx_m_s", "vy_m_s"} <= set(self.truth):
+            self.truth.pop("sideslip_rad", None)
+        first = its[0]
+        agrees = self._truth_turns()
+        # What is truth is no input, unless a navigation system is the only speed there is.
+        mine = set(map(id, self.truth.values()))
+        for signal in [n for n, f in self.taken.items() if id(f) in mine and n != "speed_m_s"]:
+            if first.role != "navigation":
+                del self.taken[signal]
+        if first.role == "sensor" and not (agrees and "reference" in first.topic.name.lower()):
+            self.checks.append(
+                Check(
+                    "truth.source",
+                    "truth",
+                    "undecided",
+                    f"{first.topic.name} holds a sideslip and does not say whether it was measured or estimated",
+                    'name it under [truth] in a mapping file, or --waive "truth.source"',
+                )
+            )
+        self.notes.append(f"truth is taken from {first.topic.name}, by the names of its fields")
+        for name, one in self.truth.items():
+            self._tell(f"truth.{name}", one)
+
+    def _truth_turns(self) -> bool:
+        """Give the truth's yaw rate the sign of the sensor's; return whether the two are one motion."""
+        sensor = self._chosen("yaw_rate_rad_s")
+        true = self.truth.get("yaw_rate_rad_s")
+        relation = None if sensor is None or true is None else fit(sensor.si, true.si)
+        if true is None or relation is None or abs(relation.correlation) < CLEAR:
+            return False
+        if relation.correlation < 0.0 and not true.fixed:
+            true.sign = -true.sign
+            true.reasons.append("sign turned: it is that of the sensor's yaw rate reversed")
+        return abs(relation.correlation) > 0.97 and abs(abs(relation.slope) - 1.0) < 0.1
+
+    # ------------------------------------------------------------------------------------------- what is said
+
+    def _tell(self, name: str, one: Found) -> None:
+        """Note what stays unsure of what is taken, and mark what stands in for a sensor."""
+        one.doubts = [d for d in one.doubts if d]
+        if name == "speed_m_s" and one.role == "navigation":
+            self.notes.append(
+                f"speed_m_s comes from the navigation system's {one.topic.name}.{one.path}: "
+                "where that is the truth too, an estimator is told the true speed"
+            )
+        one.doubts += one.unit_doubt
+        if one.doubts:
+            self.checks.append(
+                Check(
+                    f"{name}.candidate",
+                    name.removeprefix("truth."),
+                    "undecided",
+                    f"{one.topic.name}.{one.path} is taken, but {'; '.join(one.doubts)}",
+                    f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"',
+                )
+            )
+
+    def result(self) -> Weighed:
+        """Return everything as records."""
+        candidates = [f.candidate(n, "signals", taken=True) for n, f in self.taken.items()]
+        candidates += [f.candidate(n, "truth", taken=True) for n, f in self.truth.items()]
+        used = {(c.section, c.source.label) for c in candidates}
+        for one in self.fields.found:
+            for name in names_of(one.meaning.quantity, one.meaning.part)[:1]:
+                record = one.candidate(name, "signals", taken=False)
+                if (record.section, record.source.label) not in used and (one.role != "truth"):
+                    candidates.append(record)
+            name = _truth_name(one)
+            if name and one.role in ("truth", "navigation") and not self.truth:
+                candidates.append(one.candidate(name, "truth", taken=False))
+        return Weighed(
+            signals={n: f.candidate(n, "signals", taken=True).source for n, f in self.taken.items()},
+            truth={n: f.candidate(n, "truth", taken=True).source for n, f in self.truth.items()},
+            candidates=tuple(sorted(candidates, key=lambda c: (not c.taken, -c.score))),
+            notes=tuple(self.notes),
+            rivals=tuple(self.rivals),
+            checks=(*(c for c in self.fields.checks if self._is_of_ours(c)), *self.checks),
+        )
+
+
+def truth_topic(found: Sequence[Found]) -> str:
+    """Return the topic that has sideslip or a lateral velocity, one that calls itself truth first; empty without."""
+    topics: dict[str, list[Found]] = {}
+    for one in found:
+        if one.role in ("truth", "navigation", "sensor"):
+            topics.setdefault(one.topic.name, []).append(one)
+    best = (0.0, "")
+    for name, fields in topics.items():
+        kinds = {f.meaning.quantity for f in fields if f.seen.changes}
+        worth = 2.0 * ("velocity" in kinds and "speed" in kinds) + 1.5 * ("sideslip" in kinds)
+        worth += 0.5 * (fields[0].role == "truth") + 0.2 * ("latitude" in kinds) if worth else 0.0
+        if worth == 0.0 and fields[0].fixed and {"latitude", "longitude"} <= kinds:
+            worth = 0.1
+        if fields[0].role == "sensor" and "sideslip" not in kinds and not fields[0].fixed:
+            continue
+        best = max(best, (worth, name)) if worth > best[0] else best
+    return best[1]
+
+
+def _rate_by_track(rate: Found, slope_m: float) -> None:
+    """Tell the unit of a yaw rate by the track that it gives with the wheels' difference: model cars to lorries."""
+    if rate.known or rate.fixed:
+        return
+    for unit, factor in rate.factors:
+        track_m = slope_m * rate.factors[0][1] / factor
+        if 0.1 < track_m < 3.0:
+            rate.use(unit)
+            rate.reasons.append(f"unit {unit} by the wheels' difference: a track of {track_m:.2f} m")
+            return
+
+
+def _curvature(speed: Found | None, rate: Found | None, ay: Found | None) -> FloatArray | None:
+    """Return the path's curvature in 1/m where the car drives, by yaw rate, else a_y; None if it goes straight."""
+    if speed is None or (rate is None and ay is None):
+        return None
+    v = speed.si
+    if not np.isfinite(v).any():
+        return None
+    with np.errstate(invalid="ignore", divide="ignore"):
+        moving = v > max(SLOW_M_S, 0.25 * float(np.nanquantile(v, 0.95)))
+        curve = np.where(moving, rate.si / v if rate is not None else ay.si / v**2 if ay is not None else v, np.nan)
+    return curve if spread(curve) > EXCITED_CURVATURE_1_M else None
+
+
+def _unlikely(name: str, metres: float) -> float:
+    """Return how far a length is from what cars have: 2.7 m, times 16 for a steering wheel; 0 is right there."""
+    return abs(math.log(metres / (2.7 if name == "steer_rad" else 43.0)))
+
+
+def _wheel_unit(mean: FloatArray, reference: Found | None) -> tuple[str, tuple[str, float], str, str]:
+    """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit, by the speed if there is one."""
+    rpm = 2.0 * math.pi / 60.0
+    times = None if reference is None else ratio(mean, reference.si, SLOW_M_S)
+    if times is None or reference is None:
+        doubt = "the unit of the wheel speeds is not said, and no speed tells it; taken as m/s"
+        return "wheel speed", ("m/s", 1.0), "", doubt
+    unsure = "" if reference.known else "the unit of the speed that tells theirs is unsure itself"
+    said = f"{times:.4g} of it is 1 m/s of speed"
+    for unit, factor in (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)):
+        off = abs(times * factor - 1.0)
+        if off < WHEEL_UNIT:
+            also = (
+                f"it could be rad/s with a radius of {1 / times:.3f} m as well" if factor < 1.0 and off > 0.01 else ""
+            )
+            return "wheel speed", (unit, factor), said, unsure or also
+    if RADII_M[0] < 1 / times < RADII_M[1]:
+        return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", unsure
+    if RADII_M[0] < 1 / (times * rpm) < RADII_M[1]:
+        return "wheel rate", ("rpm", rpm), f"{said}: a radius of {1 / (times * rpm):.3f} m in rpm", unsure
+    return "wheel speed", ("m/s", 1.0), "", f"{said}, which is no unit of wheel speeds; taken as m/s"
+
+
+def _truth_name(one: Found) -> str:
+    kind, part = one.meaning.quantity, one.meaning.part
+    names = {
+        ("speed", "x"): "vx_m_s",
+        ("speed", ""): "vx_m_s",
+        ("velocity", "y"): "vy_m_s",
+        ("sideslip", ""): "sideslip_rad",
+        ("rate", "z"): "yaw_rate_rad_s",
+        ("latitude", ""): "lat_deg",
+        ("longitude", ""): "lon_deg",
+    }
+    if kind in ("course", "heading"):
+        return {"course": "course_rad", "heading": "yaw_rad"}[kind] if one.fixed else ""
+    return names.get((kind, part), "")

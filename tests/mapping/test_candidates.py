@@ -1,0 +1,510 @@
+"""Candidates: a drive under names, units, nestings and signs of strangers, and what is taken of it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+
+from pdhef_logtool.mapping import AutoMapping, auto_map
+from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.vendors import load_vendors
+from pdhef_logtool.records.errors import MappingFileError
+
+N = 3000
+START = 1_700_000_000_000_000_000
+T = START + np.arange(N, dtype=np.int64) * 10_000_000
+S = np.arange(N) * 0.01
+DEG = math.pi / 180.0
+G = 9.80665
+
+#: A car of 2.7 m wheelbase on a winding road: metres, seconds, radians.
+V = 15.0 + 3.0 * np.sin(0.3 * S)
+RATE = 0.25 * np.sin(0.9 * S)
+AY = V * RATE
+AX = np.gradient(V, 0.01)
+STEER = 2.7 * RATE / V
+HALF_TRACK = 0.75
+
+
+def topic(type_name: str = "car_msgs/msg/State", encoding: str = "cdr", **fields: np.ndarray) -> FakeTopic:
+    named = {k.replace("__", "."): np.asarray(v, dtype=np.float64) for k, v in fields.items()}
+    return FakeTopic(type_name, T + 2_000_000, {"header.stamp": T} | named, encoding=encoding)
+
+
+def found(**contents: FakeTopic) -> AutoMapping:
+    return auto_map(FakeLog({"/" + k.replace("__", "/"): v for k, v in contents.items()}))
+
+
+def taken(auto: AutoMapping) -> dict[str, tuple[str, float]]:
+    return {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.signals.items()}  # type: ignore[arg-type]
+
+
+def undecided(auto: AutoMapping) -> set[str]:
+    assert all(c.verdict == "undecided" and c.evidence and c.remedy for c in auto.mapping.checks)
+    return {c.name for c in auto.mapping.checks}
+
+
+def imu_fields(scale: float = 1.0, rate_scale: float = 1.0, prefix: str = "") -> dict[str, np.ndarray]:
+    return {
+        f"{prefix}linear_acceleration__x": AX / scale,
+        f"{prefix}linear_acceleration__y": AY / scale,
+        f"{prefix}linear_acceleration__z": (G + 0.0 * S) / scale,
+        f"{prefix}angular_velocity__x": 0.01 * np.sin(S) / rate_scale,
+        f"{prefix}angular_velocity__y": 0.01 * np.cos(S) / rate_scale,
+        f"{prefix}angular_velocity__z": RATE / rate_scale,
+    }
+
+
+SPEED = {"vehicle__speed": topic(speed_mps=V)}
+
+
+def test_an_imu_inside_of_a_vendors_message_is_in_si() -> None:
+    nested = topic("vn_msgs/msg/Vectornav", **imu_fields(prefix="imu__"))
+    nested.fields |= {"imu.linear_acceleration_covariance": np.zeros((N, 9)), "imu.header.stamp": T}
+    nested.fields |= {"imu.angular_velocity_covariance": np.zeros((N, 9))}
+    del nested.fields["header.stamp"]
+    auto = found(vectornav=nested, **SPEED)
+    assert taken(auto) == {
+        "ax_m_s2": ("/vectornav.imu.linear_acceleration.x", 1.0),
+        "ay_m_s2": ("/vectornav.imu.linear_acceleration.y", 1.0),
+        "yaw_rate_rad_s": ("/vectornav.imu.angular_velocity.z", 1.0),
+        "speed_m_s": ("/vehicle/speed.speed_mps", 1.0),
+    }
+    assert auto.mapping.signals["ay_m_s2"].stamp == "imu.header.stamp"
+    assert undecided(auto) == set()
+
+
+@pytest.mark.parametrize("acceleration", [1.0, G, G * 1e-3])
+@pytest.mark.parametrize("rate", [1.0, DEG])
+def test_units_that_no_name_tells_come_from_gravity_and_from_turning(acceleration: float, rate: float) -> None:
+    auto = found(sensors__core=topic(**imu_fields(acceleration, rate)), **SPEED)
+    got = taken(auto)
+    assert got["ay_m_s2"][1] == pytest.approx(acceleration, rel=1e-3)
+    assert got["yaw_rate_rad_s"][1] == pytest.approx(rate, rel=1e-3)
+    assert undecided(auto) == set()
+
+
+def test_a_unit_that_nothing_tells_is_taken_by_convention_and_told() -> None:
+    still = {k: v * 0.001 for k, v in imu_fields().items() if "angular" in k}
+    auto = found(gyro=topic(**still))
+    assert taken(auto) == {"yaw_rate_rad_s": ("/gyro.angular_velocity.z", 1.0)}
+    assert undecided(auto) == {"yaw_rate_rad_s.candidate"}
+
+
+@pytest.mark.parametrize(
+    ("field", "raw", "signal", "scale"),
+    [
+        ("steering_wheel_angle", STEER * 16.0, "steering_wheel_rad", 1.0),
+        ("SteeringWheelAngle", STEER * 16.0 / DEG, "steering_wheel_rad", DEG),
+        ("steeringAngle", STEER, "steer_rad", 1.0),
+        ("steer_ang", STEER / DEG, "steer_rad", DEG),
+        ("steering_angle", STEER * 16.0 / DEG, "steering_wheel_rad", DEG),
+        ("front_tire_angle_deg", -STEER / DEG, "", 0.0),
+        ("roadwheel_angle_deg", STEER / DEG, "steer_rad", DEG),
+        ("steering_deg", -STEER * 16.0 / DEG, "steering_wheel_rad", -DEG),
+    ],
+)
+def test_a_steering_angle_is_told_by_the_paths_curvature(
+    field: str, raw: np.ndarray, signal: str, scale: float
+) -> None:
+    auto = found(imu__data=topic(**imu_fields()), chassis=topic(**{field: raw}), **SPEED)
+    steering = {n: v for n, v in taken(auto).items() if n.startswith("steer")}
+    assert steering == ({signal: (f"/chassis.{field}", round(scale, 6))} if signal else {})
+    # Gravity is upward in the IMU, so that its yaw rate counts to the left, and steering has to.
+    assert undecided(auto) == set()
+
+
+def test_steering_is_not_turned_after_an_imu_that_may_hang_upside_down() -> None:
+    down = imu_fields()
+    down |= {k: -down[k] for k in ("linear_acceleration__y", "linear_acceleration__z", "angular_velocity__z")}
+    auto = found(vn__common=topic(**down), chassis=topic(steering_wheel_angle_deg=STEER * 16.0 / DEG), **SPEED)
+    assert taken(auto)["steering_wheel_rad"][1] == round(DEG, 6)
+    assert {"mapping.sign", "imu.mounting"} <= undecided(auto)
+
+
+def test_a_bare_float_on_a_topic_called_steering() -> None:
+    auto = found(imu__data=topic(**imu_fields()), car__steering=topic("std_msgs/msg/Float32", data=STEER), **SPEED)
+    assert taken(auto)["steer_rad"] == ("/car/steering.data", 1.0)
+    assert undecided(auto) == set()
+
+
+def test_a_measured_angle_of_any_type_goes_before_a_command() -> None:
+    drive = topic("ackermann_msgs/msg/AckermannDriveStamped", drive__steering_angle=STEER)
+    imu = {"imu__data": topic("sensor_msgs/msg/Imu", **imu_fields())}
+    alone = found(drive=drive, chassis=topic(torque=STEER), **imu, **SPEED)
+    assert taken(alone)["steer_rad"] == ("/drive.drive.steering_angle", 1.0)
+    assert any("not from a measured angle" in n for n in alone.mapping.notes)
+    both = found(drive=drive, chassis=topic(steering_wheel_angle_deg=STEER * 16.0 / DEG), **imu, **SPEED)
+    assert "steer_rad" not in taken(both)
+    assert taken(both)["steering_wheel_rad"] == ("/chassis.steering_wheel_angle_deg", round(DEG, 6))
+    assert not any("not from a measured angle" in n for n in both.mapping.notes)
+    assert [a.chosen for a in both.ambiguities] == ["/chassis.steering_wheel_angle_deg"]
+
+
+def test_what_does_not_follow_the_car_is_no_steering_angle() -> None:
+    noise = np.random.default_rng(0).normal(0.0, 0.2, N)
+    auto = found(imu__data=topic(**imu_fields()), a__steering=topic("std_msgs/msg/Float32", data=noise), **SPEED)
+    assert "steer_rad" not in auto.mapping.signals
+    (candidate,) = [c for c in auto.candidates if c.source.topic == "/a/steering"]
+    assert "does not follow" in candidate.doubt
+
+
+def test_commands_setpoints_and_estimates_are_no_sensors() -> None:
+    auto = found(
+        imu__data=topic(**imu_fields()),
+        steering_cmd=topic(steering_wheel_angle=STEER),
+        target__steering=topic(angle=STEER),
+        ekf__state=topic(speed=V, yaw_rate=RATE, sideslip=0.1 * STEER),
+    )
+    assert set(taken(auto)) == {"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"}
+    assert auto.mapping.truth == {}
+
+
+@pytest.mark.parametrize(
+    ("names", "unit", "signal", "scale"),
+    [
+        (("front_left", "front_right", "rear_left", "rear_right"), 1.0 / 3.6, "m_s", 1.0 / 3.6),
+        (("WheelSpd_FL", "WheelSpd_FR", "WheelSpd_RL", "WheelSpd_RR"), 0.31, "rad_s", 1.0),
+        (("fl_rpm", "fr_rpm", "rl_rpm", "rr_rpm"), 0.31 * math.pi / 30.0, "rad_s", math.pi / 30.0),
+        (("lf", "rf", "lr", "rr"), 1.0, "m_s", 1.0),
+    ],
+)
+def test_wheel_speeds_by_the_speed(names: tuple[str, ...], unit: float, signal: str, scale: float) -> None:
+    sides = (-1.0, 1.0, -1.0, 1.0)
+    wheels = {n: (V + side * HALF_TRACK * RATE) / unit for n, side in zip(names, sides, strict=True)}
+    auto = found(imu__data=topic(**imu_fields()), can__wheel_speeds=topic("x/WheelSpeeds", **wheels), **SPEED)
+    for wheel, name in zip(("fl", "fr", "rl", "rr"), names, strict=True):
+        assert taken(auto)[f"wheel_speed_{wheel}_{signal}"] == (f"/can/wheel_speeds.{name}", round(scale, 6))
+    assert undecided(auto) == set()
+
+
+def test_the_odd_sign_of_three_is_turned_and_of_two_is_told() -> None:
+    lateral = {"lat_accel_mps2": AY, "long_accel_mps2": AX, "yaw_rate_dps": -RATE / DEG}
+    both = found(daq=topic(**lateral), chassis=topic(steering_angle_rad=STEER), **SPEED)
+    assert taken(both)["yaw_rate_rad_s"] == ("/daq.yaw_rate_dps", round(-DEG, 6))
+    assert undecided(both) == {"mapping.sign"}
+    two = found(daq=topic(**lateral), **SPEED)
+    assert taken(two)["yaw_rate_rad_s"][1] == round(DEG, 6)
+    assert undecided(two) == {"mapping.sign"}
+
+
+PATH_YAW = np.cumsum(RATE) * 0.01
+WHERE = {
+    "latitude": 48.0 + np.cumsum(V * np.sin(PATH_YAW)) * 0.01 / 111_000.0,
+    "longitude": 11.0 + np.cumsum(V * np.cos(PATH_YAW)) * 0.01 / 111_000.0 / math.cos(math.radians(48.0)),
+}
+WHEELS = {"fl_kph": 3.6 * (V - HALF_TRACK * RATE), "fr_kph": 3.6 * (V + HALF_TRACK * RATE)}
+
+
+@pytest.mark.parametrize(
+    "witness",
+    [
+        {"gps__fix": topic("sensor_msgs/msg/NavSatFix", **WHERE)},
+        {"can__wheels": topic("x/WheelSpeeds", **WHEELS)},
+        {"ins__attitude": topic(heading_deg=np.mod(-PATH_YAW / DEG + 90.0, 360.0))},
+    ],
+    ids=["path", "wheels", "heading"],
+)
+def test_what_is_all_positive_to_the_right_is_turned_by_the_way_the_car_turned(witness: dict[str, FakeTopic]) -> None:
+    right = {"lat_accel_mps2": -AY, "long_accel_mps2": AX, "yaw_rate_dps": -RATE / DEG}
+    auto = found(daq=topic(**right), chassis=topic(roadwheel_angle_rad=-STEER), **SPEED, **witness)
+    got = {n: v[1] for n, v in taken(auto).items() if not n.startswith("wheel")}
+    assert got == {"ax_m_s2": 1, "ay_m_s2": -1, "yaw_rate_rad_s": round(-DEG, 6), "steer_rad": -1, "speed_m_s": 1}
+    assert undecided(auto) == set()
+
+
+def test_an_accelerometer_whose_gravity_is_not_upward_is_said_to_be_mounted_otherwise() -> None:
+    down = imu_fields()
+    down["linear_acceleration__z"] = -down["linear_acceleration__z"]
+    assert "imu.mounting" in undecided(found(vn__common=topic(**down), **SPEED))
+    assert undecided(found(vn__common=topic(**imu_fields()), **SPEED)) == set()
+
+
+def test_axes_that_are_not_the_cars_do_not_follow_its_motion() -> None:
+    turned = imu_fields()
+    turned["linear_acceleration__x"], turned["linear_acceleration__y"] = -AY, AX
+    turned["angular_velocity__z"] = RATE
+    assert "ay_m_s2.candidate" in undecided(found(vn__common=topic(**turned), **SPEED))
+
+
+def test_the_unit_of_a_speed_by_positions() -> None:
+    auto = found(gps__fix=topic("sensor_msgs/msg/NavSatFix", **WHERE), bus=topic(vehicle_speed=3.6 * V))
+    assert taken(auto) == {"speed_m_s": ("/bus.vehicle_speed", round(1 / 3.6, 6))}
+    assert undecided(auto) == set()
+
+
+def test_a_velocity_vector_without_a_frame_is_no_speed() -> None:
+    auto = found(vn__common=topic(velocity__x=V, velocity__y=0.0 * V, velocity__z=0.0 * V, **imu_fields()))
+    assert "speed_m_s" not in auto.mapping.signals
+
+
+def test_a_target_beside_a_sensor_is_not_taken() -> None:
+    auto = found(bus=topic(target_speed=V, vehicle_speed=3.6 * V, **imu_fields()))
+    assert taken(auto)["speed_m_s"] == ("/bus.vehicle_speed", round(1 / 3.6, 6))
+
+
+@pytest.mark.parametrize(
+    ("raw", "scale", "offset"),
+    [
+        (np.mod(90.0 - PATH_YAW / DEG, 360.0), -DEG, math.pi / 2.0),
+        (np.mod(math.pi / 2.0 - PATH_YAW, 2.0 * math.pi), -1.0, math.pi / 2.0),
+        (np.angle(np.exp(1j * PATH_YAW)), 1.0, 0.0),
+        (np.angle(np.exp(1j * PATH_YAW)) / DEG, DEG, 0.0),
+        (np.mod(200.0 - PATH_YAW / DEG, 360.0), None, None),
+    ],
+    ids=["compass deg", "compass rad", "east rad", "east deg", "turned away"],
+)
+@pytest.mark.parametrize("names", [("vel_n", "vel_e", "vel_d"), ("north_velocity", "east_velocity", "up_velocity"), ()])
+def test_the_path_shows_how_a_heading_counts(
+    raw: np.ndarray, scale: float | None, offset: float | None, names: tuple[str, ...]
+) -> None:
+    north, east = V * np.sin(PATH_YAW), V * np.cos(PATH_YAW)
+    velocity = dict(zip(names, (north, east, 0.01 * np.sin(S)), strict=False))
+    auto = found(ins__solution=topic(heading=raw, **WHERE, **velocity), imu__data=topic(**imu_fields()), **SPEED)
+    yaw = auto.mapping.truth.get("yaw_rad")
+    assert (scale, offset) == (None, None) if yaw is None else (yaw.scale, yaw.offset) == (scale, offset)
+    expected = {"lat_deg", "lon_deg"} | ({"enu_velocity_m_s"} if names else set()) | ({"yaw_rad"} if scale else set())
+    assert set(auto.mapping.truth) == expected
+    if names:
+        source = auto.mapping.truth["enu_velocity_m_s"]
+        assert source.paths == (names[1], names[0], names[2])
+        assert source.scale == (1.0, 1.0, -1.0 if names[2] == "vel_d" else 1.0)
+
+
+def test_a_magnitude_without_its_sign_is_said() -> None:
+    bus = topic(yaw_rate_dps=np.abs(RATE) / DEG, lat_accel_mps2=AY, long_accel_mps2=AX)
+    checks = {c.name: c.evidence for c in found(bus=bus, **SPEED).mapping.checks}
+    assert "never negative" in checks["yaw_rate_rad_s.candidate"]
+
+
+def test_axes_are_held_against_wheels_of_unknown_radius_too() -> None:
+    turned = imu_fields()
+    turned["linear_acceleration__x"], turned["linear_acceleration__y"] = -AY, AX
+    wheels = topic("raptor_dbw_msgs/msg/WheelSpeedReport", **dict.fromkeys(("front_left", "rear_right"), V / 0.3))
+    assert "ay_m_s2.candidate" in undecided(found(vn__common=topic(**turned), wheels=wheels))
+
+
+def test_an_adma_is_sensor_and_truth() -> None:
+    adma = topic(
+        "adma_ros_driver_msgs/msg/AdmaDataScaled",
+        acc_hor__x=AX / G,
+        acc_hor__y=AY / G,
+        rate_hor__z=RATE / DEG,
+        rate_body__z=RATE / DEG,
+        side_slip_angle=RATE,
+        ins_lat_abs=WHERE["latitude"],
+        ins_long_abs=WHERE["longitude"],
+    )
+    auto = found(genesys__adma__data_scaled=adma)
+    assert taken(auto)["yaw_rate_rad_s"] == ("/genesys/adma/data_scaled.rate_hor.z", round(DEG, 6))
+    assert {"sideslip_rad", "lat_deg", "lon_deg"} <= set(auto.mapping.truth)
+    assert undecided(auto) == set()
+
+
+def test_truth_of_a_vendors_message_by_its_names() -> None:
+    slip = topic(lng_vel_kmh=V * 3.6, lat_vel_kmh=0.2 * RATE * 3.6, yaw_rate_dps=-RATE / DEG)
+    auto = found(imu__data=topic(**imu_fields()), ins__slip=slip, **SPEED)
+    truth = {n: (s.label, round(float(s.scale), 6)) for n, s in auto.mapping.truth.items()}  # type: ignore[arg-type]
+    assert truth == {
+        "vx_m_s": ("/ins/slip.lng_vel_kmh", round(1 / 3.6, 6)),
+        "vy_m_s": ("/ins/slip.lat_vel_kmh", round(1 / 3.6, 6)),
+        "yaw_rate_rad_s": ("/ins/slip.yaw_rate_dps", round(-DEG, 6)),
+    }
+
+
+def test_a_sideslip_that_does_not_say_what_it_is_is_told() -> None:
+    auto = found(imu__data=topic(**imu_fields()), esp=topic(sideslip_deg=RATE), **SPEED)
+    assert set(auto.mapping.truth) == {"sideslip_rad"}
+    assert "truth.source" in undecided(auto)
+
+
+def test_odometry_stands_in_for_a_gyro_and_a_navigation_system_for_a_speed() -> None:
+    odometry = topic(
+        "nav_msgs/msg/Odometry",
+        twist__twist__linear__x=V,
+        twist__twist__linear__y=0.0 * V,
+        twist__twist__angular__z=RATE,
+        pose__pose__position__x=S,
+        pose__pose__position__y=S,
+    )
+    auto = found(wheel__odom=odometry)
+    assert taken(auto)["yaw_rate_rad_s"] == ("/wheel/odom.twist.twist.angular.z", 1.0)
+    assert any("no IMU gives it" in n for n in auto.mapping.notes)
+    ins = found(ins__odometry=odometry, imu__data=topic("sensor_msgs/msg/Imu", **imu_fields()))
+    assert taken(ins)["speed_m_s"] == ("/ins/odometry.twist.twist.linear.x", 1.0)
+    assert any("is told the true speed" in n for n in ins.mapping.notes)
+
+
+def test_documented_types_say_unit_sign_and_page() -> None:
+    raptor = topic("raptor_dbw_msgs/msg/SteeringReport", steering_wheel_angle=STEER * 16.0 / DEG)
+    px4 = topic("px4_msgs/msg/SensorCombined")
+    px4.fields |= {"gyro_rad": np.stack([0 * S, 0 * S, -RATE], axis=1)}
+    px4.fields |= {"accelerometer_m_s2": np.stack([AX, -AY, -G + 0 * S], axis=1)}
+    auto = found(vehicle__steering=raptor, fmu__out=px4)
+    assert taken(auto) == {
+        "steering_wheel_rad": ("/vehicle/steering.steering_wheel_angle", round(DEG, 6)),
+        "ax_m_s2": ("/fmu/out.accelerometer_m_s2[0]", 1.0),
+        "ay_m_s2": ("/fmu/out.accelerometer_m_s2[1]", -1.0),
+        "yaw_rate_rad_s": ("/fmu/out.gyro_rad[2]", -1.0),
+    }
+    assert all("https://" in c.reason for c in auto.candidates if c.taken)
+
+
+def test_an_ins_whose_type_is_documented_is_truth_before_a_bare_fix() -> None:
+    ins = topic(
+        "novatel_oem7_msgs/msg/INSPVA",
+        latitude=48.0 + S * 1e-6,
+        longitude=11.0 + S * 1e-6,
+        north_velocity=V,
+        east_velocity=0 * V,
+        up_velocity=0 * V,
+        azimuth=S,
+    )
+    fix = topic("sensor_msgs/msg/NavSatFix", latitude=48.0 + S * 1e-6, longitude=11.0 + S * 1e-6, status__status=0 * S)
+    auto = found(novatel__inspva=ins, gps__fix=fix)
+    assert {s.topic for s in auto.mapping.truth.values()} == {"/novatel/inspva"}
+    assert set(auto.mapping.truth) == {"lat_deg", "lon_deg", "yaw_rad", "enu_velocity_m_s"}
+    assert auto.mapping.truth["enu_velocity_m_s"].paths == ("east_velocity", "north_velocity", "up_velocity")
+    assert auto.mapping.quality is None
+    assert any("/gps/fix is not used" in n for n in auto.mapping.notes)
+
+
+def test_a_documented_trap_is_left_out_with_its_reason() -> None:
+    auto = found(novatel__corrimu=topic("novatel_oem7_msgs/msg/CORRIMU", yaw_rate=RATE, lateral_acc=AY))
+    assert auto.mapping.signals == {}
+    assert any("per sample" in n for n in auto.mapping.notes)
+
+
+def test_every_shipped_entry_names_its_page() -> None:
+    vendors = load_vendors()
+    assert len(vendors.types) > 20
+    for fields in vendors.types.values():
+        assert all(
+            f.page.startswith("https://") and "read 20" in f.page and f.meaning.quantity for f in fields.values()
+        )
+
+
+def test_a_users_file_comes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    entry = (
+        '[[types]]\ntype = ["car_msgs/State"]\nvendor = "me"\npage = "https://example.org"\nread = "2026-11-22"\n'
+        'fields = [{ field = "q7", signal = "yaw_rate_rad_s", scale = -0.5 }]\n'
+    )
+    (tmp_path / "mine.toml").write_text(entry)
+    monkeypatch.setenv("PDHEF_VENDORS", str(tmp_path / "mine.toml"))
+    assert taken(found(a=topic(q7=RATE))) == {"yaw_rate_rad_s": ("/a.q7", -0.5)}
+    (tmp_path / "mine.toml").write_text(entry.replace("yaw_rate_rad_s", "yaw"))
+    with pytest.raises(MappingFileError, match="no signal"):
+        load_vendors()
+
+
+def test_a_well_known_log_is_not_read_for_candidates() -> None:
+    log = FakeLog(
+        {
+            "/imu": topic("sensor_msgs/msg/Imu", **imu_fields()),
+            "/steer": topic("autoware_vehicle_msgs/msg/SteeringReport", steering_tire_angle=STEER),
+            "/speed": topic("autoware_vehicle_msgs/msg/VelocityReport", longitudinal_velocity=V),
+            "/truth/odometry": topic("nav_msgs/msg/Odometry", twist__twist__linear__x=V, twist__twist__linear__y=0 * V),
+            "/other": topic(speed_mps=V, yaw_rate=RATE),
+        }
+    )
+    auto_map(log)
+    assert not any("/other" in read for read in log.reads)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("SteeringWheelAngle", ("steering", "wheel", "angle")),
+        ("WheelSpd_FL", ("wheel", "spd", "fl")),
+        ("steeringangle", ("steering", "angle")),
+        ("latAccelG", ("lat", "accel", "g")),
+        ("/vehicle/yawrate", ("vehicle", "yaw", "rate")),
+    ],
+)
+def test_names_are_cut_into_words(name: str, words: tuple[str, ...]) -> None:
+    assert words_of(name) == words
+
+
+@pytest.mark.parametrize(
+    ("leaf", "kind", "unit"),
+    [
+        ("yaw_rate_deg_s", "rate", "degps"),
+        ("accel_m_s2", "acceleration", "mps2"),
+        ("velocity_kmh", "speed", "kmh"),
+        ("speed_km_h", "speed", "kmh"),
+        ("VehicleSpeedKph", "speed", "kph"),
+        ("x_accel_g", "acceleration", "g"),
+        ("gyro_z_rad_s", "rate", "radps"),
+        ("steer", "angle", ""),
+    ],
+)
+def test_units_of_names(leaf: str, kind: str, unit: str) -> None:
+    assert unit_of(leaf, kind)[0] == unit
+
+
+@pytest.mark.parametrize(
+    ("path", "quantity"),
+    [
+        ("steering_wheel_torque", ""),
+        ("engine_speed_rpm", ""),
+        ("yaw_rate_std", ""),
+        ("angular_velocity_covariance[0]", ""),
+        ("steering_angle_velocity", ""),
+        ("steering_ratio", ""),
+        ("wheel_speed_rpm", ""),
+        ("frame_rate", ""),
+        ("accelerator_pedal", ""),
+        ("gyro_bias.z", ""),
+        ("wind_speed", ""),
+        ("yaw_rate", "rate"),
+        ("vehicle_speed", "speed"),
+        ("angular_velocity.z", "rate"),
+        ("ay", "acceleration"),
+        ("imu.accel.y", "acceleration"),
+        ("a_lat", "acceleration"),
+        ("psi_dot", "rate"),
+        ("angVelZ", "rate"),
+        ("v_lat", "velocity"),
+        ("StrgWhlAng", "steering"),
+        ("wheel_fl.speed", "wheel speed"),
+        ("rear_right.speed", "wheel speed"),
+        ("omega_fl", "wheel rate"),
+        ("LWI_Lenkradwinkel", "steering"),
+        ("ESP_Gierrate", "rate"),
+        ("Querbeschleunigung", "acceleration"),
+        ("Längsbeschleunigung", "acceleration"),
+        ("ESP_HL_Radgeschw", "wheel speed"),
+        ("Fahrzeuggeschwindigkeit", "speed"),
+        ("lat", "latitude"),
+        ("state.twist.twist.linear.x", "speed"),
+        ("state.twist.twist.linear.y", "velocity"),
+        ("state.twist.twist.angular.z", "rate"),
+    ],
+)
+def test_what_is_beside_a_quantity_is_not_it(path: str, quantity: str) -> None:
+    meaning = meaning_of("/topic", "a/B", path)
+    assert (meaning.quantity if meaning else "") == quantity
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("values", ["nan", "inf", "huge", "zero", "noise", "few"])
+def test_values_that_are_no_drive_break_nothing(values: str) -> None:
+    noise = np.random.default_rng(0).normal(size=N)
+    made = {"nan": S * np.nan, "inf": S + np.inf, "huge": 1e300 * noise, "zero": 0.0 * S}.get(values, noise)
+    names = ("speed", "yaw_rate", "accel_x", "accel_y", "accel_z", "steering_angle", "fl_speed", "fr_speed")
+    fields = dict.fromkeys((*names, "latitude", "longitude", "heading", "sideslip", "", ".", "a..b"), made)
+    message = topic()
+    message.fields |= fields
+    if values == "few":
+        message.log_time_ns = T[:2]
+        message.fields = {k: v[:2] for k, v in message.fields.items()}
+    auto = found(ins__car=message, gps__fix=topic("sensor_msgs/msg/NavSatFix", latitude=made, longitude=made))
+    # What is no measurement is not taken; noise is told to follow nothing, or what it is not.
+    if values in ("nan", "inf", "huge", "zero"):
+        assert taken(auto) == {}
+    else:
+        assert undecided(auto)
