@@ -29,14 +29,18 @@ BEFORE = ROOT / "studies" / "before" / "strangers.json"
 
 def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
     """Return what is kept of a score."""
-    items, wrong, verdicts = {}, {}, {}
+    items: dict[str, str] = {}
+    wrong: dict[str, str] = {}
+    verdicts: dict[str, str] = {}
+    doubted: list[str] = []
     for f in score.findings:
         items[f.item] = f.verdict if f.verdict != "wrong" else "wrong, told" if f.told else "wrong, not told"
         if f.verdict == "wrong":
             wrong[f.item] = f.what
         if f.verdict == "right":
-            together = next((v for v in ("failed", "passed", "undecided") if v in f.checked), "none")
+            together = next((v for v in ("failed", "undecided", "passed") if v in f.checked), "none")
             verdicts[f.item] = together
+            doubted += [f.item] if f.doubted else []
     silent = tuple(f"{f.item} ({f.what})" for f in score.findings if f.verdict == "wrong" and not f.told)
     return Result(
         name=name,
@@ -46,6 +50,7 @@ def result_of(score: Score, name: str, group: str, what: str, page_url: str = ""
         items=items,
         wrong=wrong,
         verdicts=verdicts,
+        doubted=tuple(doubted),
         silent=silent,
         alarms=score.false_alarms,
         named=score.cause_named,

@@ -29,6 +29,8 @@ from studies.strangers.recordings import (
 
 USUAL = ("imu", "steer", "speed", "truth", "truth rate")
 IMU = frozenset({"ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"})
+#: Words for an IMU that does not lie as the car does.
+MOUNTING = r"mount|rotat|upside|z-down|z down|lies|imu[^.;]{0,60}(turned|tilt)|(turned|tilt)[^.;]{0,60}imu"
 _EMPTY = np.empty(0, dtype=np.int64)
 
 
@@ -63,7 +65,7 @@ def mountings() -> Iterator[Recording]:
             container="mcap",
             topics=road_car(car, imu=imu(car.force.times(turn), car.rate.times(turn))),
             right=answers(car, *USUAL),
-            cause="" if upright else r"mount|rotat|turned|axes|axis|upside|z-down|z down",
+            cause="" if upright else MOUNTING,
             at_fault=frozenset() if upright else IMU,
         )
     for name, what, turn in (
@@ -78,7 +80,7 @@ def mountings() -> Iterator[Recording]:
             container="mcap",
             topics=road_car(car, imu=imu(car.force.times(turn), car.rate.times(turn))),
             right=answers(car, *USUAL),
-            cause=r"mount|rotat|turned|tilt|axes|axis|upside|z-down|z down",
+            cause=MOUNTING,
             at_fault=IMU,
         )
 

@@ -129,7 +129,7 @@ def sbg() -> Recording:
         "time_stamp": micros(force),
         "temp": 30.0 + 0.0 * force.values[:, 0],
     }
-    data |= {**xyz(force.times(0.01), "delta_vel"), **xyz(rate.times(0.01), "delta_angle")}
+    data |= {**xyz(force, "delta_vel"), **xyz(rate, "delta_angle")}
     lat, lon, alt = car.fix.along(car.velocity).values.T
     nav = {"velocity.x": north, "velocity.y": east, "position.x": lat, "position.y": lon, "position.z": alt}
     return Recording(

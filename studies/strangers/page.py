@@ -42,8 +42,8 @@ class Result:
     Attributes
     ----------
     items : outcome by item, one of :data:`OUTCOMES`. wrong : what was taken in a wrong item's place.
-    silent : the wrong ones that nothing was said of, with their sources.
-    verdicts : by right item, what its checks say together: ``failed``, ``passed``, ``undecided`` or ``none``.
+    silent : the wrong ones that nothing was said of, with their sources. doubted : right ones that a sentence doubts.
+    verdicts : by right item the worst that its checks say: ``failed``, ``undecided``, ``passed``, or ``none``.
     alarms : failed checks on right channels that are not at fault. named : whether a planted cause is said.
     """
 
@@ -55,6 +55,7 @@ class Result:
     wrong: Mapping[str, str] = field(default_factory=dict)
     verdicts: Mapping[str, str] = field(default_factory=dict)
     silent: tuple[str, ...] = ()
+    doubted: tuple[str, ...] = ()
     alarms: tuple[str, ...] = ()
     named: bool | None = None
     said: str = ""
@@ -163,12 +164,15 @@ def _sum(rows: Iterable[Result], outcome: str) -> int:
 
 
 def _remarks(results: Sequence[Result]) -> str:
-    right = [v for r in results if r.group in SOUND for v in r.verdicts.values()]
+    sound = [r for r in results if r.group in SOUND]
+    right = [v for r in sound for v in r.verdicts.values()]
     counts = {verdict: right.count(verdict) for verdict in ("passed", "undecided", "failed", "none")}
+    doubted = sum(len(r.doubted) for r in sound)
     return (
-        f"On sound and excited logs (the layouts) {len(right)} items are right. Of their checks together "
-        f"{counts['passed']} passed, {counts['undecided']} stayed undecided, {counts['failed']} failed; "
-        f"{counts['none']} have no check. “Before” is the state of 2026-11-22, ahead of candidates and mountings.\n"
+        f"On sound and excited logs (the layouts) {len(right)} items are right. Of their checks all passed on "
+        f"{counts['passed']}, some stayed undecided on {counts['undecided']}, some failed on {counts['failed']}; "
+        f"{counts['none']} have no check. A sentence doubts {doubted} of the right ones. "
+        "“Before” is the state of 2026-11-22, ahead of candidates and mountings.\n"
     )
 
 
@@ -187,6 +191,10 @@ def _wrong(results: Sequence[Result]) -> str:
     checks: list[tuple[str, Callable[[Result], Iterable[str]]]] = [
         ("wrong, not told", lambda r: r.silent),
         ("failed check on what is right", lambda r: r.alarms),
+        (
+            "undecided though right, sound and excited",
+            lambda r: (i for i, v in r.verdicts.items() if v == "undecided" and r.group in SOUND),
+        ),
         ("cause not named", lambda r: ("",) if r.named is False else ()),
     ]
     for title, of in checks:

@@ -72,7 +72,8 @@ class Finding:
     """One item of one log.
 
     ``verdict`` is ``right``, ``wrong`` or ``missing``; ``told`` whether a failed or undecided check or a doubt names
-    a wrong one; ``checked`` the verdicts of the checks on its channels; ``what`` the sources that were taken.
+    a wrong one; ``checked`` the verdicts of the checks on its channels; ``what`` the sources that were taken;
+    ``doubted`` whether a sentence doubts it.
     """
 
     item: str
@@ -80,6 +81,7 @@ class Finding:
     told: bool
     checked: frozenset[str]
     what: str
+    doubted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +223,8 @@ def score_log(
         if wrong:
             findings.append(Finding(item, "wrong", all(_is_told(n, sources, told) for n in wrong), checked, what))
         elif present:
-            findings.append(Finding(item, "right", True, checked, what))
+            doubted = any(_is_doubted(n, sources.get(n, ""), told) for n in mapped)
+            findings.append(Finding(item, "right", True, checked, what, doubted))
     blamed = set(at_fault)
     false_alarms = tuple(
         f"{c['name']} ({c['subject']}): {c.get('evidence', '')}"
@@ -245,7 +248,15 @@ def _is_told(name: str, sources: Mapping[str, str], told: Told) -> bool:
     for check in told.checks:
         if check["verdict"] != "passed" and check["subject"] in (name, subject):
             return True
-    source = sources.get(name, "")
+    return _is_doubted(name, sources.get(name, ""), told)
+
+
+#: Words of a sentence that doubts what it names.
+_DOUBT = re.compile(r"doubt|took|is taken, but|waive|suspect|contradict|not sure|ambig|disagree|may be|might|perhaps")
+
+
+def _is_doubted(name: str, source: str, told: Told) -> bool:
+    """Return whether a sentence doubts a channel, by its name or the field or topic that it comes from."""
     topic = source.partition(".")[0]
-    words = re.compile(r"doubt|took|suspect|contradict|unsure|not sure|ambig|disagree|sign|unit|expected|may be|might")
-    return any((subject in d or source in d or (topic and topic in d)) and words.search(d) for d in told.doubts)
+    named = [part for part in (name.removeprefix("truth."), source, topic) if part]
+    return any(_DOUBT.search(d) and any(part in d for part in named) for d in told.doubts)
