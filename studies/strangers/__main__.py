@@ -21,8 +21,8 @@ from studies.strangers.containers import write as write_log
 from studies.strangers.faults import faults
 from studies.strangers.layouts import layouts
 from studies.strangers.page import Result, merged, page
-from studies.strangers.recordings import Recording
-from studies.strangers.scoring import Score, score_log
+from studies.strangers.recordings import ITEMS, Recording
+from studies.strangers.scoring import Score, look, score_log
 
 BEFORE = ROOT / "studies" / "before" / "strangers.json"
 
@@ -90,8 +90,30 @@ def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
         if _wanted(answer.file, only) and answer.path.exists():
             print(answer.file, file=sys.stderr)
             right, allowed = answer.series()
-            score = score_log(answer.path, right, allowed=allowed)
+            score = score_log(answer.path, right, allowed=allowed, at_fault=answer.at_fault)
             yield answer.file, result_of(score, answer.file, "recording", "")
+
+
+def others_without_answers() -> str:
+    """Look through the recordings of ``reader_corpus`` that hold nothing of a car, and say what is mapped in them."""
+    catalogue = SHARED / "reader_corpus" / "CATALOG.json"
+    if not catalogue.is_file():
+        return ""
+    answered = {answer.file for answer in load_answers()}
+    channels = {name for names in ITEMS.values() for name in names}
+    found, count = [], 0
+    for entry in json.loads(catalogue.read_text(encoding="utf-8")):
+        file = f"reader_corpus/{entry['file']}"
+        if entry["expected"] != "ok" or file in answered or "/conformance/" in file:
+            continue
+        count += 1
+        _, _, mapped = look(SHARED / file)
+        taken = {name: len(c) for name, c in mapped.items() if name in channels}
+        if taken:
+            most = max(taken.values())
+            found.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
+    text = f"{count} further recordings of `reader_corpus` hold nothing of a car. "
+    return text + (f"Something is mapped in {'; '.join(found)}.\n" if found else "Nothing is mapped in them.\n")
 
 
 def _wanted(name: str, only: Sequence[str]) -> bool:
@@ -126,8 +148,8 @@ def main() -> int:
             _show(result)
     else:
         before = json.loads(BEFORE.read_text(encoding="utf-8")) if BEFORE.is_file() else None
-        remark = "" if given.held_out else "The layouts held out were not run.\n"
-        write(given.out, page(results, before, remark))
+        remark = "" if given.held_out else "The layouts held out were not run.\n\n"
+        write(given.out, page(results, before, remark + others_without_answers()))
     if given.keep:
         text = json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True)
         write(given.keep, text + "\n")

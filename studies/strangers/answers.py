@@ -20,11 +20,12 @@ ANSWERS = Path(__file__).with_name("answers.toml")
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The right sources of one recording by channel, any of several, and those that are allowed beside them."""
+    """The right sources of one recording by channel, any of several, those allowed too, and what is at fault."""
 
     file: str
     right: dict[str, tuple[SignalSource, ...]]
     allowed: dict[str, tuple[SignalSource, ...]]
+    at_fault: tuple[str, ...]
 
     @property
     def path(self) -> Path:
@@ -40,13 +41,13 @@ class Answer:
 def load_answers() -> Iterator[Answer]:
     """Yield all of them, whether the recordings are there or not."""
     for file, table in tomllib.loads(ANSWERS.read_text(encoding="utf-8")).items():
-        yield Answer(file, _sources(table), _sources(table.get("allowed", {})))
+        yield Answer(file, _sources(table), _sources(table.get("allowed", {})), tuple(table.get("at_fault", ())))
 
 
 def _sources(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
     found = {}
     for name, given in table.items():
-        if name != "allowed":
+        if name not in ("allowed", "at_fault"):
             texts = given if isinstance(given, list) else [given]
             found[name] = tuple(_source(name.removeprefix("truth."), text) for text in texts)
     return found

@@ -25,13 +25,13 @@ What the tool makes, without a mapping and without a word of help, of logs that 
 `make strangers` makes the logs, scores them and writes this page; `python -m studies.strangers --only NAME` shows one.
 
 **How it is scored.** Each log's right answers are series of values: what the sensor reads, in SI units and ISO 8855
-axes. A mapped channel is right when its values are those (means of 0.25 s, 4 % or the floor of its unit); field names
-play no part. What may be found in a log is counted in items: steering, a_x, a_y, yaw rate, speed, wheel speeds, and the
-truth's velocity and yaw rate. *Told* means that a check that did not pass is on the wrong channel, or a doubt names it.
-Logs of one kind count as one, with the worst of each item: the 24 mountings in steps of 90 degrees are one log. A cause
-counts as named when a message holds a word of it. Layouts have the fields, units and axes of the definitions that their
-pages give; parts of messages that only say how a device does are left out. The motion is truthsim's, six drives of four
-cars with the noise, bias and delay of its usual sensors.
+axes. A mapped channel is right when its values are those (means of 0.25 s, 4 % or the floor of its unit, accelerations
+but for a bias of up to 0.3 m/s²); field names play no part. What may be found in a log is counted in items: steering,
+a_x, a_y, yaw rate, speed, wheel speeds, and the truth's velocity and yaw rate. *Told* means that a check that did not
+pass is on the wrong channel, or a doubt names it. Logs of one kind count as one, with the worst of each item: the 24
+mountings in steps of 90 degrees are one log. A cause counts as named when a message holds a word of it. Layouts have
+the fields, units and axes of the definitions that their pages give; parts of messages that only say how a device does
+are left out. The motion is truthsim's: drives of three cars with the noise, bias and delay of its usual sensors.
 """
 
 
@@ -95,12 +95,12 @@ def merged(results: Sequence[Result]) -> Result:
     )
 
 
-def page(results: Sequence[Result], before: Mapping[str, Any] | None, held_out: str) -> str:
+def page(results: Sequence[Result], before: Mapping[str, Any] | None, remark: str) -> str:
     """Return the page.
 
     Parameters
     ----------
-    results : one a kind. before : ``as_json`` of earlier results by name. held_out : what to say of the held-out logs.
+    results : one a kind. before : ``as_json`` of earlier results by name. remark : what else to say below the score.
     """
     own = [r for r in results if r.group in ("fault", "layout", "held-out")]
     others = [r for r in results if r.group == "recording"]
@@ -110,7 +110,7 @@ def page(results: Sequence[Result], before: Mapping[str, Any] | None, held_out: 
         "## Score\n",
         _score(results, before),
         _remarks(results),
-        held_out,
+        remark,
     ]
     for group, title in GROUPS.items():
         rows = [r for r in results if r.group == group]

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.inspection.report import inspect_drive_log
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
@@ -42,6 +44,8 @@ FLOORS: dict[str, float] = {
     "truth.ecef_velocity_m_s": 0.15,
     "truth.yaw_rate_rad_s": 0.004,
 }
+#: A constant of so much (m/s²) is the bias of an accelerometer, which nothing tells from a tilt of two degrees.
+BIAS_M_S2 = 0.3
 #: A share of right samples from which a channel counts as right: some logs hold invalid samples.
 RIGHT_BINS = 0.95
 
@@ -121,11 +125,24 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     said += list(inspection.notes)
     said += [f"missing: {name}" for name in inspection.missing]
     suspects = frozenset(name for w in warnings for name in (w["suspects"] or w["signals"]))
-    told = Told(tuple(document.get("checks") or ()), tuple(dict.fromkeys(said)), error, suspects)
+    checks = [*(document.get("checks") or ()), *(document.get("unsure") or ())]
+    more, refused_run = _checks_of_a_run(Path(log.path))
+    checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
+    error = error or refused_run
+    told = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
     clocks = fit_clocks(log, inspection.mapping, log.start_ns, log.end_ns)
     read = read_signals(log, inspection.mapping, clocks, log.start_ns, log.end_ns)
     channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
     return inspection.mapping, told, channels
+
+
+def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return the checks that ``pdhef run`` would show, and why it would not run."""
+    try:
+        with read_drive(path, Car.load("saloon"), require_sensors=False) as drive:
+            return [asdict(check) for check in getattr(drive, "checks", ())], ""
+    except PdhefError as error:
+        return [], str(error)
 
 
 def read_answers(path: Path, mapping: SignalMapping) -> dict[str, tuple[Series, ...]]:
@@ -140,8 +157,8 @@ def read_answers(path: Path, mapping: SignalMapping) -> dict[str, tuple[Series, 
 # ------------------------------------------------------------------------------------------------ by value
 
 
-def agrees(channel: Channel, right: Series, floor: float) -> bool:
-    """Return whether a channel has the values of a series, but for noise and a few milliseconds."""
+def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> bool:
+    """Return whether a channel has the values of a series, but for noise, a few milliseconds and a bias."""
     if not len(channel) or not len(right.stamps_ns):
         return False
     width = round(BIN_S * 1e9)
@@ -158,7 +175,9 @@ def agrees(channel: Channel, right: Series, floor: float) -> bool:
     if np.count_nonzero(both) < 0.5 * count:
         return False
     rms = float(np.sqrt(np.mean(wanted[both] ** 2)))
-    apart = np.sqrt(np.mean((got[both] - wanted[both]) ** 2, axis=1))
+    difference = got[both] - wanted[both]
+    difference -= np.clip(np.median(difference), -bias, bias)
+    apart = np.sqrt(np.mean(difference**2, axis=1))
     # A few bins may hold invalid samples; the others must agree as a whole.
     kept = np.sort(apart)[: int(np.ceil(RIGHT_BINS * apart.shape[0]))]
     return bool(np.sqrt(np.mean(kept**2)) <= max(floor, SHARE * rms))
@@ -180,6 +199,11 @@ def floor_of(name: str) -> float:
     if name in FLOORS:
         return FLOORS[name]
     return FLOORS["rad_s"] if name.endswith("rad_s") else FLOORS["m_s"]
+
+
+def bias_of(name: str) -> float:
+    """Return the constant difference that does not count for a channel."""
+    return BIAS_M_S2 if name in ("ax_m_s2", "ay_m_s2") else 0.0
 
 
 # ------------------------------------------------------------------------------------------------ the score
@@ -206,7 +230,7 @@ def score_log(
     sources = {} if mapping is None else _sources(mapping)
     fitting = {**(allowed or {}), **right}
     is_right = {
-        name: any(agrees(channel, series, floor_of(name)) for series in fitting.get(name, ()))
+        name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))
         for name, channel in channels.items()
     }
     findings = []
