@@ -18,6 +18,7 @@ from studies.strangers.recordings import (
     KMH,
     Recording,
     answers,
+    fix,
     imu,
     message,
     odometry,
@@ -179,6 +180,10 @@ def places_and_delays() -> Iterator[Recording]:
     )
 
 
+register(
+    "can_msgs/msg/Frame",
+    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n",
+)
 register("teamx_msgs/msg/DriverInput", "std_msgs/Header header\nfloat32 steering_angle\nfloat32 pedal\nuint8 gear\n")
 
 
@@ -217,6 +222,45 @@ def missing_things() -> Iterator[Recording]:
         right=answers(car, *USUAL),
         cause=r"(?s)(INS|GNSS|GPS|truth|/ins/odometry).*speed|speed.*(INS|GNSS|GPS|truth|/ins/odometry)",
         at_fault=frozenset({"speed_m_s"}),
+    )
+    enu = car.velocity.every(5)
+    course = message(
+        "/vel",
+        "geometry_msgs/msg/TwistStamped",
+        enu,
+        {"twist.linear.x": enu.values[:, 0], "twist.linear.y": enu.values[:, 1]},
+        constants={"header.frame_id": "gps"},
+    )
+    yield Recording(
+        name="speed-from-gnss",
+        group="fault",
+        what="no speed but the velocity east and north of a satellite receiver",
+        container="rosbag1",
+        topics=road_car(car, speed=course, truth=fix(car, "/fix")),
+        right=answers(car, "imu", "steer", "speed"),
+        allowed=answers(car, "truth"),
+        cause=r"(?s)(GNSS|GPS|satellite|/vel\b).*speed|speed.*(GNSS|GPS|satellite|/vel\b)",
+        at_fault=frozenset({"speed_m_s"}),
+    )
+    bits = np.clip(np.rint((car.steering_wheel.values + 10.0) / 0.001), 0, 65535).astype(np.int64)
+    frame = np.zeros((len(bits), 8))
+    frame[:, 0], frame[:, 1] = bits // 256, bits % 256
+    yield Recording(
+        name="raw-can",
+        group="fault",
+        what="steering in raw CAN frames, without the file that describes them",
+        container="mcap",
+        topics=(
+            message(
+                "/can0/received_messages",
+                "can_msgs/msg/Frame",
+                car.steering_wheel,
+                {"id": np.full(len(bits), 0x25), "dlc": np.full(len(bits), 8), "data": frame},
+            ),
+            imu(car.force, car.rate),
+        ),
+        right=answers(car, "imu"),
+        cause=r"\bdbc\b",
     )
     nothing = Series(_EMPTY, _EMPTY, np.empty((0, 3)))
     yield Recording(
