@@ -44,6 +44,7 @@ FLOORS: dict[str, float] = {
     "truth.ecef_velocity_m_s": 0.15,
     "truth.yaw_rate_rad_s": 0.004,
 }
+WEAK_SHARE = 0.6
 #: A constant of so much (m/s²) is the bias of an accelerometer, which nothing tells from a tilt of two degrees.
 BIAS_M_S2 = 0.3
 #: A share of right samples from which a channel counts as right: some logs hold invalid samples.
@@ -180,7 +181,8 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     apart = np.sqrt(np.mean(difference**2, axis=1))
     # A few bins may hold invalid samples; the others must agree as a whole.
     kept = np.sort(apart)[: int(np.ceil(RIGHT_BINS * apart.shape[0]))]
-    return bool(np.sqrt(np.mean(kept**2)) <= max(floor, SHARE * rms))
+    # Of a weak signal the floor is no more than a share: noise may stand in it, another sign may not.
+    return bool(np.sqrt(np.mean(kept**2)) <= max(SHARE * rms, min(floor, WEAK_SHARE * rms)))
 
 
 def _means(at_ns: Any, values: FloatArray, width: int, count: int) -> FloatArray:

@@ -19,7 +19,7 @@ from studies.strangers.faults import faults, right_angles, units_and_signs
 from studies.strangers.layouts import autoware, layouts, vbox
 from studies.strangers.page import Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording, answers, imu, road_car, scalar
-from studies.strangers.scoring import Finding, Score, Told, agrees, score_log
+from studies.strangers.scoring import Finding, Score, Told, agrees, bias_of, score_log
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
@@ -89,6 +89,19 @@ def test_containers_give_back_what_was_written(container: str, tmp_path: Path) -
     assert np.array_equal(got.log_time_ns, force.arrival_ns)
     assert np.array_equal(got.fields["linear_acceleration.y"], force.values[:, 1])
     assert np.allclose(read["/speed"].fields["data"], force.values[:, 0], atol=1e-5)
+
+
+def test_the_sign_of_a_weak_signal_counts() -> None:
+    weak = 0.01 * _WAVE
+    assert agrees(_channel(weak), Series(_NS, _NS, weak), 0.03)
+    assert not agrees(_channel(-weak), Series(_NS, _NS, weak), 0.03)
+
+
+def test_an_accelerometer_may_have_a_bias_and_no_tilt() -> None:
+    right = Series(_NS, _NS, _WAVE)
+    assert agrees(_channel(_WAVE + 0.25), right, 0.1, bias_of("ay_m_s2"))
+    assert not agrees(_channel(_WAVE + 0.85), right, 0.1, bias_of("ay_m_s2"))
+    assert bias_of("yaw_rate_rad_s") == 0.0
 
 
 @pytest.mark.slow
