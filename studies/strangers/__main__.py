@@ -11,20 +11,23 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 
 from studies.pages import DOCS, ROOT, options, write
-from studies.strangers.answers import SHARED, load_answers
+from studies.strangers.answers import SHARED, answered_files, load_answers
 from studies.strangers.containers import write as write_log
 from studies.strangers.faults import faults
 from studies.strangers.layouts import layouts
-from studies.strangers.page import Result, merged, page
+from studies.strangers.page import OUTCOMES, Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording
 from studies.strangers.scoring import Score, look, score_log
 
 BEFORE = ROOT / "studies" / "before" / "strangers.json"
+#: What the layouts held out gave when they were run for the first time.
+FIRST_RUN = ROOT / "studies" / "before" / "strangers_held_out.json"
 
 
 def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
@@ -94,12 +97,25 @@ def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
             yield answer.file, result_of(score, answer.file, "recording", "")
 
 
+def first_run() -> str:
+    """Return the figures of the first run of the layouts held out, where it is over."""
+    if not FIRST_RUN.is_file():
+        return ""
+    logs = json.loads(FIRST_RUN.read_text(encoding="utf-8"))
+    ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())
+    rest = ", ".join(f"{ends[outcome]} {outcome.replace(', ', ' and ')}" for outcome in OUTCOMES[:3])
+    return (
+        f"The {len(logs)} layouts held out were built last. Run for the first time, {ends['right']} of their "
+        f"{ends.total()} items were right ({100.0 * ends['right'] / ends.total():.0f} %); {rest}.\n\n"
+    )
+
+
 def others_without_answers() -> str:
     """Look through the recordings of ``reader_corpus`` that hold nothing of a car, and say what is mapped in them."""
     catalogue = SHARED / "reader_corpus" / "CATALOG.json"
     if not catalogue.is_file():
         return ""
-    answered = {answer.file for answer in load_answers()}
+    answered = answered_files()
     channels = {name for names in ITEMS.values() for name in names}
     found, count = [], 0
     for entry in json.loads(catalogue.read_text(encoding="utf-8")):
@@ -148,11 +164,10 @@ def main() -> int:
             _show(result)
     else:
         before = json.loads(BEFORE.read_text(encoding="utf-8")) if BEFORE.is_file() else None
-        remark = "" if given.held_out else "The layouts held out were not run.\n\n"
+        remark = first_run() + ("" if given.held_out else "The layouts held out were not run now.\n\n")
         write(given.out, page(results, before, remark + others_without_answers()))
     if given.keep:
-        text = json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True)
-        write(given.keep, text + "\n")
+        write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")
     return 1 if any(r.count("wrong, not told") for r in results) else 0
 
 

@@ -40,8 +40,18 @@ class Answer:
 
 def load_answers() -> Iterator[Answer]:
     """Yield all of them, whether the recordings are there or not."""
-    for file, table in tomllib.loads(ANSWERS.read_text(encoding="utf-8")).items():
-        yield Answer(file, _sources(table), _sources(table.get("allowed", {})), tuple(table.get("at_fault", ())))
+    for file, table in _tables().items():
+        if "same_as" not in table:
+            yield Answer(file, _sources(table), _sources(table.get("allowed", {})), tuple(table.get("at_fault", ())))
+
+
+def answered_files() -> frozenset[str]:
+    """Return the recordings that somebody has looked at."""
+    return frozenset(_tables())
+
+
+def _tables() -> dict[str, dict[str, Any]]:
+    return tomllib.loads(ANSWERS.read_text(encoding="utf-8"))
 
 
 def _sources(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
