@@ -16,6 +16,7 @@ from studies.strangers.answers import Answer, load_answers
 from studies.strangers.cars import Series, drive
 from studies.strangers.containers import write
 from studies.strangers.faults import faults, right_angles, units_and_signs
+from studies.strangers.held_out import held_out_layouts
 from studies.strangers.layouts import autoware, layouts, vbox
 from studies.strangers.page import Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording, answers, imu, road_car, scalar
@@ -153,9 +154,12 @@ def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.slow
 def test_forty_kinds_with_distinct_names_and_pages() -> None:
-    own = [*faults(), *layouts()]
+    last = [*held_out_layouts()]
+    own = [*faults(), *layouts(), *last]
     assert len({r.name for r in own}) == len(own)
-    assert all(r.page.startswith("https://") for r in own if r.group == "layout")
+    assert len({r.counted_as for r in own}) >= 40
+    assert len(last) == 10
+    assert all(r.page.startswith("https://") for r in own if r.group != "fault")
     names = {n for channels in ITEMS.values() for n in channels}
     assert all(set(r.right) <= names for r in own)
 
