@@ -168,8 +168,14 @@ def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> 
     count = (end - start) // width
     if count < 1:
         return False
-    got = _means(channel.stamps_ns - start, channel.values, width, count)
-    wanted = _means(right.stamps_ns - start, right.values, width, count)
+    if np.median(np.diff(channel.stamps_ns)) > width and right.values.ndim == 1:
+        # A channel this slow holds samples, which are no means.
+        got = channel.values[:, None]
+        wanted = np.interp(channel.stamps_ns - start, right.stamps_ns - start, right.values)[:, None]
+        count = len(channel)
+    else:
+        got = _means(channel.stamps_ns - start, channel.values, width, count)
+        wanted = _means(right.stamps_ns - start, right.values, width, count)
     if got.shape != wanted.shape:
         return False
     both = np.isfinite(got).all(axis=1) & np.isfinite(wanted).all(axis=1)
