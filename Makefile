@@ -10,7 +10,7 @@ CAR := saloon
 JOBS ?= 2
 
 .PHONY: help demo test quick mutants check lint format bench train-default samples conditions real switches torture \
-  docs-truthsim paper clean
+  docs-truthsim paper strangers clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -19,6 +19,7 @@ help:
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
+	@echo "make strangers  docs/strangers.md: logs that the tool has not met, and what it gets right (under two minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
 	@echo "make samples  write sample_logs/ anew with the simulator"
@@ -110,6 +111,10 @@ real: $(VENV)/installed-dev $(VENV)/compiled
 
 torture: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.torture --jobs $(JOBS)
+
+# With the layouts that were built last.
+strangers: $(VENV)/installed-dev $(VENV)/compiled
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.strangers --held-out
 
 switches: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches

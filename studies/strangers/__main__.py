@@ -1,0 +1,185 @@
+"""Logs of strangers, scored: ``docs/strangers.md``.
+
+    python -m studies.strangers [--only NAME ...] [--held-out] [--work out/strangers] [--out docs/strangers.md]
+
+``--only`` takes parts of names, prints what the tool says of these logs, and writes no page. ``--held-out`` adds the
+layouts that were built last. Exit code 1: something is wrong and the tool did not say so.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from pathlib import Path
+
+from studies.pages import DOCS, ROOT, options, write
+from studies.strangers.answers import SHARED, answered_files, load_answers
+from studies.strangers.containers import write as write_log
+from studies.strangers.faults import faults
+from studies.strangers.layouts import layouts
+from studies.strangers.page import OUTCOMES, Result, merged, page
+from studies.strangers.recordings import ITEMS, Recording
+from studies.strangers.scoring import Score, look, score_log
+
+BEFORE = ROOT / "studies" / "before" / "strangers.json"
+#: What the layouts held out gave when they were run for the first time.
+FIRST_RUN = ROOT / "studies" / "before" / "strangers_held_out.json"
+
+
+def result_of(score: Score, name: str, group: str, what: str, page_url: str = "") -> Result:
+    """Return what is kept of a score."""
+    items: dict[str, str] = {}
+    wrong: dict[str, str] = {}
+    verdicts: dict[str, str] = {}
+    doubted: list[str] = []
+    for f in score.findings:
+        items[f.item] = f.verdict if f.verdict != "wrong" else "wrong, told" if f.told else "wrong, not told"
+        if f.verdict == "wrong":
+            wrong[f.item] = f.what
+        if f.verdict == "right":
+            together = next((v for v in ("failed", "undecided", "passed") if v in f.checked), "none")
+            verdicts[f.item] = together
+            doubted += [f.item] if f.doubted else []
+    silent = tuple(f"{f.item} ({f.what})" for f in score.findings if f.verdict == "wrong" and not f.told)
+    return Result(
+        name=name,
+        group=group,
+        what=what,
+        page=page_url,
+        items=items,
+        wrong=wrong,
+        verdicts=verdicts,
+        doubted=tuple(doubted),
+        silent=silent,
+        alarms=score.false_alarms,
+        named=score.cause_named,
+        said=score.told.text,
+    )
+
+
+def score_recording(recording: Recording, folder: Path) -> Result:
+    """Write a log of our own, score it, and remove it."""
+    path = write_log(recording.topics, folder / recording.name, recording.container)
+    try:
+        score = score_log(
+            path,
+            recording.right,
+            allowed=recording.allowed,
+            cause=recording.cause,
+            at_fault=recording.at_fault,
+        )
+    finally:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    return result_of(score, recording.name, recording.group, recording.what, recording.page)
+
+
+def score_own(recordings: Sequence[Recording], folder: Path) -> Iterator[tuple[str, Result]]:
+    """Yield the kind and the result of every log of our own."""
+    for recording in recordings:
+        print(recording.name, file=sys.stderr)
+        yield recording.counted_as, score_recording(recording, folder)
+
+
+def score_others(only: Sequence[str]) -> Iterator[tuple[str, Result]]:
+    """Yield the results of the recordings of others, where they are there."""
+    if not SHARED.is_dir():
+        print(f"{SHARED} is not there: recordings of others are left out", file=sys.stderr)
+        return
+    for answer in load_answers():
+        if _wanted(answer.file, only) and answer.path.exists():
+            print(answer.file, file=sys.stderr)
+            right, allowed = answer.series()
+            score = score_log(answer.path, right, allowed=allowed, at_fault=answer.at_fault)
+            yield answer.file, result_of(score, answer.file, "recording", "")
+
+
+def first_run() -> str:
+    """Return the figures of the first run of the layouts held out, where it is over."""
+    if not FIRST_RUN.is_file():
+        return ""
+    logs = json.loads(FIRST_RUN.read_text(encoding="utf-8"))
+    ends = Counter(outcome for log in logs.values() for outcome in log["items"].values())
+    rest = ", ".join(f"{ends[outcome]} {outcome.replace(', ', ' and ')}" for outcome in OUTCOMES[:3])
+    return (
+        f"The {len(logs)} layouts held out were built last. Run for the first time, {ends['right']} of their "
+        f"{ends.total()} items were right ({100.0 * ends['right'] / ends.total():.0f} %); {rest}.\n\n"
+    )
+
+
+def others_without_answers() -> str:
+    """Look through the recordings of ``reader_corpus`` that hold nothing of a car, and say what is mapped in them."""
+    catalogue = SHARED / "reader_corpus" / "CATALOG.json"
+    if not catalogue.is_file():
+        return ""
+    answered = answered_files()
+    channels = {name for names in ITEMS.values() for name in names}
+    found, count = [], 0
+    for entry in json.loads(catalogue.read_text(encoding="utf-8")):
+        file = f"reader_corpus/{entry['file']}"
+        if entry["expected"] != "ok" or file in answered or "/conformance/" in file:
+            continue
+        count += 1
+        _, _, mapped = look(SHARED / file)
+        taken = {name: len(c) for name, c in mapped.items() if name in channels}
+        if taken:
+            most = max(taken.values())
+            found.append(f"`{entry['file']}` ({', '.join(sorted(taken))}; {most} samples at most)")
+    text = f"{count} further recordings of `reader_corpus` hold nothing of a car. "
+    return text + (f"Something is mapped in {'; '.join(found)}.\n" if found else "Nothing is mapped in them.\n")
+
+
+def _wanted(name: str, only: Sequence[str]) -> bool:
+    return not only or any(part in name for part in only)
+
+
+def held_out() -> Iterator[Recording]:
+    """Yield the layouts that were built last; none as long as there are none."""
+    from studies.strangers.held_out import held_out_layouts
+
+    return held_out_layouts()
+
+
+def main() -> int:
+    """Make the logs, score them, write the page."""
+    parser = options("strangers", __doc__)
+    parser.add_argument("--only", nargs="+", default=[], help="parts of names of logs")
+    parser.add_argument("--held-out", action="store_true", help="with the layouts that were built last")
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "strangers", help="folder for the logs")
+    parser.add_argument("--out", type=Path, default=DOCS / "strangers.md", help="the page")
+    parser.add_argument("--keep", type=Path, help="write the results as JSON, to compare with later")
+    given = parser.parse_args()
+    given.work.mkdir(parents=True, exist_ok=True)
+    made = chain(faults(), layouts(), held_out() if given.held_out else ())
+    recordings = [r for r in made if _wanted(r.name, given.only)]
+    kinds: dict[str, list[Result]] = {}
+    for kind, result in chain(score_own(recordings, given.work), score_others(given.only)):
+        kinds.setdefault(kind, []).append(result)
+    results = [merged(logs) for logs in kinds.values()]
+    if given.only:
+        for result in chain.from_iterable(kinds.values()):
+            _show(result)
+    else:
+        before = json.loads(BEFORE.read_text(encoding="utf-8")) if BEFORE.is_file() else None
+        remark = first_run() + ("" if given.held_out else "The layouts held out were not run now.\n\n")
+        write(given.out, page(results, before, remark + others_without_answers()))
+    if given.keep:
+        write(given.keep, json.dumps({r.name: r.as_json() for r in results}, indent=1, sort_keys=True) + "\n")
+    return 1 if any(r.count("wrong, not told") for r in results) else 0
+
+
+def _show(result: Result) -> None:
+    print(f"== {result.name}: {result.what}")
+    for item, outcome in result.items.items():
+        print(f"   {item}: {outcome} {result.wrong.get(item, '')} {result.verdicts.get(item, '')}".rstrip())
+    if result.named is not None:
+        print(f"   cause named: {result.named}")
+    for line in (*result.alarms, *result.said.splitlines()):
+        print(f"   | {line}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""The answers that were written by hand for recordings of other people."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import SignalSource
+from studies.pages import ROOT
+from studies.strangers.cars import Series
+from studies.strangers.scoring import read_answers
+
+SHARED = ROOT.parent / "shared"
+ANSWERS = Path(__file__).with_name("answers.toml")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The right sources of one recording by channel, any of several, those allowed too, and what is at fault."""
+
+    file: str
+    right: dict[str, tuple[SignalSource, ...]]
+    allowed: dict[str, tuple[SignalSource, ...]]
+    at_fault: tuple[str, ...]
+
+    @property
+    def path(self) -> Path:
+        """Where the recording lies, if it is there."""
+        return SHARED / self.file
+
+    def series(self) -> tuple[dict[str, tuple[Series, ...]], dict[str, tuple[Series, ...]]]:
+        """Read the right and the allowed channels."""
+        right, allowed = (_read(self.path, sources) for sources in (self.right, self.allowed))
+        return right, allowed
+
+
+def load_answers() -> Iterator[Answer]:
+    """Yield all of them, whether the recordings are there or not."""
+    for file, table in _tables().items():
+        if "same_as" not in table:
+            yield Answer(file, _sources(table), _sources(table.get("allowed", {})), tuple(table.get("at_fault", ())))
+
+
+def answered_files() -> frozenset[str]:
+    """Return the recordings that somebody has looked at."""
+    return frozenset(_tables())
+
+
+def _tables() -> dict[str, dict[str, Any]]:
+    return tomllib.loads(ANSWERS.read_text(encoding="utf-8"))
+
+
+def _sources(table: dict[str, Any]) -> dict[str, tuple[SignalSource, ...]]:
+    found = {}
+    for name, given in table.items():
+        if name not in ("allowed", "at_fault"):
+            texts = given if isinstance(given, list) else [given]
+            found[name] = tuple(_source(name.removeprefix("truth."), text) for text in texts)
+    return found
+
+
+def _source(name: str, text: str) -> SignalSource:
+    topic, field, *numbers = text.split()
+    scale, offset = (*map(float, numbers), *(1.0, 0.0)[len(numbers) :])
+    if name.endswith("ecef_velocity_m_s"):
+        return SignalSource(name, topic, field)
+    return SignalSource(name, topic, field, scale=scale, offset=offset)
+
+
+def _read(path: Path, sources: dict[str, tuple[SignalSource, ...]]) -> dict[str, tuple[Series, ...]]:
+    found: dict[str, tuple[Series, ...]] = {}
+    for turn in range(max((len(s) for s in sources.values()), default=0)):
+        here = {n: s[turn] for n, s in sources.items() if turn < len(s)}
+        truth = {n.removeprefix("truth."): s for n, s in here.items() if n.startswith("truth.")}
+        signals = {n: s for n, s in here.items() if not n.startswith("truth.")}
+        for name, series in read_answers(path, SignalMapping(signals=signals, truth=truth)).items():
+            found[name] = (*found.get(name, ()), *series)
+    return found

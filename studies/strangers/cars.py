@@ -1,0 +1,147 @@
+"""What the sensors of a simulated car read, in SI units and ISO 8855 axes: the right answers of every log made here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from pdhef_logtool.records.signals import FloatArray, IntArray
+from truthsim.batch import DriveSpec
+from truthsim.sensors import SensorChannel
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """Values [N] or [N, k] at their measurement times, and when the recorder had them."""
+
+    stamps_ns: IntArray
+    arrival_ns: IntArray
+    values: FloatArray
+
+    def __getitem__(self, column: int | tuple[int, ...]) -> Series:
+        """Return one column, or some in a new order."""
+        return Series(self.stamps_ns, self.arrival_ns, self.values[:, column])
+
+    def times(self, factor: float | FloatArray, offset: float = 0.0) -> Series:
+        """Return it in another unit, sign or rotation (a matrix [k, k] that turns each row)."""
+        turned = self.values @ factor.T if isinstance(factor, np.ndarray) else factor * self.values
+        return Series(self.stamps_ns, self.arrival_ns, np.asarray(turned + offset))
+
+    def late(self, seconds: float) -> Series:
+        """Return the values as if they had been measured later than they were."""
+        return Series(self.stamps_ns + round(seconds * 1e9), self.arrival_ns + round(seconds * 1e9), self.values)
+
+    def every(self, n: int) -> Series:
+        """Return each n-th sample."""
+        return Series(self.stamps_ns[::n], self.arrival_ns[::n], self.values[::n])
+
+    def along(self, clock: Series) -> Series:
+        """Return it at another series' times: one message that holds several sensors."""
+        at, have = clock.stamps_ns * 1e-9, self.stamps_ns * 1e-9
+        columns = self.values if self.values.ndim == 2 else self.values[:, None]
+        read = np.stack([np.interp(at - at[0], have - at[0], column) for column in columns.T], axis=1)
+        return Series(clock.stamps_ns, clock.arrival_ns, read if self.values.ndim == 2 else read[:, 0])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Car:
+    """One drive of one car.
+
+    Attributes
+    ----------
+    force, rate : specific force (m/s², with gravity) and angular rate (rad/s) of the IMU, forward, left, up, [N, 3].
+    steer, steering_wheel : road-wheel angle and angle of the steering wheel, rad, left positive.
+    wheels : speeds of fl, fr, rl, rr, m/s, [N, 4]. ratio, wheel_radius_m : of steering and wheels.
+    position, velocity, attitude : of GNSS/INS: east, north, up (m); east, north (m/s); roll, pitch, yaw (rad, ENU).
+    body_velocity : forward and left, m/s, [N, 2]. yaw_rate : rad/s. fix : latitude, longitude (deg), height (m).
+    """
+
+    force: Series
+    rate: Series
+    steer: Series
+    steering_wheel: Series
+    wheels: Series
+    ratio: float
+    wheel_radius_m: float
+    position: Series
+    velocity: Series
+    attitude: Series
+    body_velocity: Series
+    yaw_rate: Series
+    fix: Series
+
+    @property
+    def speed(self) -> Series:
+        """Mean of the rear wheels, m/s."""
+        return self.wheels.times(np.array([[0.0, 0.0, 0.5, 0.5]]))[0]
+
+    @property
+    def ground_speed(self) -> Series:
+        """Speed over ground as GNSS gives it, m/s."""
+        v = self.velocity
+        return Series(v.stamps_ns, v.arrival_ns, np.hypot(v.values[:, 0], v.values[:, 1]))
+
+    @property
+    def sideslip(self) -> Series:
+        """Sideslip of the GNSS/INS, rad; 0 where the car hardly moves."""
+        v = self.body_velocity
+        moves = v.values[:, 0] > 1.0
+        return Series(v.stamps_ns, v.arrival_ns, np.where(moves, np.arctan2(v.values[:, 1], v.values[:, 0]), 0.0))
+
+
+#: The drives: country roads with town and motorway, each of another car, and banked bends.
+DRIVES: dict[str, DriveSpec] = {
+    "sedan": DriveSpec("road", 90.0, 0.9, 11, 90.0),
+    "hatchback": DriveSpec("road", 100.0, 0.85, 12, 90.0, vehicle="hatchback"),
+    "suv": DriveSpec("road", 80.0, 0.9, 13, 90.0, vehicle="suv"),
+    "bends": DriveSpec("banked-road", 80.0, 0.9, 3, 60.0),
+    "short": DriveSpec("road", 80.0, 0.9, 21, 60.0),
+    "brief": DriveSpec("stop-and-go", 50.0, 0.9, 1, 12.0),
+    "other": DriveSpec("road", 60.0, 0.9, 31, 60.0, vehicle="hatchback"),
+}
+
+
+@lru_cache(maxsize=16)
+def drive(name: str, imu_x_m: float = 0.0) -> Car:
+    """Drive one of :data:`DRIVES`, with the IMU ``imu_x_m`` before the centre of gravity."""
+    spec = DRIVES[name]
+    made = (spec if not imu_x_m else _with_imu_at(spec, imu_x_m)).simulate()
+    start = made.start_ns
+    channels = made.channels
+    ins = channels["rtk"]
+    yaw = ins.fields["yaw_rad"]
+    v_x, v_y = ins.fields["vx_m_s"], ins.fields["vy_m_s"]
+    enu = {"e": v_x * np.cos(yaw) - v_y * np.sin(yaw), "n": v_x * np.sin(yaw) + v_y * np.cos(yaw)}
+    return Car(
+        force=_series(channels["imu"], start, "ax_m_s2", "ay_m_s2", "az_m_s2"),
+        rate=_series(channels["imu"], start, "roll_rate_rad_s", "pitch_rate_rad_s", "yaw_rate_rad_s"),
+        steer=_series(channels["steering"], start, "steer_rad")[0],
+        steering_wheel=_series(channels["steering"], start, "steering_wheel_rad")[0],
+        wheels=_series(channels["wheels"], start, "fl_m_s", "fr_m_s", "rl_m_s", "rr_m_s"),
+        ratio=made.vehicle.steering_ratio,
+        wheel_radius_m=made.vehicle.wheel_radius_m,
+        position=_series(ins, start, "x_m", "y_m", "z_m"),
+        velocity=_stacked(ins, start, enu),
+        attitude=_series(ins, start, "roll_rad", "pitch_rad", "yaw_rad"),
+        body_velocity=_series(ins, start, "vx_m_s", "vy_m_s"),
+        yaw_rate=_series(ins, start, "yaw_rate_rad_s")[0],
+        fix=_series(channels["fix"], start, "lat_deg", "lon_deg", "alt_m"),
+    )
+
+
+def _with_imu_at(spec: DriveSpec, imu_x_m: float) -> DriveSpec:
+    from dataclasses import replace
+
+    return replace(spec, sensors=(*spec.sensors, ("imu_x_m", imu_x_m)))
+
+
+def _series(channel: SensorChannel, start_ns: int, *names: str) -> Series:
+    return _stacked(channel, start_ns, {name: channel.fields[name] for name in names})
+
+
+def _stacked(channel: SensorChannel, start_ns: int, columns: Mapping[str, FloatArray]) -> Series:
+    values = np.stack(list(columns.values()), axis=1)
+    return Series(channel.stamps_ns(start_ns), channel.arrival_ns(start_ns), values)

@@ -1,0 +1,297 @@
+"""Topics as columns into the containers and encodings that recorders leave."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
+
+from pdhef_logtool.logs.writer import McapLogWriter, RawMessage, TopicBatch
+from pdhef_logtool.records.signals import IntArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Topic:
+    """One topic: columns by dotted path ([N], [N, k] for an array or a vector struct, int64 ns for a ROS time)."""
+
+    name: str
+    type_name: str
+    stamps_ns: IntArray
+    arrival_ns: IntArray
+    fields: Mapping[str, NDArray[Any]]
+    constants: Mapping[str, str | float | Sequence[float]] = field(default_factory=dict)
+
+
+@lru_cache(maxsize=4)
+def _store(ros1: bool) -> Any:
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+
+
+def register(type_name: str, text: str) -> None:
+    """Make a message type known by its definition, the types in it first."""
+    from rosbags.typesys import get_types_from_msg
+
+    for ros1 in (True, False):
+        _store(ros1).register(get_types_from_msg(text, type_name))
+
+
+def definition(type_name: str, *, ros1: bool = False) -> str:
+    """Return the full text of a type as ROS 1 or ROS 2 has it, with all types in it."""
+    text: str = _store(ros1).generate_msgdef(type_name, ros_version=1 if ros1 else 2)[0]
+    return text
+
+
+def write(topics: Sequence[Topic], path: Path, container: str) -> Path:
+    """Write a log and return its path with the container's suffix.
+
+    Parameters
+    ----------
+    container : ``mcap``, ``mcap-json`` (with schemas), ``mcap-json-bare`` (without), ``mcap-protobuf``, ``mcap-ros1``,
+        ``rosbag1``, ``rosbag2`` (sqlite3), ``rosbag2-bare`` (without message definitions, as up to Humble) or
+        ``rosbag2-mcap``.
+    """
+    return _WRITERS[container](topics, path)
+
+
+# ------------------------------------------------------------------------------------------------ ROS
+
+
+def _mcap(topics: Sequence[Topic], path: Path) -> Path:
+    path = path.with_suffix(".mcap")
+    with McapLogWriter(path) as writer:
+        for topic in topics:
+            text = definition(topic.type_name)
+            writer.add_topic(topic.name, topic.type_name, constants=topic.constants, definition=text)
+        writer.write([TopicBatch(t.name, t.arrival_ns, t.stamps_ns, t.fields) for t in topics])
+    return path
+
+
+def _messages(topics: Sequence[Topic], path: Path, *, ros1: bool) -> Iterator[tuple[Topic, int, int, bytes]]:
+    """Yield topic, arrival, stamp and the bytes of every message, in CDR or as ROS 1 has them, as they arrive."""
+    from mcap.reader import make_reader
+
+    by_name = {t.name: t for t in topics}
+    scratch = _mcap(topics, path.with_name(f".{path.stem}-scratch"))
+    store = _store(False)
+    try:
+        with scratch.open("rb") as stream:
+            for _, channel, message in make_reader(stream).iter_messages():
+                topic, data = by_name[channel.topic], message.data
+                yield (
+                    topic,
+                    message.log_time,
+                    message.publish_time,
+                    bytes(store.cdr_to_ros1(data, topic.type_name)) if ros1 else data,
+                )
+    finally:
+        scratch.unlink()
+
+
+def _rosbag1(topics: Sequence[Topic], path: Path) -> Path:
+    from rosbags.rosbag1 import Writer
+
+    path = path.with_suffix(".bag")
+    store = _store(True)
+    with Writer(path) as writer:
+        connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
+        for topic, arrival, _, data in _messages(topics, path, ros1=True):
+            writer.write(connections[topic.name], arrival, data)
+    return path
+
+
+def _mcap_ros1(topics: Sequence[Topic], path: Path) -> Path:
+    path = path.with_suffix(".mcap")
+    with McapLogWriter(path, profile="ros1") as writer:
+        ids = {
+            t.name: writer.add_raw_channel(
+                t.name,
+                schema_name=t.type_name.replace("/msg/", "/"),
+                schema_encoding="ros1msg",
+                schema_data=definition(t.type_name, ros1=True).encode(),
+                message_encoding="ros1",
+                metadata={},
+            )
+            for t in topics
+        }
+        raws = [
+            RawMessage(ids[t.name], arrival, stamp, i, data)
+            for i, (t, arrival, stamp, data) in enumerate(_messages(topics, path, ros1=True))
+        ]
+        writer.write([], raws)
+    return path
+
+
+def _rosbag2(topics: Sequence[Topic], path: Path) -> Path:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    shutil.rmtree(path, ignore_errors=True)
+    store = _store(False)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections = {t.name: writer.add_connection(t.name, t.type_name, typestore=store) for t in topics}
+        for topic, arrival, _, data in _messages(topics, path, ros1=False):
+            writer.write(connections[topic.name], arrival, data)
+    return path
+
+
+def _rosbag2_bare(topics: Sequence[Topic], path: Path) -> Path:
+    path = _rosbag2(topics, path)
+    for database in path.glob("*.db3"):
+        with sqlite3.connect(database) as connection:
+            connection.execute("DROP TABLE message_definitions")
+            connection.execute("UPDATE schema SET schema_version = 3")
+        connection.close()
+    return path
+
+
+def _rosbag2_mcap(topics: Sequence[Topic], path: Path) -> Path:
+    shutil.rmtree(path, ignore_errors=True)
+    path.mkdir(parents=True)
+    stored = _mcap(topics, path / f"{path.name}_0")
+    count = sum(len(t.stamps_ns) for t in topics)
+    start = min(int(t.arrival_ns[0]) for t in topics if len(t.arrival_ns))
+    end = max(int(t.arrival_ns[-1]) for t in topics if len(t.arrival_ns))
+    rows = "".join(
+        f"    - topic_metadata:\n        name: {t.name}\n        type: {t.type_name}\n"
+        "        serialization_format: cdr\n        offered_qos_profiles: ''\n"
+        f"      message_count: {len(t.stamps_ns)}\n"
+        for t in topics
+    )
+    (path / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  version: 5\n  storage_identifier: mcap\n"
+        f"  relative_file_paths:\n    - {stored.name}\n  duration:\n    nanoseconds: {end - start}\n"
+        f"  starting_time:\n    nanoseconds_since_epoch: {start}\n  message_count: {count}\n"
+        f"  topics_with_message_count:\n{rows}  compression_format: ''\n  compression_mode: ''\n",
+        encoding="utf-8",
+    )
+    return path
+
+
+# ------------------------------------------------------------------------------------------------ JSON, protobuf
+
+
+def _rows(topic: Topic) -> Iterator[tuple[int, int, dict[str, Any]]]:
+    """Yield arrival, stamp and the nested values of every message."""
+    columns = {path: values.tolist() for path, values in topic.fields.items()}
+    for i, (arrival, stamp) in enumerate(zip(topic.arrival_ns.tolist(), topic.stamps_ns.tolist(), strict=True)):
+        row: dict[str, Any] = {}
+        for path, value in topic.constants.items():
+            _put(row, path, value)
+        for path, column in columns.items():
+            _put(row, path, column[i])
+        yield arrival, stamp, row
+
+
+def _put(row: dict[str, Any], path: str, value: Any) -> None:
+    *parents, leaf = path.split(".")
+    for name in parents:
+        row = row.setdefault(name, {})
+    row[leaf] = value
+
+
+def _json_schema(value: Any) -> dict[str, Any]:
+    if isinstance(value, dict):
+        return {"type": "object", "properties": {name: _json_schema(v) for name, v in value.items()}}
+    if isinstance(value, list | tuple):
+        return {"type": "array", "items": {"type": "number"}}
+    return {"type": "string" if isinstance(value, str) else "number"}
+
+
+def _raw_mcap(
+    topics: Sequence[Topic], path: Path, encoding: str, schema: Callable[[Topic], tuple[str, bytes]]
+) -> tuple[McapLogWriter, dict[str, int]]:
+    writer = McapLogWriter(path, profile="")
+    ids = {}
+    for t in topics:
+        schema_encoding, data = schema(t)
+        ids[t.name] = writer.add_raw_channel(
+            t.name,
+            schema_name=t.type_name if schema_encoding else "",
+            schema_encoding=schema_encoding,
+            schema_data=data,
+            message_encoding=encoding,
+            metadata={},
+        )
+    return writer, ids
+
+
+def _json(topics: Sequence[Topic], path: Path, *, bare: bool = False) -> Path:
+    path = path.with_suffix(".mcap")
+
+    def schema(topic: Topic) -> tuple[str, bytes]:
+        first = next(_rows(topic), None)
+        return ("", b"") if bare or first is None else ("jsonschema", json.dumps(_json_schema(first[2])).encode())
+
+    writer, ids = _raw_mcap(topics, path, "json", schema)
+    with writer:
+        raws = [
+            RawMessage(ids[t.name], arrival, stamp, i, json.dumps(row).encode())
+            for t in topics
+            for i, (arrival, stamp, row) in enumerate(_rows(t))
+        ]
+        writer.write([], sorted(raws, key=lambda r: r.log_time_ns))
+    return path
+
+
+def _protobuf(topics: Sequence[Topic], path: Path) -> Path:
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    path = path.with_suffix(".mcap")
+    makers: dict[str, Callable[..., Any]] = {}
+
+    def schema(topic: Topic) -> tuple[str, bytes]:
+        package, _, name = topic.type_name.rpartition(".")
+        files = descriptor_pb2.FileDescriptorSet()
+        file = files.file.add(name=f"{name}.proto", package=package, syntax="proto3")
+        _, _, example = next(_rows(topic))
+        _add_message(file.message_type.add(name=name), topic.type_name, example)
+        pool = descriptor_pool.DescriptorPool()
+        pool.Add(files.file[0])
+        makers[topic.name] = message_factory.GetMessageClass(pool.FindMessageTypeByName(topic.type_name))
+        return "protobuf", files.SerializeToString()
+
+    writer, ids = _raw_mcap(topics, path, "protobuf", schema)
+    with writer:
+        raws = [
+            RawMessage(ids[t.name], arrival, stamp, i, makers[t.name](**row).SerializeToString())
+            for t in topics
+            for i, (arrival, stamp, row) in enumerate(_rows(t))
+        ]
+        writer.write([], sorted(raws, key=lambda r: r.log_time_ns))
+    return path
+
+
+def _add_message(message: Any, full_name: str, example: Mapping[str, Any]) -> None:
+    """Add the fields that an example has: numbers as double, texts as string, dictionaries as nested messages."""
+    for number, (name, value) in enumerate(example.items(), 1):
+        if isinstance(value, dict):
+            nested = re.sub(r"(?:^|_)(.)", lambda m: m[1].upper(), name)
+            _add_message(message.nested_type.add(name=nested), f"{full_name}.{nested}", value)
+            message.field.add(name=name, number=number, type=11, label=1, type_name=f".{full_name}.{nested}")
+        else:
+            repeated = isinstance(value, list | tuple)
+            message.field.add(
+                name=name, number=number, type=9 if isinstance(value, str) else 1, label=3 if repeated else 1
+            )
+
+
+_WRITERS: dict[str, Callable[[Sequence[Topic], Path], Path]] = {
+    "mcap": _mcap,
+    "mcap-ros1": _mcap_ros1,
+    "mcap-json": _json,
+    "mcap-json-bare": lambda topics, path: _json(topics, path, bare=True),
+    "mcap-protobuf": _protobuf,
+    "rosbag1": _rosbag1,
+    "rosbag2": _rosbag2,
+    "rosbag2-bare": _rosbag2_bare,
+    "rosbag2-mcap": _rosbag2_mcap,
+}

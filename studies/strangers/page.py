@@ -1,0 +1,203 @@
+"""``docs/strangers.md``: the score, every log, and what is wrong by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from studies.pages import table
+
+#: What can become of an item, the worst first.
+OUTCOMES = ("wrong, not told", "wrong, told", "missing", "right")
+GROUPS = {
+    "fault": "something wrong or missing",
+    "layout": "layouts of others",
+    "held-out": "layouts held out",
+    "recording": "recordings of others",
+}
+#: Groups whose logs are sound and excited, so that checks may neither fail nor stay undecided.
+SOUND = ("layout", "held-out")
+
+_INTRO = """# Logs of strangers
+
+What the tool makes, without a mapping and without a word of help, of logs that it has not met: <!-- counts -->.
+`make strangers` makes the logs, scores them and writes this page; `python -m studies.strangers --only NAME` shows one.
+
+**How it is scored.** Each log's right answers are series of values: what the sensor reads, in SI units and ISO 8855
+axes. A mapped channel is right when its values are those (means of 0.25 s, 4 % or the floor of its unit, accelerations
+but for a bias of up to 0.3 m/s²); field names play no part. What may be found in a log is counted in items: steering,
+a_x, a_y, yaw rate, speed, wheel speeds, and the truth's velocity and yaw rate. *Told* means that a check that did not
+pass is on the wrong channel, or a doubt names it. Logs of one kind count as one, with the worst of each item: the 24
+mountings in steps of 90 degrees are one log. A cause counts as named when a message holds a word of it. Layouts have
+the fields, units and axes of the definitions that their pages give; parts of messages that only say how a device does
+are left out. The motion is truthsim's: drives of three cars with the noise, bias and delay of its usual sensors.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What became of one log, or of all logs of one kind.
+
+    Attributes
+    ----------
+    items : outcome by item, one of :data:`OUTCOMES`. wrong : what was taken in a wrong item's place.
+    silent : the wrong ones that nothing was said of, with their sources. doubted : right ones that a sentence doubts.
+    verdicts : by right item the worst that its checks say: ``failed``, ``undecided``, ``passed``, or ``none``.
+    alarms : failed checks on right channels that are not at fault. named : whether a planted cause is said.
+    """
+
+    name: str
+    group: str
+    what: str
+    page: str
+    items: Mapping[str, str]
+    wrong: Mapping[str, str] = field(default_factory=dict)
+    verdicts: Mapping[str, str] = field(default_factory=dict)
+    silent: tuple[str, ...] = ()
+    doubted: tuple[str, ...] = ()
+    alarms: tuple[str, ...] = ()
+    named: bool | None = None
+    said: str = ""
+
+    @property
+    def present(self) -> int:
+        """Number of items."""
+        return len(self.items)
+
+    def count(self, outcome: str) -> int:
+        """Return how many items ended so."""
+        return sum(1 for o in self.items.values() if o == outcome)
+
+    def as_json(self) -> dict[str, Any]:
+        """What is kept of it to compare with later."""
+        return {"group": self.group, "items": dict(self.items), "named": self.named, "verdicts": dict(self.verdicts)}
+
+
+def merged(results: Sequence[Result]) -> Result:
+    """Return the logs of one kind as one: the worst of every item."""
+    first = results[0]
+    if len(results) == 1:
+        return first
+    names = list(dict.fromkeys(i for r in results for i in r.items))
+    items = {n: min((r.items[n] for r in results if n in r.items), key=OUTCOMES.index) for n in names}
+    named = [r.named for r in results if r.named is not None]
+    return Result(
+        name=f"{len(results)} logs: {first.name.rpartition('-')[0]}",
+        group=first.group,
+        what=first.what,
+        page=first.page,
+        items=items,
+        silent=tuple(f"{r.name}: {what}" for r in results for what in r.silent),
+        verdicts=first.verdicts,
+        alarms=tuple(a for r in results for a in r.alarms),
+        named=all(named) if named else None,
+    )
+
+
+def page(results: Sequence[Result], before: Mapping[str, Any] | None, remark: str) -> str:
+    """Return the page.
+
+    Parameters
+    ----------
+    results : one a kind. before : ``as_json`` of earlier results by name. remark : what else to say below the score.
+    """
+    own = [r for r in results if r.group in ("fault", "layout", "held-out")]
+    others = [r for r in results if r.group == "recording"]
+    counts = f"{len(own)} of our own making and {len(others)} recordings of other people"
+    parts = [
+        _INTRO.replace("<!-- counts -->", counts),
+        "## Score\n",
+        _score(results, before),
+        _remarks(results),
+        remark,
+    ]
+    for group, title in GROUPS.items():
+        rows = [r for r in results if r.group == group]
+        if rows:
+            parts += [f"## {title[0].upper()}{title[1:]}\n", _logs(rows)]
+    parts += ["## What is wrong, by name\n", _wrong(results)]
+    return "\n".join(parts).rstrip() + "\n"
+
+
+def _score(results: Sequence[Result], before: Mapping[str, Any] | None) -> str:
+    rows = []
+    for group, title in GROUPS.items():
+        here = [r for r in results if r.group == group]
+        if here:
+            rows.append(_score_row(title, here, before))
+    total = [r for r in results if r.group != "held-out"]
+    rows.append(_score_row("all but those held out", total, before))
+    head = ["logs", "count", "items", "right", "right before", "missing", "wrong, told", "wrong, not told"]
+    head += ["not told before", "causes named"]
+    return table(head, rows, right_from=1) + "\n"
+
+
+def _score_row(title: str, rows: Sequence[Result], before: Mapping[str, Any] | None) -> list[str]:
+    items = sum(r.present for r in rows)
+    earlier = [before[r.name]["items"].values() for r in rows if before and r.name in before]
+    planted = [r.named for r in rows if r.named is not None]
+
+    def share(count: int, of: int) -> str:
+        return f"{count} ({100.0 * count / of:.0f} %)" if of else "–"
+
+    def past(outcome: str) -> int:
+        return sum(1 for log in earlier for o in log if o == outcome)
+
+    known = sum(len(log) for log in earlier)
+    return [
+        title,
+        str(len(rows)),
+        str(items),
+        share(_sum(rows, "right"), items),
+        share(past("right"), known),
+        str(_sum(rows, "missing")),
+        str(_sum(rows, "wrong, told")),
+        str(_sum(rows, "wrong, not told")),
+        str(past("wrong, not told")) if known else "–",
+        f"{sum(planted)} of {len(planted)}" if planted else "–",
+    ]
+
+
+def _sum(rows: Iterable[Result], outcome: str) -> int:
+    return sum(r.count(outcome) for r in rows)
+
+
+def _remarks(results: Sequence[Result]) -> str:
+    sound = [r for r in results if r.group in SOUND]
+    right = [v for r in sound for v in r.verdicts.values()]
+    counts = {verdict: right.count(verdict) for verdict in ("passed", "undecided", "failed", "none")}
+    doubted = sum(len(r.doubted) for r in sound)
+    return (
+        f"On sound and excited logs (the layouts) {len(right)} items are right. Of their checks all passed on "
+        f"{counts['passed']}, some stayed undecided on {counts['undecided']}, some failed on {counts['failed']}; "
+        f"{counts['none']} have no check. A sentence doubts {doubted} of the right ones. "
+        "“Before” is the state of 2026-11-22, ahead of candidates and mountings.\n"
+    )
+
+
+def _logs(rows: Sequence[Result]) -> str:
+    def cells(r: Result) -> list[str]:
+        other = [f"{item}: {outcome}" for item, outcome in r.items.items() if outcome != "right"]
+        named = {None: "", True: "yes", False: "**no**"}[r.named]
+        what = f"[{r.what}]({r.page})" if r.page else r.what
+        return [r.name, what, f"{r.count('right')} of {r.present}", "; ".join(other), named]
+
+    return table(["log", "what", "right", "else", "cause named"], map(cells, rows)) + "\n"
+
+
+def _wrong(results: Sequence[Result]) -> str:
+    lines = []
+    checks: list[tuple[str, Callable[[Result], Iterable[str]]]] = [
+        ("wrong, not told", lambda r: r.silent),
+        ("failed check on what is right", lambda r: r.alarms),
+        (
+            "undecided though right, sound and excited",
+            lambda r: (i for i, v in r.verdicts.items() if v == "undecided" and r.group in SOUND),
+        ),
+        ("cause not named", lambda r: ("",) if r.named is False else ()),
+    ]
+    for title, of in checks:
+        for r in results:
+            lines += [f"- {r.name}: {title}{': ' + what if what else ''}" for what in of(r)]
+    return "\n".join(lines) + "\n" if lines else "Nothing.\n"

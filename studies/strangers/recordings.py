@@ -1,0 +1,209 @@
+"""A log with its right answers, and the messages that most logs here are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.records.signals import WHEELS, FloatArray
+from studies.strangers.cars import Car, Series
+from studies.strangers.containers import Topic, register
+from truthsim.recording import quaternion
+
+G_M_S2 = 9.80665
+DEG = np.pi / 180.0
+KMH = 1.0 / 3.6
+#: Turns forward, left, up into forward, right, down and back.
+DOWN: FloatArray = np.diag([1.0, -1.0, -1.0])
+
+#: What is scored: a part of a log that a person can find in it, and the channels that it may be mapped to.
+ITEMS: dict[str, tuple[str, ...]] = {
+    "steering": ("steer_rad", "steering_wheel_rad"),
+    "ax": ("ax_m_s2",),
+    "ay": ("ay_m_s2",),
+    "yaw rate": ("yaw_rate_rad_s",),
+    "speed": ("speed_m_s",),
+    "wheel speeds": tuple(f"wheel_speed_{w}_{unit}" for unit in ("m_s", "rad_s") for w in WHEELS),
+    "truth: velocity": (
+        "truth.vx_m_s",
+        "truth.vy_m_s",
+        "truth.sideslip_rad",
+        "truth.enu_velocity_m_s",
+        "truth.ecef_velocity_m_s",
+    ),
+    "truth: yaw rate": ("truth.yaw_rate_rad_s",),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """A log of our own making.
+
+    Attributes
+    ----------
+    name : of the log; logs of one ``kind`` count as one.
+    group : ``fault``, ``layout`` or ``held-out`` (built last, run once).
+    what : one line for a person.
+    right : by channel (``truth.`` before those of the truth) what it must be, any of the series.
+    allowed : channels that may be mapped, and are not missed: an INS whose figures are no truth, a second source.
+    cause : pattern of what a message must say; empty where nothing is wrong.
+    at_fault : channels with the fault; of all others no check may fail.
+    page : where the layout is documented.
+    """
+
+    name: str
+    group: str
+    what: str
+    container: str
+    topics: tuple[Topic, ...]
+    right: Mapping[str, tuple[Series, ...]]
+    cause: str = ""
+    at_fault: frozenset[str] = frozenset()
+    kind: str = ""
+    page: str = ""
+    allowed: Mapping[str, tuple[Series, ...]] = field(default_factory=dict)
+
+    @property
+    def counted_as(self) -> str:
+        """Name of the kind that the log counts for."""
+        return self.kind or self.name
+
+
+def answers(car: Car, *parts: str) -> dict[str, tuple[Series, ...]]:
+    """Return the right channels of the parts of a log.
+
+    ``parts`` of ``imu``, ``yaw rate``, ``steer``, ``steering wheel``, ``speed``, ``wheels`` (rims in m/s),
+    ``wheel rates`` (rad/s), ``truth``, ``truth rate``.
+    """
+    east_north_up = Series(
+        car.velocity.stamps_ns,
+        car.velocity.arrival_ns,
+        np.column_stack([car.velocity.values, car.speed.along(car.velocity).values * 0]),
+    )
+    rates = car.wheels.times(1.0 / car.wheel_radius_m)
+    yaw_rates = (car.rate[2], car.yaw_rate)
+    # All that goes for the speed: rims, the body's forward velocity, the speed over ground.
+    speeds = (car.speed, car.body_velocity[0], car.ground_speed)
+    known: dict[str, dict[str, tuple[Series, ...]]] = {
+        "imu": {"ax_m_s2": (car.force[0],), "ay_m_s2": (car.force[1],), "yaw_rate_rad_s": yaw_rates},
+        "yaw rate": {"yaw_rate_rad_s": yaw_rates},
+        "steer": {"steer_rad": (car.steer,)},
+        "steering wheel": {"steering_wheel_rad": (car.steering_wheel,)},
+        "speed": {"speed_m_s": speeds},
+        "wheels": {f"wheel_speed_{w}_m_s": (car.wheels[i],) for i, w in enumerate(WHEELS)},
+        "wheel rates": {f"wheel_speed_{w}_rad_s": (rates[i],) for i, w in enumerate(WHEELS)},
+        "truth": {
+            "truth.vx_m_s": speeds,
+            "truth.vy_m_s": (car.body_velocity[1],),
+            "truth.sideslip_rad": (car.sideslip,),
+            "truth.enu_velocity_m_s": (east_north_up,),
+        },
+        "truth rate": {"truth.yaw_rate_rad_s": yaw_rates},
+    }
+    return {name: series for part in parts for name, series in known[part].items()}
+
+
+def message(
+    name: str,
+    type_name: str,
+    clock: Series,
+    fields: Mapping[str, NDArray[Any]],
+    *,
+    stamp: str | None = "header.stamp",
+    constants: Mapping[str, str | float | Sequence[float]] | None = None,
+) -> Topic:
+    """Return a topic at a series' times, with the time in the field ``stamp``."""
+    columns: dict[str, NDArray[Any]] = {} if stamp is None else {stamp: clock.stamps_ns}
+    return Topic(name, type_name, clock.stamps_ns, clock.arrival_ns, {**columns, **fields}, constants or {})
+
+
+def xyz(series: Series, prefix: str, names: str = "xyz") -> dict[str, FloatArray]:
+    """Return the three columns of a vector as ``prefix.x`` and so on."""
+    return {f"{prefix}.{axis}": series.values[:, i] for i, axis in enumerate(names)}
+
+
+# ------------------------------------------------------------------------------------------------ common messages
+
+register("autoware_vehicle_msgs/msg/SteeringReport", "builtin_interfaces/Time stamp\nfloat32 steering_tire_angle\n")
+register(
+    "autoware_vehicle_msgs/msg/VelocityReport",
+    "std_msgs/Header header\nfloat32 longitudinal_velocity\nfloat32 lateral_velocity\nfloat32 heading_rate\n",
+)
+
+
+def imu(force: Series, rate: Series, name: str = "/imu/data", frame: str = "imu_link") -> Topic:
+    """Return ``sensor_msgs/Imu`` without an orientation."""
+    return message(
+        name,
+        "sensor_msgs/msg/Imu",
+        force,
+        {**xyz(force, "linear_acceleration"), **xyz(rate.along(force), "angular_velocity")},
+        constants={"header.frame_id": frame, "orientation_covariance": [-1.0] + [0.0] * 8, "orientation.w": 1.0},
+    )
+
+
+def steering(steer: Series, name: str = "/vehicle/status/steering_status") -> Topic:
+    """Return Autoware's steering report, as it were the road-wheel angle."""
+    fields = {"steering_tire_angle": steer.values}
+    return message(name, "autoware_vehicle_msgs/msg/SteeringReport", steer, fields, stamp="stamp")
+
+
+def velocity(speed: Series, name: str = "/vehicle/status/velocity_status") -> Topic:
+    """Return Autoware's velocity report with the forward velocity alone."""
+    return message(name, "autoware_vehicle_msgs/msg/VelocityReport", speed, {"longitudinal_velocity": speed.values})
+
+
+def odometry(
+    car: Car, name: str = "/ins/odometry", *, body: Series | None = None, rate: Series | None = None, up_to: int = 1
+) -> Topic:
+    """Return GNSS/INS as ``nav_msgs/Odometry``; ``body`` and ``rate`` take the place of its velocity and yaw rate."""
+    clock = (body or car.body_velocity).every(up_to)
+    at = car.position.every(up_to).values
+    roll, pitch, yaw = car.attitude.every(up_to).values.T
+    return message(
+        name,
+        "nav_msgs/msg/Odometry",
+        clock,
+        {
+            "pose.pose.position.x": at[:, 0],
+            "pose.pose.position.y": at[:, 1],
+            "pose.pose.position.z": at[:, 2],
+            "pose.pose.orientation": quaternion(roll, pitch, yaw),
+            "twist.twist.linear.x": clock.values[:, 0],
+            "twist.twist.linear.y": clock.values[:, 1],
+            "twist.twist.angular.z": (rate or car.yaw_rate).every(up_to).values,
+        },
+        constants={"header.frame_id": "map", "child_frame_id": "base_link"},
+    )
+
+
+def fix(car: Car, name: str = "/gps/fix") -> Topic:
+    """Return the receiver's ``sensor_msgs/NavSatFix``."""
+    lat, lon, alt = car.fix.values.T
+    return message(
+        name,
+        "sensor_msgs/msg/NavSatFix",
+        car.fix,
+        {"latitude": lat, "longitude": lon, "altitude": alt},
+        constants={"header.frame_id": "gps", "status.service": 1.0, "position_covariance_type": 2.0},
+    )
+
+
+def scalar(name: str, series: Series, type_name: str = "std_msgs/msg/Float32") -> Topic:
+    """Return a topic of one bare number."""
+    return message(name, type_name, series, {"data": series.values}, stamp=None)
+
+
+def road_car(car: Car, **replaced: Topic | None) -> tuple[Topic, ...]:
+    """Return IMU, steering, speed and GNSS/INS truth; a keyword of these names takes a topic's place, None drops it."""
+    usual: dict[str, Topic | None] = {
+        "imu": imu(car.force, car.rate),
+        "steering": steering(car.steer),
+        "speed": velocity(car.speed),
+        "truth": odometry(car),
+    }
+    return tuple(topic for topic in (usual | replaced).values() if topic is not None)

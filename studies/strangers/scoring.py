@@ -1,0 +1,294 @@
+"""What the tool makes of a log, held against the right answers by value: field names play no part."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.inspection.report import inspect_drive_log
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.mapping import fit_clocks, read_signals
+from pdhef_logtool.mapping.choosing import choose_mapping
+from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.signals import Channel, FloatArray
+from studies.strangers.cars import Series
+from studies.strangers.recordings import ITEMS
+
+#: Values are compared as means over so long: noise and a late stamp of a few milliseconds count little.
+BIN_S = 0.25
+#: Two channels agree when they differ by less than this share of the right one's rms, or by the floor of its unit.
+SHARE = 0.04
+FLOORS: dict[str, float] = {
+    "steer_rad": 0.002,
+    "steering_wheel_rad": 0.03,
+    "ax_m_s2": 0.12,
+    "ay_m_s2": 0.12,
+    "yaw_rate_rad_s": 0.004,
+    "speed_m_s": 0.15,
+    "rad_s": 0.5,
+    "m_s": 0.15,
+    "truth.vx_m_s": 0.15,
+    "truth.vy_m_s": 0.02,
+    "truth.sideslip_rad": 0.001,
+    "truth.enu_velocity_m_s": 0.15,
+    "truth.ecef_velocity_m_s": 0.15,
+    "truth.yaw_rate_rad_s": 0.004,
+}
+WEAK_SHARE = 0.6
+#: A constant of so much (m/s²) is the bias of an accelerometer, which nothing tells from a tilt of two degrees.
+BIAS_M_S2 = 0.3
+#: A share of right samples from which a channel counts as right: some logs hold invalid samples.
+RIGHT_BINS = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the tool says of a log.
+
+    ``checks`` as in report.json (name, subject, verdict, evidence, remedy); ``doubts`` are its other sentences:
+    ambiguities, notes, what is missing; ``suspects`` are the channels of warnings, where there are such.
+    """
+
+    checks: tuple[Mapping[str, Any], ...]
+    doubts: tuple[str, ...]
+    error: str = ""
+    suspects: frozenset[str] = frozenset()
+
+    @property
+    def text(self) -> str:
+        """Everything that a person reads of what is not in order."""
+        bad = [c for c in self.checks if c["verdict"] != "passed"]
+        said = [f"{c['name']} {c['subject']}: {c.get('evidence', '')} {c.get('remedy', '')}" for c in bad]
+        return "\n".join([*said, *self.doubts, self.error])
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One item of one log.
+
+    ``verdict`` is ``right``, ``wrong`` or ``missing``; ``told`` whether a failed or undecided check or a doubt names
+    a wrong one; ``checked`` the verdicts of the checks on its channels; ``what`` the sources that were taken;
+    ``doubted`` whether a sentence doubts it.
+    """
+
+    item: str
+    verdict: str
+    told: bool
+    checked: frozenset[str]
+    what: str
+    doubted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """What became of one log: its findings, the failed checks on right channels, whether the cause was named."""
+
+    findings: tuple[Finding, ...]
+    false_alarms: tuple[str, ...]
+    cause_named: bool | None
+    told: Told
+
+
+# ------------------------------------------------------------------------------------------------ what the tool says
+
+
+def look(path: Path) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
+    """Let the tool read a log on its own; return its mapping, what it says, and its channels."""
+    try:
+        with closing(open_log(path)) as log:
+            return _look(log)
+    except PdhefError as error:
+        return None, Told((), (), str(error)), {}
+
+
+def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]]:
+    said: list[str] = []
+    error = ""
+    try:
+        choose_mapping(log, None, said.append, prefer_truth="perfect")
+    except PdhefError as refused:
+        error = str(refused)
+    inspection = inspect_drive_log(log)
+    document = inspection.to_dict()
+    warnings = document.get("warnings") or []
+    said += [w["message"] for w in warnings]
+    said += [str(a) for a in inspection.ambiguities]
+    said += list(inspection.notes)
+    said += [f"missing: {name}" for name in inspection.missing]
+    suspects = frozenset(name for w in warnings for name in (w["suspects"] or w["signals"]))
+    checks = [*(document.get("checks") or ()), *(document.get("unsure") or ())]
+    more, refused_run = _checks_of_a_run(Path(log.path))
+    checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
+    error = error or refused_run
+    told = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)
+    clocks = fit_clocks(log, inspection.mapping, log.start_ns, log.end_ns)
+    read = read_signals(log, inspection.mapping, clocks, log.start_ns, log.end_ns)
+    channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
+    return inspection.mapping, told, channels
+
+
+def _checks_of_a_run(path: Path) -> tuple[list[dict[str, Any]], str]:
+    """Return the checks that ``pdhef run`` would show, and why it would not run."""
+    try:
+        with read_drive(path, Car.load("saloon"), require_sensors=False) as drive:
+            return [asdict(check) for check in getattr(drive, "checks", ())], ""
+    except PdhefError as error:
+        return [], str(error)
+
+
+def read_answers(path: Path, mapping: SignalMapping) -> dict[str, tuple[Series, ...]]:
+    """Return the right channels of a recording by a mapping that a person wrote."""
+    with closing(open_log(path)) as log:
+        clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
+        read = read_signals(log, mapping, clocks, log.start_ns, log.end_ns)
+    channels = read.signals | {f"truth.{name}": channel for name, channel in read.truth.items()}
+    return {n: (Series(c.stamps_ns, c.arrival_ns, c.values),) for n, c in channels.items() if len(c)}
+
+
+# ------------------------------------------------------------------------------------------------ by value
+
+
+def agrees(channel: Channel, right: Series, floor: float, bias: float = 0.0) -> bool:
+    """Return whether a channel has the values of a series, but for noise, a few milliseconds and a bias."""
+    if not len(channel) or not len(right.stamps_ns):
+        return False
+    width = round(BIN_S * 1e9)
+    start = max(int(channel.stamps_ns[0]), int(right.stamps_ns[0]))
+    end = min(int(channel.stamps_ns[-1]), int(right.stamps_ns[-1]))
+    count = (end - start) // width
+    if count < 1:
+        return False
+    if np.median(np.diff(channel.stamps_ns)) > width and right.values.ndim == 1:
+        # A channel this slow holds samples, which are no means.
+        got = channel.values[:, None]
+        wanted = np.interp(channel.stamps_ns - start, right.stamps_ns - start, right.values)[:, None]
+        count = len(channel)
+    else:
+        got = _means(channel.stamps_ns - start, channel.values, width, count)
+        wanted = _means(right.stamps_ns - start, right.values, width, count)
+    if got.shape != wanted.shape:
+        return False
+    both = np.isfinite(got).all(axis=1) & np.isfinite(wanted).all(axis=1)
+    if np.count_nonzero(both) < 0.5 * count:
+        return False
+    rms = float(np.sqrt(np.mean(wanted[both] ** 2)))
+    difference = got[both] - wanted[both]
+    difference -= np.clip(np.median(difference), -bias, bias)
+    apart = np.sqrt(np.mean(difference**2, axis=1))
+    # A few bins may hold invalid samples; the others must agree as a whole.
+    kept = np.sort(apart)[: int(np.ceil(RIGHT_BINS * apart.shape[0]))]
+    # Of a weak signal the floor is no more than a share: noise may stand in it, another sign may not.
+    return bool(np.sqrt(np.mean(kept**2)) <= max(SHARE * rms, min(floor, WEAK_SHARE * rms)))
+
+
+def _means(at_ns: Any, values: FloatArray, width: int, count: int) -> FloatArray:
+    """Return the means of the bins [count, k]; NaN where a bin is empty."""
+    bins = at_ns // width
+    inside = (bins >= 0) & (bins < count)
+    columns = values.reshape(values.shape[0], -1)
+    hits = np.bincount(bins[inside], minlength=count).astype(np.float64)
+    sums = [np.bincount(bins[inside], weights=column[inside], minlength=count) for column in columns.T]
+    with np.errstate(invalid="ignore"):
+        return np.stack(sums, axis=1) / hits[:, None]
+
+
+def floor_of(name: str) -> float:
+    """Return the least difference that counts for a channel."""
+    if name in FLOORS:
+        return FLOORS[name]
+    return FLOORS["rad_s"] if name.endswith("rad_s") else FLOORS["m_s"]
+
+
+def bias_of(name: str) -> float:
+    """Return the constant difference that does not count for a channel."""
+    return BIAS_M_S2 if name in ("ax_m_s2", "ay_m_s2") else 0.0
+
+
+# ------------------------------------------------------------------------------------------------ the score
+
+
+def score_log(
+    path: Path,
+    right: Mapping[str, Sequence[Series]],
+    *,
+    allowed: Mapping[str, Sequence[Series]] | None = None,
+    cause: str = "",
+    at_fault: Iterable[str] = (),
+) -> Score:
+    """Let the tool map a log and hold what it took against the right answers.
+
+    Parameters
+    ----------
+    right : by channel, what it must be. A channel of :data:`ITEMS` that is neither here nor allowed is wrong.
+    allowed : what may be mapped too, and is not missed where it is not.
+    cause : pattern of which some message must hold a part; empty where there is nothing to say.
+    at_fault : channels whose checks may fail even where they were mapped rightly.
+    """
+    mapping, told, channels = look(path)
+    sources = {} if mapping is None else _sources(mapping)
+    fitting = {**(allowed or {}), **right}
+    is_right = {
+        name: any(agrees(channel, series, floor_of(name), bias_of(name)) for series in fitting.get(name, ()))
+        for name, channel in channels.items()
+    }
+    findings = []
+    for item, names in ITEMS.items():
+        mapped = [n for n in names if n in channels]
+        present = any(n in right for n in names)
+        if not mapped:
+            if present:
+                findings.append(Finding(item, "missing", True, frozenset(), ""))
+            continue
+        wrong = [n for n in mapped if not is_right[n]]
+        checked = frozenset(c["verdict"] for c in told.checks if c["subject"] in mapped)
+        what = ", ".join(f"{n} = {sources[n]}" for n in (wrong or mapped) if n in sources)
+        if wrong:
+            findings.append(Finding(item, "wrong", all(_is_told(n, sources, told) for n in wrong), checked, what))
+        elif present:
+            doubted = any(_is_doubted(n, sources.get(n, ""), told) for n in mapped)
+            findings.append(Finding(item, "right", True, checked, what, doubted))
+    blamed = set(at_fault)
+    false_alarms = tuple(
+        f"{c['name']} ({c['subject']}): {c.get('evidence', '')}"
+        for c in told.checks
+        if c["verdict"] == "failed" and is_right.get(c["subject"], False) and c["subject"] not in blamed
+    )
+    named = bool(re.search(cause, told.text, re.IGNORECASE)) if cause else None
+    return Score(tuple(findings), false_alarms, named, told)
+
+
+def _sources(mapping: SignalMapping) -> dict[str, str]:
+    truth = {f"truth.{name}": source for name, source in mapping.truth.items()}
+    return {name: source.label for name, source in (mapping.signals | truth).items()}
+
+
+def _is_told(name: str, sources: Mapping[str, str], told: Told) -> bool:
+    """Return whether a check that did not pass is on the channel, or a doubt names it or its source."""
+    subject = name.removeprefix("truth.")
+    if subject in told.suspects:
+        return True
+    for check in told.checks:
+        if check["verdict"] != "passed" and check["subject"] in (name, subject):
+            return True
+    return _is_doubted(name, sources.get(name, ""), told)
+
+
+#: Words of a sentence that doubts what it names.
+_DOUBT = re.compile(r"doubt|took|is taken, but|waive|suspect|contradict|not sure|ambig|disagree|may be|might|perhaps")
+
+
+def _is_doubted(name: str, source: str, told: Told) -> bool:
+    """Return whether a sentence doubts a channel, by its name or the field or topic that it comes from."""
+    topic = source.partition(".")[0]
+    named = [part for part in (name.removeprefix("truth."), source, topic) if part]
+    return any(_DOUBT.search(d) and any(part in d for part in named) for d in told.doubts)

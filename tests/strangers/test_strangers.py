@@ -1,0 +1,192 @@
+"""The scorer against known series, the containers against what was written, and a handful of the logs."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.records.signals import Channel
+from studies.strangers.__main__ import result_of, score_recording
+from studies.strangers.answers import Answer, load_answers
+from studies.strangers.cars import Series, drive
+from studies.strangers.containers import write
+from studies.strangers.faults import faults, right_angles, units_and_signs
+from studies.strangers.held_out import held_out_layouts
+from studies.strangers.layouts import autoware, layouts, vbox
+from studies.strangers.page import Result, merged, page
+from studies.strangers.recordings import ITEMS, Recording, answers, imu, road_car, scalar
+from studies.strangers.scoring import Finding, Score, Told, agrees, bias_of, score_log
+
+_NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
+_WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
+
+
+def _channel(values: np.ndarray, shift_ns: int = 0) -> Channel:
+    return Channel("yaw_rate_rad_s", "rad/s", "/a.b", _NS + shift_ns, _NS + shift_ns, values)
+
+
+@pytest.mark.parametrize(
+    ("values", "shift_ns", "right"),
+    [
+        (_WAVE, 0, True),
+        (_WAVE + np.random.default_rng(1).normal(0.0, 0.05, _NS.size), 0, True),  # noise
+        (_WAVE, 8_000_000, True),  # a stamp that is late by a few milliseconds
+        (np.where(np.arange(_NS.size) // 25 == 7, 1e3, _WAVE), 0, True),  # a few invalid samples
+        (-_WAVE, 0, False),
+        (_WAVE * 180.0 / np.pi, 0, False),
+        (_WAVE * 0.9, 0, False),
+        (_WAVE + 0.1, 0, False),
+        (_WAVE, 300_000_000, False),
+        (np.full(_NS.size, np.nan), 0, False),
+        (_WAVE[:0], 0, False),
+    ],
+)
+def test_values_decide_whether_a_channel_is_right(values: np.ndarray, shift_ns: int, right: bool) -> None:
+    channel = _channel(values, shift_ns) if values.size else Channel("a", "1", "", _NS[:0], _NS[:0], values)
+    assert agrees(channel, Series(_NS, _NS, _WAVE), 0.01) is right
+
+
+def test_all_turns_by_right_angles_are_there_once() -> None:
+    turns = right_angles()
+    assert len({t.tobytes() for t in turns}) == 24
+    assert np.array_equal(turns[0], np.eye(3))
+    assert all(np.allclose(t @ t.T, np.eye(3)) and np.linalg.det(t) > 0.0 for t in turns)
+
+
+_CONTAINERS = (
+    "mcap",
+    "mcap-json",
+    "mcap-json-bare",
+    "mcap-ros1",
+    "mcap-protobuf",
+    "rosbag1",
+    "rosbag2",
+    "rosbag2-bare",
+    "rosbag2-mcap",
+)
+
+
+@pytest.mark.parametrize("container", _CONTAINERS)
+def test_containers_give_back_what_was_written(container: str, tmp_path: Path) -> None:
+    car = drive("short")
+    force = Series(car.force.stamps_ns[:200], car.force.arrival_ns[:200], car.force.values[:200])
+    topics = (imu(force, car.rate), scalar("/speed", force[0]))
+    if container == "mcap-protobuf":
+        fields = {k: v for k, v in topics[0].fields.items() if k != "header.stamp"}
+        topics = (
+            replace(topics[0], type_name="sensor.Imu", fields=fields, constants={}),
+            replace(topics[1], type_name="a.B"),
+        )
+    path = write(topics, tmp_path / "log", container)
+    with closing(open_log(path)) as log:
+        read = log.read({"/imu/data": ["linear_acceleration.y", "angular_velocity.z"], "/speed": ["data"]})
+        assert [t.messages for t in log.topics] == [200, 200]
+    got = read["/imu/data"]
+    assert np.array_equal(got.log_time_ns, force.arrival_ns)
+    assert np.array_equal(got.fields["linear_acceleration.y"], force.values[:, 1])
+    assert np.allclose(read["/speed"].fields["data"], force.values[:, 0], atol=1e-5)
+
+
+def test_the_sign_of_a_weak_signal_counts() -> None:
+    weak = 0.01 * _WAVE
+    assert agrees(_channel(weak), Series(_NS, _NS, weak), 0.03)
+    assert not agrees(_channel(-weak), Series(_NS, _NS, weak), 0.03)
+
+
+def test_an_accelerometer_may_have_a_bias_and_no_tilt() -> None:
+    right = Series(_NS, _NS, _WAVE)
+    assert agrees(_channel(_WAVE + 0.25), right, 0.1, bias_of("ay_m_s2"))
+    assert not agrees(_channel(_WAVE + 0.85), right, 0.1, bias_of("ay_m_s2"))
+    assert bias_of("yaw_rate_rad_s") == 0.0
+
+
+@pytest.mark.slow
+def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
+    sound = score_recording(autoware(), tmp_path)
+    assert set(sound.items.values()) == {"right"}
+    assert not list(tmp_path.iterdir())
+    car = drive("short")
+    turned = replace(autoware(), topics=road_car(car, truth=None), right=answers(car, "steer", "speed"))
+    absent = score_recording(turned, tmp_path)  # what is mapped and stands in no answer is wrong
+    assert absent.items["yaw rate"].startswith("wrong")
+
+
+@pytest.mark.parametrize("recording", [r for r in units_and_signs() if r.name in ("yaw-rate-deg", "steering-sign")])
+def test_wrong_units_and_signs_are_corrected_or_told(recording: Recording, tmp_path: Path) -> None:
+    result = score_recording(recording, tmp_path)
+    assert result.count("wrong, not told") == 0
+    assert result.named is not False
+
+
+def test_told_means_that_a_check_or_a_doubt_is_on_the_channel() -> None:
+    told = Told(({"name": "a.sign", "subject": "ay_m_s2", "verdict": "failed"},), ())
+    findings = (
+        Finding("ay", "wrong", True, frozenset({"failed"}), "x"),
+        Finding("ax", "right", True, frozenset(), "y"),
+    )
+    result = result_of(Score(findings, ("alarm",), None, told), "n", "fault", "w")
+    assert result.items == {"ay": "wrong, told", "ax": "right"}
+    assert result.verdicts == {"ax": "none"}
+    worse = replace(result, items={"ay": "wrong, not told", "ax": "missing"}, silent=("ay",))
+    both = merged([result, worse])
+    assert both.items == {"ay": "wrong, not told", "ax": "missing"}
+
+
+def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    car = drive("short")
+    path = write((imu(car.force.times(-1.0), car.rate),), tmp_path / "log", "mcap")
+    right = answers(car, "imu")
+    from studies.strangers import scoring
+
+    found = scoring.look(path)
+    check = {"name": "ay.sign", "subject": "ay_m_s2", "verdict": "undecided"}
+    monkeypatch.setattr(scoring, "look", lambda _: (found[0], Told((check,), ()), found[2]))
+    by_item = {f.item: f for f in score_log(path, right).findings}
+    assert (by_item["ay"].verdict, by_item["ay"].told) == ("wrong", True)
+    assert (by_item["ax"].verdict, by_item["ax"].told) == ("wrong", False)
+    assert by_item["yaw rate"].verdict == "right"
+
+
+@pytest.mark.slow
+def test_forty_kinds_with_distinct_names_and_pages() -> None:
+    last = [*held_out_layouts()]
+    own = [*faults(), *layouts(), *last]
+    assert len({r.name for r in own}) == len(own)
+    assert len({r.counted_as for r in own}) >= 40
+    assert len(last) == 10
+    assert all(r.page.startswith("https://") for r in own if r.group != "fault")
+    names = {n for channels in ITEMS.values() for n in channels}
+    assert all(set(r.right) <= names for r in own)
+
+
+def test_the_page_says_what_is_wrong() -> None:
+    rows = [
+        Result("a", "fault", "w", "", {"ay": "wrong, not told"}, silent=("ay (ay_m_s2 = /x.y)",), named=False),
+        Result("b", "layout", "w", "https://x", {"ax": "right"}, verdicts={"ax": "passed"}),
+    ]
+    text = page(rows, None, "")
+    assert "- a: wrong, not told: ay (ay_m_s2 = /x.y)" in text
+    assert "- a: cause not named" in text
+    assert "[w](https://x)" in text
+    assert "all passed on 1, some stayed undecided on 0, some failed on 0" in text
+
+
+def test_a_log_without_type_names_is_still_scored(tmp_path: Path) -> None:
+    result = score_recording(vbox(), tmp_path)
+    assert set(result.items) >= {"ax", "ay", "yaw rate", "speed"}
+    assert result.count("wrong, not told") == 0
+
+
+_QUICK = ("data/drives/comma2k19_segment.mcap", "data/drives/lunda_v40", "data/drives/revs_250lm_a.mcap")
+
+
+@pytest.mark.parametrize("answer", [a for a in load_answers() if a.file in _QUICK], ids=lambda a: a.file)
+def test_answers_are_found_in_their_recordings(answer: Answer, shared_dir: Path) -> None:
+    right, allowed = answer.series()
+    assert set(right) == set(answer.right)
+    assert set(allowed) == set(answer.allowed)
