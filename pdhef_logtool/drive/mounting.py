@@ -341,7 +341,7 @@ class Survey:
         }
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
-            if check.name in ("imu.mounting", "mapping.sign") and self.is_mounted:
+            if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
                 continue
             if f"{signal}.sign" not in passed:
                 yield check

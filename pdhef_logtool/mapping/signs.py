@@ -85,9 +85,12 @@ def judge_signs(
     if not against:
         return Signs(absolute=absolute)
     free = [n for n in turns if (one := trio[n]) is not None and may_turn(one)]
-    ways = _ways(free, votes)
-    # An IMU that may be mounted in any way may be the odd one: its axes are found later, and signs with them.
-    decided = len(ways) == 1 and len(free) == len(turns) and (absolute or len(votes) > 1)
+    # An IMU whose axes may lie in any way may be the odd one: they are found later, and the signs with them.
+    imu = tuple(n for n in turns if (one := trio[n]) is not None and one.is_axis and not one.fixed and n not in free)
+    ways = _ways([*((n,) for n in free), *([imu] if imu else [])], votes)
+    decided = (
+        len(ways) == 1 and set(ways[0]) <= set(free) and (absolute or (len(votes) > 1 and len(free) == len(turns)))
+    )
     return Signs(ways[0] if decided else (), absolute, ", ".join(against), decided)
 
 
@@ -108,13 +111,14 @@ def upright(fields: Fields, rate: Found) -> float:
     return 0.0
 
 
-def _ways(free: Sequence[str], votes: Mapping[tuple[str, str], float]) -> list[tuple[str, ...]]:
-    """Return the smallest sets of signals whose turning settles every vote."""
-    for size in range(1, len(free) + 1):
+def _ways(units: Sequence[tuple[str, ...]], votes: Mapping[tuple[str, str], float]) -> list[tuple[str, ...]]:
+    """Return the smallest sets of signals whose turning settles every vote; those of a unit turn together."""
+    for size in range(1, len(units) + 1):
+        chosen = [tuple(n for unit in units_of for n in unit) for units_of in itertools.combinations(units, size)]
         ways = [
-            chosen
-            for chosen in itertools.combinations(free, size)
-            if all(v * (-1.0) ** sum(n in chosen for n in pair) > 0.0 for pair, v in votes.items())
+            turned
+            for turned in chosen
+            if all(v * (-1.0) ** sum(n in turned for n in pair) > 0.0 for pair, v in votes.items())
         ]
         if ways:
             return ways

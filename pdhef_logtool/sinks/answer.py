@@ -255,7 +255,7 @@ def _next_steps(report: Report, main: MainFacts, figures: _Figures) -> list[str]
     if any(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())):
         steps.append("mend what failed above, or waive it by name")
     lacks = {e["reason"] for e in report["estimators"] if e["name"] == "physics" and e["outcome"] == "skipped"}
-    steps += [f"map what is missing, for {reason} (pdhef inspect LOG --write-mapping m.toml)" for reason in lacks]
+    steps += [f"map what is missing, for {reason} (pdhef map LOG)" for reason in lacks]
     if vehicle["file"] is None:
         steps.append("name your car: --car vehicle.toml with mass, geometry and tyres (docs/car.md)")
     elif main.distrusted:

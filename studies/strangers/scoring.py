@@ -115,7 +115,7 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     said: list[str] = []
     error = ""
     try:
-        choose_mapping(log, None, said.append, prefer_truth="perfect")
+        choose_mapping(log, None, said.append, said.append, prefer_truth="perfect")
     except PdhefError as refused:
         error = str(refused)
     inspection = inspect_drive_log(log)
