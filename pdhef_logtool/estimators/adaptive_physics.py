@@ -11,11 +11,12 @@ nothing; of the others each has one cure: a state that scales all forces, or one
 trade the same error to and fro, and cost more than they find. With Λ the sum of a filter's log-likelihood of its
 measurements, forgotten within seconds, the weight of filter i is
 
-    w_i ∝ exp(Λ_i + π_i)
+    w_i ∝ exp(Λ_i)
 
-which is multiple-model estimation (Magill 1965) for what comes and goes. π is 0 where the car's driving has shown that
-the cure is worth having (:mod:`~pdhef_logtool.learning.car.physics_fit`); for any other car a cure has to earn its
-weight, as a state more always fits something. The output is the mixture of all, its covariance with their differences.
+which is multiple-model estimation (Magill 1965) for what comes and goes. A cure has a filter where the car's driving
+has shown that it is worth having (:mod:`~pdhef_logtool.learning.car.physics_fit`), and nowhere else: a state more
+always fits something. A car of which nothing was found has F1 alone. The output is the mixture of all, its covariance
+with their differences.
 """
 
 from __future__ import annotations
@@ -44,12 +45,9 @@ if TYPE_CHECKING:
 
 #: What a model may lack, as parts of ``physics``; each is the state of one filter.
 CURES = ("force_scale", "bank")
-# Both constants were chosen on simulated drives that no table holds: 16 rows of ``pdhef simulate conditions --drives 8
-# --seed 41`` with the saloon, and 96 drives of 32 other cars that were identified without cures (studies.many_cars).
-#: Time constant with which the likelihood is forgotten, s. From 1 to 5 s little changes.
+#: Time constant with which the likelihood is forgotten, s. Chosen on simulated drives that no table holds; from 1 to
+#: 5 s little changes.
 FORGET_S = 2.0
-#: -π of a cure that no driving has shown to be worth having. At 0 those other cars' median was a third worse.
-UNPROVEN = 20.0
 #: A smaller weight is none.
 LEAST_WEIGHT = 1e-6
 #: A longer step starts the evidence anew, as it does the filters.
@@ -204,24 +202,14 @@ class AdaptivePhysics:
 
     @property
     def filters(self) -> tuple[PhysicsFilter, ...]:
-        """F1, and one filter a cure."""
-        if not self.adaptive:
-            return (self.physics,)
+        """F1, and one filter a cure that the car has."""
         vehicle = self.physics.vehicle
-        read_with = self.physics.read_with or vehicle
-        parts = [vehicle.physics.model_copy(update={c: c == cure for c in CURES}) for cure in ("", *CURES)]
-        vehicles = [vehicle if p == vehicle.physics else vehicle.model_copy(update={"physics": p}) for p in parts]
-        return tuple(
-            self.physics if v is vehicle else replace(self.physics, vehicle=v, read_with=read_with) for v in vehicles
-        )
-
-    @property
-    def prior(self) -> FloatArray:
-        """π of each filter, [H]."""
-        if not self.adaptive:
-            return np.zeros(1)
-        own = self.physics.vehicle.physics
-        return np.array([0.0, *(0.0 if getattr(own, cure) else -UNPROVEN for cure in CURES)])
+        cures = [cure for cure in CURES if getattr(vehicle.physics, cure)]
+        if not self.adaptive or not cures:
+            return (self.physics,)
+        parts = [vehicle.physics.model_copy(update={c: c == cure for c in CURES}) for cure in ("", *cures)]
+        vehicles = [vehicle.model_copy(update={"physics": p}) for p in parts]
+        return tuple(replace(self.physics, vehicle=v, read_with=self.physics.read_with or vehicle) for v in vehicles)
 
     def inputs(self, signals: Signals, carry: InputCarry | None) -> tuple[CheckedInputs, InputCarry]:
         """Return what the filters take: checked signals with the residual at trust 1; and the carry."""
@@ -241,7 +229,7 @@ class AdaptivePhysics:
         gathered, evidence = gather_evidence(
             [steps for steps, _ in runs], c.last_stamp_ns if c else None, c.evidence if c else np.zeros(len(filters))
         )
-        weights = weigh(gathered + self.prior, np.stack([steps.valid for steps, _ in runs], axis=1))
+        weights = weigh(gathered, np.stack([steps.valid for steps, _ in runs], axis=1))
         tracks, after = [], []
         for h, (one, b, (steps, moved)) in enumerate(zip(filters, before, runs, strict=True)):
             # Only what the mixture takes is predicted to the stamps.

@@ -319,7 +319,7 @@ class SmoothedPhysics:
         told: dict[str, Any] = {}
         if len(tracks) > 1:
             evidence = self._two_sided([f.posterior for f in steps], shared.evidence, count, origin_ns)
-            weights = weigh(evidence + self.filtered.prior, np.stack(valid, axis=1))
+            weights = weigh(evidence, np.stack(valid, axis=1))
             track = mix(weights, tracks)
             told["mixture_weight"] = np.where(track.valid, 1.0 - weights[:, 0], np.nan)
         return replace(

@@ -211,8 +211,8 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
 
 def test_what_is_estimated_stands_in_the_track_and_only_that() -> None:
     signals = _signals()
-    track, _ = hybrid("roll", "bank", "biases").run(signals, None)
-    for name in ESTIMATED_COLUMNS:  # F2 has the force scale, which F1 takes to be 0
+    track, _ = hybrid("roll", "bank", "biases", "force_scale").run(signals, None)
+    for name in ESTIMATED_COLUMNS:  # a filter without such a state takes it to be 0
         assert np.isfinite(getattr(track, name)[track.valid]).all(), name
     static, _ = replace(hybrid(), adaptive=False).run(signals, None)
     assert [n for n in ESTIMATED_COLUMNS if len(getattr(static, n))] == []

@@ -491,10 +491,10 @@ def test_its_weights_know_what_comes_later():
     made = drive(slalom(0.035, 0.5), 12.0, speed=22.0, mu=0.75 * 0.85)
     signals = with_noise(made.signals, 0)
     signals.friction[:] = 0.85
-    estimator = flat_smoother()
+    estimator = flat_smoother(("force_scale",))
     weights = [e.run(signals, None)[0].mixture_weight for e in (estimator, estimator.filtered)]
-    assert weights[0][:150].mean() > weights[1][:150].mean() + 0.2
-    assert weights[0].mean() > 0.9
+    assert weights[1][:10].max() < 0.6
+    assert weights[0].min() > 0.99
 
 
 def test_links_cost_the_filter_no_bit(rough):
@@ -580,7 +580,8 @@ def test_a_run_is_the_same_whatever_its_windows_and_marks_it(sample_logs_dir: Pa
     console = Console(file=io.StringIO(), width=200)
     render_run(result, console)
     printed = console.file.getvalue()
-    assert printed.index("zero") < printed.index("pd-hef-smoothed (not causal)")
+    assert printed.rindex("\n zero") < printed.rindex("\n pd-hef-smoothed")
+    assert "not causal" in printed
 
 
 def test_a_covariance_without_an_inverse_is_repaired() -> None:
