@@ -163,7 +163,6 @@ def _findings(inspection: Inspection) -> list[tuple[str, str, str]]:
         found.append(("missing", "yellow", ", ".join(inspection.missing)))
     if not inspection.truth:
         found.append(("missing", "yellow", "truth: nothing to score an estimate against"))
-    found += [("unsure", "yellow", f"{c.evidence}; {c.remedy}") for c in inspection.mapping.checks]
     found += [("ambiguous", "yellow", str(a)) for a in inspection.ambiguities]
     for verdict, style in (("failed", "red"), ("undecided", "yellow")):
         checks = [c for c in inspection.checks if c.verdict == verdict]

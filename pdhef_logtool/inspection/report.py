@@ -185,7 +185,6 @@ class Inspection:
             "proposals": [{"subject": p.subject, "home": p.home, "evidence": p.evidence} for p in self.proposals],
             "lost": self.lost,
             "candidates": self.candidates,
-            "unsure": self.mapping.checks,
             **self.uses,
         }
         return {key: jsonable(value) for key, value in document.items()}
@@ -401,18 +400,18 @@ def mapping_comments(inspection: Inspection) -> dict[str, str]:
     types = {t.name: t.type for t in inspection.topics}
     comments: dict[str, str] = {}
     for section, reports in (("signals", inspection.signals), ("truth", inspection.truth)):
-        prefix = "truth." if section == "truth" else ""
         for name, report in reports.items():
             text = f"{types.get(report.topic, '')}, {_number(report.rate_hz)} Hz"
             if math.isfinite(report.minimum):
                 text += f", {_number(report.minimum)} to {_number(report.maximum)} {report.unit}"
             subject = name if section == "signals" else f"truth.{name}"
-            doubts = [c for c in inspection.checks if c.subject == subject and c.verdict != "passed"]
+            doubts = [
+                c
+                for c in inspection.checks
+                if c.verdict != "passed" and subject in (c.subject, c.name.removesuffix(".candidate"))
+            ]
             done = any(p.subject == subject for p in inspection.proposals)
             lines = [] if done else [f"CHECK {c.name} {c.verdict}: {c.evidence}; {c.remedy}" for c in doubts]
-            lines += [
-                f"UNSURE: {c.evidence}" for c in inspection.mapping.checks if c.name == f"{prefix}{name}.candidate"
-            ]
             comments[f"{section}.{name}"] = "\n".join([text, *lines])
     head = [f"Written from {Path(inspection.path).name}."]
     head += [f"Ambiguous: {a}" for a in inspection.ambiguities]

@@ -84,7 +84,7 @@ def test_doubtful_candidates_stand_in_the_file_as_comments(shared_dir: Path, tmp
     found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
     write_mapping(found, tmp_path / "m.toml")
     text = (tmp_path / "m.toml").read_text()
-    assert "# UNSURE: /steering_angle_1.data is taken" in text
+    assert "undecided: /steering_angle_1.data is taken" in text
     assert '# topic = "/steering_1"' in text
     assert "score 0." in text
     assert set(load_mapping(tmp_path / "m.toml").signals) == {"steer_rad"}
