@@ -33,8 +33,8 @@ from truthsim.vehicle import GRAVITY_M_S2
 from truthsim.vehicle_choice import choose_vehicle
 
 SEED = 4000
-CARS = 40
-DRIVES_PER_CAR = 8
+CARS = 300
+DRIVES_PER_CAR = 6
 #: Of these, the drives that a car is identified on; no residual is taken from them. Steps of the fit, some 5 s a car.
 FIT_DRIVES, FIT_ITERATIONS = 3, 4
 #: With so little driving the parts are not chosen: those that a bare car cannot do without, and none that adapts.
@@ -55,9 +55,14 @@ SENSOR_FACTORS = {
     "acceleration_bias_m_s2": (0.3, 1.5),
     "yaw_rate_bias_rad_s": (0.2, 1.5),
     "steer_bias_rad": (0.5, 2.0),
+    # Noise of accelerometers that is not white: vibration of the body, temperature.
+    "acceleration_walk_m_s2": (1.0, 5.0),
+    "walk_time_s": (0.005, 1.0),
 }
-DELAY_S = (0.0, 0.025)
+DELAY_S = (0.0, 0.040)
 STEER_GAIN = 0.01
+#: Where the IMU may be from where the car's file has it, forward and to the left.
+LEVER_M = 0.15
 #: Less understeer than this no maker sells: 0.5 degrees per g.
 LEAST_UNDERSTEER = np.radians(0.5) / GRAVITY_M_S2
 #: A ramp steer at this friction shows the axles' curves.
@@ -103,6 +108,7 @@ def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
     }
     values["can_delay_s"] = float(rng.uniform(*DELAY_S))
     values["steer_gain"] = STEER_GAIN
+    values |= {name: float(rng.uniform(-LEVER_M, LEVER_M)) for name in ("imu_x_m", "imu_y_m")}
     return tuple((name, round(value, 6)) for name, value in sorted(values.items()))
 
 

@@ -40,7 +40,7 @@ CARS, UNSEEN = ROOT / "out" / "many-cars", ROOT / "out" / "many-cars-unseen"
 #: Runs of the independent simulator that its car is identified on; the others are scored.
 IDENTIFY_ON = ("ramp_100kmh_mu100_long", "normal_40_80kmh_mu090")
 UNSEEN_SEED, UNSEEN_CARS, UNSEEN_DRIVES = 4100, 24, 4
-EPOCHS = 16
+EPOCHS = 48
 #: Estimator by the name in the table: registered name, and which network it has.
 COLUMNS = {
     "phy-ukf-tuned": ("phy-ukf-tuned", "one"),

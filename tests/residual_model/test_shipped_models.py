@@ -37,7 +37,7 @@ def test_noise_evidence_and_calibration_are_of_the_shipped_network() -> None:
     assert model is not None
     assert car.network is not None and car.network.sha256 == model.sha256
     assert car.trust is not None and car.trust.network_sha256 == model.sha256
-    assert car.allowed_trust.cap == 0.5
+    assert car.allowed_trust.cap == 0.75
     assert car.notes == ()
     assert {"phy-ukf-tuned", "physics"} == set(car.noise)
     for chosen in (None, UNSURE):
