@@ -20,11 +20,11 @@ class TurnedLog:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._log, name)
 
-    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int) -> dict[str, Any]:
+    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
         asked = dict(requests)
         if self._topic in asked:
             asked[self._topic] = [*dict.fromkeys([*asked[self._topic], *TRIADS[0], *TRIADS[1]])]
-        found = dict(self._log.read(asked, start_ns, end_ns))
+        found = dict(self._log.read(asked, start_ns, end_ns, **options))
         if self._topic in found:
             columns = found[self._topic]
             fields = dict(columns.fields)

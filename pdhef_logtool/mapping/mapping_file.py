@@ -221,8 +221,9 @@ def _shape_problem(name: str, model: _SourceTable) -> str:
     for key, value in (("field", model.field), ("scale", model.scale), ("offset", model.offset)):
         if isinstance(value, list) and columns > 1 and len(value) != columns:
             return f"{key} must hold {columns} entries, got {len(value)}"
-    if len(fields) > 1 and any(f.startswith(CAN_PREFIX) for f in fields):
-        return f"{name} has several fields: frames of several signals do not come together"
+    if (columns > 1 or len(fields) > 1) and any(f.startswith(CAN_PREFIX) for f in fields):
+        what = "is a vector" if columns > 1 else "has several fields"
+        return f"{name} {what}: frames of several signals do not come together"
     if any(f.startswith(CAN_PREFIX) and f.count(".") != 1 for f in fields):
         return f"field must be {CAN_PREFIX}<message>.<signal>"
     return ""

@@ -327,7 +327,7 @@ def _motion(
     place = own[-1] if set(own[:-1]) <= {"gps", "gnss", "ins", "pos", "position", "abs"} else ""
     if place in ("lat", "lon", "lng", "long") and not speeds:
         return "latitude" if place == "lat" else "longitude", "", "position"
-    if have & {"wheel", "wheels", "whl"} and index is not None:
+    if have & {"wheel", "wheels", "whl"} and (index is not None or have & {"left", "right"}):
         return None  # which wheel it is does not stand there
     if have & {"ecef", "enu", "ned", "east", "north", "up", "down"} and speeds:
         return None

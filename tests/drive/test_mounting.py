@@ -129,8 +129,8 @@ def test_a_mapping_file_is_checked_and_left_alone(log) -> None:
 @pytest.mark.slow
 def test_a_sensor_that_takes_gravity_off_is_turned_by_its_rates(log) -> None:
     class Compensated(TurnedLog):
-        def read(self, requests, start_ns, end_ns):
-            found = super().read(requests, start_ns, end_ns)
+        def read(self, requests, start_ns, end_ns, **options):
+            found = super().read(requests, start_ns, end_ns, **options)
             for name, columns in found.items():
                 if name == "/imu/data":
                     gravity = 9.81 * self._turn[2]

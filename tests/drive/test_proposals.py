@@ -26,8 +26,8 @@ CAR = default_vehicle().model_copy(update={"name": "other"})
 class WrongLog(TurnedLog):
     """An IMU on its side and off the CG, its gyro late and with a gain, and a steering of the wrong sign."""
 
-    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int) -> dict[str, Any]:
-        found = super().read(requests, start_ns, end_ns)
+    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
+        found = super().read(requests, start_ns, end_ns, **options)
         if "/imu/data" in found:
             columns = found["/imu/data"]
             fields = dict(columns.fields)
@@ -145,8 +145,8 @@ def test_a_part_of_a_drive_tells_what_its_sensors_are(log) -> None:
 class TurnedTruth(TurnedLog):
     """A truth whose body velocity is turned by 0.4 degrees."""
 
-    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int) -> dict[str, Any]:
-        found = dict(self._log.read(requests, start_ns, end_ns))
+    def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
+        found = dict(self._log.read(requests, start_ns, end_ns, **options))
         c, s = np.cos(np.radians(0.4)), np.sin(np.radians(0.4))
         for topic, columns in found.items():
             vx, vy = (columns.fields.get(f"twist.twist.linear.{a}") for a in "xy")
