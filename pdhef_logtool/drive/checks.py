@@ -499,7 +499,8 @@ def _wheel_radius(columns: Mapping[str, FloatArray], speed: FloatArray, vehicle:
         return []
     moving = moving_at(speed)
     wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_rad_s") in columns]
-    ratios = [float(np.median((speed / w)[k])) for w in wheels if (k := moving & np.isfinite(w) & (w != 0.0)).any()]
+    turning = [(w, moving & np.isfinite(w) & (w != 0.0)) for w in wheels]
+    ratios = [float(np.median(speed[k] / w[k])) for w, k in turning if k.any()]
     if not ratios:
         return []
     radius = float(np.median(ratios))
