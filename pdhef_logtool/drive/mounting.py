@@ -343,7 +343,8 @@ class Survey:
             signal = check.name.removesuffix(".candidate")
             if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
                 continue
-            if f"{signal}.sign" not in passed:
+            # A doubt about a unit stays: a gain that passes is wider than units that look alike.
+            if f"{signal}.sign" not in passed or "unit" in check.evidence:
                 yield check
 
 
