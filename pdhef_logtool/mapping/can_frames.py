@@ -348,6 +348,11 @@ def _selectors(signal: Signal, by_name: Mapping[str, Signal]) -> Iterator[tuple[
         signal = selector
 
 
+def holds_frames(topic: str, fields: tuple[FieldInfo, ...]) -> bool:
+    """Return whether a topic's fields are those of raw CAN frames, by their names."""
+    return not isinstance(_frame_paths(topic, fields, CanSettings(())), str)
+
+
 def _frame_paths(topic: str, fields: tuple[FieldInfo, ...], settings: CanSettings) -> _FramePaths | str:
     """Find the parts of frames among a topic's fields, or return what is missing."""
     kinds = _plain_kinds(fields)

@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
 from pdhef_logtool.mapping.mapping_file import missing_signals
@@ -218,6 +219,11 @@ def auto_map(
     found.notes += _what_cannot_be_read(log, [t for t in topics if not _type(t).startswith(NO_SENSORS)])
     found.notes += [
         f"{t.name} ({_type(t)}) has no messages" for t in log.topics if not t.messages and _is_well_known(t)
+    ]
+    found.notes += [
+        f'{t.name} holds raw CAN frames: a mapping file with [can] dbc = ["car.dbc"] tells what stands in them'
+        for t in topics
+        if "can" in _words(f"{t.name} {t.type_name}") and holds_frames(t.name, log.fields(t.name, quiet=True))
     ]
     _map_imu(found, topics)
     _map_steering(found, topics)

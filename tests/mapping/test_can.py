@@ -393,3 +393,12 @@ def test_wrong_entries_are_named(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "m.toml").write_text(text)
     with pytest.raises(MappingError, match=says):
         load_mapping(tmp_path / "m.toml")
+
+
+def test_frames_without_their_description_are_said_to_need_one(tmp_path: Path) -> None:
+    frames = [Frame(0x10, bytes([i, 2, 3])) for i in range(5)]
+    _write_ros(tmp_path / "ros.mcap", frames)
+    _write_json(tmp_path / "json.mcap", frames, list)
+    for name in ("ros", "json"):
+        notes = inspect_log(tmp_path / f"{name}.mcap").notes
+        assert any("/can/raw holds raw CAN frames" in n and "dbc" in n for n in notes), notes
