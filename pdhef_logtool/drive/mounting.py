@@ -386,30 +386,28 @@ def survey_log(
         found = replace(found, named=found.rows)
     survey = Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), triads, found)
     if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
-        return survey_log(log, scaled, clocks, span_ns, truth_position_m, rescale=False)
+        undone = survey_log(log, scaled, clocks, span_ns, truth_position_m, rescale=False)
+        # A sensor that fails looks like a wrong unit of another; what is right contradicts nothing any more.
+        failed = [check.name for check in undone.all_checks() if check.verdict == "failed"]
+        if not any(name.endswith((".sign", ".unit", ".axis")) for name in failed):
+            return undone
     return survey
 
 
 def _rescaled(survey: Survey) -> Mapping:
     """Return a recognised mapping with the one unit or sign undone that alone contradicts all else, with a note.
 
-    Of the signals by themselves alone; of the truth by them and by itself.
+    The truth takes no part in it, and is itself only checked: what is scored against is not bent.
     """
     mapping = survey.mapping
     alone = replace(survey.channels, truth={})
     found = explained_factors(alone, None, known_mounting=survey.is_mounted, most=1)
-    if not found and survey.truth is not None:
-        every = explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted, most=1)
-        found = every if all(n.startswith("truth.") for n in every) else {}
-    for subject, (factor, evidence) in found.items():
-        name = subject.removeprefix("truth.")
-        section = dict(mapping.truth if subject.startswith("truth.") else mapping.signals)
-        if name not in section:
+    for name, (factor, evidence) in found.items():
+        if name not in mapping.signals:
             continue
-        section[name] = scaled_source(section[name], factor)
-        mapping = replace(mapping, truth=section) if name != subject else replace(mapping, signals=section)
-        note = f"{subject} is read with {factor:.6g} times its scale: {evidence}"
-        mapping = replace(mapping, notes=(*mapping.notes, note))
+        signals = {**mapping.signals, name: scaled_source(mapping.signals[name], factor)}
+        note = f"{name} is read with {factor:.6g} times its scale: {evidence}"
+        mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
     return mapping
 
 
