@@ -38,14 +38,23 @@ def read_toml(path: Path, what: str, error: type[PdhefError], remedy: str = "") 
     return _read(path, tomllib.loads, what, error, remedy)
 
 
-def read_json(path: Path, what: str, error: type[PdhefError], remedy: str = "") -> dict[str, Any]:
+def read_json(
+    path: Path, what: str, error: type[PdhefError], remedy: str = "", max_bytes: int = MAX_BYTES
+) -> dict[str, Any]:
     """Return the object of a JSON file; otherwise as :func:`read_toml`, and a list or a number is refused as well."""
-    return _read(path, json.loads, what, error, remedy)
+    return _read(path, json.loads, what, error, remedy, max_bytes)
 
 
-def _read(path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefError], remedy: str) -> dict[str, Any]:
+def _read(
+    path: Path,
+    parse: Callable[[str], Any],
+    what: str,
+    error: type[PdhefError],
+    remedy: str,
+    max_bytes: int = MAX_BYTES,
+) -> dict[str, Any]:
     try:
-        document = parse(read_text(path))
+        document = parse(read_text(path, max_bytes))
         got = _oddity(document)
     except FileNotFoundError:
         got = "no such file"
@@ -60,12 +69,12 @@ def _read(path: Path, parse: Callable[[str], Any], what: str, error: type[PdhefE
     return dict(document)
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, max_bytes: int = MAX_BYTES) -> str:
     """Return the text of a document; raises OSError, or ValueError if it is no UTF-8 or longer than any document."""
     with path.open("rb") as file:
-        data = file.read(MAX_BYTES + 1)
-    if len(data) > MAX_BYTES:
-        raise ValueError(f"more than {MAX_BYTES >> 20} MiB")
+        data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise ValueError(f"more than {max_bytes >> 20} MiB")
     return data.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 

@@ -31,6 +31,7 @@ from pdhef_logtool.records.errors import (
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
+from pdhef_logtool.results.opened_run import ESTIMATES_FILE, LOGS, METRICS_FILE, RECORDING_FILE, REPORT_FILE
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
@@ -64,10 +65,8 @@ if TYPE_CHECKING:
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
 
-#: Folder of a log's outputs within those of a run, what a run writes into it, and the figures of all logs.
-LOGS = "logs"
-LOG_FILES = ("annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.json")
-METRICS_FILE = "metrics.parquet"
+#: What a run writes into a log's folder.
+LOG_FILES = ("annotated.mcap", ESTIMATES_FILE, METRICS_FILE, RECORDING_FILE, REPORT_FILE)
 
 _SILENT = "{} has no valid row although the car moves"
 _ALL_SILENT = "no estimator has a valid row although the car moves"

@@ -49,11 +49,11 @@ from pdhef_logtool.records.signals import (
 )
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
+from pdhef_logtool.results.opened_run import LOGS
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
 from pdhef_logtool.runs.pipeline import (
-    LOGS,
     LogResult,
     Progress,
     RunResult,

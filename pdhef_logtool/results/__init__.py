@@ -1,0 +1,1 @@
+"""Finished runs, read back: their figures, tracks and reports, compared and searched."""
