@@ -39,6 +39,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
 )
+from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
@@ -67,7 +68,7 @@ class DrivePlan:
     latency : of the truth against the sensors; None without truth yaw rate or gyro.
     dependent : truth quantities that are an input of the estimators, with the reason.
     derivation : by truth quantity, how it is derived.
-    checks : of signals, truth and vehicle file.
+    checks : of signals, truth and vehicle file. placed : where recorded frames put the IMU.
     """
 
     mapping: Mapping
@@ -83,6 +84,7 @@ class DrivePlan:
     start_ns: int
     end_ns: int
     checks: tuple[Check, ...] = ()
+    placed: Placement | None = None
 
     @property
     def truth_latency_s(self) -> float:
@@ -159,6 +161,7 @@ def plan_drive(
         start_ns=start_ns,
         end_ns=end_ns,
         checks=looked_at.all_checks(vehicle),
+        placed=looked_at.placed,
     )
 
 
