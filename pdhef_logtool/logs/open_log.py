@@ -47,7 +47,7 @@ def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | Non
     Parameters
     ----------
     budget : what reading it may cost; what claims more is among the log's losses.
-    msgs : folder with definitions of types that the log does not define (:func:`read_definitions`).
+    msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`).
 
     Raises
     ------

@@ -377,7 +377,7 @@ def _run_estimators(
             sink.finish(report, events)
         write_metrics(change.file("metrics.parquet"), rows)
         write_json(change.file("report.json"), report)
-    outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car))
+    outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car), main=None if main is None else main.name)
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
     return LogResult(outcome, change.target, report, tuple(rows), checks=drive.checks)
@@ -394,7 +394,14 @@ def _short(algorithm: Algorithm | None) -> str:
 
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     """Return how a log that was read is recorded in run.json."""
-    return LogOutcome(log=drive.name, file=drive.path.name, sha256=drive.sha256, lost=lost_texts(losses))
+    return LogOutcome(
+        log=drive.name,
+        file=drive.path.name,
+        sha256=drive.sha256,
+        signals_sha256=drive.signals_sha256,
+        truth_sha256=drive.truth_sha256,
+        lost=lost_texts(losses),
+    )
 
 
 def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[Estimator], list[Skipped]]:
@@ -510,6 +517,8 @@ def report_facts(
             file=drive.path.name,
             kind=log.kind,
             sha256=drive.sha256,
+            signals_sha256=drive.signals_sha256,
+            truth_sha256=drive.truth_sha256,
             start_ns=plan.start_ns,
             end_ns=plan.end_ns,
             topics=[

@@ -50,7 +50,10 @@ class TopicFacts:
 
 @dataclass(frozen=True, slots=True)
 class LogFacts:
-    """The log that was read; ``file`` is its file name without folders, [start_ns, end_ns) its log times."""
+    """The log that was read; ``file`` is its file name without folders, [start_ns, end_ns) its log times.
+
+    ``signals_sha256``, ``truth_sha256``: of what was read of it, None where nothing was.
+    """
 
     name: str
     file: str
@@ -59,6 +62,8 @@ class LogFacts:
     start_ns: int
     end_ns: int
     topics: Sequence[TopicFacts] = ()
+    signals_sha256: str | None = None
+    truth_sha256: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +192,7 @@ class LogOutcome:
     """How one log of a run ended, with which car; None where it was not read or nothing was estimated.
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
+    ``main``: the estimator that is the answer.
     """
 
     log: str
@@ -195,6 +201,9 @@ class LogOutcome:
     failed: str | None = None
     lost: Sequence[str] = ()
     car: CarFacts | None = None
+    signals_sha256: str | None = None
+    truth_sha256: str | None = None
+    main: str | None = None
 
     @property
     def outcome(self) -> str:
@@ -305,7 +314,16 @@ def build_run(
         "config": dict(config),
         "model": None if model is None else dict(model),
         "logs": [
-            {"log": o.log, "file": PurePath(o.file).name, "sha256": o.sha256, "outcome": o.outcome, "car": o.car}
+            {
+                "log": o.log,
+                "file": PurePath(o.file).name,
+                "sha256": o.sha256,
+                "signals_sha256": o.signals_sha256,
+                "truth_sha256": o.truth_sha256,
+                "outcome": o.outcome,
+                "main": o.main,
+                "car": o.car,
+            }
             for o in outcomes
         ],
     }
