@@ -39,6 +39,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
 )
+from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
@@ -63,11 +64,11 @@ class DrivePlan:
 
     Attributes
     ----------
-    survey_signals, survey_truth : the channels that it was decided on.
+    survey_truth : the truth's channels that it was decided on.
     latency : of the truth against the sensors; None without truth yaw rate or gyro.
     dependent : truth quantities that are an input of the estimators, with the reason.
     derivation : by truth quantity, how it is derived.
-    checks : of signals, truth and vehicle file.
+    checks : of signals, truth and vehicle file. placed : where recorded frames put the IMU.
     """
 
     mapping: Mapping
@@ -78,11 +79,11 @@ class DrivePlan:
     latency: LatencyEstimate | None
     dependent: dict[str, str]
     derivation: dict[str, str]
-    survey_signals: dict[str, Channel]
     survey_truth: dict[str, Channel]
     start_ns: int
     end_ns: int
     checks: tuple[Check, ...] = ()
+    placed: Placement | None = None
 
     @property
     def truth_latency_s(self) -> float:
@@ -133,7 +134,7 @@ def plan_drive(
     mapping = with_gyro_delay(mapping, vehicle)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
-    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle.truth_position_m)
+    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle)
     mapping, survey = looked_at.mapping, looked_at.channels
     if require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
@@ -154,11 +155,11 @@ def plan_drive(
         latency=looked_at.latency,
         dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
         derivation=derivation,
-        survey_signals=survey.signals,
         survey_truth=survey.truth,
         start_ns=start_ns,
         end_ns=end_ns,
-        checks=looked_at.all_checks(vehicle),
+        checks=looked_at.checks,
+        placed=looked_at.placed,
     )
 
 

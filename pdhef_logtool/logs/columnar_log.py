@@ -182,6 +182,29 @@ class ColumnarLog:
                 reasons.append(str(schema))
         return reasons[0] if reasons else ""
 
+    def borrowed(self, topic: str) -> tuple[Path, ...]:
+        """Return the files of an installed ROS that a topic's type is read by."""
+        schemas = (self._schema(c, channel) for c, channel in self._by_topic.get(topic, ()))
+        return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
+
+    def first_messages(self, topic: str, most: int) -> list[object]:
+        """Return the first messages of a topic whole; what does not decode is left out."""
+        found: list[object] = []
+        for c, channel in self._by_topic.get(topic, ()):
+            schema = self._schema(c, channel)
+            if not isinstance(schema, MessageSchema):
+                continue
+            decode = ChannelDecoder(schema, ()).single_decoder()
+            with self.containers[c].meter.running():
+                for span in (s for s in self.containers[c].spans if channel.id in s.counts):
+                    block = self.load(c, span, frozenset({channel.id})) if len(found) < most else None
+                    if block is None:
+                        continue
+                    for row in block.rows.get(channel.id, np.empty(0, np.int64))[: most - len(found)]:
+                        at, n = int(block.offset[row]), int(block.length[row])
+                        found.append(decode(bytes(block.buffer[at : at + n])))
+        return [message for message in found if message is not None]
+
     def read(
         self,
         requests: Mapping[str, Sequence[str]],

@@ -17,6 +17,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
+from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
@@ -194,6 +195,10 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         fields = log.fields(topic.name, quiet=True)
         if len(fields) > MOST_FIELDS or vendors.why_left_out(topic.type_name):
             continue
+        if is_joints(topic):
+            joints = () if role == "command" else joint_meanings(log, topic)
+            found += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
+            continue
         known = vendors.fields_of(topic.type_name)
         for info in fields:
             if is_command(info.path) or info.kind != "number" or info.path.count("[]") > info.path.endswith("[]"):
@@ -250,7 +255,7 @@ def look(
                 one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
             if one.factors:
                 found.append(one)
-    return pieces, found + _anchors(log, sources, read)
+    return pieces, found + sources_found(log, sources, read)
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
@@ -269,13 +274,15 @@ def _document(one: Found, entry: VendorField) -> None:
     one.reasons.append(f"documented: {entry.page}")
 
 
-def _anchors(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Found]:
+def sources_found(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Found]:
     """Return what is mapped already, as fields that nothing here changes."""
     topics = {t.name: t for t in log.topics}
     found = []
     for source in sources:
         seen = read.get((source.topic, source.paths[0]))
-        if seen is None or not isinstance(source.scale, float) or not isinstance(source.offset, float):
+        if seen is None or isinstance(source.scale, tuple) or not isinstance(source.offset, float):
+            continue
+        if not isinstance(source.field, str):
             continue
         meaning = meaning_of_signal(source.name)
         one = Found(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))

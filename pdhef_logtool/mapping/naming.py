@@ -370,6 +370,11 @@ def _corner(words: tuple[str, ...], own: tuple[str, ...]) -> str:
     return ""
 
 
+def corner_of(words: tuple[str, ...]) -> str:
+    """Return the wheel (fl, fr, rl, rr) that words name; empty without one."""
+    return _corner(words, words)
+
+
 def _steering_kind(have: set[str]) -> str:
     if have & {"road", "tire", "tyre", "tires", "tyres", "roadwheel", "roadwheels", "axle", "delta"}:
         return "road"

@@ -22,6 +22,7 @@ VECTOR_COLUMNS: dict[str, int] = {
 
 StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]
+Combine: TypeAlias = Literal["sum", "norm"]
 
 #: How a frame's bytes stand in a message: as numbers, or as a text of digits.
 CanDataEncoding: TypeAlias = Literal["bytes", "hex", "base64"]
@@ -40,7 +41,7 @@ class SignalSource:
     """Where one signal comes from: ``value_SI = scale * raw + offset``, measured at ``stamp - latency_s``.
 
     A scalar signal of several fields is their sum, each times its own scale: a component of a sensor that is mounted
-    askew.
+    askew. With ``combine`` ``norm`` it is the length of their vector: a speed of its components.
 
     Attributes
     ----------
@@ -67,6 +68,7 @@ class SignalSource:
     valid_max: float | None = None
     stamp_unit: StampUnit = "ros"
     clock: Clock = "utc"
+    combine: Combine = "sum"
 
     @property
     def paths(self) -> tuple[str, ...]:
