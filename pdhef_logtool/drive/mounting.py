@@ -142,7 +142,8 @@ def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatAr
 class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
-    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells; ``along``: the speed alone says which way is forward.
+    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells; ``along``: the speed alone says
+    which way is forward.
     """
 
     rotation: FloatArray
