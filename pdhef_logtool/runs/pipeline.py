@@ -189,7 +189,10 @@ def run_logs(
                 if isinstance(car, Exception):
                     raise car
                 pool = pools.get(id(car))
-                result = run_log(log_input, outputs, config, car, mapping, pool=pool, progress=of_all, warn=warn)
+                result = run_log(
+                    log_input, outputs, config, car, mapping,
+                    pool=pool, thresholds=thresholds, progress=of_all, warn=warn,
+                )  # fmt: skip
             except Exception as error:  # one bad log never stops the others, whatever is wrong with it
                 if len(inputs) == 1:
                     raise
@@ -282,6 +285,7 @@ def run_log(
     mapping: Mapping | None,
     *,
     pool: SelfCalibration | None = None,
+    thresholds: Sequence[Threshold] | None = None,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> LogResult:
@@ -290,6 +294,7 @@ def run_log(
     Parameters
     ----------
     pool : what all logs of the run together say of the car; None: the log says it, if it is asked.
+    thresholds : what the report's verdicts name; None: there are none.
 
     Raises
     ------
@@ -301,7 +306,7 @@ def run_log(
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
-        job = _Job(drive, car, calibration, ready, skipped)
+        job = _Job(drive, car, calibration, ready, skipped, tuple(thresholds or ()))
         try:
             # What driving with truth showed of a car is worth more than d2, and its estimate stays causal.
             unproven = config.calibrate != "off" and not drive.car.has_evidence
@@ -322,6 +327,7 @@ class _Job:
     calibration: SelfCalibration | None
     ready: Sequence[Estimator]
     skipped: Sequence[Skipped]
+    thresholds: Sequence[Threshold]
 
 
 class _FallBackError(Exception):
@@ -343,6 +349,9 @@ def _run_estimators(
     job: _Job, outputs: OutputFolder, config: RunConfig, progress: Progress, *, falls_back: bool
 ) -> LogResult:
     """Estimate, score and write one drive; raises _FallBackError, before anything stays, where it is asked to."""
+    from pdhef_logtool.evaluation.thresholds import check_thresholds
+    from pdhef_logtool.runs.drive_details import drive_details
+
     drive, car, ready = job.drive, job.car, job.ready
     algorithms = {e.name: resolve(e) for e in ready}
     intervals = calibrator(car, ready)
@@ -354,10 +363,13 @@ def _run_estimators(
             if drive.friction.bank is not None:
                 observable = friction_events(drive.friction, signals)
                 found = replace(found, events=sorted([*found.events, *observable], key=in_time))
-        if against := distrust(found.rows):
-            drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
-            if falls_back:
-                raise _FallBackError(against)
+            if against := distrust(found.rows):
+                drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
+                if falls_back:
+                    raise _FallBackError(against)
+            main = choose_main(ready, found.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
+            limits = check_thresholds(job.thresholds, found.rows, log=drive.name)
+            details = drive_details(drive, ready, main.name, store.read, signals, limits)
         rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
         events = found.events
         if not found.moves:
@@ -378,8 +390,8 @@ def _run_estimators(
         left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
         facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
         calibration = None if job.calibration is None else job.calibration.to_dict()
-        main = choose_main(ready, rows, proven=drive.car.has_evidence, named=config.estimators is not None)
-        facts = replace(facts, friction=friction_facts(drive.friction), calibration=calibration, main=main)
+        facts = replace(facts, friction=friction_facts(drive.friction), calibration=calibration)
+        facts = replace(facts, main=main, details=details)
         report = build_report(facts)
         from pdhef_logtool.sinks.parquet import write_metrics
 
@@ -410,6 +422,7 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
         sha256=drive.sha256,
         signals_sha256=drive.signals_sha256,
         truth_sha256=drive.truth_sha256,
+        mapping_sha256=drive.mapping.sha256,
         lost=lost_texts(losses),
     )
 
