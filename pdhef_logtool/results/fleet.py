@@ -144,7 +144,7 @@ class Breakdown:
 
 @dataclass(frozen=True, slots=True)
 class Failures:
-    """Logs that ended alike: ``labels`` of the first :data:`NAMED` of ``count``."""
+    """Logs that ended alike: the ``reason`` of the first, and ``labels`` of the first :data:`NAMED` of ``count``."""
 
     reason: str
     count: int
@@ -182,8 +182,9 @@ class Fleet:
 
     @property
     def worst(self) -> tuple[FleetDrive, ...]:
-        """The scored drives with the largest errors, the largest first."""
-        return tuple(sorted(self.scored, key=lambda d: (-d.error(), d.label))[:WORST])
+        """The scored drives with the largest errors, the largest first; at most a quarter, but for a few."""
+        scored = sorted(self.scored, key=lambda d: (-d.error(), d.label))
+        return tuple(scored[: min(WORST, max(5, len(scored) // 4))])
 
     @property
     def without_truth(self) -> tuple[FleetDrive, ...]:
@@ -270,8 +271,6 @@ class _Gathered:
         if kind == "failed" or report is None:
             self.failed.append((log.label, reason or "its report is not there any more"))
             return
-        if kind == "lost":
-            self.lost += [(log.label, part) for part in reason.split("; ")]
         try:
             drive = _drive(log, report, figures)
             self._add_space(report.get("operating_space"))
@@ -279,6 +278,7 @@ class _Gathered:
             self.failed.append((log.label, f"its report is none of this tool: {type(error).__name__}"))
             return
         self.drives.append(drive)
+        self.lost += [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
 
     def _add_space(self, space: Mapping[str, Any] | None) -> None:
         if not space:
@@ -476,13 +476,13 @@ def _share(of_logs: Median) -> Median:
 
 
 def _breakdowns(drives: Sequence[FleetDrive], by: Sequence[str]) -> list[Breakdown]:
-    """Return the drives by each key that tells them apart, the one that explains most first; by ``by`` in its order."""
+    """Return the drives by each key that tells them apart, the one that explains most first; ``by`` keeps its order."""
     known = {key: None for d in drives for key in d.keys}
     found = []
     for key in by or known:
         values = _told(key, drives)
         count = len({v for v in values if v is not None})
-        if by or (2 <= count <= MOST_VALUES + 1 and count < len(drives)):
+        if by or 2 <= count <= min(MOST_VALUES, len(drives) - 1):
             found.append(_breakdown(key, drives, values))
     if by:
         return found
@@ -504,7 +504,7 @@ def _told(key: str, drives: Sequence[FleetDrive]) -> list[str | None]:
     if len(finite) == sum(counts.values()):
         edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, _QUARTERS + 1)))
         at = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
-        names = [f"{a:g} to {b:g}" for a, b in pairwise(edges)] or [f"{edges[0]:g}"]
+        names = [f"{a:.4g} to {b:.4g}" for a, b in pairwise(edges)] or [f"{edges[0]:.4g}"]
         return [names[i] if math.isfinite(x) else None for i, x in zip(at, numbers, strict=True)]
     common = {value for value, _ in counts.most_common(MOST_VALUES)}
     rest = f"{len(counts) - MOST_VALUES} others"
@@ -550,14 +550,14 @@ def _explained(groups: Sequence[FloatArray]) -> float:
 
 def _grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
     """Return reasons with their logs, the most frequent first; numbers and places do not tell reasons apart."""
-    members: dict[str, dict[str, None]] = {}
+    members: dict[str, tuple[str, dict[str, None]]] = {}
     for label, reason in found:
-        members.setdefault(_kind_of(reason), {})[label] = None
-    groups = [Failures(reason, len(labels), tuple(labels)[:NAMED]) for reason, labels in members.items()]
+        text = _without_place(reason)
+        members.setdefault(_NUMBER.sub("", text), (text, {}))[1][label] = None
+    groups = [Failures(text, len(labels), tuple(labels)[:NAMED]) for text, labels in members.values()]
     return tuple(sorted(groups, key=lambda g: (-g.count, g.reason))[:_MOST_GROUPS])
 
 
-def _kind_of(reason: str) -> str:
+def _without_place(reason: str) -> str:
     _, expected, rest = reason.partition(": expected ")
-    text = f"expected {rest}" if expected else _PLACE.sub("", reason)
-    return _NUMBER.sub("N", text)
+    return f"expected {rest}" if expected else _PLACE.sub("", reason)
