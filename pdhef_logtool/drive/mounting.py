@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import check_drive, drive_columns, explained_factors
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.checks import check_drive, explained_factors
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
-    GRAVITY_M_S2,
+    IS_GRAVITY_M_S2,
     frames_alone,
     frames_check,
     gravity_agrees,
@@ -26,6 +27,7 @@ from pdhef_logtool.drive.frames import (
     placed_rotation,
     rotation_text,
 )
+from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.relations import steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
@@ -43,7 +45,7 @@ from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSou
 from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check, Verdict
-from pdhef_logtool.records.signals import Channel, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 #: Mean accelerations below are no gravity: the sensor's software took it off.
 COMPENSATED_M_S2 = 3.0
@@ -98,24 +100,14 @@ class Mounting:
         return f"{rotation_text(self.rotation)}{mirrored}"
 
 
-def find_mounting(
-    signals: Mapped[str, Channel],
-    truth: Mapped[str, Channel],
-    derived: TruthTrack | None,
-    triads: tuple[Triad | None, Triad | None],
-    mapping: Mapping,
-) -> Mounting | None:
+def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
     """Find the rotation of an IMU from its six components; None where there are none, or the drive says nothing.
 
-    Parameters
-    ----------
-    signals : as mapped, with the components of the triads beside them. derived : truth, for the sign of the yaw rate.
+    ``measured``: with the components of the triads beside the signals, and truth for the sign of the yaw rate.
     """
     accelerations, rates = triads
-    if accelerations is None or rates is None:
-        return None
-    columns, speed_name = drive_columns(signals, truth, derived)
-    if not all(n in columns for n in (*ACCELERATIONS, *RATES)):
+    columns, speed_name = measured.columns, measured.speed_name
+    if accelerations is None or rates is None or not all(n in columns for n in (*ACCELERATIONS, *RATES)):
         return None
     f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
     w = np.stack([columns[n] for n in RATES], axis=1)
@@ -165,7 +157,7 @@ def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
     """Return the directions [3] that may be up: gravity's, or any axis where the sensor takes gravity off."""
     mean = np.nanmean(f, axis=0) if np.isfinite(f).all(axis=1).any() else np.zeros(3)
     size = float(np.linalg.norm(mean))
-    if GRAVITY_M_S2[0] < size < GRAVITY_M_S2[1]:
+    if IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1]:
         return [mean / size]
     if size > COMPENSATED_M_S2:
         return []
@@ -281,12 +273,17 @@ def _level_only(rest: FloatArray) -> FloatArray:
 # ------------------------------------------------------------------------------------- into the mapping
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Survey:
-    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain."""
+    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
+
+    ``vehicle``: whose file is held against the drive; the default car stands for none.
+    """
 
     mapping: Mapping
     channels: MappedChannels
+    measured: Measured
+    vehicle: VehicleParameters
     truth: TruthTrack | None
     truth_plan: TruthPlan | None
     latency: LatencyEstimate | None
@@ -296,7 +293,7 @@ class Survey:
     framed: Check | None = None
 
     @property
-    def checks(self) -> tuple[Check, ...]:
+    def mounted(self) -> tuple[Check, ...]:
         """Whether each of the IMU's signals is read from the axis that the drive says, and what frames say of it."""
         framed = () if self.framed is None else (self.framed,)
         if self.mounting is None:
@@ -308,16 +305,18 @@ class Survey:
         """Whether the IMU is known to be read from the right axes."""
         return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
 
-    def all_checks(self, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
-        """Return the checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
+    @cached_property
+    def checks(self) -> tuple[Check, ...]:
+        """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
         channels = self.channels
         found = check_drive(
             channels.signals,
             channels.truth,
             self.truth,
-            vehicle,
+            self.vehicle,
             latency=self.latency,
             mounting_is_known=self.is_mounted,
+            measured=self.measured,
         )
         if self.mounting is not None and self.is_mounted:
             # Right axes have right signs, and gravity says the unit.
@@ -327,7 +326,7 @@ class Survey:
             found = tuple(
                 k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)
             )
-        return (*self.checks, *self._of_names(found), *found)
+        return (*self.mounted, *self._of_names(found), *found)
 
     def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""
@@ -348,7 +347,7 @@ def survey_log(
     mapping: Mapping,
     clocks: dict[str, ClockModel],
     span_ns: tuple[int, int],
-    truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    vehicle: VehicleParameters | None = None,
     *,
     rescale: bool = True,
 ) -> Survey:
@@ -358,23 +357,27 @@ def survey_log(
 
     Parameters
     ----------
+    vehicle : of the drive; None: nothing is known of it.
     rescale : whether a wrong unit or sign is looked for.
     """
+    vehicle = vehicle or default_vehicle()
     triads = find_triads(log, mapping)
     extra: dict[str, SignalSource] = {}
     for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
         extra |= {} if triad is None else triad.components(names)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan = plan_truth(channels.truth, truth_position_m=truth_position_m) if channels.truth else None
+    truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
+    measured = measure(channels.signals, channels.truth, truth)
     # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
-    found = find_mounting(channels.signals, {}, None, triads, mapping)
+    found = find_mounting(measured.without_truth(), triads, mapping)
     blind = found is not None and found.confident
     if not blind and truth is not None:
-        found = find_mounting(channels.signals, channels.truth, truth, triads, mapping)
+        found = find_mounting(measured, triads, mapping)
     placed, framed, by_frames = _by_frames(log, mapping, channels, triads, found)
     found = by_frames or found
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
+    measured = measured.without(extra)
     trusted = blind or by_frames is not None
     if found is not None and mapping.origin == "auto" and trusted and not found.is_as_named:
         note = f"{found.text}, and is read so: {found.evidence}"
@@ -382,13 +385,14 @@ def survey_log(
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         found = replace(found, named=found.rows)
+        measured = measure(channels.signals, channels.truth, truth)
     latency = truth_latency(channels, truth)
-    survey = Survey(mapping, channels, truth, truth_plan, latency, triads, found, placed, framed)
+    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found, placed, framed)
     if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
-        undone = survey_log(log, scaled, clocks, span_ns, truth_position_m, rescale=False)
+        undone = survey_log(log, scaled, clocks, span_ns, vehicle, rescale=False)
         # A sensor that fails looks like a wrong unit of another; what is right contradicts nothing any more.
-        failed = [check.name for check in undone.all_checks() if check.verdict == "failed"]
-        if not any(name.endswith((".sign", ".unit", ".axis")) for name in failed):
+        failed = [check.name for check in undone.checks if check.verdict == "failed"]
+        if not any(name.endswith((".sign", ".unit", ".axis", ".fault")) for name in failed):
             return undone
     return survey
 
@@ -429,8 +433,12 @@ def _rescaled(survey: Survey) -> Mapping:
     The truth takes no part in it, and is itself only checked: what is scored against is not bent.
     """
     mapping = survey.mapping
-    alone = replace(survey.channels, truth={})
-    found = explained_factors(alone, None, known_mounting=survey.is_mounted, most=1)
+    alone = survey.measured.without_truth()
+    found = explained_factors(alone, mounting_is_known=survey.is_mounted, most=1)
+    if found:
+        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
+        if shares:
+            found = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
     for name, (factor, evidence) in found.items():
         if name not in mapping.signals:
             continue

@@ -8,11 +8,11 @@ from itertools import combinations
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 DEGREE = float(np.pi / 180.0)
-G = 9.80665
 
 #: Below this correlation a gain says nothing; above it, it is known to its reciprocal.
 MIN_CORRELATION = 0.6
@@ -250,7 +250,7 @@ def _units(name: str) -> list[tuple[float, str]]:
     if name == "steering_wheel_rad":
         return [*to_radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")]
     if name in ("ax_m_s2", "ay_m_s2"):
-        return [(G, "is in g"), (1.0 / G, "was converted from g twice")]
+        return [(GRAVITY_M_S2, "is in g"), (1.0 / GRAVITY_M_S2, "was converted from g twice")]
     if name in ("vx_m_s", "vy_m_s", "speed_m_s"):
         return [*of_speeds, (1e-3, "is in mm/s")]
     if name.startswith("wheel_speed") and name.endswith("_rad_s"):

@@ -64,7 +64,7 @@ class DrivePlan:
 
     Attributes
     ----------
-    survey_signals, survey_truth : the channels that it was decided on.
+    survey_truth : the truth's channels that it was decided on.
     latency : of the truth against the sensors; None without truth yaw rate or gyro.
     dependent : truth quantities that are an input of the estimators, with the reason.
     derivation : by truth quantity, how it is derived.
@@ -79,7 +79,6 @@ class DrivePlan:
     latency: LatencyEstimate | None
     dependent: dict[str, str]
     derivation: dict[str, str]
-    survey_signals: dict[str, Channel]
     survey_truth: dict[str, Channel]
     start_ns: int
     end_ns: int
@@ -135,7 +134,7 @@ def plan_drive(
     mapping = with_gyro_delay(mapping, vehicle)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
-    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle.truth_position_m)
+    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle)
     mapping, survey = looked_at.mapping, looked_at.channels
     if require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
@@ -156,11 +155,10 @@ def plan_drive(
         latency=looked_at.latency,
         dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
         derivation=derivation,
-        survey_signals=survey.signals,
         survey_truth=survey.truth,
         start_ns=start_ns,
         end_ns=end_ns,
-        checks=looked_at.all_checks(vehicle),
+        checks=looked_at.checks,
         placed=looked_at.placed,
     )
 
