@@ -38,6 +38,8 @@ WORST = 20
 #: Values of a key that are told one by one; numbers beyond them are told by quarters.
 MOST_VALUES = 12
 _QUARTERS = 4
+#: Folders from the top that drives are told by.
+_MOST_FOLDERS = 3
 #: Labels that a group of failures names, and groups that are told.
 NAMED, _MOST_GROUPS = 10, 50
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
@@ -385,20 +387,19 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
     """Return what a drive can be told by: what its log says of itself, and what the run knows."""
     friction = report.get("friction") or {}
     car = log.entry.get("car") or {}
+    source = str(friction.get("source", ""))
     own = {
         "car": car.get("name") or report["vehicle"]["name"],
         "log format": report["log"]["kind"],
         "answer": main,
-        "friction source": "estimated"
-        if friction.get("estimated")
-        else str(friction.get("source", "")).partition(",")[0],
+        "friction source": "estimated" if friction.get("estimated") else source.partition(",")[0],
         "length": _length(float(report["log"]["duration_s"])),
         "sensor faults": _fault_text(report),
     }
-    return {
-        **{str(k): str(v) for k, v in (report.get("metadata") or {}).items()},
-        **{k: v for k, v in own.items() if v},
-    }
+    parts = str(log.entry.get("folder") or "").split("/")[:_MOST_FOLDERS]
+    own |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
+    told = {str(k): str(v) for k, v in (report.get("metadata") or {}).items()}
+    return {**told, **{k: v for k, v in own.items() if v}}
 
 
 def _length(seconds: float) -> str:

@@ -46,7 +46,8 @@ class Run:
         self.rows: list[tuple[Any, ...]] = []
 
     def add(self, label: str, errors: Mapping[str, float] | None = None, outcome: str = "ok", **changes: Any) -> None:
-        self.logs.append({"log": label, "outcome": outcome, "car": {"name": "golf"}})
+        entry = {"log": label, "outcome": outcome, "car": {"name": "golf"}, "folder": changes.pop("folder", "")}
+        self.logs.append(entry)
         if outcome.startswith("failed"):
             return
         folder = self.folder / "logs" / label
@@ -193,6 +194,14 @@ def test_a_run_of_nothing_is_told_too(run: Run) -> None:
     run.add("a", outcome="failed: empty")
     found = run.read()
     assert found.drives == () and found.space is None and found.ranking == () and found.worst == ()
+
+
+def test_folders_part_drives(run: Run) -> None:
+    for i in range(6):
+        run.add(f"d{i}", {"pd-hef": 0.1 * (1 + i)}, folder=("golf/monday", "golf/friday", "mini")[i // 2])
+    found = {b.key: [(g.value, g.drives) for g in b.groups] for b in run.read(by=["folder", "folder 2"]).breakdowns}
+    assert found["folder"] == [("golf", 4), ("mini", 2)]
+    assert found["folder 2"] == [("golf/friday", 2), ("golf/monday", 2), ("not told", 2)]
 
 
 @pytest.mark.slow
