@@ -37,7 +37,7 @@ def report(
     png: Annotated[bool, Option("--png", help="Each figure as a picture too, in logs/LOG/figures.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write the pages of a run: report.html of all logs and of each.
+    """Write the pages of a run: of all logs, and of each.
 
     They are made from what the run left, as at the end of run itself.
     """
