@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
@@ -21,6 +22,8 @@ Verdict: TypeAlias = Literal["equal", "worse", "not worse", "better", "cannot te
 
 RESAMPLES = 2000
 _SEED = 0
+#: Drives times resamples that are in memory at once.
+_AT_ONCE = 1 << 20
 #: With fewer drives (clusters) the bootstrap knows too little to give bounds: all of four are worse by chance in 6 %.
 LEAST_CLUSTERS = 5
 #: Normal deviates of a one-sided 95 % bound, and of being found in 80 % of all cases.
@@ -95,7 +98,11 @@ def paired_change(ratios: FloatArray, clusters: Sequence[object] | None = None) 
     votes = _sign_p(np.array([np.sum(np.sign(ratios[of_drive == g])) for g in range(groups)]) if clusters else ratios)
     if groups < LEAST_CLUSTERS:
         return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes)
-    medians = np.sort(_middle(ascending, _draws(groups)[:, of_drive[order]]))
+    if ascending[0] == ascending[-1]:  # whatever is drawn
+        return PairedChange(n, groups, median, median, median, median, median, 0.0, votes)
+    step = max(1, _AT_ONCE // n)
+    parts = (_draws(groups)[i : i + step, of_drive[order]] for i in range(0, RESAMPLES, step))
+    medians = np.sort(np.concatenate([_middle(ascending, counts) for counts in parts]))
     low, least, most, high = (float(medians[_rank(share)]) for share in (0.025, 0.05, 0.95, 0.975))
     error = float(np.std(medians)) if np.isfinite(medians).all() else nan
     return PairedChange(n, groups, median, low, high, least, most, error, votes)
@@ -118,16 +125,16 @@ def _rank(share: float) -> int:
 
 
 @lru_cache(maxsize=2)
-def _draws(groups: int) -> IntArray:
+def _draws(groups: int) -> NDArray[np.int32]:
     """Return how often each cluster is drawn [RESAMPLES, groups]; always the same for as many."""
     rng = np.random.default_rng(_SEED)
-    drawn = np.empty((RESAMPLES, groups), dtype=np.int64)
+    drawn = np.empty((RESAMPLES, groups), dtype=np.int32)
     for row in drawn:
         row[:] = np.bincount(rng.integers(0, groups, groups), minlength=groups)
     return drawn
 
 
-def _middle(ascending: FloatArray, counts: IntArray) -> FloatArray:
+def _middle(ascending: FloatArray, counts: NDArray[np.int32]) -> FloatArray:
     """Return the medians [M] of ascending values [N] that count [M, N] times each."""
     reached = np.cumsum(counts, axis=1)
     total = reached[:, -1:]

@@ -424,6 +424,7 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
         sha256=drive.sha256,
         signals_sha256=drive.signals_sha256,
         truth_sha256=drive.truth_sha256,
+        mapping_sha256=drive.mapping.sha256,
         lost=lost_texts(losses),
     )
 

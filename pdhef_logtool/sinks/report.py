@@ -205,6 +205,7 @@ class LogOutcome:
     car: CarFacts | None = None
     signals_sha256: str | None = None
     truth_sha256: str | None = None
+    mapping_sha256: str | None = None
     main: str | None = None
     folder: str = ""
 
@@ -325,6 +326,7 @@ def build_run(
                 "sha256": o.sha256,
                 "signals_sha256": o.signals_sha256,
                 "truth_sha256": o.truth_sha256,
+                "mapping_sha256": o.mapping_sha256,
                 "outcome": o.outcome,
                 "main": o.main,
                 "car": o.car,
