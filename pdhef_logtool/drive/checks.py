@@ -46,6 +46,8 @@ GYRO_DELAY_S = 0.03
 NEUTRAL_RAD_PER_M_S2 = 0.0006
 #: Steering angle over what the file's ratio and wheelbase make of the curvature.
 STEERING_RANGE = (0.75, 1.33)
+#: Share of the steering's spread that curvature and lateral acceleration may leave.
+UNEXPLAINED_STEERING = 0.5
 #: Effective radius over the file's: tyres wear by 3 %, sizes of one car differ by 5 %.
 RADIUS_RANGE = (0.85, 1.18)
 #: Highest over lowest speed from which wheelbase and understeer can be told apart.
@@ -238,25 +240,36 @@ def _levels(
     """Judge what driving leaves of the accelerometers' means: gravity on an axis that should be level."""
     checks = []
     speed = None if speed_name is None else columns[speed_name]
+    yaw = columns.get("yaw_rate_rad_s")
     for name in ("ax_m_s2", "ay_m_s2"):
         if name not in columns:
             continue
-        driven: FloatArray = np.zeros_like(columns[name])
+        driven, at_ease = np.zeros_like(columns[name]), np.ones(columns[name].shape[0], np.bool_)
+        if speed is not None and yaw is not None:
+            # Where the car slides, speed and yaw rate no longer say what accelerates it.
+            at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - _median(columns[name]), at_ease)
         if speed is not None and name == "ax_m_s2":
             driven = derivative(speed)
-        elif speed is not None and "yaw_rate_rad_s" in columns:
-            driven = columns["yaw_rate_rad_s"] * speed
+        elif speed is not None and yaw is not None:
+            driven = yaw * speed
         rest = columns[name] - driven
         known = np.isfinite(rest)
         if independent_samples(int(np.count_nonzero(known))) < 6.0:
             rest, known = columns[name], np.isfinite(columns[name])
         if independent_samples(int(np.count_nonzero(known))) < 2.0:
             continue
+        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= 6.0
+        use = known & at_ease if told else known
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
-        check = _level(name, float(np.mean(rest[known])) - bias, float(np.mean(columns[name][known])) - bias)
-        if driving_is_known or check.name == f"{name}.axis":
+        check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
+        if (driving_is_known and told) or check.name == f"{name}.axis":
             checks.append(check)
     return checks
+
+
+def _median(column: FloatArray) -> float:
+    known = column[np.isfinite(column)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def _level(name: str, rest: float, mean: float) -> Check:
@@ -490,7 +503,11 @@ def _steering_checks(steer: FloatArray, rate: FloatArray, speed: FloatArray, veh
     if found is None or np.quantile(speeds, 0.9) < SPEED_SPREAD * np.quantile(speeds, 0.1):
         lacks = "needs bends to both sides at low and at high speed"
         return [Check(n, "vehicle", "undecided", "too little driving in bends", lacks) for n in names]
-    (share, gradient, _), (share_error, error, _), _ = found
+    (share, gradient, _), (share_error, error, _), left = found
+    if left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
+        lacks = "needs bends that the car does not slide through"
+        evidence = "curvature and lateral acceleration do not explain the steering"
+        return [Check(n, "vehicle", "undecided", evidence, lacks) for n in names]
     file = vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
     return [_steering_check(share, share_error), _understeer_check(gradient, error, file)]
 

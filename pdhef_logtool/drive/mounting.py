@@ -28,7 +28,7 @@ from pdhef_logtool.drive.frames import (
     rotation_text,
 )
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.relations import steering_references, yaw_references
+from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -67,6 +67,8 @@ ASKEW_CORRELATION = 0.85
 ASKEW_ERROR_DEG = 1.5
 #: Correlation of the yaw rate with another measurement of it that settles its sign.
 SIGN_CORRELATION = 0.5
+#: And that makes a sensor left-handed: the wheels' difference turns round where a car pushes over its front tyres.
+HAND_CORRELATION = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,10 +122,10 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
     found = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
     hands = [1.0] * (len(found) // 2) + [-1.0] * (len(found) // 2)
     # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
-    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and (m.sign > 0.0 or h + m.sign > 0.0)]
+    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
     if not fitting:
         return None
-    best, hand = max(fitting, key=lambda x: x[0].correlation + x[0].sign)
+    best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
     return Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
 
 
@@ -140,7 +142,8 @@ def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatAr
 class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
-    ``sign``: what other measurements say of the yaw rate's; ``along``: the speed alone says which way is forward.
+    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells; ``along``: the speed alone says
+    which way is forward.
     """
 
     rotation: FloatArray
@@ -210,7 +213,9 @@ def _turned(
         mean = np.mean(f[use], axis=0) - rotation.T @ np.array([driven[use].real.mean(), driven[use].imag.mean(), 0.0])
         if np.linalg.norm(mean) > COMPENSATED_M_S2:
             axis = mean / np.linalg.norm(mean)
-    sign, said = _sign_of(w @ axis, references)
+    sign, said = _sign_of(np.where(gentle_at(speed * rate, moving), rate, np.nan), references)
+    if sign == 0.0:
+        sign, said = _sign_of(rate, references)
     evidence = (
         f"speed and yaw rate explain the level accelerations with correlation {correlation:.2f} and gain {gain:.2f}, "
         f"yaw known to {error:.1f} deg{said}"
@@ -227,7 +232,7 @@ def _along(measured: FloatArray, driven: FloatArray) -> bool:
 
 
 def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
-    """Return +1, -1 or 0 for the sign of the yaw rate by the best of other measurements of it, and what that is."""
+    """Return the correlation of the yaw rate with the best of other measurements of it, and what that is; 0: none."""
     best, said = 0.0, ""
     for text, reference in references:
         use = np.isfinite(rate) & np.isfinite(reference)
@@ -238,7 +243,7 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
         correlation = float(np.mean(a * b)) / spread if spread > 0.0 else 0.0
         if abs(correlation) > max(SIGN_CORRELATION, abs(best)):
             best, said = correlation, f", yaw rate against {text} {correlation:.2f}"
-    return float(np.sign(best)), said
+    return best, said
 
 
 def _snapped(turn: _Turn) -> FloatArray:

@@ -94,6 +94,7 @@ class Found:
     factors : units that it may be in, the likeliest first. fixed : unit and sign are documented.
     section : ``signals`` or ``truth`` if its documentation says which.
     known : its unit is sure. anchor : it is mapped already. sign : that it is taken with.
+    is_weak : values do not decide what it is, so that it is never taken.
     """
 
     topic: TopicInfo
@@ -112,6 +113,7 @@ class Found:
     reasons: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     offset: float = 0.0
+    is_weak: bool = False
 
     @property
     def scale(self) -> float:
@@ -148,7 +150,7 @@ class Found:
         score += 0.15 if self.meaning.unit else 0.0
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
         score -= {"device": 0.2, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
-        return min(0.94, max(0.0, score))
+        return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def standing_for(self, speed: FloatArray) -> Found:
         """Return a known speed on the grid [M], m/s, that is made of this field and others like it."""
@@ -205,7 +207,7 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
                 continue
             if info.path in known:
                 found.append((topic, role, info, known[info.path].meaning, True))
-            elif not known or info.path.count("."):
+            elif not known or info.path.count(".") or vendors.is_export(topic.type_name):
                 meaning = meaning_of(topic.name, topic.type_name, info.path)
                 if meaning is not None:
                     found.append((topic, role, info, meaning, False))

@@ -213,7 +213,9 @@ def auto_map(
         RTK-like one; a log with only one of them gets that.
     vendors : documented types; None takes those that are shipped and the user's.
     """
+    vendors = load_vendors() if vendors is None else vendors
     there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
+    there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
     found = _Finding(log=log, samples=_probe(log, topics))
@@ -232,7 +234,6 @@ def auto_map(
     _map_speed(found, topics)
     _map_wheel_speeds(found, topics)
     _map_truth(found, topics, prefer_truth)
-    vendors = load_vendors() if vendors is None else vendors
     _map_documented_truth(found, topics, vendors)
     weighed = _weigh_the_rest(found, topics, vendors)
     _map_navigation(found, topics, vendors)

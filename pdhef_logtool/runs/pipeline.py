@@ -31,7 +31,15 @@ from pdhef_logtool.records.errors import (
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
-from pdhef_logtool.results.opened_run import ESTIMATES_FILE, LOGS, METRICS_FILE, RECORDING_FILE, REPORT_FILE
+from pdhef_logtool.results.opened_run import (
+    ESTIMATES_FILE,
+    LOGS,
+    METRICS_FILE,
+    PAGE_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    open_run,
+)
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
@@ -66,7 +74,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float], None]
 
 #: What a run writes into a log's folder.
-LOG_FILES = ("annotated.mcap", ESTIMATES_FILE, METRICS_FILE, RECORDING_FILE, REPORT_FILE)
+LOG_FILES = ("annotated.mcap", ESTIMATES_FILE, METRICS_FILE, RECORDING_FILE, REPORT_FILE, PAGE_FILE)
 
 _SILENT = "{} has no valid row although the car moves"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
@@ -141,6 +149,7 @@ def run_logs(
     config: RunConfig,
     *,
     junit: Path | None = None,
+    report: bool = True,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> RunResult:
@@ -151,6 +160,7 @@ def run_logs(
     Parameters
     ----------
     arguments : logs, folders, glob patterns. junit : where the verdicts of the thresholds are written as JUnit XML.
+    report : whether the pages of the run are written (:mod:`pdhef_logtool.reports`); those of an earlier run go.
     progress, warn : called with lines for people.
 
     Raises
@@ -194,7 +204,19 @@ def run_logs(
             results.append(judge(result, thresholds))
         write_run(output, config.to_dict(), results, [car for car in had if isinstance(car, Car)])
         write_verdicts(junit, results)
+        _write_pages(output, report, lambda text: progress(text, 1.0), warn)
     return RunResult(output, tuple(results))
+
+
+def _write_pages(output: Path, report: bool, tell: Callable[[str], None], warn: Callable[[str], None]) -> None:
+    from pdhef_logtool.reports.pages import remove_pages, write_pages
+
+    run = open_run(output)
+    if not report:
+        return remove_pages(run)
+    for line in write_pages(run, lambda text, _: tell(text)).wrong:
+        warn(line)
+    return None
 
 
 def _car_of(cars: RunCars, log_input: LogInput, *, alone: bool) -> Car | Exception:
@@ -532,6 +554,7 @@ def report_facts(
         vehicle_sha256=car.physics_sha256,
         vehicle_file=car.file_name,
         vehicle_proven=car.has_evidence,
+        low_speed_m_s=car.vehicle.low_speed_blend_m_s,
         estimators=list(estimators),
         truth=TruthFacts(
             quantities=[

@@ -146,7 +146,8 @@ class ReportFacts:
     """Everything that report.json says about one log.
 
     ``vehicle_file``: the car's folder or file, None where none was given; ``vehicle_proven``: whether driving with
-    truth showed it to be right. ``main``: the estimator that is the answer, None where nothing was estimated.
+    truth showed it to be right. ``low_speed_m_s``: below it sideslip is not scored.
+    ``main``: the estimator that is the answer, None where nothing was estimated.
     ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
     ``calibration``: what the drive said of its car without truth, None where it was not asked.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
@@ -162,6 +163,7 @@ class ReportFacts:
     truth: TruthFacts
     vehicle_file: str | None = None
     vehicle_proven: bool = False
+    low_speed_m_s: float | None = None
     friction: FrictionFacts | None = None
     calibration: Mapping[str, Any] | None = None
     metrics: Sequence[MetricRow] = ()
@@ -242,6 +244,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "sha256": facts.vehicle_sha256,
             "file": facts.vehicle_file,
             "proven": facts.vehicle_proven,
+            "low_speed_blend_m_s": facts.low_speed_m_s,
         },
         "estimators": [
             {
