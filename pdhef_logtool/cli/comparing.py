@@ -60,7 +60,11 @@ def compare(
     found = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
     if junit is not None:
         write_comparison_junit(junit, found)
-    del html
+    if html is not None:
+        from pdhef_logtool.records.files import write_bytes
+        from pdhef_logtool.reports.comparison import comparison_page
+
+        write_bytes(html, comparison_page(found))
     console.finish(found, render_comparison, as_json)
 
 

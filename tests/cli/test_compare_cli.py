@@ -43,7 +43,7 @@ def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[st
     assert re.search(r"drive_9 +0\.573 +0\.6818 +\+19\.0 %", text)
     assert "0.573 °" in text  # the largest difference of the tracks
     assert "Verdict: B is worse" in text
-    assert "gate closed: sideslip_rad rmse (all) of main: worse" in text
+    assert "gate closed: sideslip_rad rmse (all): worse" in text
 
 
 def test_the_same_run_is_equal(runs: tuple[str, str]) -> None:

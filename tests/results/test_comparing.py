@@ -73,7 +73,7 @@ def test_a_removed_drive_closes_the_gate_unless_it_is_allowed(tmp_path: Path) ->
 def test_a_figure_that_vanished_closes_the_gate_too(tmp_path: Path) -> None:
     a, b = write_run(tmp_path / "a", TEN), write_run(tmp_path / "b", {**TEN, "d3": float("nan")})
     found = _compare(a, b, GATE)
-    assert found.failures == ("figures in A only: sideslip_rad rmse (all) of main: d3",)
+    assert found.failures == ("figures in A only: sideslip_rad rmse (all): d3",)
     assert found.exit_code == 4
     assert _compare(a, b).exit_code == 3
 
@@ -121,7 +121,7 @@ def test_each_figure_of_a_gate_has_its_limit_and_floor(tmp_path: Path) -> None:
     ]
     found = _compare(a, b, gate_from_dict({"figure": figures}, where="gate.toml"))
     assert [f.verdict for f in found.figures] == ["not worse", "worse", "no figure", "not worse"]
-    assert found.failures == ("vy_m_s rmse (all) of main: worse", "sideslip_rad max_abs (all) of main: no figure")
+    assert found.failures == ("vy_m_s rmse (all): worse", "sideslip_rad max_abs (all): no figure")
     assert "lateral_1s_m" not in {f.figure.signal for f in found.others}  # there is no such figure
 
 
