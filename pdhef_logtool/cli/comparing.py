@@ -32,6 +32,7 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
 def compare(
     a: Annotated[Path, Argument(metavar="A", help="Outputs of the run that is the yardstick.")],
     b: Annotated[Path, Argument(metavar="B", help="Outputs of the run that is held against it.")],
+    *,
     gate: Annotated[Path | None, Option(metavar="FILE", help="gate.toml: figures with their limits.")] = None,
     max_regression: Annotated[
         str | None, Option(metavar="SHARE", help="Gate of one figure: how much worse it may be, 5% or 0.05.")
@@ -53,9 +54,11 @@ def compare(
 ) -> None:
     """Say whether run B is better or worse than run A. Drives are paired; nobody can tell is an answer."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
+    from pdhef_logtool.records.outputs import check_no_input
     from pdhef_logtool.results.comparing import compare_runs
     from pdhef_logtool.results.opened_run import open_run
 
+    check_no_input([a, b, gate], [file for file in (html, junit) if file is not None])
     asked = _gate(gate, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
     found = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
     if junit is not None:
@@ -105,6 +108,7 @@ def _gate(
 )
 def events(
     output: Annotated[Path, Argument(metavar="OUTPUT", help="Folder of a run.")],
+    *,
     where: Annotated[str, Option(metavar="EXPR", help="What is to hold; docs/compare.md.")],
     pad: Annotated[
         str | None,
@@ -122,6 +126,7 @@ def events(
 ) -> None:
     """Find where in the drives of a run something holds. Each event can be cut out as a clip."""
     from pdhef_logtool.cli.event_tables import render_events
+    from pdhef_logtool.records.outputs import check_no_input
     from pdhef_logtool.results.events import find_events, write_events
     from pdhef_logtool.results.expression import parse_condition
     from pdhef_logtool.results.opened_run import open_run
@@ -130,6 +135,7 @@ def events(
     pad_s = (_CLIP_PAD_S if clip else _PAD_S) if pad is None else _seconds(pad)
     if source is not None and not clip:
         raise UsageError(expected="--clip", got="--source alone", where="--source")
+    check_no_input([output], [] if parquet is None else [parquet])
     run = open_run(output)
     found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
     if clip:
