@@ -7,13 +7,13 @@ from itertools import permutations, product
 
 import numpy as np
 
-from pdhef_logtool.drive.relations import G
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import FloatArray
 
 #: Mean accelerations between these are gravity.
-GRAVITY_M_S2 = (0.75 * G, 1.25 * G)
+IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
 #: A rotation found from a drive is as good as this, grade and crossfall, sideslip and bias in it.
 APART_DEG = 12.0
 #: Gravity of a drive is along the car's vertical but for so much.
@@ -93,7 +93,7 @@ def _named(placed: Placement) -> str:
 def _tilt_deg(placed: Placement, force: FloatArray) -> float | None:
     """Return the angle from the vertical of frames to gravity; None where the sensor takes gravity off."""
     size = float(np.linalg.norm(force))
-    if not GRAVITY_M_S2[0] < size < GRAVITY_M_S2[1]:
+    if not IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1]:
         return None
     return math.degrees(math.acos(float(np.clip(placed.rotation[2] @ force / size, -1.0, 1.0))))
 

@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import check_drive, drive_columns, explained_factors
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.checks import check_drive, explained_factors
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
-    GRAVITY_M_S2,
+    IS_GRAVITY_M_S2,
     frames_alone,
     frames_check,
     gravity_agrees,
@@ -26,7 +27,8 @@ from pdhef_logtool.drive.frames import (
     placed_rotation,
     rotation_text,
 )
-from pdhef_logtool.drive.relations import steering_references, yaw_references
+from pdhef_logtool.drive.measured import Measured, measure
+from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -43,7 +45,7 @@ from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSou
 from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check, Verdict
-from pdhef_logtool.records.signals import Channel, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
 #: Mean accelerations below are no gravity: the sensor's software took it off.
 COMPENSATED_M_S2 = 3.0
@@ -65,6 +67,8 @@ ASKEW_CORRELATION = 0.85
 ASKEW_ERROR_DEG = 1.5
 #: Correlation of the yaw rate with another measurement of it that settles its sign.
 SIGN_CORRELATION = 0.5
+#: And that makes a sensor left-handed: the wheels' difference turns round where a car pushes over its front tyres.
+HAND_CORRELATION = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,24 +102,14 @@ class Mounting:
         return f"{rotation_text(self.rotation)}{mirrored}"
 
 
-def find_mounting(
-    signals: Mapped[str, Channel],
-    truth: Mapped[str, Channel],
-    derived: TruthTrack | None,
-    triads: tuple[Triad | None, Triad | None],
-    mapping: Mapping,
-) -> Mounting | None:
+def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
     """Find the rotation of an IMU from its six components; None where there are none, or the drive says nothing.
 
-    Parameters
-    ----------
-    signals : as mapped, with the components of the triads beside them. derived : truth, for the sign of the yaw rate.
+    ``measured``: with the components of the triads beside the signals, and truth for the sign of the yaw rate.
     """
     accelerations, rates = triads
-    if accelerations is None or rates is None:
-        return None
-    columns, speed_name = drive_columns(signals, truth, derived)
-    if not all(n in columns for n in (*ACCELERATIONS, *RATES)):
+    columns, speed_name = measured.columns, measured.speed_name
+    if accelerations is None or rates is None or not all(n in columns for n in (*ACCELERATIONS, *RATES)):
         return None
     f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
     w = np.stack([columns[n] for n in RATES], axis=1)
@@ -128,10 +122,10 @@ def find_mounting(
     found = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
     hands = [1.0] * (len(found) // 2) + [-1.0] * (len(found) // 2)
     # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
-    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and (m.sign > 0.0 or h + m.sign > 0.0)]
+    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
     if not fitting:
         return None
-    best, hand = max(fitting, key=lambda x: x[0].correlation + x[0].sign)
+    best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
     return Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
 
 
@@ -148,7 +142,8 @@ def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatAr
 class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
-    ``sign``: what other measurements say of the yaw rate's; ``along``: the speed alone says which way is forward.
+    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells; ``along``: the speed alone says
+    which way is forward.
     """
 
     rotation: FloatArray
@@ -165,7 +160,7 @@ def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
     """Return the directions [3] that may be up: gravity's, or any axis where the sensor takes gravity off."""
     mean = np.nanmean(f, axis=0) if np.isfinite(f).all(axis=1).any() else np.zeros(3)
     size = float(np.linalg.norm(mean))
-    if GRAVITY_M_S2[0] < size < GRAVITY_M_S2[1]:
+    if IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1]:
         return [mean / size]
     if size > COMPENSATED_M_S2:
         return []
@@ -218,7 +213,9 @@ def _turned(
         mean = np.mean(f[use], axis=0) - rotation.T @ np.array([driven[use].real.mean(), driven[use].imag.mean(), 0.0])
         if np.linalg.norm(mean) > COMPENSATED_M_S2:
             axis = mean / np.linalg.norm(mean)
-    sign, said = _sign_of(w @ axis, references)
+    sign, said = _sign_of(np.where(gentle_at(speed * rate, moving), rate, np.nan), references)
+    if sign == 0.0:
+        sign, said = _sign_of(rate, references)
     evidence = (
         f"speed and yaw rate explain the level accelerations with correlation {correlation:.2f} and gain {gain:.2f}, "
         f"yaw known to {error:.1f} deg{said}"
@@ -235,7 +232,7 @@ def _along(measured: FloatArray, driven: FloatArray) -> bool:
 
 
 def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
-    """Return +1, -1 or 0 for the sign of the yaw rate by the best of other measurements of it, and what that is."""
+    """Return the correlation of the yaw rate with the best of other measurements of it, and what that is; 0: none."""
     best, said = 0.0, ""
     for text, reference in references:
         use = np.isfinite(rate) & np.isfinite(reference)
@@ -246,7 +243,7 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
         correlation = float(np.mean(a * b)) / spread if spread > 0.0 else 0.0
         if abs(correlation) > max(SIGN_CORRELATION, abs(best)):
             best, said = correlation, f", yaw rate against {text} {correlation:.2f}"
-    return float(np.sign(best)), said
+    return best, said
 
 
 def _snapped(turn: _Turn) -> FloatArray:
@@ -281,12 +278,17 @@ def _level_only(rest: FloatArray) -> FloatArray:
 # ------------------------------------------------------------------------------------- into the mapping
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Survey:
-    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain."""
+    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
+
+    ``vehicle``: whose file is held against the drive; the default car stands for none.
+    """
 
     mapping: Mapping
     channels: MappedChannels
+    measured: Measured
+    vehicle: VehicleParameters
     truth: TruthTrack | None
     truth_plan: TruthPlan | None
     latency: LatencyEstimate | None
@@ -296,7 +298,7 @@ class Survey:
     framed: Check | None = None
 
     @property
-    def checks(self) -> tuple[Check, ...]:
+    def mounted(self) -> tuple[Check, ...]:
         """Whether each of the IMU's signals is read from the axis that the drive says, and what frames say of it."""
         framed = () if self.framed is None else (self.framed,)
         if self.mounting is None:
@@ -308,16 +310,18 @@ class Survey:
         """Whether the IMU is known to be read from the right axes."""
         return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
 
-    def all_checks(self, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
-        """Return the checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
+    @cached_property
+    def checks(self) -> tuple[Check, ...]:
+        """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
         channels = self.channels
         found = check_drive(
             channels.signals,
             channels.truth,
             self.truth,
-            vehicle,
+            self.vehicle,
             latency=self.latency,
             mounting_is_known=self.is_mounted,
+            measured=self.measured,
         )
         if self.mounting is not None and self.is_mounted:
             # Right axes have right signs, and gravity says the unit.
@@ -327,7 +331,7 @@ class Survey:
             found = tuple(
                 k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)
             )
-        return (*self.checks, *self._of_names(found), *found)
+        return (*self.mounted, *self._of_names(found), *found)
 
     def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""
@@ -348,7 +352,7 @@ def survey_log(
     mapping: Mapping,
     clocks: dict[str, ClockModel],
     span_ns: tuple[int, int],
-    truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    vehicle: VehicleParameters | None = None,
     *,
     rescale: bool = True,
 ) -> Survey:
@@ -358,23 +362,27 @@ def survey_log(
 
     Parameters
     ----------
+    vehicle : of the drive; None: nothing is known of it.
     rescale : whether a wrong unit or sign is looked for.
     """
+    vehicle = vehicle or default_vehicle()
     triads = find_triads(log, mapping)
     extra: dict[str, SignalSource] = {}
     for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
         extra |= {} if triad is None else triad.components(names)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan = plan_truth(channels.truth, truth_position_m=truth_position_m) if channels.truth else None
+    truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
+    measured = measure(channels.signals, channels.truth, truth)
     # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
-    found = find_mounting(channels.signals, {}, None, triads, mapping)
+    found = find_mounting(measured.without_truth(), triads, mapping)
     blind = found is not None and found.confident
     if not blind and truth is not None:
-        found = find_mounting(channels.signals, channels.truth, truth, triads, mapping)
+        found = find_mounting(measured, triads, mapping)
     placed, framed, by_frames = _by_frames(log, mapping, channels, triads, found)
     found = by_frames or found
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
+    measured = measured.without(extra)
     trusted = blind or by_frames is not None
     if found is not None and mapping.origin == "auto" and trusted and not found.is_as_named:
         note = f"{found.text}, and is read so: {found.evidence}"
@@ -382,13 +390,14 @@ def survey_log(
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         found = replace(found, named=found.rows)
+        measured = measure(channels.signals, channels.truth, truth)
     latency = truth_latency(channels, truth)
-    survey = Survey(mapping, channels, truth, truth_plan, latency, triads, found, placed, framed)
+    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found, placed, framed)
     if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
-        undone = survey_log(log, scaled, clocks, span_ns, truth_position_m, rescale=False)
+        undone = survey_log(log, scaled, clocks, span_ns, vehicle, rescale=False)
         # A sensor that fails looks like a wrong unit of another; what is right contradicts nothing any more.
-        failed = [check.name for check in undone.all_checks() if check.verdict == "failed"]
-        if not any(name.endswith((".sign", ".unit", ".axis")) for name in failed):
+        failed = [check.name for check in undone.checks if check.verdict == "failed"]
+        if not any(name.endswith((".sign", ".unit", ".axis", ".fault")) for name in failed):
             return undone
     return survey
 
@@ -429,8 +438,12 @@ def _rescaled(survey: Survey) -> Mapping:
     The truth takes no part in it, and is itself only checked: what is scored against is not bent.
     """
     mapping = survey.mapping
-    alone = replace(survey.channels, truth={})
-    found = explained_factors(alone, None, known_mounting=survey.is_mounted, most=1)
+    alone = survey.measured.without_truth()
+    found = explained_factors(alone, mounting_is_known=survey.is_mounted, most=1)
+    if found:
+        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
+        if shares:
+            found = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
     for name, (factor, evidence) in found.items():
         if name not in mapping.signals:
             continue

@@ -18,12 +18,12 @@ from pdhef_logtool.drive.checks import (
     LEVER_M,
     SURE,
     SensorErrors,
-    drive_columns,
     explained_factors,
     is_turned,
     sensor_errors,
     sideslip_offset,
 )
+from pdhef_logtool.drive.measured import drive_columns
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
 from pdhef_logtool.drive.truth import LATE_GYRO_S, LatencyEstimate, TruthTrack
 from pdhef_logtool.mapping.frames import Placement
@@ -89,9 +89,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
             if source != signals[name]:
                 signals[name] = source
                 found.append(Proposal("mapping", name, f"{mounting.text}: {mounting.evidence}", source))
-    factors = (
-        {} if is_turned_imu else explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted)
-    )
+    factors = {} if is_turned_imu else explained_factors(survey.measured, mounting_is_known=survey.is_mounted)
     for subject, (factor, evidence) in factors.items():
         section = truth if subject.startswith("truth.") else signals
         name = subject.removeprefix("truth.")
@@ -110,8 +108,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
 
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     """Return the sources of a truth whose sideslip is off by a constant, as far as a mapping can turn them back."""
-    columns, _ = drive_columns(survey.channels.signals, survey.channels.truth, survey.truth)
-    found = sideslip_offset(columns)
+    found = sideslip_offset(survey.measured.columns)
     if found is None or survey.truth is None or not is_turned(*found):
         return []
     offset, error = found

@@ -74,6 +74,7 @@ class ColumnarLog:
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
+        self._wanted: set[tuple[int, int]] = set()  # and of these the ones whose messages somebody wanted
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -149,7 +150,7 @@ class ColumnarLog:
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
         for (of, channel, _), rows in self._undecodable.items():
-            if of == c and (of, channel) in self._asked:
+            if of == c and (of, channel) in self._wanted:
                 counts[channel] += len(rows)
         for channel, n in sorted(counts.items()):
             what = f"{n} messages do not fit the type of their topic"
@@ -223,8 +224,10 @@ class ColumnarLog:
         """
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         if not quiet:
-            self._asked |= {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
-        return self._collect(plans, start_ns, end_ns, quiet=quiet)
+            wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
+            self._asked |= wanted
+            self._wanted |= wanted
+        return self._collect(plans, start_ns, end_ns)
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
         """Read only log and publish times of every topic."""
@@ -395,15 +398,13 @@ class ColumnarLog:
             remedy=f"nearest: {', '.join(near)}" if near else "the log has no topics",
         )
 
-    def _collect(
-        self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None, *, quiet: bool = False
-    ) -> dict[str, Columns]:
+    def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         for c, container in enumerate(self.containers):
             with container.meter.running():
                 for span in container.spans:
                     if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
-                        self._collect_span(plans, c, span, (start_ns, end_ns), parts, quiet=quiet)
+                        self._collect_span(plans, c, span, (start_ns, end_ns), parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
 
     def _collect_span(
@@ -413,8 +414,6 @@ class ColumnarLog:
         span: Span,
         window_ns: tuple[int | None, int | None],
         parts: Mapping[str, list[Columns]],
-        *,
-        quiet: bool,
     ) -> None:
         """Add what a span holds of the topics asked for."""
         channels = self.containers[c].channels
@@ -432,12 +431,12 @@ class ColumnarLog:
                 rows = rows if unused is None else rows[~unused]
             rows = rows if keep is None else rows[keep[rows]]
             if topic in plans and rows.size:
-                columns = self._decode(topic, plans[topic], c, span, id_, block, rows, quiet=quiet)
+                columns = self._decode(topic, plans[topic], c, span, id_, block, rows)
                 if columns is not None:
                     parts[topic].append(columns)
 
     def _decode(
-        self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray, *, quiet: bool
+        self, topic: str, plan: _Plan, c: int, span: Span, id_: int, block: Block, rows: IntArray
     ) -> Columns | None:
         """Decode some messages of a channel. The boundary: whatever escapes a decoder is the loss of these messages."""
         decoder = plan.decoders.get((c, id_))
@@ -452,7 +451,7 @@ class ColumnarLog:
             what = f"{len(rows)} messages cannot be decoded: {text}"
             self._partial[c, span.index, id_] = Loss(kind, what, topic, span.start_ns, span.end_ns, len(rows))
             return None
-        if decoder is not None and decoder.undecodable and not quiet:
+        if decoder is not None and decoder.undecodable:
             key = (c, id_, span.index)
             seen = self._undecodable.get(key, np.empty(0, dtype=np.int64))
             # Count by place in the channel: which other channels a block holds depends on what was asked for.

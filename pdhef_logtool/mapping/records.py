@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.documents import jsonable
 
 #: Number of columns of the truth channels that are vectors; all other signals are scalars.
 VECTOR_COLUMNS: dict[str, int] = {
@@ -186,6 +189,12 @@ class Mapping:
     estimates: dict[str, dict[str, SignalSource]] = field(default_factory=dict)
     fill_recognised: bool = False
     checks: tuple[Check, ...] = ()
+
+    @property
+    def sha256(self) -> str:
+        """Hash of what is read and how: sources, scales, stamps, latencies, limits and the truth's gate."""
+        said = jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality})
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, truth, the gate."""

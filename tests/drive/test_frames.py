@@ -117,7 +117,7 @@ def test_frames_alone_turn_an_imu_where_gravity_agrees_and_this_is_said(drives) 
     assert "the recorded frames say so" in survey.mapping.notes[-1]
     file = surveyed(FramedLog(drives["fishhook"], turn, turn), 2.0, origin="file")
     assert file.mapping.signals["ay_m_s2"].field == "linear_acceleration.y"
-    assert {c.verdict for c in file.checks} == {"undecided"}
+    assert {c.verdict for c in file.mounted} == {"undecided"}
 
 
 def test_frames_that_contradict_gravity_are_not_taken(drives) -> None:
