@@ -94,11 +94,11 @@ def weigh(
     fields = Fields(pieces, anchors, [f for f in found if not f.anchor], places)
     decide_units(fields)
     nameless = nameless_columns(log, topics, pieces) if without_names else []
-    meant, note = identified(fields, nameless) if nameless else ([], "")
+    meant, named, evidence = identified(fields, nameless) if nameless else ([], "", "")
     fields.found += meant
     at_work = _Weighing(fields, "" if truth else truth_topic(fields.found))
-    if note:
-        at_work.say_nameless(note)
+    if named:
+        at_work.say_nameless(named, evidence)
     at_work.choose_signals(set(signals))
     if not truth:
         at_work.choose_truth()
@@ -167,11 +167,12 @@ class _Weighing:
         for name, one in self.taken.items():
             self._tell(name, one)
 
-    def say_nameless(self, note: str) -> None:
-        """Say that values alone told what fields are."""
-        self.notes.append(note)
+    def say_nameless(self, topic: str, evidence: str) -> None:
+        """Say that values alone told what the fields of a topic are."""
+        self.notes.append(f"values alone tell what {topic} holds: left and right may be exchanged in all of it")
+        evidence = f"the names of {topic} say nothing; {evidence}; nothing tells left from right"
         remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
-        self.checks.append(Check("mapping.names", "mapping", "undecided", note, remedy))
+        self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
 
     def _take(self, name: str, candidates: Sequence[Found]) -> None:
         if name == "speed_m_s":
