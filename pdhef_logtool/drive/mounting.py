@@ -18,6 +18,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive, explained_factors
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
@@ -139,7 +140,8 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
 class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
-    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells; ``along``: the speed alone says which way is forward.
+    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells. ``along``: the speed alone says
+    which way is forward.
     """
 
     rotation: FloatArray
@@ -324,6 +326,7 @@ class Survey:
             self.truth,
             self.vehicle,
             latency=self.latency,
+            late=self.late,
             mounting_is_known=self.is_mounted,
             measured=self.measured,
         )
@@ -336,6 +339,15 @@ class Survey:
                 k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)
             )
         return (*self.mounted, *self._of_names(found), *found)
+
+    @cached_property
+    def late(self) -> tuple[LateSensor, ...]:
+        """The sensors whose stamps are late by what the signals alone say; a sensor that fails for a while is none."""
+        found = late_sensors(self.channels.signals)
+        if not found:
+            return ()
+        sound, shares = without_faulty_samples(self.channels.signals, self.vehicle)
+        return late_sensors(sound) if shares else found
 
     def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""
