@@ -163,6 +163,8 @@ class Car:
         bundle = None if home is None else load_bundle(home)
         found = _intervals_of(folder, name, intervals)
         car = replace(car, network=bundle, network_name=name, network_folder=home, intervals=found)
+        if str(intervals) == NO_INTERVALS and car.fitted_physics is not None:
+            car = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"varied": ()}))
         stale = list(car.notes)
         if other := car._other_than_tried:
             stale.append(f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef trust makes it anew")
@@ -187,6 +189,12 @@ class Car:
         """The vehicle as ``physics`` has it: with the values that were found through it, else every filter's."""
         found = self.fitted_physics
         return self.vehicle if found is None else found.values.applied_to(self.own)
+
+    @property
+    def varied_physics(self) -> tuple[VehicleParameters, ...]:
+        """That vehicle one posterior 1-sigma away in each direction that was kept; none without a posterior."""
+        varied = () if self.fitted_physics is None else self.fitted_physics.varied
+        return tuple(values.applied_to(self.physics_vehicle) for values in varied)
 
     def physics_of(self, name: str) -> str:
         """Return the digest of the physics that the filter of a name runs with, and that its noise belongs to."""
@@ -285,7 +293,8 @@ class Car:
         other = {k: v for k, v in vehicle if v != getattr(self.vehicle, k)}
         if physics is not None:
             told = {k: None for k in FittedValues.model_fields if k in other}
-            physics = physics.model_copy(update={"values": physics.values.model_copy(update=told)})
+            values, *varied = (v.model_copy(update=told) for v in (physics.values, *physics.varied))
+            physics = physics.model_copy(update={"values": values, "varied": tuple(varied)})
         if trust is not None and trust.physics_sha256 == self.tried_with[0]:
             trust = trust.model_copy(update={"physics_sha256": None})
         own = self.own.model_copy(update=other)

@@ -175,10 +175,15 @@ class TriedParts(Record):
 
 
 class FittedPhysics(Record):
-    """What ``physics`` has of its own: values and noise that were found through it, and why it has its parts."""
+    """What ``physics`` has of its own: values and noise that were found through it, and why it has its parts.
+
+    ``varied``: what of the values is another one posterior 1-sigma away, by direction. The directions are independent,
+    and those that move the sideslip of the drives most: what the drives leave open of the values.
+    """
 
     values: FittedValues
     noise: FilterNoise
+    varied: Annotated[tuple[FittedValues, ...], Field(strict=False)] = ()
     tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 
 

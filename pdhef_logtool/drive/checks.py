@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, Sensors, VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.columns import derivative, earlier, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, delay_checks
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured, measure
@@ -34,6 +34,8 @@ from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray
 #: (0.3 m/s^2), a production sensor's bias less than that; 0.8 m/s^2 is a tilt of 4.7 degrees, half of g another axis.
 LEVEL_M_S2 = 0.8
 OTHER_AXIS_M_S2 = 5.0
+#: Independent samples of gentle driving from which on a mean is a tilt or a bias, and no manoeuvre: 10 s.
+LEVEL_SAMPLES = 20.0
 #: Truth stands wrong by more than what tyres and crossfall make of straight driving, and is known to a third of it.
 SIDESLIP_OFFSET_RAD = math.radians(0.15)
 #: No car drives sideways: half of its moving time beyond that, the heading and the velocity do not belong together.
@@ -44,6 +46,8 @@ LEVER_M = 0.5
 GAIN_ERROR = 0.05
 #: What an accelerometer reads of the lateral acceleration: roll adds a tenth, banked bends take a quarter.
 AY_GAIN_RANGE = (0.65, 1.3)
+#: The delay of a_y is found in so many steps, and is none beyond.
+DELAY_STEPS, MOST_DELAY_S = 4, 0.5
 #: A sensor's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
 SENSOR_DELAY_S = 0.03
 #: Understeer gradients that have opposite signs and are this far from neutral; rad per m/s^2. Cars have 0.002 to 0.006.
@@ -184,10 +188,10 @@ def _by_relations(measured: Measured, *, mounting_is_known: bool) -> list[Check]
         stray = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
         if stray:
             checks.append(_stray(name, stray[0]))
-        if name in blamed:
-            checks += _blamed(name, blamed[name], bad or telling)
-        elif name in suspected:
-            checks += [replace(c, verdict="undecided") for c in _blamed(name, suspected[name], bad or telling)]
+        if name in blamed or name in suspected:
+            found = _blamed(name, blamed.get(name) or suspected[name], bad or telling)
+            is_sure = name in blamed and not (bad and all(r.is_vague for r in bad))
+            checks += found if is_sure else [replace(c, verdict="undecided") for c in found]
         elif name in culprits:
             checks.append(_unexplained(name, bad))
         elif good or (bad and explanations):
@@ -311,7 +315,7 @@ def _levels(
             rest, known = columns[name], np.isfinite(columns[name])
         if independent_samples(int(np.count_nonzero(known))) < 2.0:
             continue
-        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= 6.0
+        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= LEVEL_SAMPLES
         use = known & at_ease if told else known
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
         check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
@@ -450,7 +454,7 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     """Regress a_y and the gyro on the truth; NaN for what the drive does not tell.
 
     a_y is the truth's v̇_y + v_x r, as far as roll makes it larger; a lever adds the derivative of the yaw rate, a delay
-    takes the derivative of a_y off, a bias adds a constant.
+    takes the derivative of all that off, a bias adds a constant.
     """
     nothing = (math.nan, math.inf)
     lever = gain = ay_gain = delay = nothing
@@ -464,10 +468,14 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
         regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate)]
-        found = fit(ay, regressors, moving_at(vx))
-        if found is not None and found[0][1] > 0.0:
-            (place, scale, late, _), (place_error, scale_error, late_error, _), _ = found
-            lever, ay_gain, delay = (place, place_error), (scale, scale_error), (-late / scale, late_error / scale)
+        late_s = 0.0
+        for _ in range(DELAY_STEPS):  # a lever's part is late too, so that one step is not all of it
+            found = fit(earlier(ay, late_s), regressors, moving_at(vx))
+            if found is None or found[0][1] <= 0.0 or abs(late_s) > MOST_DELAY_S:
+                break
+            (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = found
+            late_s -= slope / scale
+            lever, ay_gain, delay = (place, place_error), (scale, scale_error), (late_s, slope_error / scale)
     return SensorErrors(*(float(x) for x in (*lever, *gain, *ay_gain, *delay)))
 
 
@@ -514,7 +522,10 @@ def ay_delay(errors: SensorErrors, latency: LatencyEstimate | None) -> tuple[flo
 
     A truth whose yaw rate is the gyro's own may have velocities of another time, and says nothing of a_y.
     """
-    if latency is None or not latency.reliable or latency.identical or not math.isfinite(errors.ay_delay_s):
+    low, high = AY_GAIN_RANGE
+    if latency is None or not latency.reliable or latency.identical:
+        return None
+    if not low < errors.ay_gain < high or abs(errors.ay_delay_s) > MOST_DELAY_S:
         return None
     return errors.ay_delay_s + latency.latency_s, math.hypot(errors.ay_delay_error_s, latency.std_error_s)
 
@@ -597,7 +608,7 @@ def _steering_checks(steer: FloatArray, rate: FloatArray, speed: FloatArray, veh
         lacks = "needs bends to both sides at low and at high speed"
         return [Check(n, "vehicle", "undecided", "too little driving in bends", lacks) for n in names]
     (share, gradient, _), (share_error, error, _), left = found
-    if left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
+    if share <= 0.0 or left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
         lacks = "needs bends that the car does not slide through"
         evidence = "curvature and lateral acceleration do not explain the steering"
         return [Check(n, "vehicle", "undecided", evidence, lacks) for n in names]

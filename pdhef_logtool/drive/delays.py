@@ -25,6 +25,8 @@ SPEED_AFTER_A_X_S = (-0.2, 0.12)
 YAW_RATE_AFTER_STEERING_S = (-0.02, 0.45)
 #: A shift must be known to this, and be beyond the range by so many of its standard errors.
 KNOWN_TO_S, SURE = 0.015, 4.0
+#: Where the car slides, wheels and gyro go apart; what goes together less than this tells no delay. Of exact ones more.
+LEAST_CORRELATION = (0.9, 0.95)
 #: Both sides are averaged over as long, which shifts neither; no derivative spans more.
 SMOOTH_S = 0.1
 DERIVATIVE_S = 0.15
@@ -52,7 +54,9 @@ def late_sensors(signals: Mapping[str, Channel]) -> tuple[LateSensor, ...]:
         one, other = _averaged(first), _averaged(second)
         shift = estimate_truth_latency(one, other, max_error_s=KNOWN_TO_S)
         margin = SURE * shift.std_error_s
-        if not shift.reliable or low - margin <= shift.latency_s <= high + margin:
+        if not shift.reliable or shift.correlation < LEAST_CORRELATION[exact]:
+            continue
+        if low - margin <= shift.latency_s <= high + margin:
             continue
         # A sine goes with itself a period later as well.
         if has_peak_within(on_common_grid(one.stamps_ns, one.values, other.stamps_ns, other.values), low, high):

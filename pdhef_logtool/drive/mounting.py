@@ -11,15 +11,23 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import permutations, product
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive, explained_factors
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
 from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
+from pdhef_logtool.drive.frames import (
+    IS_GRAVITY_M_S2,
+    frames_alone,
+    frames_check,
+    gravity_agrees,
+    nearest_step,
+    placed_rotation,
+    rotation_text,
+)
 from pdhef_logtool.drive.measured import Measured, measure
 from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
@@ -35,12 +43,12 @@ from pdhef_logtool.drive.truth import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check, Verdict
 from pdhef_logtool.records.signals import FloatArray
 
-#: Mean accelerations between these are gravity; below the least, the sensor's software took it off.
-IS_GRAVITY_M_S2 = (0.75 * GRAVITY_M_S2, 1.25 * GRAVITY_M_S2)
+#: Mean accelerations below are no gravity: the sensor's software took it off.
 COMPENSATED_M_S2 = 3.0
 #: How far speed and yaw rate explain the level accelerations once the axes are right; the rest is sideslip, roll,
 #: grade, crossfall and noise. Below, nothing is said.
@@ -89,21 +97,10 @@ class Mounting:
         return all(np.allclose(r, n, atol=1e-3) for r, n in zip(self.rows, self.named, strict=True) if n.any())
 
     @property
-    def degrees(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw of the sensor in the car: it is turned by yaw first, then pitch, then roll."""
-        m = self.rotation
-        pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
-        if abs(m[2, 0]) > 1.0 - 1e-6:  # straight up or down: roll and yaw are one angle
-            return 0.0, math.degrees(pitch), math.degrees(math.atan2(-m[0, 1], m[1, 1]))
-        roll, yaw = math.atan2(m[2, 1], m[2, 2]), math.atan2(m[1, 0], m[0, 0])
-        return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
-
-    @property
     def text(self) -> str:
         """The rotation in words."""
-        roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in self.degrees)
         mirrored = "" if self.hand > 0.0 else ", its angular rates with the opposite sign"
-        return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg{mirrored}"
+        return f"{rotation_text(self.rotation)}{mirrored}"
 
 
 def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
@@ -117,10 +114,7 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
         return None
     f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
     w = np.stack([columns[n] for n in RATES], axis=1)
-    named = np.zeros((3, 3))
-    for i, name in enumerate(MOUNTED):
-        if name in mapping.signals:
-            named[i] = (rates if i == 2 else accelerations).row(mapping.signals[name])
+    named = _named_rows(mapping, accelerations, rates)
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
@@ -134,6 +128,15 @@ def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None],
         return None
     best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
     return Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+
+
+def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatArray:
+    """Return the rows [3, 3] of the sensor's axes that a mapping reads, 0 where it lacks one."""
+    named = np.zeros((3, 3))
+    for i, name in enumerate(MOUNTED):
+        if name in mapping.signals:
+            named[i] = (rates if i == 2 else accelerations).row(mapping.signals[name])
+    return named
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -247,7 +250,7 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
 def _snapped(turn: _Turn) -> FloatArray:
     """Return the multiple of 90 degrees beside a rotation, with what of the rest is no grade, crossfall or sideslip."""
     rotation = turn.rotation
-    step = max(_right_angles(), key=lambda p: float(np.sum(p * rotation)))
+    step = nearest_step(rotation)
     rest = rotation @ step.T
     tilt = math.degrees(math.acos(float(np.clip(rest[2, 2], -1.0, 1.0))))
     yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
@@ -273,19 +276,6 @@ def _level_only(rest: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + sine * cross + (1.0 - cosine) * cross @ cross)
 
 
-def _right_angles() -> list[FloatArray]:
-    """Return the 24 rotations by multiples of 90 degrees."""
-    found = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            for row, (column, sign) in enumerate(zip(order, signs, strict=True)):
-                matrix[row, column] = sign
-            if np.linalg.det(matrix) > 0.0:
-                found.append(matrix)
-    return found
-
-
 # ------------------------------------------------------------------------------------- into the mapping
 
 
@@ -305,11 +295,16 @@ class Survey:
     latency: LatencyEstimate | None
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
+    placed: Placement | None = None
+    framed: Check | None = None
 
     @property
     def mounted(self) -> tuple[Check, ...]:
-        """Whether each of the IMU's signals is read from the axis that the drive says."""
-        return () if self.mounting is None else tuple(mounting_checks(self.mapping, self.mounting, self.triads))
+        """Whether each of the IMU's signals is read from the axis that the drive says, and what frames say of it."""
+        framed = () if self.framed is None else (self.framed,)
+        if self.mounting is None:
+            return framed
+        return (*mounting_checks(self.mapping, self.mounting, self.triads), *framed)
 
     @property
     def is_mounted(self) -> bool:
@@ -395,9 +390,12 @@ def survey_log(
     blind = found is not None and found.confident
     if not blind and truth is not None:
         found = find_mounting(measured, triads, mapping)
+    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, found)
+    found = by_frames or found
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
     measured = measured.without(extra)
-    if found is not None and mapping.origin == "auto" and blind and not found.is_as_named:
+    trusted = blind or by_frames is not None
+    if found is not None and mapping.origin == "auto" and trusted and not found.is_as_named:
         note = f"{found.text}, and is read so: {found.evidence}"
         signals = turned_signals(mapping, found, triads)
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
@@ -405,7 +403,7 @@ def survey_log(
         found = replace(found, named=found.rows)
         measured = measure(channels.signals, channels.truth, truth)
     latency = truth_latency(channels, truth)
-    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found)
+    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found, placed, framed)
     if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
         undone = survey_log(log, scaled, clocks, span_ns, vehicle, rescale=False)
         # A sensor that fails looks like a wrong unit of another; what is right contradicts nothing any more.
@@ -413,6 +411,36 @@ def survey_log(
         if not any(name.endswith((".sign", ".unit", ".axis", ".fault")) for name in failed):
             return undone
     return survey
+
+
+def _by_frames(
+    log: DriveLog,
+    mapping: Mapping,
+    channels: MappedChannels,
+    triads: tuple[Triad | None, Triad | None],
+    found: Mounting | None,
+) -> tuple[Placement | None, Check | None, Mounting | None]:
+    """Return where recorded frames put the IMU, the check of it, and the mounting where they alone say it.
+
+    Parameters
+    ----------
+    found : what the drive shows.
+    """
+    accelerations, rates = triads
+    placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
+    if placed is None or accelerations is None or rates is None:
+        return placed, None, None
+    components = [channels.signals.get(n) for n in ACCELERATIONS]
+    force = np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
+    sure = found if found is not None and found.confident else None
+    shown, evidence = (None, "") if sure is None else (sure.rotation, sure.evidence)
+    check = frames_check(placed, shown, evidence, force)
+    believed = "" if sure is not None else gravity_agrees(placed, force)
+    if not believed:
+        return placed, check, None
+    rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
+    alone = Mounting(rotation, named, f"{believed}; the drive does not tell the rest", confident=False)
+    return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
 def _rescaled(survey: Survey) -> Mapping:

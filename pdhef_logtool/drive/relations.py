@@ -29,6 +29,8 @@ MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
 #: A gain that is off by less, or of a correlation below, may be the car's: it slides, a wheel spins, a brake locks.
 CLOSE, CLOSE_CORRELATION = 2.5, 0.8
+#: A wrong unit leaves the correlation of a right one.
+CLEAR_CORRELATION = 0.9
 #: Gains between these are tyres, roll, bank, grade and noise; beyond them they are units.
 GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
@@ -94,7 +96,14 @@ class Relation:
     @property
     def is_close(self) -> bool:
         """Return whether a gain that is not plausible is off by less than known mistakes make, or hardly known."""
-        return abs(self.correlation) < CLOSE_CORRELATION or self.accepts(CLOSE) or self.accepts(1.0 / CLOSE)
+        low, high = self.expected
+        wide = replace(self, expected=(low / CLOSE, high * CLOSE))
+        return abs(self.correlation) < CLOSE_CORRELATION or wide.accepts()
+
+    @property
+    def is_vague(self) -> bool:
+        """Return whether it is close and its sides go with one another as they do with noise or sliding in between."""
+        return self.is_close and abs(self.correlation) < CLEAR_CORRELATION
 
     @property
     def unrelated(self) -> bool:
@@ -534,7 +543,8 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
     curvature times a lever, less a_y times the compliance of the rear tyres.
     """
-    names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s")
+    turning = next((n for n in ("truth.yaw_rate_rad_s", "yaw_rate_rad_s") if n in columns), "")
+    names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", turning)
     if not all(n in columns for n in names):
         return []
     ay, vx, vy, rate = (columns[n] for n in names)
@@ -551,7 +561,7 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     gentle = gentle_at(vx * rate, moving)
     handling = _partial(text, {subject: 1, "ay_m_s2": -1}, -ay, sideslip, [curvature, one], gentle)
     text = f"{subject} against curvature, apart from a_y"
-    powers = {subject: 1, "truth.yaw_rate_rad_s": -1}
+    powers = {subject: 1, turning: -1}
     rolling = _partial(text, powers, curvature, sideslip, [ay, one], gentle)
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),

@@ -31,7 +31,7 @@ from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.intervals import MAX_SIDESLIP_STD_RAD
 
-#: Names that take the calibrated vehicle where there is one; the others run on the file as it stands.
+#: Names that run on ``physics``: they take the calibrated vehicle where there is one, the others the file as it stands.
 SELF_CALIBRATED = frozenset(
     {
         "physics",
@@ -43,8 +43,8 @@ SELF_CALIBRATED = frozenset(
 )
 #: What runs on the file runs once more on the calibrated vehicle under this name.
 OPEN_LOOP = "open-loop-calibrated"
-#: k_o and k_d above, chosen on 16 simulated cars with wrong files, whose parameters' posterior held as it is.
-OWN_SHARE, D2_SHARE = 0.25, 0.5
+#: k_o and k_d above, chosen on 16 simulated cars with right and wrong files, whose parameters' posterior held as it is.
+OWN_SHARE, D2_SHARE = 0.4, 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,14 +124,16 @@ class SelfCalibrated:
             self.estimator,
             self._read(signals),
             None if carry is None else carry.estimator,
-            None if ahead is None else self._read(self._of_friction(ahead)),
+            None if ahead is None else self.given(ahead),
         )
         if self.name == OPEN_LOOP:  # it gives no interval
             return track, Carry(after, ())
         compared, before = self.compared or Compared(), None if carry is None else carry.compared
         vy, carried = compared.run(self._filters, window, signals, before)
-        slow = self.calibration.vehicle.low_speed_blend_m_s
-        return widened(track, vy, self.calibration.driven_d2_m_s, slow), Carry(after, carried)
+        slow, d2 = self.calibration.vehicle.low_speed_blend_m_s, self.calibration.driven_d2_m_s
+        told = math.isfinite(d2)
+        seen = np.full(len(track), D2_SHARE * d2 if told else 0.0)
+        return widened(track, vy, seen, slow, own_share=OWN_SHARE if told else 1.0), Carry(after, carried)
 
     @cached_property
     def _filters(self) -> tuple[PhysicsFilter, ...]:
@@ -139,6 +141,10 @@ class SelfCalibrated:
         found = self.calibration
         vehicles = (found.vehicle, *found.varied) if found.varied else ()
         return tuple(replace(physics_filter(v, found.noise), read_with=self.read_with) for v in vehicles)
+
+    def given(self, signals: Signals) -> Signals:
+        """Return what the estimator is given of signals that were read with the other vehicle."""
+        return self._read(self._of_friction(signals))
 
     def _read(self, signals: Signals) -> Signals:
         return corrected_anew(signals, self.read_with, self.calibration.vehicle)
@@ -149,29 +155,30 @@ class SelfCalibrated:
         return replace(signals, friction=np.full(len(signals), np.nan))
 
 
-def widened(track: StateTrack, compared: Sequence[FloatArray], d2_m_s: float, slow_m_s: float) -> StateTrack:
-    """Return a track [N] with the 1-sigma of sideslip and v_y as the head of this file has it; NaN stays NaN.
+def widened(
+    track: StateTrack, compared: Sequence[FloatArray], seen_m_s: FloatArray, slow_m_s: float, *, own_share: float
+) -> StateTrack:
+    """Return a track [N] with wider 1-sigmas of sideslip and v_y; NaN stays NaN.
 
     Parameters
     ----------
     compared : v_y of the physics filter [N], first on the vehicle, then on those away from it.
-    d2_m_s : as far as it goes with the driving; NaN where it cannot be told.
+    seen_m_s : what the sensors contradict, as a velocity [N].
     slow_m_s : a velocity tells of sideslip no more below this speed than there.
+    own_share : of the track's own 1-sigma that counts.
     """
-    told = math.isfinite(d2_m_s)
-    share = OWN_SHARE if told else 1.0
-    added = np.full(len(track), (D2_SHARE * d2_m_s) ** 2 if told else 0.0)
+    added = np.where(np.isfinite(seen_m_s), seen_m_s, 0.0) ** 2
     for vy in compared[1:]:
         away = vy - compared[0]
         added += np.where(np.isfinite(away), away**2, 0.0)
     speed = np.abs(track.vx_m_s)
     added = added / np.maximum(speed, slow_m_s) ** 2
-    std = np.minimum(np.sqrt((share * track.sideslip_std_rad) ** 2 + added), MAX_SIDESLIP_STD_RAD)
+    std = np.minimum(np.sqrt((own_share * track.sideslip_std_rad) ** 2 + added), MAX_SIDESLIP_STD_RAD)
     covariance = track.covariance
     if covariance.shape[0]:
         scale = np.ones((len(track), 3))  # row and column alike, so that correlations stay
         own = covariance[:, 1, 1]
         positive = own > 0.0
-        scale[positive, 1] = np.sqrt(share**2 + (added * speed**2)[positive] / own[positive])
+        scale[positive, 1] = np.sqrt(own_share**2 + (added * speed**2)[positive] / own[positive])
         covariance = covariance * scale[:, :, None] * scale[:, None, :]
     return replace(track, sideslip_std_rad=std, covariance=covariance)

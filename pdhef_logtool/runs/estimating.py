@@ -14,6 +14,7 @@ from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.drive.windows import with_look_ahead
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, run_window
+from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED
 from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -85,15 +86,23 @@ def estimate_windows(
 
 
 def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
-    """Return what puts the car's intervals on the tracks of estimators, by what they really are."""
-    algorithms, own = {}, {}
+    """Return what puts the car's intervals on the tracks of estimators, by what they really are.
+
+    What it has none for gets the band of what its identification left open of its parameters.
+    """
+    from pdhef_logtool.estimators.posterior_band import posterior_band
+
+    algorithms, own, posterior = {}, {}, {}
+    band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
     for estimator in estimators:
         if note := getattr(estimator, "intervals_note", ""):
             own[estimator.name] = note
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
-    return TrackCalibrator(car.intervals, algorithms, own)
+        if band is not None and estimator.name in SELF_CALIBRATED:
+            posterior[estimator.name] = band.add
+    return TrackCalibrator(car.intervals, algorithms, own, posterior)
 
 
 class DeadReckoning:

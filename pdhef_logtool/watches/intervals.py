@@ -13,7 +13,7 @@ is scaled row and column alike, so that its correlations stay. Estimates themsel
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -40,18 +40,26 @@ YAW_RATE_TERMS = ("floor", "filter", "yaw_rate")
 MAX_SIDESLIP_STD_RAD = 1.0
 
 
+#: Takes the next window of a track and its signals and returns it with wider intervals.
+Widening = Callable[[StateTrack, Signals], StateTrack]
+#: What is told of intervals that hold what is open of a car's parameters.
+POSTERIOR_NOTE = "intervals: own, identified parameters and sensors"
+
+
 @dataclass(slots=True)
 class TrackCalibrator:
     """Applies intervals, or none, to the tracks of a drive window by window.
 
     ``algorithms`` says by name what ran, then what else its intervals may be taken from. Intervals are found by the
     structure of what ran, never by its name; what else they rest on (noise, physics, network) is compared and told.
-    ``own`` says by name what is told of intervals that stay as they are.
+    ``own`` says by name what is told of intervals that stay as they are. ``posterior`` widens, by name, what the car
+    has no intervals for.
     """
 
     intervals: Intervals | None
     algorithms: Mapping[str, Sequence[Algorithm]]
     own: Mapping[str, str] = field(default_factory=dict)
+    posterior: Mapping[str, Widening] = field(default_factory=dict)
     _carries: dict[str, FeatureCarry] = field(default_factory=dict)
     _has_interval: set[str] = field(default_factory=set)
 
@@ -61,7 +69,7 @@ class TrackCalibrator:
             self._has_interval.add(track.name)
         found = self._found(track.name)
         if self.intervals is None or found is None:
-            return track
+            return self.posterior[track.name](track, signals) if track.name in self.posterior else track
         track, self._carries[track.name] = calibrated(
             track,
             signals,
@@ -79,7 +87,7 @@ class TrackCalibrator:
             return (self.own[name],)
         found = self._found(name)
         if self.intervals is None or found is None:
-            return ("intervals not calibrated",)
+            return (POSTERIOR_NOTE if name in self.posterior else "intervals not calibrated",)
         made = self.intervals
         of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
         then, now = found[0].algorithm, found[1]

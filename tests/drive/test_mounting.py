@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.frames import angles_deg
 from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import Mounting, find_mounting, survey_log
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
@@ -156,11 +157,11 @@ def test_a_drive_that_says_nothing_turns_nothing(sample_logs_dir: Path) -> None:
 
 def test_angles_are_those_of_the_sensor_in_the_car() -> None:
     mounting = Mounting(rotation(10, -20, 30), np.eye(3), "", confident=True)
-    assert mounting.degrees == pytest.approx((10, -20, 30))
+    assert angles_deg(mounting.rotation) == pytest.approx((10, -20, 30))
     assert mounting.text == "the IMU is mounted with roll 10, pitch -20, yaw 30 deg"
 
 
 @pytest.mark.parametrize("angles", [(0, 90, 30), (0, -90, -120), (170, 20, -30)])
 def test_angles_give_the_rotation_back(angles: tuple[float, float, float]) -> None:
     mounting = Mounting(rotation(*angles), np.eye(3), "", confident=True)
-    assert np.allclose(rotation(*mounting.degrees), mounting.rotation, atol=1e-6)
+    assert np.allclose(rotation(*angles_deg(mounting.rotation)), mounting.rotation, atol=1e-6)

@@ -29,6 +29,7 @@ from pdhef_logtool.learning.car.physics_fit import (
     make_priors,
     physics_parts,
     usable_seconds,
+    varied_vehicles,
 )
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import make_track
@@ -100,6 +101,42 @@ def test_stiffness_is_found_within_the_posteriors_interval(static: FitDrive) -> 
     (unseen,) = drive_errors([static_drive(2)], start, found.vehicle, found.noise)
     assert math.degrees(unseen.rms) < 0.1
     assert 0.3 < after.nis < 3.0
+
+
+def test_what_is_kept_of_the_posterior_is_what_moves_the_sideslip_most(static: FitDrive) -> None:
+    """Each kept direction is a 1-sigma of the posterior; noise has none."""
+    short = part_of(static, 0, 500)
+    found = fit_physics([short], guess(), STATIC, starts=STARTS[:1], iterations=1)
+    moved = []
+    for number, vehicle in enumerate(kept := varied_vehicles([short], guess(), found)):
+        theta = np.array([p.theta(_entry(vehicle, p.name)) for p in found.priors if not p.tuning])
+        at = np.array([p.theta(_entry(found.vehicle, p.name)) for p in found.priors if not p.tuning])
+        free = [i for i, p in enumerate(found.priors) if not p.tuning]
+        away = theta - at
+        mahalanobis = away @ np.linalg.solve(found.covariance[np.ix_(free, free)], away)
+        assert mahalanobis == pytest.approx(1.0, abs=0.02), number
+        (there,) = drive_errors([short], guess(), vehicle, found.noise)
+        (here,) = drive_errors([short], guess(), found.vehicle, found.noise)
+        moved.append(float(np.sqrt(np.mean((there.error - here.error) ** 2))))
+    assert len(kept) == physics_fit.VARIED
+    assert moved[0] == max(moved)
+    assert moved[0] > 1e-5
+
+
+def _entry(vehicle: VehicleParameters, name: str) -> float:
+    """Return a parameter of the static car by the name of its prior."""
+    axle, _, what = name.partition(" ")
+    if axle in ("front", "rear"):
+        tyre = vehicle.tyres.front if axle == "front" else vehicle.tyres.rear
+        stiffness, peak = vehicle.cornering_stiffness_n_per_rad(axle == "front", 0.85), 0.85 * tyre.D_n
+        return {"cornering stiffness": stiffness, "peak force": peak, "shape": tyre.C}[what]
+    return {
+        "yaw inertia": vehicle.yaw_inertia_kg_m2,
+        "steering offset": vehicle.steer_offset_rad,
+        "roll gradient": vehicle.roll_gradient_rad_per_m_s2,
+        "a_y bias": vehicle.sensors.ay_bias_m_s2,
+        "yaw rate bias": vehicle.sensors.yaw_rate_bias_rad_s,
+    }[name]
 
 
 @pytest.mark.slow

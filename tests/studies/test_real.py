@@ -17,14 +17,50 @@ def test_without_the_drives_it_says_so_and_ends_with_0(monkeypatch, tmp_path: Pa
     assert not list(tmp_path.iterdir())
 
 
+def row(name: str, error: np.ndarray, stamps: np.ndarray, half: float | None = None) -> real.Row:
+    inside = None if half is None else np.abs(error) <= half
+    width = math.nan if half is None else 2.0 * half / math.sqrt(np.nanmean(error**2))
+    return real.Row(real.Errors(name, error, stamps, inside), width)
+
+
 def test_errors_of_constant_size_have_no_spread_and_differ_by_their_difference():
     stamps = np.arange(6000, dtype=np.int64) * 10_000_000
     sign = np.where(np.arange(6000) % 2, 1.0, -1.0)
-    yard = real.Errors(real.YARDSTICKS[0], np.radians(0.5) * sign, stamps)
+    yard = row(real.YARDSTICKS[0], np.radians(0.5) * sign, stamps, half=np.radians(1.0))
     half = np.where(np.arange(6000) < 3000, math.nan, np.radians(0.3) * sign)
-    lines = real.case_table([yard, real.Errors("other", half, stamps)]).splitlines()
-    assert lines[2] == f"| {yard.name} | 0.500 [0.500, 0.500] | 100 % | – |"
-    assert lines[3] == "| other | 0.300 [0.300, 0.300] | 50 % | -0.200 [-0.200, -0.200] |"
+    lines = real.case_table([yard, row("other", half, stamps)]).splitlines()
+    assert lines[2] == f"| {yard.errors.name} | 0.500 [0.500, 0.500] | 100 % | – | 100 % | 4.0 |"
+    assert lines[3] == "| other | 0.300 [0.300, 0.300] | 50 % | -0.200 [-0.200, -0.200] | – | – |"
+
+
+def test_a_finished_stage_is_taken_as_long_as_nothing_changed_that_it_rests_on(tmp_path: Path):
+    stamps = np.arange(5, dtype=np.int64)
+    rows = [row("a", np.array([0.1, math.nan, 0.3, 0.4, 0.5]), stamps, half=0.35), row("b", np.zeros(5), stamps)]
+    called = []
+
+    def work() -> tuple[list[real.Row], str]:
+        called.append(1)
+        return rows, "a remark"
+
+    first, _ = real.Finished(tmp_path / "case", "one").stage("learnt", work)
+    again, remark = real.Finished(tmp_path / "case", "one").stage("learnt", work)
+    assert (len(called), remark) == (1, "a remark")
+    for have, want in zip(again, first, strict=True):
+        assert have.errors.name == want.errors.name
+        np.testing.assert_array_equal(have.errors.error, want.errors.error)
+        np.testing.assert_array_equal(have.width, want.width)
+        assert (have.errors.inside is None) == (want.errors.inside is None)
+    real.Finished(tmp_path / "case", "other").stage("learnt", work)
+    assert len(called) == 2
+
+
+def test_looks_are_counted_on_from_what_was_before_and_the_same_figures_count_once(tmp_path: Path):
+    case, file = real.CASES[0], tmp_path / "real" / real.LOOKS_FILE
+    before = real.LOOKS_BEFORE + real.LOOKS_BEFORE_PUBLISHED[case.name]
+    assert real.count_look(file, case, "one") == before + 1
+    assert real.count_look(file, case, "one") == before + 1
+    assert real.count_look(file, real.CASES[-1], "one") == real.LOOKS_BEFORE + 1
+    assert real.count_look(file, case, "two") == before + 2
 
 
 def test_every_case_has_its_reference_files():

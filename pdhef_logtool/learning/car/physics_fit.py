@@ -57,6 +57,8 @@ MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
 Theta = dict[str, float]
+#: Directions of the posterior that are kept: those that move the sideslip most.
+VARIED = 5
 #: Where θ starts: the noise has two valleys, that of clean sensors and that of a filter that hardly hears a_y.
 STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
 
@@ -201,15 +203,20 @@ def drive_errors(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhysicsFit:
-    """A fitted car: vehicle, noise, priors with θ, posterior 1-sigma in prior units, cost and RMS by drive."""
+    """A fitted car: vehicle, noise, priors with θ [K], its posterior covariance [K, K], cost and RMS."""
 
     vehicle: VehicleParameters
     noise: FilterNoise
     priors: tuple[Prior, ...]
     theta: FloatArray
-    std: FloatArray
+    covariance: FloatArray
     cost: float
     rms_deg: float
+
+    @property
+    def std(self) -> FloatArray:
+        """Posterior 1-sigma in prior units, [K]."""
+        return np.sqrt(np.diag(self.covariance))
 
 
 def fit_physics(
@@ -253,11 +260,36 @@ def fit_physics(
         for first in firsts
     ]
     (theta, normal, value), found = min(ends, key=lambda end: end[0].cost)
-    std = np.sqrt(np.diag(np.linalg.inv(normal)))
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     vehicle, noise = build_car(start, parts, priors, theta, digits=6)
     squares = sum(float(np.sum(d.error**2)) for d in found)
     rms = math.degrees(math.sqrt(squares / max(1, sum(d.counted for d in found))))
-    return PhysicsFit(vehicle, noise, priors, theta, std, value, rms)
+    return PhysicsFit(vehicle, noise, priors, theta, covariance, value, rms)
+
+
+def varied_vehicles(
+    drives: Sequence[FitDrive], start: VehicleParameters, found: PhysicsFit
+) -> tuple[VehicleParameters, ...]:
+    """Return a fitted vehicle 1-sigma away along the directions of its posterior that move the sideslip most.
+
+    They are uncorrelated in the posterior and in what they do to the sideslip of the drives. Its noise stays.
+    """
+    held = np.array([p.tuning for p in found.priors])
+    free = np.flatnonzero(~held)
+    root = np.zeros((held.size, free.size))
+    root[free] = np.linalg.cholesky(found.covariance[np.ix_(free, free)])
+
+    def vehicle(theta: FloatArray, digits: int = 17) -> VehicleParameters:
+        return build_car(start, found.vehicle.physics, found.priors, theta, digits=digits)[0]
+
+    def errors(theta: FloatArray) -> FloatArray:
+        return np.concatenate([d.error for d in drive_errors(drives, start, vehicle(theta), found.noise)])
+
+    at = errors(found.theta)
+    moved = np.stack([errors(found.theta + step) - at for step in root.T])
+    _, axes = np.linalg.eigh(moved @ moved.T)
+    steps = root @ axes[:, ::-1][:, :VARIED]  # largest first
+    return tuple(vehicle(found.theta + step, digits=6) for step in steps.T)
 
 
 def _scale(drive: DriveError) -> float:
@@ -411,4 +443,6 @@ def find_physics(
             )
     progress("fitting the physics filter's sideslip to the truth", 0.7)
     found = fit_physics(drives, start, parts, steering_wheel=steering_wheel)
-    return found, FittedPhysics(values=FittedValues.of(found.vehicle), noise=found.noise, tried=tried)
+    varied = tuple(FittedValues.between(found.vehicle, v) for v in varied_vehicles(drives, start, found))
+    values = FittedValues.of(found.vehicle)
+    return found, FittedPhysics(values=values, noise=found.noise, varied=varied, tried=tried)

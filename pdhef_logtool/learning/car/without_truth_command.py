@@ -115,7 +115,11 @@ def fit_part(calibration: SelfCalibration, drives: Sequence[Any]) -> Fit:
     return Fit(
         physics_sha256=physics_sha256(own),
         values=FittedValues.between(own, vehicle),
-        physics=FittedPhysics(values=FittedValues.of(vehicle), noise=calibration.noise),
+        physics=FittedPhysics(
+            values=FittedValues.of(vehicle),
+            noise=calibration.noise,
+            varied=tuple(FittedValues.between(vehicle, v) for v in calibration.varied),
+        ),
         without_truth=True,
         drives=tuple(drives),
         notes=(calibration.text, "no truth was looked at: what a drive with truth finds is worth more"),

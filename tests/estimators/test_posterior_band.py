@@ -1,0 +1,125 @@
+"""The band of an identified car: what its drives left open of its parameters, and what the sensors contradict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from reference_car import cut, drive, slalom, with_noise
+
+from pdhef_logtool.car.car import NO_INTERVALS, Car
+from pdhef_logtool.car.flat import flat_toml, vehicle_toml
+from pdhef_logtool.car.parts import PHYSICS, FilterNoise, FittedPhysics, FittedValues, IntervalEntry, Intervals
+from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.estimators.physics_ukf import physics_filter
+from pdhef_logtool.estimators.posterior_band import OWN_SHARE
+from pdhef_logtool.estimators.table import make_estimator
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.watches.error_features import TERMS, error_terms
+from pdhef_logtool.watches.intervals import POSTERIOR_NOTE, make_inflation
+
+OWN = default_vehicle()
+PARTS = PhysicsParts(lag=True, force_scale=True)
+VALUES = FittedValues(yaw_inertia_kg_m2=1700.0, relaxation_length_m=0.6, physics=PARTS)
+NOISE = FilterNoise(r_std={"ay_m_s2": 1.0})
+
+
+def identified(share: float = 0.1) -> Car:
+    """Return a car whose rear stiffness and steering offset are known to a share of it and of a radian."""
+    rear = OWN.tyres.rear
+    assert rear.B is not None
+    softer = OWN.tyres.model_copy(update={"rear": rear.model_copy(update={"B": rear.B * (1.0 - share)})})
+    varied = (FittedValues(tyres=softer), FittedValues(steer_offset_rad=0.05 * share))
+    found = FittedPhysics(values=VALUES, noise=NOISE, varied=varied)
+    return Car.of(OWN, fitted_physics=found).with_noise(PHYSICS, NOISE)
+
+
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    s = with_noise(drive(slalom(0.03, 0.5), 3.0, speed=22.0).signals, seed=3)
+    return replace(s, friction=np.full(len(s), 0.85))
+
+
+def banded(car: Car, *windows: Signals, name: str = "physics") -> tuple[list[StateTrack], list[StateTrack]]:
+    """Return the tracks of windows as the estimator gives them, and with their bands."""
+    estimator, carry = make_estimator(name, car), None
+    applied = calibrator(car, [estimator])
+    plain, wide = [], []
+    for window in windows:
+        track, carry = run_window(estimator, window, carry, None)
+        plain.append(track)
+        wide.append(applied.add(track, window))
+    return plain, wide
+
+
+def test_windows_change_no_bit_and_no_estimate_changes(signals: Signals) -> None:
+    (plain,), (whole,) = banded(identified(), signals)
+    _, parts = banded(identified(), *(cut(signals, a, b) for a, b in ((0, 1), (1, 111), (111, len(signals)))))
+    for column in ("sideslip_std_rad", "covariance"):
+        np.testing.assert_array_equal(np.concatenate([getattr(p, column) for p in parts]), getattr(whole, column))
+    for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "nis", "yaw_rate_std_rad_s"):
+        np.testing.assert_array_equal(getattr(whole, column), getattr(plain, column))
+    assert (np.linalg.eigvalsh(whole.covariance[10:]) > 0.0).all()
+
+
+def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
+    """What the filter does on the other vehicles counts without the states that would cure them."""
+    car = identified()
+    (plain,), (wide,) = banded(car, signals)
+    bare = {"physics": PARTS.model_copy(update={"force_scale": False})}
+    vehicles = [v.model_copy(update=bare) for v in (car.physics_vehicle, *car.varied_physics)]
+    assert vehicles[1].tyres.rear != OWN.tyres.rear
+    assert vehicles[2].steer_offset_rad == pytest.approx(0.005)
+    assert {v.yaw_inertia_kg_m2 for v in vehicles} == {1700.0}
+    filters = [replace(physics_filter(v, NOISE), read_with=OWN) for v in vehicles]
+    middle, *others = (f.run(signals, None)[0].vy_m_s for f in filters)
+    terms, _ = error_terms(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2, None)
+    seen = terms[:, TERMS.index("kinematic")] * plain.vx_m_s
+    expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + seen**2 + sum((vy - middle) ** 2 for vy in others)
+    fast = plain.vx_m_s > OWN.low_speed_blend_m_s
+    np.testing.assert_allclose(wide.vy_std_m_s[fast] ** 2, expected[fast], rtol=1e-9)
+
+
+def test_what_is_known_less_has_the_wider_band(signals: Signals) -> None:
+    (_, (narrow,)), (_, (wide,)) = (banded(identified(share), signals) for share in (0.05, 0.4))
+    assert np.mean(wide.sideslip_std_rad) > 1.3 * np.mean(narrow.sideslip_std_rad)
+
+
+def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> None:
+    car = identified()
+    for name, note in (("physics", POSTERIOR_NOTE), ("phy-ukf", "intervals not calibrated")):
+        estimator = make_estimator(name, car)
+        applied = calibrator(car, [estimator])
+        track, _ = run_window(estimator, signals, None, None)
+        assert (applied.add(track, signals) is track) == (name == "phy-ukf")
+        assert applied.notes(name) == (note,)
+
+
+def test_calibrated_intervals_come_first(signals: Signals) -> None:
+    car = identified()
+    estimator = make_estimator("physics", car)
+    track, _ = run_window(estimator, signals, None, None)
+    inflation = make_inflation((0.0, 9.0, *(0.0,) * (len(TERMS) - 2)), (9.0,) * 3)
+    entry = IntervalEntry(estimator="physics", algorithm=resolve(estimator), inflation=inflation)
+    intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=(entry,))
+    wide = calibrator(replace(car, intervals=intervals), [estimator]).add(track, signals)
+    np.testing.assert_allclose(wide.sideslip_std_rad, np.minimum(9.0 * track.sideslip_std_rad, 1.0))
+
+
+def test_a_file_keeps_the_posterior_and_a_wrong_car_stays_wrong(tmp_path: Path) -> None:
+    car, file = identified(), tmp_path / "car.toml"
+    told = {PHYSICS: car.fitted_physics.model_dump(mode="json", exclude_none=True)}  # type: ignore[union-attr]
+    file.write_text(flat_toml(vehicle_toml(OWN), OWN, OWN, dict(car.noise), None, told), encoding="utf-8")
+    again = Car.load(file, network="none")
+    assert again.varied_physics == car.varied_physics
+    assert calibrator(Car.load(file, network="none", intervals=NO_INTERVALS), []).posterior == {}
+    heavy = OWN.model_copy(update={"yaw_inertia_kg_m2": 2000.0, "steer_offset_rad": 0.1})
+    wrong = car.with_vehicle(heavy)
+    assert {v.yaw_inertia_kg_m2 for v in wrong.varied_physics} == {2000.0}
+    assert {v.steer_offset_rad for v in wrong.varied_physics} == {0.1}
