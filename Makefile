@@ -10,7 +10,7 @@ CAR := saloon
 JOBS ?= 2
 
 .PHONY: help demo test quick mutants check lint format bench train-default samples conditions real switches torture \
-  docs-truthsim paper strangers clean
+  docs docs-truthsim paper strangers clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -26,6 +26,7 @@ help:
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
 	@echo "make switches  docs/switches.md: bias states, roll, standstill, slip gate, latency of the filters, on and off"
+	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
 	@echo "make clean    remove the virtual environment and everything that was built"
@@ -89,6 +90,14 @@ bench: $(VENV)/installed-dev $(VENV)/compiled
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
 	$(BIN)/python -m studies.model_card
+
+$(VENV)/installed-docs: $(VENV)/installed pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	@touch $@
+
+docs: $(VENV)/installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo "Site: out/site/index.html"
 
 samples: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/python -m truthsim.samples sample_logs

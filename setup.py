@@ -13,6 +13,8 @@ setup(
             "models/*/*/*/*",
             "models/*/*/*/*/*",
             "mapping/*.toml",
+            "reports/assets/*",
+            "reports/templates/*",
         ],
         "truthsim": ["py.typed", "vehicles/*.toml"],
         "pdhef_logtool.schemas": ["*.json", "*.md", "*/msg/*.msg"],

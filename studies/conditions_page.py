@@ -43,6 +43,10 @@ BIN_DRIVES = 30
 #: Steps of the aligned signals per second.
 RATE_HZ = 100.0
 MARGIN = 1.05
+#: In the picture with their spans, from the naive to the best; the others are medians in grey.
+DRAWN = ("zero", "open-loop", "phy-ukf", "physics", "pd-hef", "pd-hef-smoothed")
+#: Okabe and Ito (2008), without yellow.
+COLOURS = ("#000000", "#E69F00", "#56B4E9", "#0072B2", "#D55E00", "#009E73")
 _MARKS = {"better": "**<**", "not worse": "=", "worse": "**>**", "open": "?", "–": ""}
 
 
@@ -470,10 +474,11 @@ def _write_parquet(folder: Path, tables: Tables, rows: Sequence[str], names: Seq
 
 
 def _plot_rows(path: Path, figures: Figures, rows: Sequence[str], names: Sequence[str]) -> None:
-    """Median with the span from the 10th to the 90th percentile, a line a row."""
+    """Median with the span from the 10th to the 90th percentile, a line a row; most estimators as grey dots."""
     spans = {n: np.degrees([percentiles(figures.get(r, n)[0]) for r in rows]).reshape(-1, 3) for n in names}
+    drawn = {n: spans.pop(n) for n in DRAWN if n in spans}
     label = "sideslip RMSE in degrees: median and 10th to 90th percentile over drives"
-    _plot(path, rows, spans, label, row_height=0.32, alpha=0.6, markers="os^")
+    _plot(path, rows, drawn, label, medians=spans)
 
 
 def _plot_ratios(path: Path, figures: Figures, rows: Sequence[str], subject: str, references: Sequence[str]) -> None:
@@ -483,27 +488,33 @@ def _plot_ratios(path: Path, figures: Figures, rows: Sequence[str], subject: str
         bounds = [ratios(figures, r, subject, reference)[0] for r in rows]
         spans[reference] = np.array([(b.low, b.value, b.high) for b in bounds])
     label = f"median sideslip RMSE of {subject} over that of the reference, 95 % interval"
-    _plot(path, rows, spans, label, row_height=0.3, alpha=0.7, markers="o", limits={1.0: "-", MARGIN: ":"})
+    _plot(path, rows, spans, label, limits={1.0: "-", MARGIN: ":"})
 
 
 def _plot(
     path: Path, rows: Sequence[str], spans: Mapping[str, FloatArray], label: str, *,
-    row_height: float, alpha: float, markers: str, limits: Mapping[float, str] = MappingProxyType({}),
+    medians: Mapping[str, FloatArray] = MappingProxyType({}), limits: Mapping[float, str] = MappingProxyType({}),
 ) -> None:  # fmt: skip
-    """Draw low, middle and high [rows, 3] of every name, a line a row."""
-    fig, grid = subplots(1, 1, 9.0, 1.5 + row_height * len(rows), {})
+    """Draw low, middle and high [rows, 3] of every name in a lane of its own in each row, and medians in grey."""
+    fig, grid = subplots(1, 1, 9.0, 1.5 + 0.36 * len(rows), {"font.size": 9})
     axes = grid[0, 0]
-    step = 0.75 / max(len(spans), 1)
+    for row in range(0, len(rows), 2):
+        axes.axhspan(row - 0.5, row + 0.5, color="0.94", linewidth=0)
+    step = 0.8 / max(len(spans), 1)
     for i, (name, span) in enumerate(spans.items()):
         y = np.arange(len(rows)) + (i - 0.5 * (len(spans) - 1)) * step
-        marker, colour = markers[i // 10 % len(markers)], f"C{i % 10}"
-        axes.hlines(y, span[:, 0], span[:, 2], color=colour, linewidth=1.0, alpha=alpha)
-        axes.plot(span[:, 1], y, marker, markersize=3.0, color=colour, label=name)
+        colour, marker = COLOURS[i % len(COLOURS)], "osD^vP"[i % 6]
+        axes.hlines(y, span[:, 0], span[:, 2], color=colour, linewidth=1.6, alpha=0.55)
+        axes.plot(span[:, 1], y, marker, markersize=4.5, color=colour, label=name)
+    for i, span in enumerate(medians.values()):
+        label_of = None if i else "the others of the table"
+        axes.plot(span[:, 1], np.arange(len(rows)), "|", markersize=7, color="0.6", zorder=1.5, label=label_of)
     for at, dash in limits.items():
         axes.axvline(at, color="black", linewidth=0.8, linestyle=dash)
-    axes.set(xscale="log", xlabel=label)
+    axes.set(xscale="log", xlabel=label, ylim=(len(rows) - 0.5, -0.5))
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_yticks(range(len(rows)), rows)
-    axes.invert_yaxis()
-    axes.grid(alpha=0.3, axis="x")
-    axes.legend(frameon=False, fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    axes.tick_params(axis="y", length=0)
+    axes.grid(alpha=0.4, axis="x")
+    fig.legend(frameon=False, loc="outside upper center", ncols=7)
     save(fig, path)

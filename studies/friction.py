@@ -2,7 +2,7 @@
 
     python -m studies.friction [--write-docs]
 
-Simulates every manoeuvre of ``PLAN`` on every friction of ``FRICTIONS`` with the car of the sample logs, a seed a drive
+Simulates every manoeuvre of ``PLAN`` on every friction of ``FRICTIONS`` with the shipped car, a seed a drive
 from ``FIRST_SEED`` on, which no network, filter noise or table is made of. ``--write-docs`` puts the tables into
 docs/friction.md.
 """
@@ -24,7 +24,7 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from studies.condition_drives import ConditionDrive, read_drive, root_mean_square, sideslip_error
-from studies.pages import DOCS, SAMPLE_VEHICLE, fill, options, table, write
+from studies.pages import DOCS, fill, options, table, write
 from truthsim.drive import simulate_drive, write_drive
 
 FIRST_SEED = 6100
@@ -40,7 +40,7 @@ PLAN: dict[str, tuple[float, float | None]] = {
     "road": (90.0, 120.0),
 }
 ORDINARY = "road"
-ESTIMATORS = ("phy-ukf", "pd-hef")
+ESTIMATORS = ("phy-ukf", "physics", "pd-hef")
 TOLD = ("true", "1", "0.85", "estimated")
 DOCUMENT = DOCS / "friction.md"
 
@@ -82,7 +82,7 @@ def measure(drive: ConditionDrive, manoeuvre: str, friction: float, car: Car) ->
 
 def measure_all(folder: Path) -> list[Outcome]:
     """Simulate and measure every drive; one that spins is left out, with a line on stderr."""
-    car = Car.load(SAMPLE_VEHICLE)
+    car = Car.load("saloon")
     outcomes = []
     for seed, (manoeuvre, friction) in enumerate(product(PLAN, FRICTIONS), start=FIRST_SEED + 1):
         speed, duration = PLAN[manoeuvre]

@@ -22,6 +22,7 @@ class FakeTopic:
     fields: dict[str, NDArray]  # type: ignore[type-arg]
     publish_time_ns: IntArray | None = None
     encoding: str = "cdr"
+    examples: tuple[object, ...] = ()
 
 
 @dataclass
@@ -69,6 +70,12 @@ class FakeLog:
 
     def unreadable(self, topic: str) -> str:
         return ""
+
+    def borrowed(self, topic: str) -> tuple[Path, ...]:
+        return ()
+
+    def first_messages(self, topic: str, most: int) -> list[object]:
+        return list(self.contents[topic].examples[:most])
 
     def read(
         self,

@@ -54,7 +54,7 @@ _OPTIONS: dict[str, Any] = {
         _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/friction.md")
     ],
     "prefer_truth": Annotated[_Text, Option(help="perfect or rtk: which truth of a simulated log counts.")],
-    "msgs": Annotated[_File, Option(metavar="DIR", help="Folder of .msg files or workspace: types a log lacks.")],
+    "msgs": Annotated[_File, Option(metavar="DIR", help="Folder, zip or wheel of .msg files: types a log lacks.")],
     "budget": Annotated[
         float | None, Option(metavar="FACTOR", help="Raise what a log may cost in memory and time: docs/formats.md.")
     ],

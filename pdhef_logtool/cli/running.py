@@ -42,13 +42,14 @@ def run(
     output: Annotated[Path, Option("--output", "-o", help="Folder for everything that the run writes.")],
     config: RunConfig,
     junit: options.JunitFile = None,
+    report: Annotated[bool, Option(help="Write pages for people: report.html of every log.")] = True,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Run estimators on logs, score and annotate them. Recordings and metrics are written too."""
     from pdhef_logtool.runs.pipeline import run_logs
 
     with console.progress() as bar:
-        result = run_logs(logs, output, config, junit=junit, progress=bar, warn=console.warn)
+        result = run_logs(logs, output, config, junit=junit, report=report, progress=bar, warn=console.warn)
     _finish(result, as_json)
 
 

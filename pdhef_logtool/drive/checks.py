@@ -12,25 +12,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import Sensors, VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import columns_on_grid, derivative, independent_samples, moving_at
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2, Sensors, VehicleParameters, default_vehicle
+from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.faulty_samples import without_faulty_samples
+from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured, measure
 from pdhef_logtool.drive.relations import (
-    G,
     Mistake,
     Relation,
     best_explanation,
     gentle_at,
     known_mistakes,
-    measured_relations,
     smallest_explanations,
 )
-from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack, channel_of
-from pdhef_logtool.mapping import MappedChannels
+from pdhef_logtool.drive.truth import LatencyEstimate, TruthTrack
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray
 
-#: Name of the column that is the mean of the wheel speeds.
-WHEEL_SPEEDS = "wheel_speeds"
 #: What of an accelerometer's mean driving does not explain. Grade and crossfall of a whole drive are 3 % at most
 #: (0.3 m/s^2), a production sensor's bias less than that; 0.8 m/s^2 is a tilt of 4.7 degrees, half of g another axis.
 LEVEL_M_S2 = 0.8
@@ -49,16 +46,19 @@ GYRO_DELAY_S = 0.03
 NEUTRAL_RAD_PER_M_S2 = 0.0006
 #: Steering angle over what the file's ratio and wheelbase make of the curvature.
 STEERING_RANGE = (0.75, 1.33)
+#: Share of the steering's spread that curvature and lateral acceleration may leave.
+UNEXPLAINED_STEERING = 0.5
 #: Effective radius over the file's: tyres wear by 3 %, sizes of one car differ by 5 %.
 RADIUS_RANGE = (0.85, 1.18)
 #: Highest over lowest speed from which wheelbase and understeer can be told apart.
 SPEED_SPREAD = 1.4
 #: Lateral acceleration driven over what the file's tyres carry at friction 1: summer tyres reach 1.15 of it.
 MAX_GRIP_USE = 1.25
+#: A sensor whose silent samples held so much of the drive's motion is itself a failed check.
+FAULTY_SHARE = 0.5
 #: A figure of a fit counts from this many standard errors on.
 SURE = 4.0
 
-_TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
 _LACKS = {
     "ax_m_s2": "speeding up and braking, on straights",
     "speed_m_s": "a wheel speed, an accelerometer or truth to hold it against, and speeding up or bends",
@@ -74,8 +74,11 @@ def check_drive(
     *,
     latency: LatencyEstimate | None = None,
     mounting_is_known: bool = False,
+    measured: Measured | None = None,
 ) -> tuple[Check, ...]:
     """Return the checks of mapped signals, of the truth and of the vehicle file; nothing that they decide is a guess.
+
+    What contradicts is looked at again without the samples that a sensor fault has spoilt.
 
     Parameters
     ----------
@@ -83,19 +86,38 @@ def check_drive(
     vehicle : its file is held against the drive; None, or the default car: there is none.
     latency : of the truth against the gyro, or the gyro's own.
     mounting_is_known : gravity has shown that the IMU is not upside down.
+    measured : what :func:`~pdhef_logtool.drive.measured.measure` makes of the channels, where that is known.
     """
-    truth = truth or {}
-    columns, speed_name = drive_columns(signals, truth, derived)
-    relations = measured_relations(columns, speed_name)
-    groups = _groups({} if mounting_is_known else signals, columns)
-    found = _by_relations(signals, columns, relations, groups)
+    asked = _Asked(vehicle, latency, mounting_is_known, derived is not None)
+    found = _all_checks(measure(signals, truth, derived) if measured is None else measured, asked)
+    if all(check.verdict != "failed" for check in found):
+        return found
+    sound, shares = without_faulty_samples(signals, vehicle or default_vehicle())
+    if not shares:
+        return found
+    again = _all_checks(measure(sound, truth, derived), asked)
+    return (*(_fault_check(n, share) for n, share in shares.items() if share > FAULTY_SHARE), *again)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    vehicle: VehicleParameters | None
+    latency: LatencyEstimate | None
+    mounting_is_known: bool
+    has_truth: bool
+
+
+def _all_checks(measured: Measured, asked: _Asked) -> tuple[Check, ...]:
+    columns, speed_name = measured.columns, measured.speed_name
+    vehicle = asked.vehicle or default_vehicle()
+    found = _by_relations(measured, mounting_is_known=asked.mounting_is_known)
     wrong = {c.subject for c in found if c.verdict == "failed"}
     known = not wrong & {"yaw_rate_rad_s", "ay_m_s2", speed_name}
-    found += _levels(columns, speed_name, (vehicle or default_vehicle()).sensors, driving_is_known=known)
-    if derived is not None:
+    found += _levels(columns, speed_name, vehicle.sensors, driving_is_known=known)
+    if asked.has_truth:
         found += _sideslip_checks(columns)
-        found += _sensor_error_checks(columns, latency, vehicle or default_vehicle(), wrong)
-    if vehicle is not None and vehicle != default_vehicle():
+        found += _sensor_error_checks(columns, asked.latency, vehicle, wrong)
+    if vehicle != default_vehicle():
         found += _vehicle_checks(columns, speed_name, vehicle)
     unique: dict[str, Check] = {}
     for check in found:  # of two of a name the worse counts
@@ -104,17 +126,19 @@ def check_drive(
     return tuple(unique.values())
 
 
-def explained_factors(
-    channels: MappedChannels, derived: TruthTrack | None, *, known_mounting: bool, most: int = 2
-) -> dict[str, tuple[float, str]]:
+def _fault_check(name: str, share: float) -> Check:
+    evidence = f"{share:.0%} of what the car did fell into samples of it that are stuck or dead"
+    return Check(f"{name}.fault", name, "failed", evidence, "look at the sensor, its cable and its power")
+
+
+def explained_factors(measured: Measured, *, mounting_is_known: bool, most: int = 2) -> dict[str, tuple[float, str]]:
     """Return by signal the factor that undoes its wrong unit or sign, with the evidence, where only one explains it.
 
     ``most``: mistakes at once that are believed.
     """
-    columns, speed_name = drive_columns(channels.signals, channels.truth, derived)
-    relations = measured_relations(columns, speed_name)
-    groups = _groups({} if known_mounting else channels.signals, columns)
-    explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
+    relations = measured.relations
+    groups = measured.groups(mounting_is_known=mounting_is_known)
+    explanations = smallest_explanations(relations, known_mistakes(list(measured.columns), groups))
     chosen = best_explanation(relations, explanations)
     if chosen is None or len(chosen) > most or not all(m.is_exact for m in chosen):
         return {}
@@ -130,60 +154,14 @@ def explained_factors(
 _BADNESS = {"passed": 0, "undecided": 1, "failed": 2}
 
 
-# --------------------------------------------------------------------------------------------- columns
-
-
-def drive_columns(
-    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
-) -> tuple[dict[str, FloatArray], str | None]:
-    """Return signals and truth on one grid, and the name of the column that stands for the speed."""
-    channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
-    if derived is not None:
-        for name in _TRUTH:
-            channels[f"truth.{name}"] = channel_of(derived, name)
-        # As mapped: a wrong unit is wrapped away in what is derived of it, and a derived a_y says nothing new.
-        channels |= {f"truth.{n}": truth[n] for n in ("sideslip_rad", "ay_m_s2") if n in truth}
-    columns = columns_on_grid(channels)
-    if "truth.x_m" in columns and "truth.y_m" in columns:
-        vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
-        columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
-        columns["truth.course_rate_rad_s"] = _turning(vx, vy)
-    return columns, _speed_of(columns)
-
-
-def _speed_of(columns: dict[str, FloatArray]) -> str | None:
-    """Return the name of the column that stands for the speed; the wheels' is added, since one alone turns in bends."""
-    if "speed_m_s" in columns:
-        return "speed_m_s"
-    for unit in ("m_s", "rad_s"):
-        wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_{unit}") in columns]
-        if wheels:
-            columns[WHEEL_SPEEDS] = np.asarray(np.mean(wheels, axis=0))
-            return WHEEL_SPEEDS
-    return "truth.vx_m_s" if "truth.vx_m_s" in columns else None
-
-
-def _turning(vx: FloatArray, vy: FloatArray) -> FloatArray:
-    ax, ay = derivative(vx), derivative(vy)
-    speed = np.hypot(vx, vy)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        rate = (vx * ay - vy * ax) / speed**2
-    # Slower, the noise of a position turns the path.
-    with np.errstate(invalid="ignore"):
-        return np.where(moving_at(speed) & (speed > 1.0), rate, np.nan)
-
-
 # ------------------------------------------------------------------------------- sign, unit, right field
 
 
-def _by_relations(
-    signals: Mapping[str, Channel],
-    columns: Mapping[str, FloatArray],
-    relations: Sequence[Relation],
-    groups: Sequence[tuple[str, ...]],
-) -> list[Check]:
+def _by_relations(measured: Measured, *, mounting_is_known: bool) -> list[Check]:
     """Judge sign, unit and field of every signal that a relation is about."""
-    names = [n for n in columns if n in signals or n in _JUDGED_TRUTH]
+    columns, relations = measured.columns, measured.relations
+    groups = measured.groups(mounting_is_known=mounting_is_known)
+    names = [n for n in columns if n in measured.topics or n in _JUDGED_TRUTH]
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
@@ -213,19 +191,6 @@ def _by_relations(
 
 
 _JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")),)
-
-
-def _groups(signals: Mapping[str, Channel], columns: Mapping[str, FloatArray]) -> list[tuple[str, ...]]:
-    """Return the signals of one topic, whose signs or units are wrong together."""
-    topics: dict[str, list[str]] = {}
-    for name, channel in signals.items():
-        if name in columns and not name.startswith("wheel_speed_"):
-            topics.setdefault(channel.source.split(".")[0], []).append(name)
-    wheels = [n for n in columns if n.startswith("wheel_speed")]
-    truth = [n for n in ("truth.yaw_rate_rad_s", "truth.vy_m_s", "truth.sideslip_rad", "truth.ay_m_s2") if n in columns]
-    speeds = [n for n in ("truth.vx_m_s", "truth.vy_m_s", "truth.position_speed_m_s") if n in columns]
-    groups = [tuple(g) for g in (*topics.values(), truth, speeds) if 2 <= len(g) <= 6]
-    return [*groups, *([tuple(wheels)] if len(wheels) > 1 else [])]
 
 
 def _is_cleared(name: str, stray: Relation, relations: Sequence[Relation]) -> bool:
@@ -275,25 +240,36 @@ def _levels(
     """Judge what driving leaves of the accelerometers' means: gravity on an axis that should be level."""
     checks = []
     speed = None if speed_name is None else columns[speed_name]
+    yaw = columns.get("yaw_rate_rad_s")
     for name in ("ax_m_s2", "ay_m_s2"):
         if name not in columns:
             continue
-        driven: FloatArray = np.zeros_like(columns[name])
+        driven, at_ease = np.zeros_like(columns[name]), np.ones(columns[name].shape[0], np.bool_)
+        if speed is not None and yaw is not None:
+            # Where the car slides, speed and yaw rate no longer say what accelerates it.
+            at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - _median(columns[name]), at_ease)
         if speed is not None and name == "ax_m_s2":
             driven = derivative(speed)
-        elif speed is not None and "yaw_rate_rad_s" in columns:
-            driven = columns["yaw_rate_rad_s"] * speed
+        elif speed is not None and yaw is not None:
+            driven = yaw * speed
         rest = columns[name] - driven
         known = np.isfinite(rest)
         if independent_samples(int(np.count_nonzero(known))) < 6.0:
             rest, known = columns[name], np.isfinite(columns[name])
         if independent_samples(int(np.count_nonzero(known))) < 2.0:
             continue
+        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= 6.0
+        use = known & at_ease if told else known
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
-        check = _level(name, float(np.mean(rest[known])) - bias, float(np.mean(columns[name][known])) - bias)
-        if driving_is_known or check.name == f"{name}.axis":
+        check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
+        if (driving_is_known and told) or check.name == f"{name}.axis":
             checks.append(check)
     return checks
+
+
+def _median(column: FloatArray) -> float:
+    known = column[np.isfinite(column)]
+    return float(np.median(known)) if known.size else 0.0
 
 
 def _level(name: str, rest: float, mean: float) -> Check:
@@ -303,7 +279,7 @@ def _level(name: str, rest: float, mean: float) -> Check:
     if size > OTHER_AXIS_M_S2:
         return Check(f"{name}.axis", name, "failed", f"{evidence}: that is gravity", "map a level axis of the sensor")
     if size > LEVEL_M_S2:
-        tilt = math.degrees(math.asin(size / G))
+        tilt = math.degrees(math.asin(size / GRAVITY_M_S2))
         remedy = f"the sensor is tilted by {tilt:.1f} deg, which belongs in the mapping, or has a bias: a fit's matter"
         return Check(f"{name}.level", name, "failed", evidence, remedy)
     return Check(f"{name}.level", name, "passed", evidence)
@@ -527,7 +503,11 @@ def _steering_checks(steer: FloatArray, rate: FloatArray, speed: FloatArray, veh
     if found is None or np.quantile(speeds, 0.9) < SPEED_SPREAD * np.quantile(speeds, 0.1):
         lacks = "needs bends to both sides at low and at high speed"
         return [Check(n, "vehicle", "undecided", "too little driving in bends", lacks) for n in names]
-    (share, gradient, _), (share_error, error, _), _ = found
+    (share, gradient, _), (share_error, error, _), left = found
+    if left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
+        lacks = "needs bends that the car does not slide through"
+        evidence = "curvature and lateral acceleration do not explain the steering"
+        return [Check(n, "vehicle", "undecided", evidence, lacks) for n in names]
     file = vehicle.understeer_gradient_rad_per_m_s2(vehicle.assumed_friction)
     return [_steering_check(share, share_error), _understeer_check(gradient, error, file)]
 
@@ -567,7 +547,7 @@ def _grip_check(lateral: FloatArray, vehicle: VehicleParameters) -> Check:
     known = lateral[np.isfinite(lateral)]
     friction = max(1.0, vehicle.assumed_friction)
     carried = [vehicle.magic_formula(front, friction)[2] / vehicle.axle_load_n(front) for front in (True, False)]
-    most = G * min(carried)
+    most = GRAVITY_M_S2 * min(carried)
     seen = float(np.quantile(known, 0.99)) if known.size else 0.0
     evidence = f"{seen:.1f} m/s^2 were driven, the file's tyres carry its mass up to {most:.1f} m/s^2"
     if seen > MAX_GRIP_USE * most:

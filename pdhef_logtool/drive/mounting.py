@@ -9,16 +9,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
-from itertools import permutations, product
+from functools import cached_property
 
 import numpy as np
 
-from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.drive.checks import check_drive, drive_columns, explained_factors
+from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
+from pdhef_logtool.drive.checks import check_drive, explained_factors
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
-from pdhef_logtool.drive.relations import G, steering_references, yaw_references
+from pdhef_logtool.drive.faulty_samples import without_faulty_samples
+from pdhef_logtool.drive.frames import (
+    IS_GRAVITY_M_S2,
+    frames_alone,
+    frames_check,
+    gravity_agrees,
+    nearest_step,
+    placed_rotation,
+    rotation_text,
+)
+from pdhef_logtool.drive.measured import Measured, measure
+from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -32,12 +42,12 @@ from pdhef_logtool.drive.truth import (
 )
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import ClockModel, MappedChannels, Mapping, SignalSource, read_signals
+from pdhef_logtool.mapping.frames import Placement, placement_of
 from pdhef_logtool.mapping.triads import ACCELERATIONS, MOUNTED, RATES, Triad, find_triads
 from pdhef_logtool.records.checks import Check, Verdict
-from pdhef_logtool.records.signals import Channel, FloatArray
+from pdhef_logtool.records.signals import FloatArray
 
-#: Mean accelerations between these are gravity; below the least, the sensor's software took it off.
-GRAVITY_M_S2 = (0.75 * G, 1.25 * G)
+#: Mean accelerations below are no gravity: the sensor's software took it off.
 COMPENSATED_M_S2 = 3.0
 #: How far speed and yaw rate explain the level accelerations once the axes are right; the rest is sideslip, roll,
 #: grade, crossfall and noise. Below, nothing is said.
@@ -57,6 +67,8 @@ ASKEW_CORRELATION = 0.85
 ASKEW_ERROR_DEG = 1.5
 #: Correlation of the yaw rate with another measurement of it that settles its sign.
 SIGN_CORRELATION = 0.5
+#: And that makes a sensor left-handed: the wheels' difference turns round where a car pushes over its front tyres.
+HAND_CORRELATION = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,48 +96,24 @@ class Mounting:
         return all(np.allclose(r, n, atol=1e-3) for r, n in zip(self.rows, self.named, strict=True) if n.any())
 
     @property
-    def degrees(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw of the sensor in the car: it is turned by yaw first, then pitch, then roll."""
-        m = self.rotation
-        pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
-        if abs(m[2, 0]) > 1.0 - 1e-6:  # straight up or down: roll and yaw are one angle
-            return 0.0, math.degrees(pitch), math.degrees(math.atan2(-m[0, 1], m[1, 1]))
-        roll, yaw = math.atan2(m[2, 1], m[2, 2]), math.atan2(m[1, 0], m[0, 0])
-        return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
-
-    @property
     def text(self) -> str:
         """The rotation in words."""
-        roll, pitch, yaw = (round(a) + 0 if abs(a - round(a)) < 0.05 else round(a, 1) for a in self.degrees)
         mirrored = "" if self.hand > 0.0 else ", its angular rates with the opposite sign"
-        return f"the IMU is mounted with roll {roll:g}, pitch {pitch:g}, yaw {yaw:g} deg{mirrored}"
+        return f"{rotation_text(self.rotation)}{mirrored}"
 
 
-def find_mounting(
-    signals: Mapped[str, Channel],
-    truth: Mapped[str, Channel],
-    derived: TruthTrack | None,
-    triads: tuple[Triad | None, Triad | None],
-    mapping: Mapping,
-) -> Mounting | None:
+def find_mounting(measured: Measured, triads: tuple[Triad | None, Triad | None], mapping: Mapping) -> Mounting | None:
     """Find the rotation of an IMU from its six components; None where there are none, or the drive says nothing.
 
-    Parameters
-    ----------
-    signals : as mapped, with the components of the triads beside them. derived : truth, for the sign of the yaw rate.
+    ``measured``: with the components of the triads beside the signals, and truth for the sign of the yaw rate.
     """
     accelerations, rates = triads
-    if accelerations is None or rates is None:
-        return None
-    columns, speed_name = drive_columns(signals, truth, derived)
-    if not all(n in columns for n in (*ACCELERATIONS, *RATES)):
+    columns, speed_name = measured.columns, measured.speed_name
+    if accelerations is None or rates is None or not all(n in columns for n in (*ACCELERATIONS, *RATES)):
         return None
     f = np.stack([columns[n] for n in ACCELERATIONS], axis=1)
     w = np.stack([columns[n] for n in RATES], axis=1)
-    named = np.zeros((3, 3))
-    for i, name in enumerate(MOUNTED):
-        if name in mapping.signals:
-            named[i] = (rates if i == 2 else accelerations).row(mapping.signals[name])
+    named = _named_rows(mapping, accelerations, rates)
     speed = np.full(f.shape[0], np.nan) if speed_name is None else columns[speed_name]
     references = yaw_references(columns, speed_name)
     ups = _ups(f, w, named)
@@ -134,18 +122,28 @@ def find_mounting(
     found = [m for h in (1.0, -1.0) for up in ups if (m := _turned(f, h * w, speed, up, references)) is not None]
     hands = [1.0] * (len(found) // 2) + [-1.0] * (len(found) // 2)
     # Another measurement of the yaw rate must say so before a sensor is taken for a left-handed one.
-    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and (m.sign > 0.0 or h + m.sign > 0.0)]
+    fitting = [(m, h) for m, h in zip(found, hands, strict=True) if m.fits and h * HAND_CORRELATION > -m.sign]
     if not fitting:
         return None
-    best, hand = max(fitting, key=lambda x: x[0].correlation + x[0].sign)
+    best, hand = max(fitting, key=lambda x: x[0].correlation + np.sign(x[0].sign))
     return Mounting(_snapped(best), named, best.evidence, best.sign > 0.0 or best.along, hand)
+
+
+def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatArray:
+    """Return the rows [3, 3] of the sensor's axes that a mapping reads, 0 where it lacks one."""
+    named = np.zeros((3, 3))
+    for i, name in enumerate(MOUNTED):
+        if name in mapping.signals:
+            named[i] = (rates if i == 2 else accelerations).row(mapping.signals[name])
+    return named
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
-    ``sign``: what other measurements say of the yaw rate's; ``along``: the speed alone says which way is forward.
+    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells; ``along``: the speed alone says
+    which way is forward.
     """
 
     rotation: FloatArray
@@ -162,7 +160,7 @@ def _ups(f: FloatArray, w: FloatArray, named: FloatArray) -> list[FloatArray]:
     """Return the directions [3] that may be up: gravity's, or any axis where the sensor takes gravity off."""
     mean = np.nanmean(f, axis=0) if np.isfinite(f).all(axis=1).any() else np.zeros(3)
     size = float(np.linalg.norm(mean))
-    if GRAVITY_M_S2[0] < size < GRAVITY_M_S2[1]:
+    if IS_GRAVITY_M_S2[0] < size < IS_GRAVITY_M_S2[1]:
         return [mean / size]
     if size > COMPENSATED_M_S2:
         return []
@@ -215,7 +213,9 @@ def _turned(
         mean = np.mean(f[use], axis=0) - rotation.T @ np.array([driven[use].real.mean(), driven[use].imag.mean(), 0.0])
         if np.linalg.norm(mean) > COMPENSATED_M_S2:
             axis = mean / np.linalg.norm(mean)
-    sign, said = _sign_of(w @ axis, references)
+    sign, said = _sign_of(np.where(gentle_at(speed * rate, moving), rate, np.nan), references)
+    if sign == 0.0:
+        sign, said = _sign_of(rate, references)
     evidence = (
         f"speed and yaw rate explain the level accelerations with correlation {correlation:.2f} and gain {gain:.2f}, "
         f"yaw known to {error:.1f} deg{said}"
@@ -232,7 +232,7 @@ def _along(measured: FloatArray, driven: FloatArray) -> bool:
 
 
 def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tuple[float, str]:
-    """Return +1, -1 or 0 for the sign of the yaw rate by the best of other measurements of it, and what that is."""
+    """Return the correlation of the yaw rate with the best of other measurements of it, and what that is; 0: none."""
     best, said = 0.0, ""
     for text, reference in references:
         use = np.isfinite(rate) & np.isfinite(reference)
@@ -243,13 +243,13 @@ def _sign_of(rate: FloatArray, references: list[tuple[str, FloatArray]]) -> tupl
         correlation = float(np.mean(a * b)) / spread if spread > 0.0 else 0.0
         if abs(correlation) > max(SIGN_CORRELATION, abs(best)):
             best, said = correlation, f", yaw rate against {text} {correlation:.2f}"
-    return float(np.sign(best)), said
+    return best, said
 
 
 def _snapped(turn: _Turn) -> FloatArray:
     """Return the multiple of 90 degrees beside a rotation, with what of the rest is no grade, crossfall or sideslip."""
     rotation = turn.rotation
-    step = max(_right_angles(), key=lambda p: float(np.sum(p * rotation)))
+    step = nearest_step(rotation)
     rest = rotation @ step.T
     tilt = math.degrees(math.acos(float(np.clip(rest[2, 2], -1.0, 1.0))))
     yaw = math.degrees(math.atan2(rest[1, 0] - rest[0, 1], rest[0, 0] + rest[1, 1]))
@@ -275,54 +275,53 @@ def _level_only(rest: FloatArray) -> FloatArray:
     return np.asarray(np.eye(3) + sine * cross + (1.0 - cosine) * cross @ cross)
 
 
-def _right_angles() -> list[FloatArray]:
-    """Return the 24 rotations by multiples of 90 degrees."""
-    found = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            for row, (column, sign) in enumerate(zip(order, signs, strict=True)):
-                matrix[row, column] = sign
-            if np.linalg.det(matrix) > 0.0:
-                found.append(matrix)
-    return found
-
-
 # ------------------------------------------------------------------------------------- into the mapping
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Survey:
-    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain."""
+    """The first minutes of a log as its mapping reads them, the IMU turned into the car where that is certain.
+
+    ``vehicle``: whose file is held against the drive; the default car stands for none.
+    """
 
     mapping: Mapping
     channels: MappedChannels
+    measured: Measured
+    vehicle: VehicleParameters
     truth: TruthTrack | None
     truth_plan: TruthPlan | None
     latency: LatencyEstimate | None
     triads: tuple[Triad | None, Triad | None] = (None, None)
     mounting: Mounting | None = None
+    placed: Placement | None = None
+    framed: Check | None = None
 
     @property
-    def checks(self) -> tuple[Check, ...]:
-        """Whether each of the IMU's signals is read from the axis that the drive says."""
-        return () if self.mounting is None else tuple(mounting_checks(self.mapping, self.mounting, self.triads))
+    def mounted(self) -> tuple[Check, ...]:
+        """Whether each of the IMU's signals is read from the axis that the drive says, and what frames say of it."""
+        framed = () if self.framed is None else (self.framed,)
+        if self.mounting is None:
+            return framed
+        return (*mounting_checks(self.mapping, self.mounting, self.triads), *framed)
 
     @property
     def is_mounted(self) -> bool:
         """Whether the IMU is known to be read from the right axes."""
         return self.mounting is not None and self.mounting.confident and self.mounting.is_as_named
 
-    def all_checks(self, vehicle: VehicleParameters | None = None) -> tuple[Check, ...]:
-        """Return the checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
+    @cached_property
+    def checks(self) -> tuple[Check, ...]:
+        """The checks of the mounting with those of :func:`~pdhef_logtool.drive.checks.check_drive`."""
         channels = self.channels
         found = check_drive(
             channels.signals,
             channels.truth,
             self.truth,
-            vehicle,
+            self.vehicle,
             latency=self.latency,
             mounting_is_known=self.is_mounted,
+            measured=self.measured,
         )
         if self.mounting is not None and self.is_mounted:
             # Right axes have right signs, and gravity says the unit.
@@ -332,7 +331,7 @@ class Survey:
             found = tuple(
                 k if c.verdict == "undecided" and c.name in settled else c for c, k in zip(found, known, strict=True)
             )
-        return (*self.checks, *self._of_names(found), *found)
+        return (*self.mounted, *self._of_names(found), *found)
 
     def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""
@@ -353,7 +352,7 @@ def survey_log(
     mapping: Mapping,
     clocks: dict[str, ClockModel],
     span_ns: tuple[int, int],
-    truth_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    vehicle: VehicleParameters | None = None,
     *,
     rescale: bool = True,
 ) -> Survey:
@@ -363,35 +362,74 @@ def survey_log(
 
     Parameters
     ----------
+    vehicle : of the drive; None: nothing is known of it.
     rescale : whether a wrong unit or sign is looked for.
     """
+    vehicle = vehicle or default_vehicle()
     triads = find_triads(log, mapping)
     extra: dict[str, SignalSource] = {}
     for triad, names in zip(triads, (ACCELERATIONS, RATES), strict=True):
         extra |= {} if triad is None else triad.components(names)
     channels = read_signals(log, replace(mapping, signals={**mapping.signals, **extra}), clocks, *span_ns)
-    truth_plan = plan_truth(channels.truth, truth_position_m=truth_position_m) if channels.truth else None
+    truth_plan = plan_truth(channels.truth, truth_position_m=vehicle.truth_position_m) if channels.truth else None
     truth = None if truth_plan is None else derive_truth(channels.truth, plan=truth_plan)
+    measured = measure(channels.signals, channels.truth, truth)
     # What an estimator is given must not hang on the truth: with it, a mounting is only checked.
-    found = find_mounting(channels.signals, {}, None, triads, mapping)
+    found = find_mounting(measured.without_truth(), triads, mapping)
     blind = found is not None and found.confident
     if not blind and truth is not None:
-        found = find_mounting(channels.signals, channels.truth, truth, triads, mapping)
+        found = find_mounting(measured, triads, mapping)
+    placed, framed, by_frames = _by_frames(log, mapping, channels, triads, found)
+    found = by_frames or found
     channels = replace(channels, signals={n: c for n, c in channels.signals.items() if n not in extra})
-    if found is not None and mapping.origin == "auto" and blind and not found.is_as_named:
+    measured = measured.without(extra)
+    trusted = blind or by_frames is not None
+    if found is not None and mapping.origin == "auto" and trusted and not found.is_as_named:
         note = f"{found.text}, and is read so: {found.evidence}"
         signals = turned_signals(mapping, found, triads)
         mapping = replace(mapping, signals=signals, notes=(*mapping.notes, note))
         channels = read_signals(log, mapping, clocks, *span_ns)
         found = replace(found, named=found.rows)
-    survey = Survey(mapping, channels, truth, truth_plan, truth_latency(channels, truth), triads, found)
+        measured = measure(channels.signals, channels.truth, truth)
+    latency = truth_latency(channels, truth)
+    survey = Survey(mapping, channels, measured, vehicle, truth, truth_plan, latency, triads, found, placed, framed)
     if rescale and mapping.origin == "auto" and (scaled := _rescaled(survey)) != mapping:
-        undone = survey_log(log, scaled, clocks, span_ns, truth_position_m, rescale=False)
+        undone = survey_log(log, scaled, clocks, span_ns, vehicle, rescale=False)
         # A sensor that fails looks like a wrong unit of another; what is right contradicts nothing any more.
-        failed = [check.name for check in undone.all_checks() if check.verdict == "failed"]
-        if not any(name.endswith((".sign", ".unit", ".axis")) for name in failed):
+        failed = [check.name for check in undone.checks if check.verdict == "failed"]
+        if not any(name.endswith((".sign", ".unit", ".axis", ".fault")) for name in failed):
             return undone
     return survey
+
+
+def _by_frames(
+    log: DriveLog,
+    mapping: Mapping,
+    channels: MappedChannels,
+    triads: tuple[Triad | None, Triad | None],
+    found: Mounting | None,
+) -> tuple[Placement | None, Check | None, Mounting | None]:
+    """Return where recorded frames put the IMU, the check of it, and the mounting where they alone say it.
+
+    Parameters
+    ----------
+    found : what the drive shows.
+    """
+    accelerations, rates = triads
+    placed = None if accelerations is None else placement_of(log, accelerations.source.topic)
+    if placed is None or accelerations is None or rates is None:
+        return placed, None, None
+    components = [channels.signals.get(n) for n in ACCELERATIONS]
+    force = np.array([np.nanmean(c.values) if c is not None and len(c) else np.nan for c in components])
+    sure = found if found is not None and found.confident else None
+    shown, evidence = (None, "") if sure is None else (sure.rotation, sure.evidence)
+    check = frames_check(placed, shown, evidence, force)
+    believed = "" if sure is not None else gravity_agrees(placed, force)
+    if not believed:
+        return placed, check, None
+    rotation, named = placed_rotation(placed), _named_rows(mapping, accelerations, rates)
+    alone = Mounting(rotation, named, f"{believed}; the drive does not tell the rest", confident=False)
+    return placed, check if alone.is_as_named else frames_alone(placed, believed), alone
 
 
 def _rescaled(survey: Survey) -> Mapping:
@@ -400,8 +438,12 @@ def _rescaled(survey: Survey) -> Mapping:
     The truth takes no part in it, and is itself only checked: what is scored against is not bent.
     """
     mapping = survey.mapping
-    alone = replace(survey.channels, truth={})
-    found = explained_factors(alone, None, known_mounting=survey.is_mounted, most=1)
+    alone = survey.measured.without_truth()
+    found = explained_factors(alone, mounting_is_known=survey.is_mounted, most=1)
+    if found:
+        sound, shares = without_faulty_samples(survey.channels.signals, survey.vehicle)
+        if shares:
+            found = explained_factors(measure(sound), mounting_is_known=survey.is_mounted, most=1)
     for name, (factor, evidence) in found.items():
         if name not in mapping.signals:
             continue

@@ -17,14 +17,16 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import (
     LEVER_M,
     SURE,
-    drive_columns,
+    SensorErrors,
     explained_factors,
     is_turned,
     sensor_errors,
     sideslip_offset,
 )
+from pdhef_logtool.drive.measured import drive_columns
 from pdhef_logtool.drive.mounting import Survey, scaled_source, turned_signals
 from pdhef_logtool.drive.truth import LATE_GYRO_S, LatencyEstimate, TruthTrack
+from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.mapping.records import Mapping, SignalSource
 from pdhef_logtool.records.signals import Channel
 
@@ -33,6 +35,8 @@ LEAST_GAIN = 0.01
 LEAST_LEVER_M = 0.3 * LEVER_M
 #: Beyond, it is no gain but a unit, and no place in a car.
 MOST_GAIN = 0.25
+#: As well as recorded frames know a place.
+FRAMES_M = 0.15
 MOST_LEVER_M = 5.0
 
 
@@ -85,9 +89,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
             if source != signals[name]:
                 signals[name] = source
                 found.append(Proposal("mapping", name, f"{mounting.text}: {mounting.evidence}", source))
-    factors = (
-        {} if is_turned_imu else explained_factors(survey.channels, survey.truth, known_mounting=survey.is_mounted)
-    )
+    factors = {} if is_turned_imu else explained_factors(survey.measured, mounting_is_known=survey.is_mounted)
     for subject, (factor, evidence) in factors.items():
         section = truth if subject.startswith("truth.") else signals
         name = subject.removeprefix("truth.")
@@ -106,8 +108,7 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
 
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:
     """Return the sources of a truth whose sideslip is off by a constant, as far as a mapping can turn them back."""
-    columns, _ = drive_columns(survey.channels.signals, survey.channels.truth, survey.truth)
-    found = sideslip_offset(columns)
+    found = sideslip_offset(survey.measured.columns)
     if found is None or survey.truth is None or not is_turned(*found):
         return []
     offset, error = found
@@ -139,12 +140,14 @@ def car_proposals(
     latency: LatencyEstimate | None,
     gyro_latency_s: float,
     vehicle: VehicleParameters,
+    placed: Placement | None = None,
 ) -> tuple[Proposal, ...]:
     """Return what regression on truth says of place, gain and delay of the sensors beside what the vehicle knows.
 
     Parameters
     ----------
     channels : as measured, mapped right. gyro_latency_s : what was taken off the gyro's stamps already.
+    placed : where recorded frames put the IMU.
     """
     if latency is not None and "yaw_rate_rad_s" in channels:  # late, it would look smaller than it is
         gyro = channels["yaw_rate_rad_s"]
@@ -159,6 +162,8 @@ def car_proposals(
         evidence = f"a_y goes with {errors.lever_m:.2f} +- {errors.lever_error_m:.2f} m of the yaw acceleration"
         place = {"imu_position_m": (round(errors.lever_m, 3), *rest)}
         found.append(Proposal("car", "ay_m_s2", evidence, entries=place, error=errors.lever_error_m))
+    if placed is not None and errors.lever_error_m < MOST_LEVER_M:
+        found += _of_frames(placed, errors, vehicle)
     off = abs(errors.yaw_rate_gain - vehicle.sensors.yaw_rate_gain)
     if max(LEAST_GAIN, SURE * errors.gain_error) < off < MOST_GAIN:
         evidence = f"the gyro reads {errors.yaw_rate_gain:.3f} +- {errors.gain_error:.3f} of the truth's yaw rate"
@@ -168,6 +173,26 @@ def car_proposals(
         delay = {"sensors.yaw_rate_delay_s": round(gyro_latency_s + latency.gyro_delay_s, 4)}
         found.append(Proposal("car", "yaw_rate_rad_s", latency.reason, entries=delay, error=latency.std_error_s))
     return tuple(found)
+
+
+def _of_frames(placed: Placement, errors: SensorErrors, vehicle: VehicleParameters) -> list[Proposal]:
+    """Return the place in the car that recorded frames give, where a_y tells which point of it their origin is."""
+    x, y = (float(v) for v in placed.position_m[:2])
+    origins = {"the CG": 0.0, "the middle of the rear axle": -vehicle.cg_to_rear_axle_m}
+    off = {name: abs(x + at - errors.lever_m) for name, at in origins.items()}
+    near = [name for name, metres in off.items() if metres < max(FRAMES_M, 2.0 * errors.lever_error_m)]
+    if len(near) != 1 or abs(y) > MOST_LEVER_M:
+        return []
+    ahead = x + origins[near[0]]
+    own_x, own_y, own_z = vehicle.imu_position_m
+    if math.hypot(ahead - own_x, y - own_y) < LEAST_LEVER_M:
+        return []
+    evidence = (
+        f"the recorded frames put {placed.frame} at {x:.2f}, {y:.2f} m of {placed.base}, which is {near[0]}: "
+        f"a_y goes with {errors.lever_m:.2f} +- {errors.lever_error_m:.2f} m of the yaw acceleration"
+    )
+    place = {"imu_position_m": (round(ahead, 3), round(y, 3), own_z)}
+    return [Proposal("car", "ay_m_s2", evidence, entries=place, error=FRAMES_M)]
 
 
 def surest(proposals: Iterable[Proposal]) -> tuple[Proposal, ...]:

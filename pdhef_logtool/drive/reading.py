@@ -116,6 +116,16 @@ class Drive:
         return self._sha256
 
     @property
+    def signals_sha256(self) -> str | None:
+        """Hash of the mapped signals, None where there are none; complete once all windows were read."""
+        return None if self._reader is None else self._reader.hashes["signal"].hexdigest()
+
+    @property
+    def truth_sha256(self) -> str | None:
+        """Hash of the mapped truth, as :attr:`signals_sha256`."""
+        return None if self._reader is None else self._reader.hashes["truth"].hexdigest()
+
+    @property
     def losses(self) -> tuple[Loss, ...]:
         """What could not be used; complete once all windows were read. Files are named without their folder."""
         found = merge_losses(

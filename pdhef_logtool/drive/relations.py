@@ -8,14 +8,16 @@ from itertools import combinations
 
 import numpy as np
 
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
 from pdhef_logtool.records.signals import WHEELS, BoolArray, FloatArray
 
 DEGREE = float(np.pi / 180.0)
-G = 9.80665
 
 #: Below this correlation a gain says nothing; above it, it is known to its reciprocal.
 MIN_CORRELATION = 0.6
+#: What is left of two columns by regression is small, and a car that slides leaves it related otherwise.
+MIN_PARTIAL_CORRELATION = 0.8
 #: And it must stand so far out of chance, by Fisher's z of the independent samples.
 MIN_CHANCE_Z = 3.0
 #: Independent samples below which nothing is said: 3 s of driving.
@@ -67,6 +69,7 @@ class Relation:
     ----------
     expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
         together, move by more than what disturbs them. signless : a side is a size.
+    least_correlation : below it the gain says nothing.
     """
 
     text: str
@@ -77,11 +80,12 @@ class Relation:
     samples: float
     moves: bool = False
     signless: bool = False
+    least_correlation: float = MIN_CORRELATION
 
     @property
     def tells(self) -> bool:
         """Return whether the drive excites the relation enough for a verdict."""
-        return abs(self.correlation) >= MIN_CORRELATION and self._chance_z >= MIN_CHANCE_Z
+        return abs(self.correlation) >= self.least_correlation and self._chance_z >= MIN_CHANCE_Z
 
     @property
     def unrelated(self) -> bool:
@@ -149,7 +153,7 @@ def measured_relations(columns: Mapping[str, FloatArray], speed_name: str | None
         found += _steering(columns, speed_name, speed)
         found += _speeds(columns, speed_name, speed)
         found += _wheel_differences(columns, speed_name, speed)
-        found += _courses(columns, moving_at(speed))
+        found += _courses(columns, speed)
     found += _twice(columns, "yaw_rate_rad_s", "truth.yaw_rate_rad_s", MOVES_RAD_S)
     found += _twice(columns, "ay_m_s2", "truth.ay_m_s2", MOVES_M_S2)
     return found + _sideslips(columns)
@@ -250,7 +254,7 @@ def _units(name: str) -> list[tuple[float, str]]:
     if name == "steering_wheel_rad":
         return [*to_radians, (TYPICAL_STEERING_RATIO, "is the road-wheel angle")]
     if name in ("ax_m_s2", "ay_m_s2"):
-        return [(G, "is in g"), (1.0 / G, "was converted from g twice")]
+        return [(GRAVITY_M_S2, "is in g"), (1.0 / GRAVITY_M_S2, "was converted from g twice")]
     if name in ("vx_m_s", "vy_m_s", "speed_m_s"):
         return [*of_speeds, (1e-3, "is in mm/s")]
     if name.startswith("wheel_speed") and name.endswith("_rad_s"):
@@ -296,6 +300,27 @@ def compare(
     return [Relation(text, powers, correlation, gain, expected, samples, both)]
 
 
+def compare_at_ease(
+    text: str,
+    powers: dict[str, int],
+    reference: FloatArray,
+    measured: FloatArray,
+    use: tuple[BoolArray, BoolArray],
+    expected: tuple[float, float],
+    *,
+    moves: float | None = None,
+) -> list[Relation]:  # positional: both sides of a relation and what is wanted of them
+    """Return the relation over the first of ``use``, or over the second where it holds there alone.
+
+    A sign, a unit and an axis are wrong everywhere; what holds in gentle driving is not wrong where the car slides.
+    """
+    found = compare(text, powers, reference, measured, use[0], expected, moves=moves)
+    if all(r.accepts() and not r.unrelated for r in found):
+        return found
+    gentle = compare(text, powers, reference, measured, use[1], expected, moves=moves)
+    return gentle if gentle and all(r.tells and r.accepts() for r in gentle) else found
+
+
 def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace: FloatArray) -> list[Relation]:
     """Relate the accelerations to speed and yaw rate, of the sensors or of the truth."""
     found: list[Relation] = []
@@ -304,7 +329,8 @@ def _motion(columns: Mapping[str, FloatArray], prefix: str, pace_name: str, pace
     if yaw is not None and left is not None:
         powers = {f"{prefix}ay_m_s2": 1, f"{prefix}yaw_rate_rad_s": -1, pace_name: -1}
         text = f"{prefix}ay_m_s2 against {prefix}yaw_rate_rad_s x speed"
-        found += compare(text, powers, yaw * pace, left, moving, GAIN_RANGE, moves=MOVES_M_S2)
+        use = (moving, gentle_at(yaw * pace, moving))
+        found += compare_at_ease(text, powers, yaw * pace, left, use, GAIN_RANGE, moves=MOVES_M_S2)
     if forward is not None:
         powers = {f"{prefix}ax_m_s2": 1, pace_name: -1}
         text = f"{prefix}ax_m_s2 against the derivative of the speed"
@@ -363,11 +389,15 @@ def _speeds(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatArra
     wanted |= {"truth.vx_m_s": SAME_RANGE, "truth.position_speed_m_s": SAME_RANGE}
     found = []
     moving = moving_at(speed)
+    # A wheel spins or locks at the limit, and each of them goes its own way where the car does.
+    gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
     for name, expected in wanted.items():
         column = columns.get(name)
         if column is None or name == speed_name:
             continue
-        use = moving & np.isfinite(column)
+        use = gentle & np.isfinite(column)
+        if independent_samples(int(np.count_nonzero(use))) < MIN_SAMPLES:
+            use = moving & np.isfinite(column)
         samples = independent_samples(int(np.count_nonzero(use)))
         if samples < MIN_SAMPLES:
             continue
@@ -409,6 +439,7 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
     """Relate yaw rate and a_y to what the wheels of an axle turn faster on the right: no wheel is mounted wrong."""
     moving = moving_at(speed)
     pairs = _axle_differences(columns, speed)
+    gentle = moving if "yaw_rate_rad_s" not in columns else gentle_at(columns["yaw_rate_rad_s"] * speed, moving)
     found = []
     for name, factor, powers in (
         ("yaw_rate_rad_s", np.ones_like(speed), {"yaw_rate_rad_s": -1, speed_name: 1}),
@@ -418,7 +449,9 @@ def _wheel_differences(columns: Mapping[str, FloatArray], speed_name: str, speed
             either = [
                 r
                 for text, difference in pairs
-                for r in compare(f"{text} against {name}", powers, columns[name], factor * difference, moving, TRACK_M)
+                for r in compare_at_ease(
+                    f"{text} against {name}", powers, columns[name], factor * difference, (moving, gentle), TRACK_M
+                )
             ]
             found += sorted(either, key=lambda r: abs(r.correlation))[-1:]
     return found
@@ -430,16 +463,18 @@ def _scaled_to(wheel: FloatArray, speed: FloatArray, moving: BoolArray) -> Float
     return wheel / ratio if ratio != 0.0 else np.full(wheel.shape[0], np.nan)
 
 
-def _courses(columns: Mapping[str, FloatArray], moving: BoolArray) -> list[Relation]:
+def _courses(columns: Mapping[str, FloatArray], speed: FloatArray) -> list[Relation]:
     """Relate the yaw rates to the rate of the truth's course over ground."""
     course = columns.get("truth.course_rate_rad_s")
     if course is None:
         return []
     found = []
+    moving = moving_at(speed)
     for name in ("yaw_rate_rad_s", "truth.yaw_rate_rad_s"):
         if name in columns:
             text = f"{name} against the turning of the truth's path"
-            found += compare(text, {name: 1}, course, columns[name], moving, GAIN_RANGE, moves=MOVES_RAD_S)
+            use = (moving, gentle_at(columns[name] * speed, moving))
+            found += compare_at_ease(text, {name: 1}, course, columns[name], use, GAIN_RANGE, moves=MOVES_RAD_S)
     return found
 
 
@@ -505,4 +540,5 @@ def _partial(
         out = np.full(column.shape[0], np.nan)
         out[known] = column[known] - aside @ np.linalg.lstsq(aside, column[known], rcond=None)[0]
         left.append(out)
-    return compare(text, powers, left[0], left[1], known, (0.0, np.inf))
+    found = compare(text, powers, left[0], left[1], known, (0.0, np.inf))
+    return [replace(r, least_correlation=MIN_PARTIAL_CORRELATION) for r in found]

@@ -19,6 +19,7 @@ from pdhef_logtool.drive.alignment import (
     no_alignment,
     plan_alignment,
 )
+from pdhef_logtool.drive.channel_hash import ChannelHash
 from pdhef_logtool.drive.mounting import survey_log
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
@@ -38,6 +39,7 @@ from pdhef_logtool.mapping import (
     merge_losses,
     read_signals,
 )
+from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.ledger import Role, SampleCount
 from pdhef_logtool.records.readings import impossible_readings
@@ -49,6 +51,8 @@ TOLD_GAP_S = 1.0
 TOLD_GAP_PERIODS = 10.0
 #: Why a signal's samples are not used although nothing is wrong with them.
 _NOT_NEEDED = "not-needed"
+#: Before every stamp.
+_FIRST_NS = -(1 << 63)
 _JUMP = "samples whose stamps jump back behind what had been processed were dropped"
 _IMPOSSIBLE = "readings that no vehicle can have were taken as missing by the estimators"
 _LATE = "samples arrived much later than their neighbours: they were not waited for and count as missing"
@@ -60,11 +64,11 @@ class DrivePlan:
 
     Attributes
     ----------
-    survey_signals, survey_truth : the channels that it was decided on.
+    survey_truth : the truth's channels that it was decided on.
     latency : of the truth against the sensors; None without truth yaw rate or gyro.
     dependent : truth quantities that are an input of the estimators, with the reason.
     derivation : by truth quantity, how it is derived.
-    checks : of signals, truth and vehicle file.
+    checks : of signals, truth and vehicle file. placed : where recorded frames put the IMU.
     """
 
     mapping: Mapping
@@ -75,11 +79,11 @@ class DrivePlan:
     latency: LatencyEstimate | None
     dependent: dict[str, str]
     derivation: dict[str, str]
-    survey_signals: dict[str, Channel]
     survey_truth: dict[str, Channel]
     start_ns: int
     end_ns: int
     checks: tuple[Check, ...] = ()
+    placed: Placement | None = None
 
     @property
     def truth_latency_s(self) -> float:
@@ -130,7 +134,7 @@ def plan_drive(
     mapping = with_gyro_delay(mapping, vehicle)
     clocks = fit_clocks(log, mapping, start_ns, end_ns)
     span_ns = (start_ns, min(end_ns, start_ns + round(SURVEY_S * 1e9)))
-    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle.truth_position_m)
+    looked_at = survey_log(log, mapping, clocks, span_ns, vehicle)
     mapping, survey = looked_at.mapping, looked_at.channels
     if require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
@@ -151,11 +155,11 @@ def plan_drive(
         latency=looked_at.latency,
         dependent=dependent_signals(survey.signals, survey.truth) if survey.truth else {},
         derivation=derivation,
-        survey_signals=survey.signals,
         survey_truth=survey.truth,
         start_ns=start_ns,
         end_ns=end_ns,
-        checks=looked_at.all_checks(vehicle),
+        checks=looked_at.checks,
+        placed=looked_at.placed,
     )
 
 
@@ -173,7 +177,8 @@ def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
 class DriveReader:
     """Reads a planned drive once from start to end; ``losses``, ``samples`` and ``counts`` grow while it does.
 
-    ``counts`` are those of :class:`~pdhef_logtool.mapping.channels.MappedChannels`, of all windows so far.
+    ``counts`` are those of :class:`~pdhef_logtool.mapping.channels.MappedChannels`, of all windows so far;
+    ``hashes`` by role what the channels held, complete once all windows were read.
     """
 
     log: DriveLog
@@ -182,6 +187,7 @@ class DriveReader:
     losses: tuple[Loss, ...] = ()
     samples: dict[str, int] | None = None
     counts: dict[tuple[Role, str], Counter[str]] = field(default_factory=dict)
+    hashes: dict[Role, ChannelHash] = field(default_factory=lambda: {"signal": ChannelHash(), "truth": ChannelHash()})
     _done: bool = False
 
     def windows(self) -> Iterator[DriveWindow]:
@@ -192,6 +198,7 @@ class DriveReader:
         truth: dict[str, Channel] = {}
         counts: dict[str, int] = {}
         done_ns: int | None = None
+        hashed_ns = _FIRST_NS
         ends = list(windows(plan.start_ns, plan.end_ns, round(self.window_s * 1e9), self.log.occupied))
         for a, b in ends:
             part = read_signals(self.log, plan.mapping, plan.clocks, a, b)
@@ -221,6 +228,8 @@ class DriveReader:
             until = newest if last else min(newest, b) - margin
             if until <= done_ns:
                 continue
+            self._hash(signals, truth, hashed_ns, None if last else until)
+            hashed_ns = until
             yield self._window(signals, truth, done_ns, until, (b - plan.start_ns) / (plan.end_ns - plan.start_ns))
             done_ns = until
             signals = {n: c.between(until - margin) for n, c in signals.items()}
@@ -238,6 +247,15 @@ class DriveReader:
             seam = sum(len(c.between(done_ns)) for c in (before, channel)) - len(joined.between(done_ns))
             behind = int(np.searchsorted(channel.stamps_ns, done_ns))
         self.counts[role, name].update({"time-jump": back, "late": behind - back, "duplicate-stamp": seam})
+
+    def _hash(self, signals: dict[str, Channel], truth: dict[str, Channel], start_ns: int, end_ns: int | None) -> None:
+        """Hash the samples with stamps in [start_ns, end_ns), which no later window changes."""
+        for channels, sources, found in (
+            (signals, self.plan.mapping.signals, self.hashes["signal"]),
+            (truth, self.plan.mapping.truth, self.hashes["truth"]),
+        ):
+            for name, channel in channels.items():
+                found.add(channel.between(start_ns, end_ns), round(sources[name].latency_s * 1e9))
 
     def ledger(self) -> tuple[SampleCount, ...]:
         """Return what became of every sample of the mapped topics; empty until all windows were read."""

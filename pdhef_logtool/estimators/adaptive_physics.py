@@ -33,7 +33,7 @@ from pdhef_logtool.estimators.filter_shell import VX, PosteriorSteps, sideslip_s
 from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
+from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
@@ -50,8 +50,6 @@ CURES = ("force_scale", "bank")
 FORGET_S = 2.0
 #: A smaller weight is none.
 LEAST_WEIGHT = 1e-6
-#: A longer step starts the evidence anew, as it does the filters.
-RESTART_GAP_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,7 +69,6 @@ class AdaptiveCarry:
     inputs: InputCarry
     filters: tuple[FilterCarry, ...]
     evidence: FloatArray
-    last_stamp_ns: int | None
     waiting: MixtureSteps
 
 
@@ -89,10 +86,14 @@ def _gather(dt, likelihood, starts, evidence, out):  # type: ignore[no-untyped-d
 
 
 def gather_evidence(
-    steps: Sequence[PosteriorSteps], before_ns: int | None, evidence: FloatArray
+    steps: Sequence[PosteriorSteps], before: Sequence[FilterCarry] | None, evidence: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Λ [K, H] of the filters' steps, and that after the last; ``evidence`` [H] is that before the first."""
-    evidence = evidence.copy()
+    """Return Λ [K, H] of the filters' steps, and that after the last.
+
+    ``before`` and ``evidence`` [H] are the filters and Λ before the first step, None at the start of a log.
+    """
+    before_ns = None if before is None else before[0].last_stamp_ns
+    evidence = np.zeros(len(steps)) if evidence is None else evidence.copy()
     likelihood = np.stack([s.log_likelihood for s in steps], axis=1)
     out = np.empty_like(likelihood)
     starts = ~np.isfinite(steps[0].prior[:, VX])
@@ -227,7 +228,7 @@ class AdaptivePhysics:
         before: Sequence[FilterCarry | None] = c.filters if c else [None] * len(filters)
         runs = [f.filter_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
         gathered, evidence = gather_evidence(
-            [steps for steps, _ in runs], c.last_stamp_ns if c else None, c.evidence if c else np.zeros(len(filters))
+            [steps for steps, _ in runs], c.filters if c else None, c.evidence if c else None
         )
         weights = weigh(gathered, np.stack([steps.valid for steps, _ in runs], axis=1))
         tracks, after = [], []
@@ -250,8 +251,7 @@ class AdaptivePhysics:
             told["mixture_weight"] = np.where(track.valid, 1.0 - mixture.weights[at, 0], np.nan)
             told["reason"] = np.where(released.arrived, mixture.reason[at], 0)
         track = replace(track, name=self.name, **told)
-        last = last_stamp_ns(signals.stamps_ns, c.last_stamp_ns if c else None)
-        return track, AdaptiveCarry(inputs, tuple(after), evidence, last, mixture.since(released.needed))
+        return track, AdaptiveCarry(inputs, tuple(after), evidence, mixture.since(released.needed))
 
 
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics:

@@ -26,7 +26,14 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.unscented import unscented_weights
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import Release, StepColumns, last_stamp_ns, predictable, step_durations_s
+from pdhef_logtool.records.release import (
+    RESTART_GAP_S,
+    Release,
+    StepColumns,
+    last_stamp_ns,
+    predictable,
+    step_durations_s,
+)
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.watches.speed_slip import SlipCarry
@@ -43,8 +50,6 @@ INPUTS = 5
 #: Speed process noise where the log has no longitudinal accelerometer: the speed is then a random walk (METHOD §1).
 NO_AX_Q_STD = 3.0
 INITIAL_STD = (0.5, 0.5, 0.1, 0.3)
-#: Longer steps are no steps: the filter starts anew behind such a gap.
-RESTART_GAP_S = 0.5
 #: The last steering angle is kept for this long where the signal is missing.
 STEER_HOLD_S = 0.2
 #: A sample further from its prediction than this many standard deviations is not used ...

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 from pdhef_logtool.estimators.stepwise import (
     AY,
-    RESTART_GAP_S,
     VX,
     VY,
     YAW_RATE,
@@ -17,6 +16,7 @@ from pdhef_logtool.estimators.stepwise import (
     run_stepwise,
 )
 from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.records.release import RESTART_GAP_S
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 

@@ -16,7 +16,6 @@ from pdhef_logtool.car.nominal_model import (
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.stepwise import (
     AY,
-    RESTART_GAP_S,
     VX,
     VY,
     YAW_RATE,
@@ -25,6 +24,7 @@ from pdhef_logtool.estimators.stepwise import (
     run_stepwise,
 )
 from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.records.release import RESTART_GAP_S
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 

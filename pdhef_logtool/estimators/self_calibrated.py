@@ -124,7 +124,7 @@ class SelfCalibrated:
             self.estimator,
             self._read(signals),
             None if carry is None else carry.estimator,
-            None if ahead is None else self._read(self._of_friction(ahead)),
+            None if ahead is None else self.given(ahead),
         )
         if self.name == OPEN_LOOP:  # it gives no interval
             return track, Carry(after, ())
@@ -141,6 +141,10 @@ class SelfCalibrated:
         found = self.calibration
         vehicles = (found.vehicle, *found.varied) if found.varied else ()
         return tuple(replace(physics_filter(v, found.noise), read_with=self.read_with) for v in vehicles)
+
+    def given(self, signals: Signals) -> Signals:
+        """Return what the estimator is given of signals that were read with the other vehicle."""
+        return self._read(self._of_friction(signals))
 
     def _read(self, signals: Signals) -> Signals:
         return corrected_anew(signals, self.read_with, self.calibration.vehicle)

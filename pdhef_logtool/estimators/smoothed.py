@@ -33,7 +33,6 @@ import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import (
     FORGET_S,
-    RESTART_GAP_S,
     AdaptivePhysics,
     gather_evidence,
     mix,
@@ -44,7 +43,7 @@ from pdhef_logtool.estimators.filter_shell import AX_BIAS, VX, PosteriorSteps
 from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, StepLinks
 from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import StepColumns, step_durations_s
+from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
@@ -287,9 +286,7 @@ class SmoothedPhysics:
         before = carry.forward if carry else [None] * len(filters)
         runs = [f.linked_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
         gathered, evidence = gather_evidence(
-            [steps for steps, _, _ in runs],
-            carry.forward[0].last_stamp_ns if carry else None,
-            carry.evidence if carry else np.zeros(len(filters)),
+            [steps for steps, _, _ in runs], carry.forward if carry else None, carry.evidence if carry else None
         )
         shared = SharedSteps(gathered, faults.extra_r, faults.reason)
         forward = tuple(ForwardSteps(steps, links) for steps, _, links in runs)

@@ -16,8 +16,6 @@ from pdhef_logtool.watches.speed_slip import ASSUMED_STD_M_S, SlipCarry, believa
 
 #: A speed sample is carried on by a_x for this long.
 SPEED_HOLD_S = 0.5
-#: Longer steps start an integration anew.
-RESTART_GAP_S = 0.5
 
 # Entries of a step's values and of their time derivatives.
 VX, VY, YAW_RATE, AY = 0, 1, 2, 3

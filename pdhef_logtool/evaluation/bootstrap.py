@@ -30,7 +30,7 @@ def block_bootstrap_interval(
     errors : NaN does not count. stamps_ns : int64 [N]. block_s : METHOD asks for at least 10 s. n : resamples.
     """
     sums, counts, _ = block_sums([errors], stamps_ns, block_s)
-    return _interval(lambda s, c: np.sqrt(s[0] / c), sums, counts, n, seed, level)
+    return rmse_interval(sums, counts, n=n, seed=seed, level=level)
 
 
 def block_bootstrap_difference(
@@ -48,20 +48,36 @@ def block_bootstrap_difference(
     ``errors`` belong to the better estimator when the whole interval lies below 0.
     """
     sums, counts, _ = block_sums([errors, other_errors], stamps_ns, block_s)
+    return rmse_difference_interval(sums, counts, n=n, seed=seed, level=level)
+
+
+def rmse_interval(
+    sums: FloatArray, counts: FloatArray, *, n: int = 1000, seed: int = 0, level: float = 0.95
+) -> Interval:
+    """Return the RMSE of blocks with its interval; ``sums`` of squares [1, K] and ``counts`` [K] of samples."""
+    return _interval(lambda s, c: np.sqrt(s[0] / c), sums, counts, n, seed, level)
+
+
+def rmse_difference_interval(
+    sums: FloatArray, counts: FloatArray, *, n: int = 1000, seed: int = 0, level: float = 0.95
+) -> Interval:
+    """Return the first RMSE less the second with its interval; ``sums`` of squares [2, K], ``counts`` [K]."""
     return _interval(lambda s, c: np.sqrt(s[0] / c) - np.sqrt(s[1] / c), sums, counts, n, seed, level)
 
 
 def block_sums(
-    columns: list[FloatArray], stamps_ns: IntArray, block_s: float = 10.0
+    columns: list[FloatArray], stamps_ns: IntArray, block_s: float = 10.0, first_ns: int | None = None
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Return sums of squares [columns, K], samples [K] and numbers [K] of the blocks that hold any.
 
-    Blocks are counted from the first stamp at which all columns [N] are known, and hold such stamps alone.
+    Blocks hold only stamps at which all columns [N] are known, and are counted from ``first_ns``; None: the first of
+    those stamps.
     """
     known = np.isfinite(np.stack(columns)).all(axis=0)
     if not known.any():
         return np.zeros((len(columns), 0)), np.zeros(0), np.zeros(0, dtype=np.int64)
-    block = (stamps_ns[known] - stamps_ns[known][0]) // round(block_s * 1e9)
+    start_ns = stamps_ns[known][0] if first_ns is None else first_ns
+    block = (stamps_ns[known] - start_ns) // round(block_s * 1e9)
     numbers, index = np.unique(block, return_inverse=True)
     sums = [np.bincount(index, weights=c[known] ** 2) for c in columns]
     return np.stack(sums).astype(np.float64), np.bincount(index).astype(np.float64), numbers

@@ -17,8 +17,11 @@ from pdhef_logtool.records.tracks import StateTrack
 
 #: Stamps with the same reason up to this far apart are one interval.
 MERGE_S = 0.5
-#: Intervals that a summary names.
+#: Intervals that a summary names, and that a list of faults holds.
 NAMED_INTERVALS = 3
+LISTED_INTERVALS = 50
+#: Signal by what the name of a reason ends with.
+_SENSORS = {"ay": "ay_m_s2", "yaw_rate": "yaw_rate_rad_s"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +53,23 @@ class ReasonFacts:
     first_ns: int
     end_ns: int
     longest: tuple[Interval, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SensorFault:
+    """One kind of fault of one sensor over a drive.
+
+    Attributes
+    ----------
+    sensor : signal. kind : ``burst``, ``spike``, ``stuck``, ``dead`` or ``missing``.
+    count, seconds : of all intervals. intervals : up to :data:`LISTED_INTERVALS` of the longest, in order of time.
+    """
+
+    sensor: str
+    kind: str
+    count: int
+    seconds: float
+    intervals: tuple[Interval, ...]
 
 
 @dataclass(slots=True)
@@ -108,7 +128,6 @@ class ReasonIntervals:
                 continue
             spans = self._spans[r.bit]
             found = _intervals(spans)
-            longest = sorted(found, key=lambda i: (i.start_ns - i.end_ns, i.start_ns))[:NAMED_INTERVALS]
             facts.append(
                 ReasonFacts(
                     name=r.name,
@@ -118,7 +137,7 @@ class ReasonIntervals:
                     intervals=len(found),
                     first_ns=found[0].start_ns,
                     end_ns=found[-1].end_ns,
-                    longest=tuple(sorted(longest, key=lambda i: i.start_ns)),
+                    longest=_longest(found, NAMED_INTERVALS),
                 )
             )
         return tuple(facts)
@@ -126,13 +145,37 @@ class ReasonIntervals:
 
 def summarise_reasons(track: StateTrack) -> tuple[ReasonFacts, ...] | None:
     """Return the summary of a whole track; None where the source gives no reasons."""
+    found = _gathered(track)
+    return None if found is None else found.summary()
+
+
+def sensor_faults(track: StateTrack) -> tuple[SensorFault, ...] | None:
+    """Return the faults that an estimator found in its sensors; None where it does not look."""
+    found = _gathered(track)
+    if found is None:
+        return None
+    faults = []
+    for name, intervals in found.intervals().items():
+        kind, _, sensor = name.partition("_")
+        seconds = sum(i.end_ns - i.start_ns for i in intervals) * 1e-9
+        listed = _longest(intervals, LISTED_INTERVALS)
+        faults.append(SensorFault(_SENSORS[sensor], kind, len(intervals), seconds, listed))
+    return tuple(sorted(faults, key=lambda f: f.sensor))
+
+
+def _gathered(track: StateTrack) -> ReasonIntervals | None:
     if not len(track.rows(0, 1).reason) == len(track.rows(0, 1)) > 0:
         return None
     found = ReasonIntervals()
     for a, b in row_blocks(len(track)):
         part = track.rows(a, b)
         found.append(part.stamps_ns, part.reason)
-    return found.summary()
+    return found
+
+
+def _longest(intervals: list[Interval], most: int) -> tuple[Interval, ...]:
+    longest = sorted(intervals, key=lambda i: (i.start_ns - i.end_ns, i.start_ns))[:most]
+    return tuple(sorted(longest, key=lambda i: i.start_ns))
 
 
 def _intervals(spans: _Spans) -> list[Interval]:

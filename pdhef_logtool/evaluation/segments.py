@@ -73,7 +73,7 @@ def segment_masks(signals: Signals, truth: StateTrack | None, vehicle: VehiclePa
     ----------
     signals : what the sensors say at the scored stamps. truth : at the same stamps, or None.
     """
-    step_ns, of_truth, bits = median_step_ns(signals), _known_of(truth), []
+    step_ns, of_truth, bits = median_step_ns(signals), known_of(truth), []
     for first, a, b, end in blocks_with_halo(signals, HALO_S, reach_rows(step_ns, MANOEUVRE_SMOOTHING_HZ)):
         part = truth.rows(first, end) if truth else None
         masks = _masks(signals.rows(first, end), part, of_truth, step_ns, vehicle)
@@ -129,7 +129,7 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
 
     ``signals``, ``truth`` as for :func:`segment_masks`.
     """
-    of_truth = _known_of(truth)
+    of_truth = known_of(truth)
     if "vx_m_s" not in of_truth and not _known_anywhere(signals, "speed_m_s"):
         return np.ones(len(signals), dtype=np.bool_)
     blocks = []
@@ -139,11 +139,16 @@ def moving_mask(signals: Signals, truth: StateTrack | None, vehicle: VehiclePara
     return np.concatenate(blocks)
 
 
-def _known_of(truth: StateTrack | None) -> frozenset[str]:
+def known_of(truth: StateTrack | None) -> frozenset[str]:
     """Return what is taken from the truth: all that it ever knows, so that a drive does not mix two sources."""
     if truth is None:
         return frozenset()
     return frozenset(c for c in ("ay_m_s2", "yaw_rate_rad_s", "vx_m_s") if _known_anywhere(truth, c))
+
+
+def speed_and_ay(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str]) -> tuple[FloatArray, FloatArray]:
+    """Return speed in m/s and lateral acceleration in m/s², [N] each; ``of_truth`` from :func:`known_of`."""
+    return _speed(signals, truth, of_truth), _taken(signals, truth, of_truth, "ay_m_s2")
 
 
 def _taken(signals: Signals, truth: StateTrack | None, of_truth: frozenset[str], column: str) -> FloatArray:

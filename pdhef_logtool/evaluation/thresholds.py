@@ -202,15 +202,24 @@ def _read_table(raw: object, where: str, problems: list[str]) -> Threshold | Non
         problems.append(f"{where}: min must not be above max")
     if len(problems) > before:
         return None
-    native = _OTHER_UNITS.get(table.metric) or SIGNALS[table.signal]
-    unit = native if table.unit is None else table.unit
-    factor = 1.0 if unit == native else _CONVERSIONS.get((unit, native))
-    if factor is None:
-        allowed = [native, *(u for u, of in _CONVERSIONS if of == native)]
-        problems.append(f"{where}.unit: {table.signal} {table.metric} is in {' or '.join(allowed)}, not {unit!r}")
+    unit, factor = unit_of(table.signal, table.metric, table.unit, where, problems)
+    if len(problems) > before:
         return None
     rest = table.model_dump(exclude={"min", "max", "unit"})
     return Threshold(minimum=table.min, maximum=table.max, unit=unit, factor=factor, **rest)
+
+
+def unit_of(signal: str, metric: str, unit: str | None, where: str, problems: list[str]) -> tuple[str, float]:
+    """Return the unit that an entry is in and its factor to that of metrics.parquet; a wrong one adds to ``problems``.
+
+    ``unit``: what the entry says; None: that of metrics.parquet.
+    """
+    native = _OTHER_UNITS.get(metric) or SIGNALS[signal]
+    factor = 1.0 if unit in (None, native) else _CONVERSIONS.get((unit, native))
+    if factor is None:
+        allowed = [native, *(u for u, of in _CONVERSIONS if of == native)]
+        problems.append(f"{where}.unit: {signal} {metric} is in {' or '.join(allowed)}, not {unit!r}")
+    return unit or native, factor or 1.0
 
 
 def check_thresholds(thresholds: Sequence[Threshold], rows: Sequence[MetricRow], *, log: str) -> list[Verdict]:

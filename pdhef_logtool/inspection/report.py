@@ -258,7 +258,7 @@ def inspect_drive_log(
         missing=missing_signals(mapping),
         ambiguities=ambiguities,
         notes=(*mapping.notes, *_clock_notes(mapping, clocks)),
-        checks=looked_at.all_checks(),
+        checks=looked_at.checks,
         proposals=mapping_proposals(looked_at),
         # Last, since a log knows all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),

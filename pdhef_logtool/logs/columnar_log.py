@@ -74,6 +74,7 @@ class ColumnarLog:
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
+        self._wanted: set[tuple[int, int]] = set()  # and of these the ones whose messages somebody wanted
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -149,7 +150,7 @@ class ColumnarLog:
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
         for (of, channel, _), rows in self._undecodable.items():
-            if of == c and (of, channel) in self._asked:
+            if of == c and (of, channel) in self._wanted:
                 counts[channel] += len(rows)
         for channel, n in sorted(counts.items()):
             what = f"{n} messages do not fit the type of their topic"
@@ -182,6 +183,29 @@ class ColumnarLog:
                 reasons.append(str(schema))
         return reasons[0] if reasons else ""
 
+    def borrowed(self, topic: str) -> tuple[Path, ...]:
+        """Return the files of an installed ROS that a topic's type is read by."""
+        schemas = (self._schema(c, channel) for c, channel in self._by_topic.get(topic, ()))
+        return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
+
+    def first_messages(self, topic: str, most: int) -> list[object]:
+        """Return the first messages of a topic whole; what does not decode is left out."""
+        found: list[object] = []
+        for c, channel in self._by_topic.get(topic, ()):
+            schema = self._schema(c, channel)
+            if not isinstance(schema, MessageSchema):
+                continue
+            decode = ChannelDecoder(schema, ()).single_decoder()
+            with self.containers[c].meter.running():
+                for span in (s for s in self.containers[c].spans if channel.id in s.counts):
+                    block = self.load(c, span, frozenset({channel.id})) if len(found) < most else None
+                    if block is None:
+                        continue
+                    for row in block.rows.get(channel.id, np.empty(0, np.int64))[: most - len(found)]:
+                        at, n = int(block.offset[row]), int(block.length[row])
+                        found.append(decode(bytes(block.buffer[at : at + n])))
+        return [message for message in found if message is not None]
+
     def read(
         self,
         requests: Mapping[str, Sequence[str]],
@@ -200,7 +224,9 @@ class ColumnarLog:
         """
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         if not quiet:
-            self._asked |= {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
+            wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
+            self._asked |= wanted
+            self._wanted |= wanted
         return self._collect(plans, start_ns, end_ns)
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:

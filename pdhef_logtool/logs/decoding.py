@@ -192,7 +192,7 @@ class ChannelDecoder:
         return left[:0] if n == len(left) else np.setdiff1d(left, read, assume_unique=True)
 
     def _read_singly(self, block: Block, rows: IntArray) -> dict[str, NDArray[Any]]:
-        decode = self._single_decoder()
+        decode = self.single_decoder()
         getters = [(s.path, self._getter(s)) for s in self.selections]
         values: dict[str, list[object]] = {s.path: [] for s in self.selections}
         most = min(self.schema.budget.array_width, _most_columns(len(rows)))
@@ -219,7 +219,7 @@ class ChannelDecoder:
             return plain
         return lambda message: bytes_of_text(plain(message), selection.text)
 
-    def _single_decoder(self) -> Callable[[bytes], object]:
+    def single_decoder(self) -> Callable[[bytes], object]:
         """Return what decodes one message; None where its payload does not fit the type, or costs too much."""
         schema = self.schema
         if schema.wire == "protobuf":

@@ -1,9 +1,13 @@
-"""Message definitions for logs that hold none: a folder of the user's, and a few common packages that are shipped."""
+"""Message definitions for logs that hold none: the user's, those of an installed ROS, and a few that are shipped."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
+import re
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 from pdhef_logtool.logs.schema_files import shipped_definition
@@ -13,57 +17,117 @@ from pdhef_logtool.records.errors import UsageError
 #: A workspace with more files is more than messages, and a longer text is no message.
 MOST_FILES = 50_000
 MOST_BYTES = 1 << 20
+#: A type name may come from a log, and becomes a path.
+_TYPE_NAME = re.compile(r"([A-Za-z]\w*)/msg/([A-Za-z]\w*)", re.ASCII)
+#: Where ROS 2 and ROS 1 say that their packages are, and where they are without a word.
+_PREFIXES, _SOURCES = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH"), "ROS_PACKAGE_PATH"
+_USUAL = (Path("/usr/local"), Path("/usr"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Definitions:
-    """Files of definitions by type name in ROS 2 form, and by bare name where a file lies in no package."""
+    """Files of definitions by type name in ROS 2 form, and by bare name where a file lies in no package.
+
+    ``archive`` is the zip file or wheel in which the files are; None where they are files of their own. ``prefixes``
+    and ``sources`` are folders of an installed ROS: ``share/PACKAGE/msg`` below the first, ``PACKAGE/msg`` below the
+    others.
+    """
 
     files: Mapping[str, Path] = field(default_factory=dict)
+    archive: Path | None = None
+    prefixes: tuple[Path, ...] = ()
+    sources: tuple[Path, ...] = ()
 
     def text_of(self, type_name: str) -> str:
         """Return the text of a type without the types it contains; empty where there is none.
 
-        The user's files come first, then what is shipped.
+        The user's files come first, then what is shipped, then what is installed.
         """
         package, _, name = type_name.partition("/msg/")
         path = self.files.get(type_name) or self.files.get(name if package else "")
         if path is None:
-            return shipped_definition(type_name)
-        return read_text(path)[:MOST_BYTES]
+            installed = self.installed(type_name)
+            return shipped_definition(type_name) if installed is None else read_text(installed)[:MOST_BYTES]
+        if self.archive is None:
+            return read_text(path)[:MOST_BYTES]
+        with zipfile.ZipFile(self.archive) as archive, archive.open(path.as_posix()) as file:
+            return file.read(MOST_BYTES).decode("utf-8", errors="replace")
+
+    def installed(self, type_name: str) -> Path | None:
+        """Return the file of a type that only an installed ROS or a sourced workspace defines."""
+        found = _TYPE_NAME.fullmatch(type_name)
+        if found is None or type_name in self.files or found[2] in self.files or shipped_definition(type_name):
+            return None
+        return next((path for path in self._places(found[1], found[2]) if path.is_file()), None)
+
+    def _places(self, package: str, name: str) -> Iterator[Path]:
+        file = Path("msg", f"{name}.msg")
+        for prefix in self.prefixes:
+            yield prefix / "share" / package / file
+        for source in self.sources:
+            if source.name == package:
+                yield source / file
+            yield source / package / file
+            yield from sorted(source.glob(f"*/{package}/{file.as_posix()}"))
 
 
-#: What there is without a folder of the user's.
+#: What there is without anything of the user's or the machine's.
 SHIPPED = Definitions()
 
 
-def read_definitions(folder: Path | None) -> Definitions:
-    """Find the definitions in a folder of ``.msg`` files, of packages, or in a workspace; None gives those shipped.
+@cache
+def _of_machine(prefixes: str, sources: str) -> Definitions:
+    """Return what is shipped and installed: sourced workspaces first, then the newest distribution."""
+    named = (Path(p) for p in prefixes.split(os.pathsep) if p)
+    distributions = sorted(Path("/opt/ros").glob("*"), reverse=True)
+    return Definitions(
+        prefixes=tuple(dict.fromkeys((*named, *distributions, *_USUAL))),
+        sources=tuple(Path(s) for s in sources.split(os.pathsep) if s),
+    )
+
+
+def read_definitions(place: Path | None) -> Definitions:
+    """Find the definitions in a folder of ``.msg`` files, of packages, in a workspace, a zip file or a wheel.
 
     ``PACKAGE/msg/Name.msg`` and ``PACKAGE/Name.msg`` are ``PACKAGE/msg/Name``; a file that lies in the folder itself
-    stands for its name in any package.
+    stands for its name in any package. None gives those shipped and installed.
 
     Raises
     ------
-    UsageError : It is no folder, or holds no definition.
+    UsageError : It is neither folder nor archive, or holds no definition.
     """
-    if folder is None:
-        return SHIPPED
+    prefixes = os.pathsep.join(os.environ.get(name, "") for name in _PREFIXES)
+    machine = _of_machine(prefixes, os.environ.get(_SOURCES, ""))
+    if place is None:
+        return machine
+    archive = place if place.is_file() and zipfile.is_zipfile(place) else None
+    if archive is None:
+        files = _named(sorted(place.rglob("*.msg")) if place.is_dir() else (), place)
+    else:
+        with zipfile.ZipFile(archive) as opened:
+            inside = sorted(n for n in opened.namelist() if n.endswith(".msg"))
+        files = _named(map(Path, inside), Path(), in_archive=True)
+    if not files:
+        there = place.is_dir() or archive is not None
+        raise UsageError(
+            expected="a folder, zip file or wheel that holds .msg files, packages or a workspace",
+            got="one without any" if there else "neither folder nor archive",
+            where=str(place),
+            remedy="give the package's source, or /opt/ros/DISTRO/share of the machine that recorded",
+        )
+    return replace(machine, files=files, archive=archive)
+
+
+def _named(paths: Iterable[Path], root: Path, *, in_archive: bool = False) -> dict[str, Path]:
+    """Return files by type name, and by bare name where they lie in the root itself."""
     files: dict[str, Path] = {}
-    for number, path in enumerate(sorted(folder.rglob("*.msg")) if folder.is_dir() else ()):
+    for number, path in enumerate(paths):
         if number >= MOST_FILES:
             break
         above = path.parent.parent if path.parent.name == "msg" else path.parent
-        own = path.parent == folder or (path.parent.name == "msg" and path.parent.parent == folder)
         # A package's own folder may be given as well: package.xml tells it from a folder of files.
-        if own and not (above / "package.xml").is_file():
+        if root in (path.parent, above) and (in_archive or not (above / "package.xml").is_file()):
             files.setdefault(path.stem, path)
-        files.setdefault(f"{above.resolve().name}/msg/{path.stem}", path)
-    if not files:
-        raise UsageError(
-            expected="a folder that holds .msg files, packages or a workspace",
-            got="one without any" if folder.is_dir() else "no folder",
-            where=str(folder),
-            remedy="give the folder of the package's source, or /opt/ros/DISTRO/share of the machine that recorded",
-        )
-    return Definitions(files)
+        package = above.name if in_archive else above.resolve().name
+        files.setdefault(f"{package}/msg/{path.stem}", path)
+    return files

@@ -105,6 +105,15 @@ class DriveLog(Protocol):
     def unreadable(self, topic: str) -> str:
         """Return why no field of a topic is known; empty where one is."""
 
+    def borrowed(self, topic: str) -> tuple[Path, ...]:
+        """Return the files of an installed ROS that a topic's type is read by, as the log does not define it."""
+
+    def first_messages(self, topic: str, most: int) -> list[object]:
+        """Return the first messages of a topic whole, with their texts; what does not decode is left out.
+
+        ``value_at`` of ``message_schema`` reads places in them.
+        """
+
     def read(
         self,
         requests: Mapping[str, Sequence[str]],

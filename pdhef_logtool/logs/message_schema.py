@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
@@ -84,7 +85,8 @@ class MessageSchema:
     """A message type: its tree, and what its messages are decoded with.
 
     ``wire`` is ``cdr``, ``ros1``, ``json`` or ``protobuf``; ``store`` holds the definitions of ROS types,
-    ``message_class`` is the class of a protobuf type; ``budget`` holds for its messages, too.
+    ``message_class`` is the class of a protobuf type; ``budget`` holds for its messages, too; ``borrowed`` are the
+    files of an installed ROS that it was read from, where the log holds no definition.
     """
 
     type_name: str
@@ -93,6 +95,7 @@ class MessageSchema:
     store: Typestore | None = None
     message_class: Any = None
     budget: Budget = DEFAULT_BUDGET
+    borrowed: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,6 +217,7 @@ def ros_schema(
     from pdhef_logtool.logs.idl_parser import idl_types
 
     what = f"the definition of {type_name}"
+    borrowed: tuple[Path, ...] = ()
     with parsing(what):
         budget.check("schema_bytes", len(text) * _BYTES_OF_TEXT, what)
         base = Stores.ROS1_NOETIC if wire == "ros1" else _store_of(distro)
@@ -231,9 +235,11 @@ def ros_schema(
             store = get_typestore(base)
             if type_name not in store.fielddefs:
                 types = _completed({}, store.fielddefs, definitions, budget, type_name)
+                files = (definitions.installed(name) for name in sorted(set(types) - set(store.fielddefs)))
+                borrowed = tuple(file for file in files if file is not None)
                 store.register(types)
             root = _ros_root(store.fielddefs, type_name, budget)
-    return MessageSchema(type_name, wire, root, store, budget=budget)
+    return MessageSchema(type_name, wire, root, store, budget=budget, borrowed=borrowed)
 
 
 def _store_of(distro: str) -> Any:

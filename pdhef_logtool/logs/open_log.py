@@ -47,7 +47,7 @@ def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | Non
     Parameters
     ----------
     budget : what reading it may cost; what claims more is among the log's losses.
-    msgs : folder with definitions of types that the log does not define (:func:`read_definitions`).
+    msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`).
 
     Raises
     ------
@@ -91,15 +91,20 @@ def log_metadata(path: Path, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
     """
     log = open_log(path, budget)
     try:
-        assert isinstance(log, ColumnarLog)
-        found: dict[str, str] = {}
-        for container in log.containers:
-            for record in container.metadata_records():
-                found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
+        return metadata_of(log, budget)
     finally:
         log.close()
-    if is_log_folder(path):
-        custom = _read_metadata(path, budget).get("custom_data")
+
+
+def metadata_of(log: DriveLog, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
+    """Return what an open log says of itself, as :func:`log_metadata` does."""
+    assert isinstance(log, ColumnarLog)
+    found: dict[str, str] = {}
+    for container in log.containers:
+        for record in container.metadata_records():
+            found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
+    if is_log_folder(log.path):
+        custom = _read_metadata(log.path, budget).get("custom_data")
         found |= {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
     return found
 

@@ -207,6 +207,16 @@ class CanSignalLog:
         view = self._views.get(topic)
         return self._log.unreadable(topic if view is None else view.source.topic)
 
+    def borrowed(self, topic: str) -> tuple[Path, ...]:
+        """Return the files of an installed ROS that a topic's type is read by."""
+        view = self._views.get(topic)
+        return self._log.borrowed(topic if view is None else view.source.topic)
+
+    def first_messages(self, topic: str, most: int) -> list[object]:
+        """Return the first messages of a topic whole."""
+        view = self._views.get(topic)
+        return self._log.first_messages(topic if view is None else view.source.topic, most)
+
     def read(
         self,
         requests: Mapping[str, Sequence[str]],

@@ -17,6 +17,7 @@ import numpy as np
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.checking import STAMP_PATHS, stamp_path_of
 from pdhef_logtool.mapping.evidence import MOST_COLUMNS, Pieces, Seen
+from pdhef_logtool.mapping.joints import is_joints, joint_meanings
 from pdhef_logtool.mapping.naming import UNIT_TEXTS, UNITS, Meaning, is_command, meaning_of, words_of
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.vendors import VendorField, Vendors, meaning_of_signal
@@ -93,6 +94,7 @@ class Found:
     factors : units that it may be in, the likeliest first. fixed : unit and sign are documented.
     section : ``signals`` or ``truth`` if its documentation says which.
     known : its unit is sure. anchor : it is mapped already. sign : that it is taken with.
+    is_weak : values do not decide what it is, so that it is never taken.
     """
 
     topic: TopicInfo
@@ -111,6 +113,7 @@ class Found:
     reasons: list[str] = field(default_factory=list)
     doubts: list[str] = field(default_factory=list)
     offset: float = 0.0
+    is_weak: bool = False
 
     @property
     def scale(self) -> float:
@@ -147,7 +150,7 @@ class Found:
         score += 0.15 if self.meaning.unit else 0.0
         score += 0.05 if self.seen.rate_hz >= 9.0 else -0.1 if self.seen.rate_hz < 3.0 else 0.0
         score -= {"device": 0.2, "navigation": 0.1 if self.meaning.quantity == "speed" else 0.0}.get(self.role, 0.0)
-        return min(0.94, max(0.0, score))
+        return min(LEAST_SCORE - 0.01 if self.is_weak else 0.94, max(0.0, score))
 
     def standing_for(self, speed: FloatArray) -> Found:
         """Return a known speed on the grid [M], m/s, that is made of this field and others like it."""
@@ -194,13 +197,17 @@ def named_fields(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], vendor
         fields = log.fields(topic.name, quiet=True)
         if len(fields) > MOST_FIELDS or vendors.why_left_out(topic.type_name):
             continue
+        if is_joints(topic):
+            joints = () if role == "command" else joint_meanings(log, topic)
+            found += [(topic, role, FieldInfo(path, "number"), meaning, False) for path, meaning in joints]
+            continue
         known = vendors.fields_of(topic.type_name)
         for info in fields:
             if is_command(info.path) or info.kind != "number" or info.path.count("[]") > info.path.endswith("[]"):
                 continue
             if info.path in known:
                 found.append((topic, role, info, known[info.path].meaning, True))
-            elif not known or info.path.count("."):
+            elif not known or info.path.count(".") or vendors.is_export(topic.type_name):
                 meaning = meaning_of(topic.name, topic.type_name, info.path)
                 if meaning is not None:
                     found.append((topic, role, info, meaning, False))
@@ -250,7 +257,7 @@ def look(
                 one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
             if one.factors:
                 found.append(one)
-    return pieces, found + _anchors(log, sources, read)
+    return pieces, found + sources_found(log, sources, read)
 
 
 def _is_nested_imu(topic: TopicInfo, fields: tuple[FieldInfo, ...], path: str) -> bool:
@@ -269,13 +276,15 @@ def _document(one: Found, entry: VendorField) -> None:
     one.reasons.append(f"documented: {entry.page}")
 
 
-def _anchors(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Found]:
+def sources_found(log: DriveLog, sources: Sequence[SignalSource], read: Mapping[tuple[str, str], Seen]) -> list[Found]:
     """Return what is mapped already, as fields that nothing here changes."""
     topics = {t.name: t for t in log.topics}
     found = []
     for source in sources:
         seen = read.get((source.topic, source.paths[0]))
-        if seen is None or not isinstance(source.scale, float) or not isinstance(source.offset, float):
+        if seen is None or isinstance(source.scale, tuple) or not isinstance(source.offset, float):
+            continue
+        if not isinstance(source.field, str):
             continue
         meaning = meaning_of_signal(source.name)
         one = Found(topics[source.topic], source.paths[0], meaning, "sensor", source.stamp, seen, (("", 1.0),))

@@ -296,7 +296,7 @@ def _channel(
 
 
 def si_values(topic: Columns, source: SignalSource) -> FloatArray:
-    """Return ``scale * raw + offset`` of a source: [N], the sum of several fields, or [N, k] for a vector."""
+    """Return ``scale * raw + offset`` of a source: [N], the sum or length of several fields, or [N, k] for a vector."""
     parts = [np.asarray(topic.fields[p], dtype=np.float64) for p in source.paths]
     raw = parts[0] if len(parts) == 1 else np.stack(parts, axis=1)
     width = source.columns
@@ -304,6 +304,9 @@ def si_values(topic: Columns, source: SignalSource) -> FloatArray:
     if width == 1 and len(parts) > 1 and raw.ndim == 2:
         # Summed one by one: a matrix product may round differently with the number of rows, and windows must join.
         scales = np.broadcast_to(np.asarray(source.scale), len(parts))
+        if source.combine == "norm":
+            squares = sum((s * raw[:, i]) ** 2 for i, s in enumerate(scales))
+            return np.asarray(np.sqrt(squares) + source.offset, dtype=np.float64)
         return np.asarray(sum(s * raw[:, i] for i, s in enumerate(scales)) + source.offset, dtype=np.float64)
     if width > 1 and raw.ndim == 2 and raw.shape[1] != width:
         raw = np.full((n, width), np.nan)  # Not the vector that the signal is: every sample is counted as lost.

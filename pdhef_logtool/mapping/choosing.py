@@ -47,13 +47,13 @@ def choose_mapping(
         mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)
     if mapping is not None:
         check_mapping(mapping, log)
-        for note in mapping.notes:
+        for note in (*mapping.notes, *_borrowed(log, mapping)):
             remark(note)
         return mapping, tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
     found = auto_map(log, prefer_truth=prefer_truth)
     for ambiguity in found.ambiguities:
         tell(str(ambiguity))
-    for note in found.mapping.notes:
+    for note in (*found.mapping.notes, *_borrowed(log, found.mapping)):
         remark(note)
     if require_signals and not found.mapping.signals:
         raise MappingError(
@@ -63,6 +63,17 @@ def choose_mapping(
             remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
         )
     return found.mapping, found.missing
+
+
+def _borrowed(log: DriveLog, mapping: Mapping) -> list[str]:
+    """Say which topics are read by definitions of this machine, which may be another version's."""
+    files = {source.topic: log.borrowed(source.topic) for source in mapping.sources()}
+    return [
+        f"{topic} is read by {', '.join(map(str, paths))} of this machine, as the log does not define its type: "
+        "right only if that is the version that was recorded"
+        for topic, paths in files.items()
+        if paths
+    ]
 
 
 def _topics_there_are(log: DriveLog) -> str:

@@ -73,8 +73,11 @@ class Pieces:
         self.starts = [log.start_ns + i * step for i in range(count)]
         self.cells_a_piece = PIECE_NS // CELL_NS
 
-    def read(self, requests: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], Seen]:
-        """Read fields by topic; arrays come as one entry a column, ``name[i]``. What cannot be read is left out."""
+    def read(self, requests: Mapping[str, Sequence[str]], most: int = MOST_COLUMNS) -> dict[tuple[str, str], Seen]:
+        """Read fields by topic; arrays come as one entry a column, ``name[i]``, ``most`` of them.
+
+        What cannot be read is left out.
+        """
         parts: dict[tuple[str, str], list[tuple[int, IntArray, FloatArray]]] = {}
         for number, start in enumerate(self.starts):
             for topic, columns in self._columns(requests, start).items():
@@ -85,7 +88,7 @@ class Pieces:
                     if values.ndim == 1:
                         parts.setdefault((topic, path), []).append((number, at, values))
                         continue
-                    for i, column in enumerate(values.T[:MOST_COLUMNS]):
+                    for i, column in enumerate(values.T[:most]):
                         parts.setdefault((topic, f"{path}[{i}]"), []).append((number, at, column))
         return {key: self._seen(found) for key, found in parts.items()}
 
@@ -127,6 +130,19 @@ class Pieces:
         out = np.full_like(rows, np.nan)
         out[:, 2:-2] = sum(rows[:, i : rows.shape[1] - 4 + i] for i in range(5)) / 5.0
         return out.ravel()
+
+    def ahead_s(self, y: FloatArray, x: FloatArray) -> float:
+        """Return how far y is ahead of x, by the parabola through three correlations a cell apart; 0 if unknown."""
+        rows = x.reshape(len(self.starts), self.cells_a_piece)
+        correlations = []
+        for shift in (-1, 0, 1):
+            moved = np.roll(rows, shift, axis=1)
+            moved[:, [0, -1]] = np.nan
+            relation = fit(y, moved.ravel())
+            correlations.append(0.0 if relation is None else abs(relation.correlation))
+        before, middle, after = correlations
+        bend = 2.0 * middle - before - after
+        return 0.5 * (before - after) / bend * CELL_NS * 1e-9 if bend > 0.0 else 0.0
 
 
 def ratio(y: FloatArray, x: FloatArray, slow: float) -> float | None:

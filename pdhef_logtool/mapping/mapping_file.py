@@ -20,6 +20,7 @@ from pdhef_logtool.mapping.records import (
     CanDataEncoding,
     CanSettings,
     Clock,
+    Combine,
     Mapping,
     QualityGate,
     SignalSource,
@@ -64,6 +65,7 @@ class _SourceTable(_Timed):
     offset: Finite | list[Finite] = 0.0
     valid_min: Finite | None = None
     valid_max: Finite | None = None
+    combine: Combine = "sum"
 
     @model_validator(mode="after")
     def _values_make_sense(self) -> _SourceTable:
@@ -209,6 +211,8 @@ def _read_can(raw: object, folder: Path, problems: list[str]) -> CanSettings | N
 def _shape_problem(name: str, model: _SourceTable) -> str:
     columns = VECTOR_COLUMNS.get(name, 1)
     fields = model.field if isinstance(model.field, list) else [model.field]
+    if model.combine == "norm" and (columns > 1 or len(fields) < 2):
+        return f'combine = "norm" is the length of two or more fields, {name} has {columns} columns of {len(fields)}'
     if columns == 1 and isinstance(model.offset, list):
         return f"offset must be a single value, {name} is no vector"
     if columns == 1 and (len(fields) > 1 or isinstance(model.scale, list)):
@@ -363,7 +367,7 @@ def _example_lines() -> list[str]:
 
 
 def _source_lines(source: SignalSource) -> list[str]:
-    names = ("stamp", "scale", "offset", "latency_s", "valid_min", "valid_max", "stamp_unit", "clock")
+    names = ("stamp", "scale", "offset", "latency_s", "valid_min", "valid_max", "stamp_unit", "clock", "combine")
     lines = _lines(source, {n: n for n in names}, always=("scale",))
     return [f"topic = {_toml(source.topic)}", f"field = {_toml(source.field)}", *lines]
 

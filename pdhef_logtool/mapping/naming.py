@@ -212,6 +212,20 @@ def is_command(*names: str) -> bool:
     return any(_COMMANDS & set(words_of(n)) for n in names)
 
 
+#: Words of names that only count.
+_COUNTING = _set(
+    """
+    data value values val ch chan channel channels signal signals sig var variable variables col column columns
+    field fields entry item element num array vector row rows sample samples msg message topic reading readings
+    """
+)
+
+
+def says_nothing(name: str) -> bool:
+    """Return whether a name is no more than letters, numbers and words that only count; so is an empty one."""
+    return all(len(w) == 1 or w.isdigit() or w in _COUNTING for w in words_of(name))
+
+
 def unit_of(leaf: str, kind: str) -> tuple[str, float | None]:
     """Return the unit that a name ends with or holds, and its factor to SI; ``("", None)`` without one.
 
@@ -368,6 +382,11 @@ def _corner(words: tuple[str, ...], own: tuple[str, ...]) -> str:
         if all(len(f) == 1 for f in found):
             return "".join(found)
     return ""
+
+
+def corner_of(words: tuple[str, ...]) -> str:
+    """Return the wheel (fl, fr, rl, rr) that words name; empty without one."""
+    return _corner(words, words)
 
 
 def _steering_kind(have: set[str]) -> str:

@@ -13,6 +13,8 @@ from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.mapping.can_frames import holds_frames
 from pdhef_logtool.mapping.candidates import Candidate, Role
 from pdhef_logtool.mapping.checking import has_path, stamp_path_of
+from pdhef_logtool.mapping.ground_speed import NEVER_NEGATIVE, length_of, speed_over_ground
+from pdhef_logtool.mapping.joints import is_joints, joint_names, mean_of_sides
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.mapping.naming import is_command
 from pdhef_logtool.mapping.navigation import navigation_truth
@@ -211,7 +213,9 @@ def auto_map(
         RTK-like one; a log with only one of them gets that.
     vendors : documented types; None takes those that are shipped and the user's.
     """
+    vendors = load_vendors() if vendors is None else vendors
     there = [t for t in log.topics if t.messages > 0 and not _is_ours(t)]
+    there = [vendors.typed(t, log.fields(t.name, quiet=True)) for t in there]
     unlike = [t for t in there if not _has_its_fields(log, t)]
     topics = [t for t in there if t not in unlike]
     found = _Finding(log=log, samples=_probe(log, topics))
@@ -230,7 +234,6 @@ def auto_map(
     _map_speed(found, topics)
     _map_wheel_speeds(found, topics)
     _map_truth(found, topics, prefer_truth)
-    vendors = load_vendors() if vendors is None else vendors
     _map_documented_truth(found, topics, vendors)
     weighed = _weigh_the_rest(found, topics, vendors)
     _map_navigation(found, topics, vendors)
@@ -282,6 +285,19 @@ def _weigh_the_rest(found: _Finding, topics: list[TopicInfo], vendors: Vendors) 
         measured = next(s.label for n, s in weighed.signals.items() if n.startswith("steer"))
         found.doubt("steering", (measured, command.label), measured, "a measured angle before a command")
     found.signals.update(weighed.signals)
+    both = (
+        mean_of_sides(found.log, {t.name: t for t in topics}, found.signals["steer_rad"])
+        if "steer_rad" in weighed.signals
+        else None
+    )
+    if both is not None:
+        found.signals["steer_rad"] = both
+        found.notes.append(f"steer_rad is the mean of the two steered wheels in {both.topic}")
+    found.notes += [
+        f"{t.name} holds other joints, or in another order, from message to message: none of them is used"
+        for t, role in rest
+        if is_joints(t) and role != "command" and not joint_names(found.log, t)
+    ]
     found.truth.update(weighed.truth)
     found.notes += weighed.notes
     for name, fields in weighed.rivals:
@@ -362,16 +378,35 @@ def _fall_back(found: _Finding, topics: list[TopicInfo]) -> None:
         if chosen is not None:
             found.take(found.signals, "yaw_rate_rad_s", chosen.name, _twist(chosen, "angular", "z"))
             found.notes.append(f"yaw_rate_rad_s comes from the odometry {chosen.name}, as no IMU gives it")
-    truth = found.truth.get("vx_m_s")
-    if truth is None or "speed_m_s" in found.signals or any(n.startswith("wheel_speed_") for n in found.signals):
+    if "speed_m_s" in found.signals or any(n.startswith("wheel_speed_") for n in found.signals) or not found.signals:
         return
-    source = next((t for t in topics if t.name == truth.topic), None)
-    if source is not None and _role(source) == "navigation" and found.signals:
-        found.signals["speed_m_s"] = replace(truth, name="speed_m_s")
-        found.notes.append(
-            f"speed_m_s comes from {source.name}, which is the truth too, as nothing else gives a speed: "
-            "an estimator is told the true speed"
-        )
+    _speed_of_navigation(found, topics)
+    if "speed_m_s" not in found.signals:
+        unsaid = [(t, TWIST_FIELDS[_type(t)].format("linear")) for t in twists if not _words(t.name) & VEHICLE_WORDS]
+        other = [t for t in topics if _role(t) in ("sensor", "navigation") and not _is_well_known(t)]
+        vectors = [*unsaid, *((t, "") for t in other if not _type(t).startswith(NO_SENSORS))]
+        speed = speed_over_ground(found.log, vectors, found.signals, found.truth)
+        if speed is not None:
+            found.signals["speed_m_s"], evidence = speed
+            found.notes.append(f"speed_m_s comes from {speed[0].topic}, {evidence}: it is {NEVER_NEGATIVE}")
+            found.ambiguities = [a for a in found.ambiguities if (a.subject, a.chosen) != ("speed", None)]
+
+
+def _speed_of_navigation(found: _Finding, topics: list[TopicInfo]) -> None:
+    """Take the speed of a navigation system that is the truth too."""
+    names = ("vx_m_s", "enu_velocity_m_s", "ecef_velocity_m_s")
+    truth = next((found.truth[n] for n in names if n in found.truth), None)
+    source = None if truth is None else next((t for t in topics if t.name == truth.topic), None)
+    if truth is None or source is None:
+        return
+    if _role(source) != "navigation" and (_role(source) != "sensor" or _is_well_known(source)):
+        return
+    forward = truth.name == "vx_m_s"
+    found.signals["speed_m_s"] = replace(truth, name="speed_m_s") if forward else length_of(truth)
+    found.notes.append(
+        f"speed_m_s comes from {source.name}, which is the truth too, as nothing else gives a speed: "
+        "an estimator is told the true speed" + ("" if forward else f"; it is {NEVER_NEGATIVE}")
+    )
 
 
 def _type(topic: TopicInfo) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.documents import jsonable
 
 #: Number of columns of the truth channels that are vectors; all other signals are scalars.
 VECTOR_COLUMNS: dict[str, int] = {
@@ -19,6 +22,7 @@ VECTOR_COLUMNS: dict[str, int] = {
 
 StampUnit: TypeAlias = Literal["ros", "s", "ms", "us", "ns"]
 Clock: TypeAlias = Literal["utc", "device"]
+Combine: TypeAlias = Literal["sum", "norm"]
 
 #: How a frame's bytes stand in a message: as numbers, or as a text of digits.
 CanDataEncoding: TypeAlias = Literal["bytes", "hex", "base64"]
@@ -37,7 +41,7 @@ class SignalSource:
     """Where one signal comes from: ``value_SI = scale * raw + offset``, measured at ``stamp - latency_s``.
 
     A scalar signal of several fields is their sum, each times its own scale: a component of a sensor that is mounted
-    askew.
+    askew. With ``combine`` ``norm`` it is the length of their vector: a speed of its components.
 
     Attributes
     ----------
@@ -64,6 +68,7 @@ class SignalSource:
     valid_max: float | None = None
     stamp_unit: StampUnit = "ros"
     clock: Clock = "utc"
+    combine: Combine = "sum"
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -184,6 +189,12 @@ class Mapping:
     estimates: dict[str, dict[str, SignalSource]] = field(default_factory=dict)
     fill_recognised: bool = False
     checks: tuple[Check, ...] = ()
+
+    @property
+    def sha256(self) -> str:
+        """Hash of what is read and how: sources, scales, stamps, latencies, limits and the truth's gate."""
+        said = jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality})
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, truth, the gate."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from pdhef_logtool.logs.drive_log import FieldInfo, TopicInfo
 from pdhef_logtool.mapping.naming import Meaning
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS, SignalSource
 from pdhef_logtool.records.documents import checked, read_toml
@@ -67,6 +68,7 @@ class _TypeTable(BaseModel):
     read: str
     note: str = ""
     leave_out: str = ""
+    has: list[str] = []
     fields: list[_FieldTable]
 
 
@@ -106,12 +108,26 @@ def meaning_of_signal(name: str) -> Meaning:
 class Vendors:
     """Documented types by name, as ROS 2 spells it without ``/msg``, and why some are left out.
 
-    ``vectors`` are truth quantities that several fields make, with an empty topic.
+    ``vectors`` are truth quantities that several fields make, with an empty topic. ``exports`` are the fields that tell
+    a recorder's export, which has no type of its own, by the name that it has here; other channels stand beside them.
     """
 
     types: Mapping[str, Mapping[str, VendorField]] = field(default_factory=dict)
     vectors: Mapping[str, tuple[SignalSource, ...]] = field(default_factory=dict)
     reasons: Mapping[str, str] = field(default_factory=dict)
+    exports: Mapping[str, frozenset[str]] = field(default_factory=dict)
+
+    def typed(self, topic: TopicInfo, fields: Iterable[FieldInfo]) -> TopicInfo:
+        """Return a topic with the name of the export that its fields are, if it has no type and they are one."""
+        if topic.encoding != "json" or _plain(topic.type_name) in self.types:
+            return topic
+        there = {f.path for f in fields}
+        names = (name for name, needed in self.exports.items() if needed <= there)
+        return next((replace(topic, type_name=name) for name in names), topic)
+
+    def is_export(self, type_name: str) -> bool:
+        """Return whether a type is an export, whose other fields may be anything."""
+        return _plain(type_name) in self.exports
 
     def fields_of(self, type_name: str) -> Mapping[str, VendorField]:
         """Return the documented fields of a type by path; empty for a type that is not documented here."""
@@ -146,6 +162,7 @@ def load_vendors(path: Path | None = None) -> Vendors:
         {**_shipped().types, **own.types},
         {**{n: v for n, v in _shipped().vectors.items() if n not in own.types}, **own.vectors},
         {**kept, **own.reasons},
+        {**_shipped().exports, **own.exports},
     )
 
 
@@ -160,11 +177,13 @@ def _read(path: Path) -> Vendors:
     found: dict[str, dict[str, VendorField]] = {}
     reasons: dict[str, str] = {}
     vectors: dict[str, tuple[SignalSource, ...]] = {}
+    exports: dict[str, frozenset[str]] = {}
     entries = raw.get("types", [])
     for number, table in enumerate(entries if isinstance(entries, list) else [], 1):
         model = checked(_TypeTable, table, f"types[{number}]", problems)
         if model is None:
             continue
+        exports.update({_plain(name): frozenset(model.has) for name in model.type if model.has})
         page = f"{model.page}, read {model.read}"
         fields = {
             f.field: _field(f, f.scale, page)
@@ -182,7 +201,7 @@ def _read(path: Path) -> Vendors:
             where=str(path),
             remedy="see docs/vendors.md for every entry",
         )
-    return Vendors(found, vectors, reasons)
+    return Vendors(found, vectors, reasons, exports)
 
 
 def _field(table: _FieldTable, scale: float, page: str) -> VendorField:

@@ -28,6 +28,7 @@ from pdhef_logtool.mapping.candidates import (
 from pdhef_logtool.mapping.checking import has_path
 from pdhef_logtool.mapping.evidence import Fit, fit, is_of_both_signs, is_of_one_sign, ratio, spread
 from pdhef_logtool.mapping.fields import CLEAR, Fields, mean_of
+from pdhef_logtool.mapping.nameless import identified, nameless_columns, wanted_nameless
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.mapping.signs import SLOW_M_S, WITNESSES, WORDS, judge_signs
 from pdhef_logtool.mapping.units import RADII_M, decide_units
@@ -78,7 +79,8 @@ def weigh(
     wanted = [
         n for n in named_fields(log, topics, vendors) if _is_wanted(n[3].quantity, n[3].part, n[1], signals, truth)
     ]
-    if not wanted or log.end_ns <= log.start_ns:
+    without_names = wanted_nameless(signals, [n[3] for n in wanted])
+    if not (wanted or without_names) or log.end_ns <= log.start_ns:
         return Weighed()
     positions = [s for n, s in truth.items() if n in _POSITIONS]
     known = {**signals, **_upward(log, signals)}
@@ -87,7 +89,12 @@ def weigh(
     places = [f for f in found if f.meaning.quantity in ("latitude", "longitude", "position")]
     fields = Fields(pieces, anchors, [f for f in found if not f.anchor], places)
     decide_units(fields)
+    nameless = nameless_columns(log, topics, pieces) if without_names else []
+    meant, note = identified(fields, nameless) if nameless else ([], "")
+    fields.found += meant
     at_work = _Weighing(fields, "" if truth else truth_topic(fields.found))
+    if note:
+        at_work.say_nameless(note)
     at_work.choose_signals(set(signals))
     if not truth:
         at_work.choose_truth()
@@ -153,6 +160,12 @@ class _Weighing:
         self._follow()
         for name, one in self.taken.items():
             self._tell(name, one)
+
+    def say_nameless(self, note: str) -> None:
+        """Say that values alone told what fields are."""
+        self.notes.append(note)
+        remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
+        self.checks.append(Check("mapping.names", "mapping", "undecided", note, remedy))
 
     def _take(self, name: str, candidates: Sequence[Found]) -> None:
         if name == "speed_m_s":

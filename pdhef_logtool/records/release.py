@@ -11,6 +11,8 @@ from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: An output is not predicted further than this beyond the newest processed step; the stamp is then not valid.
 MAX_PREDICTION_S = 0.3
+#: A longer step between stamps is a gap: behind it every filter and every watch starts anew.
+RESTART_GAP_S = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,6 +19,8 @@ METRICS_FILE = "metrics.parquet"
 REPORT_FILE = "report.json"
 ESTIMATES_FILE = "estimates.parquet"
 RECORDING_FILE = "recording.rrd"
+#: A page for people: of a log in its folder, of all logs in the run's.
+PAGE_FILE = "report.html"
 
 #: Bytes of one document: run.json of 10⁵ logs has 40 MB.
 MAX_DOCUMENT_BYTES = 1 << 28

@@ -31,7 +31,15 @@ from pdhef_logtool.records.errors import (
 from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.outputs import OutputFolder, Transaction, check_no_input
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss, Signals
-from pdhef_logtool.results.opened_run import ESTIMATES_FILE, LOGS, METRICS_FILE, RECORDING_FILE, REPORT_FILE
+from pdhef_logtool.results.opened_run import (
+    ESTIMATES_FILE,
+    LOGS,
+    METRICS_FILE,
+    PAGE_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    open_run,
+)
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
@@ -66,7 +74,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str, float], None]
 
 #: What a run writes into a log's folder.
-LOG_FILES = ("annotated.mcap", ESTIMATES_FILE, METRICS_FILE, RECORDING_FILE, REPORT_FILE)
+LOG_FILES = ("annotated.mcap", ESTIMATES_FILE, METRICS_FILE, RECORDING_FILE, REPORT_FILE, PAGE_FILE)
 
 _SILENT = "{} has no valid row although the car moves"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
@@ -141,6 +149,7 @@ def run_logs(
     config: RunConfig,
     *,
     junit: Path | None = None,
+    report: bool = True,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> RunResult:
@@ -151,6 +160,7 @@ def run_logs(
     Parameters
     ----------
     arguments : logs, folders, glob patterns. junit : where the verdicts of the thresholds are written as JUnit XML.
+    report : whether the pages of the run are written (:mod:`pdhef_logtool.reports`); those of an earlier run go.
     progress, warn : called with lines for people.
 
     Raises
@@ -179,7 +189,10 @@ def run_logs(
                 if isinstance(car, Exception):
                     raise car
                 pool = pools.get(id(car))
-                result = run_log(log_input, outputs, config, car, mapping, pool=pool, progress=of_all, warn=warn)
+                result = run_log(
+                    log_input, outputs, config, car, mapping,
+                    pool=pool, thresholds=thresholds, progress=of_all, warn=warn,
+                )  # fmt: skip
             except Exception as error:  # one bad log never stops the others, whatever is wrong with it
                 if len(inputs) == 1:
                     raise
@@ -191,7 +204,19 @@ def run_logs(
             results.append(judge(result, thresholds))
         write_run(output, config.to_dict(), results, [car for car in had if isinstance(car, Car)])
         write_verdicts(junit, results)
+        _write_pages(output, report, lambda text: progress(text, 1.0), warn)
     return RunResult(output, tuple(results))
+
+
+def _write_pages(output: Path, report: bool, tell: Callable[[str], None], warn: Callable[[str], None]) -> None:
+    from pdhef_logtool.reports.pages import remove_pages, write_pages
+
+    run = open_run(output)
+    if not report:
+        return remove_pages(run)
+    for line in write_pages(run, lambda text, _: tell(text)).wrong:
+        warn(line)
+    return None
 
 
 def _car_of(cars: RunCars, log_input: LogInput, *, alone: bool) -> Car | Exception:
@@ -260,6 +285,7 @@ def run_log(
     mapping: Mapping | None,
     *,
     pool: SelfCalibration | None = None,
+    thresholds: Sequence[Threshold] | None = None,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> LogResult:
@@ -268,6 +294,7 @@ def run_log(
     Parameters
     ----------
     pool : what all logs of the run together say of the car; None: the log says it, if it is asked.
+    thresholds : what the report's verdicts name; None: there are none.
 
     Raises
     ------
@@ -279,7 +306,7 @@ def run_log(
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
-        job = _Job(drive, car, calibration, ready, skipped)
+        job = _Job(drive, car, calibration, ready, skipped, tuple(thresholds or ()))
         try:
             # What driving with truth showed of a car is worth more than d2, and its estimate stays causal.
             unproven = config.calibrate != "off" and not drive.car.has_evidence
@@ -300,6 +327,7 @@ class _Job:
     calibration: SelfCalibration | None
     ready: Sequence[Estimator]
     skipped: Sequence[Skipped]
+    thresholds: Sequence[Threshold]
 
 
 class _FallBackError(Exception):
@@ -321,6 +349,9 @@ def _run_estimators(
     job: _Job, outputs: OutputFolder, config: RunConfig, progress: Progress, *, falls_back: bool
 ) -> LogResult:
     """Estimate, score and write one drive; raises _FallBackError, before anything stays, where it is asked to."""
+    from pdhef_logtool.evaluation.thresholds import check_thresholds
+    from pdhef_logtool.runs.drive_details import drive_details
+
     drive, car, ready = job.drive, job.car, job.ready
     algorithms = {e.name: resolve(e) for e in ready}
     intervals = calibrator(car, ready)
@@ -332,10 +363,13 @@ def _run_estimators(
             if drive.friction.bank is not None:
                 observable = friction_events(drive.friction, signals)
                 found = replace(found, events=sorted([*found.events, *observable], key=in_time))
-        if against := distrust(found.rows):
-            drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
-            if falls_back:
-                raise _FallBackError(against)
+            if against := distrust(found.rows):
+                drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
+                if falls_back:
+                    raise _FallBackError(against)
+            main = choose_main(ready, found.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
+            limits = check_thresholds(job.thresholds, found.rows, log=drive.name)
+            details = drive_details(drive, ready, main.name, store.read, signals, limits)
         rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
         events = found.events
         if not found.moves:
@@ -356,8 +390,8 @@ def _run_estimators(
         left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
         facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
         calibration = None if job.calibration is None else job.calibration.to_dict()
-        main = choose_main(ready, rows, proven=drive.car.has_evidence, named=config.estimators is not None)
-        facts = replace(facts, friction=friction_facts(drive.friction), calibration=calibration, main=main)
+        facts = replace(facts, friction=friction_facts(drive.friction), calibration=calibration)
+        facts = replace(facts, main=main, details=details)
         report = build_report(facts)
         from pdhef_logtool.sinks.parquet import write_metrics
 
@@ -365,7 +399,7 @@ def _run_estimators(
             sink.finish(report, events)
         write_metrics(change.file("metrics.parquet"), rows)
         write_json(change.file("report.json"), report)
-    outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car))
+    outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car), main=None if main is None else main.name)
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
     return LogResult(outcome, change.target, report, tuple(rows), checks=drive.checks)
@@ -382,7 +416,15 @@ def _short(algorithm: Algorithm | None) -> str:
 
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     """Return how a log that was read is recorded in run.json."""
-    return LogOutcome(log=drive.name, file=drive.path.name, sha256=drive.sha256, lost=lost_texts(losses))
+    return LogOutcome(
+        log=drive.name,
+        file=drive.path.name,
+        sha256=drive.sha256,
+        signals_sha256=drive.signals_sha256,
+        truth_sha256=drive.truth_sha256,
+        mapping_sha256=drive.mapping.sha256,
+        lost=lost_texts(losses),
+    )
 
 
 def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[Estimator], list[Skipped]]:
@@ -498,6 +540,8 @@ def report_facts(
             file=drive.path.name,
             kind=log.kind,
             sha256=drive.sha256,
+            signals_sha256=drive.signals_sha256,
+            truth_sha256=drive.truth_sha256,
             start_ns=plan.start_ns,
             end_ns=plan.end_ns,
             topics=[
@@ -510,6 +554,7 @@ def report_facts(
         vehicle_sha256=car.physics_sha256,
         vehicle_file=car.file_name,
         vehicle_proven=car.has_evidence,
+        low_speed_m_s=car.vehicle.low_speed_blend_m_s,
         estimators=list(estimators),
         truth=TruthFacts(
             quantities=[

@@ -19,11 +19,11 @@ _DEG = math.degrees(1.0)
 HOLDS, NEARLY_HOLDS = 0.94, 0.90
 _WIDE = 0.995
 #: Two errors that differ by less than this share are said to be the same.
-_SAME = 0.03
+SAME = 0.03
 #: A ratio below this is told with a decimal.
 _FEW = 10.0
 #: Rad: a truth whose sideslip stays below this on average was not measured.
-_NO_SIDESLIP_RAD = 1e-5
+NO_SIDESLIP_RAD = 1e-5
 #: An estimate whose d2 is not less than this share of that of sideslip 0 has nothing to show for itself.
 _LESS = 0.8
 #: NIS over its degrees of freedom beyond which sensors are said to surprise a filter less or more than it expects.
@@ -107,10 +107,10 @@ def _result(report: Report, main: MainFacts, figures: _Figures) -> str:
     said += [_against(own, other, text) for text, other in others]
     if "sideslip_rad" in truth["not_independent"]:
         said.append("that truth is an input or the estimate itself: no independent check")
-    if (measured := figures.get(("zero", "sideslip_rad", "rmse"))) is not None and measured < _NO_SIDESLIP_RAD:
+    if (measured := figures.get(("zero", "sideslip_rad", "rmse"))) is not None and measured < NO_SIDESLIP_RAD:
         said.append("but that truth's sideslip is 0 throughout, as of one that does not measure it")
     naive = None if main.name == main.naive else _error(figures, main.naive)
-    useless = ". It is of no use here" if naive is not None and own > (1.0 + _SAME) * naive else ""
+    useless = ". It is of no use here" if naive is not None and own > (1.0 + SAME) * naive else ""
     return ", ".join(said) + useless
 
 
@@ -118,7 +118,7 @@ def _against(own: float, other: float, text: str) -> str:
     beside = f"{text} ({degrees(other)})"
     if other == own:
         return f"the same as {beside}"
-    if abs(own - other) <= _SAME * other:
+    if abs(own - other) <= SAME * other:
         return f"as good as {beside}"
     if own == 0.0 or other == 0.0:
         return f"{'nearer' if own < other else 'farther off'} than {beside}"

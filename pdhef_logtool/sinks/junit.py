@@ -5,10 +5,27 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from pdhef_logtool.evaluation.thresholds import Verdict
 from pdhef_logtool.records.files import write_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One testcase. ``suite``, ``subject``: what it is of; ``output``: its figures, shown whatever came out.
+
+    ``outcome`` is the type of a failure where it ``failed``; ``reason`` says why it failed or was skipped.
+    """
+
+    suite: str
+    subject: str
+    name: str
+    outcome: str
+    failed: bool = False
+    reason: str = ""
+    output: str | None = None
 
 
 def write_junit(path: Path, verdicts: Mapping[str, Sequence[Verdict]]) -> None:
@@ -18,50 +35,65 @@ def write_junit(path: Path, verdicts: Mapping[str, Sequence[Verdict]]) -> None:
 
 def junit_bytes(verdicts: Mapping[str, Sequence[Verdict]]) -> bytes:
     """Return JUnit XML in UTF-8; the same verdicts give the same bytes, so that there is no time of day in it."""
-    everything = [v for of_log in verdicts.values() for v in of_log]
+    return cases_bytes({log: [_case(verdict) for verdict in of_log] for log, of_log in verdicts.items()})
+
+
+def cases_bytes(suites: Mapping[str, Sequence[Case]]) -> bytes:
+    """Return JUnit XML of testcases by suite, as :func:`junit_bytes`."""
+    everything = [case for of_suite in suites.values() for case in of_suite]
     root = ET.Element("testsuites", {"name": "pdhef", **_counts(everything)})
-    for log, of_log in verdicts.items():
-        suite = ET.SubElement(root, "testsuite", {"name": _text(log), **_counts(of_log)})
-        for verdict in of_log:
-            _add_case(suite, verdict)
+    for name, of_suite in suites.items():
+        suite = ET.SubElement(root, "testsuite", {"name": _text(name), **_counts(of_suite)})
+        for case in of_suite:
+            _add_case(suite, case)
     ET.indent(root)
     document: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
     return document + b"\n"
 
 
-def _counts(verdicts: Sequence[Verdict]) -> dict[str, str]:
+def _case(verdict: Verdict) -> Case:
+    note = f", {verdict.reason}" if verdict.reason and not verdict.failed else ""
+    return Case(
+        verdict.log,
+        verdict.estimator,
+        verdict.threshold.label,
+        verdict.outcome,
+        verdict.failed,
+        verdict.reason,
+        None
+        if verdict.value is None
+        else f"value {verdict.value:.9g} {verdict.threshold.unit}, margin {verdict.margin:.9g}, n={verdict.n}{note}",
+    )
+
+
+def _counts(cases: Sequence[Case]) -> dict[str, str]:
     return {
-        "tests": str(len(verdicts)),
-        "failures": str(sum(v.failed for v in verdicts)),
+        "tests": str(len(cases)),
+        "failures": str(sum(c.failed for c in cases)),
         "errors": "0",
-        "skipped": str(sum(v.outcome == "skipped" for v in verdicts)),
+        "skipped": str(sum(c.outcome == "skipped" for c in cases)),
         "time": "0",
     }
 
 
-def _add_case(suite: ET.Element, verdict: Verdict) -> None:
-    threshold = verdict.threshold
-    case = ET.SubElement(
+def _add_case(suite: ET.Element, case: Case) -> None:
+    element = ET.SubElement(
         suite,
         "testcase",
         # Dots would be read as a hierarchy of packages.
         {
-            "classname": _text(f"pdhef.{verdict.log.replace('.', '_')}.{verdict.estimator.replace('.', '_')}"),
-            "name": _text(threshold.label),
+            "classname": _text(f"pdhef.{case.suite.replace('.', '_')}.{case.subject.replace('.', '_')}"),
+            "name": _text(case.name),
             "time": "0",
         },
     )
-    if verdict.failed:
-        failure = ET.SubElement(case, "failure", {"message": _text(verdict.reason), "type": verdict.outcome})
-        failure.text = _text(f"{verdict.log}: {verdict.estimator}: {threshold.label}: {verdict.reason}")
-    elif verdict.outcome == "skipped":
-        ET.SubElement(case, "skipped", {"message": _text(verdict.reason)})
-    if verdict.value is not None:
-        output = ET.SubElement(case, "system-out")
-        note = f", {verdict.reason}" if verdict.reason and not verdict.failed else ""
-        output.text = _text(
-            f"value {verdict.value:.9g} {threshold.unit}, margin {verdict.margin:.9g}, n={verdict.n}{note}"
-        )
+    if case.failed:
+        failure = ET.SubElement(element, "failure", {"message": _text(case.reason), "type": case.outcome})
+        failure.text = _text(f"{case.suite}: {case.subject}: {case.name}: {case.reason}")
+    elif case.outcome == "skipped":
+        ET.SubElement(element, "skipped", {"message": _text(case.reason)})
+    if case.output is not None:
+        ET.SubElement(element, "system-out").text = _text(case.output)
 
 
 def _text(text: str) -> str:

@@ -13,7 +13,9 @@ from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.evaluation.metrics import MetricRow
-from pdhef_logtool.evaluation.reasons import ReasonFacts
+from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, Cell
+from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
+from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.documents import jsonable
@@ -22,9 +24,12 @@ from pdhef_logtool.records.ledger import SampleCount
 from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.sinks.answer import MainFacts, answer_of
 from pdhef_logtool.sinks.base import Event
+from pdhef_logtool.sinks.verdicts import verdicts_of
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from pdhef_logtool.evaluation.thresholds import Verdict
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
@@ -45,7 +50,10 @@ class TopicFacts:
 
 @dataclass(frozen=True, slots=True)
 class LogFacts:
-    """The log that was read; ``file`` is its file name without folders, [start_ns, end_ns) its log times."""
+    """The log that was read; ``file`` is its file name without folders, [start_ns, end_ns) its log times.
+
+    ``signals_sha256``, ``truth_sha256``: of what was read of it, None where nothing was.
+    """
 
     name: str
     file: str
@@ -54,6 +62,8 @@ class LogFacts:
     start_ns: int
     end_ns: int
     topics: Sequence[TopicFacts] = ()
+    signals_sha256: str | None = None
+    truth_sha256: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,15 +123,35 @@ class FrictionFacts:
 
 
 @dataclass(frozen=True, slots=True)
+class DriveDetails:
+    """What a report's page shows and no table holds, of a drive that a run estimated.
+
+    ``faults`` of the sensors, None where no estimator looks for them. ``innovations`` by channel.
+    ``standings`` of the main estimator, empty without truth; ``limits``: how it stands against the thresholds.
+    ``error_budget`` has a reason where there is none. ``operating_space``: the cells that the drive was in.
+    ``metadata`` : what the log says of itself.
+    """
+
+    faults: Sequence[SensorFault] | None
+    innovations: Sequence[Any]
+    standings: Sequence[Standing]
+    limits: Sequence[Verdict]
+    error_budget: Any
+    operating_space: Sequence[Cell]
+    metadata: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
 class ReportFacts:
     """Everything that report.json says about one log.
 
     ``vehicle_file``: the car's folder or file, None where none was given; ``vehicle_proven``: whether driving with
-    truth showed it to be right. ``main``: the estimator that is the answer, None where nothing was estimated.
+    truth showed it to be right. ``low_speed_m_s``: below it sideslip is not scored.
+    ``main``: the estimator that is the answer, None where nothing was estimated.
     ``warnings``: what may be wrong; ``remarks``: what else is worth knowing.
     ``calibration``: what the drive said of its car without truth, None where it was not asked.
     ``file_bytes``: what became of the bytes of each file; ``samples``: of the samples of each mapped source.
-    ``checks``: what physics says of signals, truth and vehicle file.
+    ``checks``: what physics says of signals, truth and vehicle file. ``details``: None where nothing was estimated.
     """
 
     log: LogFacts
@@ -133,6 +163,7 @@ class ReportFacts:
     truth: TruthFacts
     vehicle_file: str | None = None
     vehicle_proven: bool = False
+    low_speed_m_s: float | None = None
     friction: FrictionFacts | None = None
     calibration: Mapping[str, Any] | None = None
     metrics: Sequence[MetricRow] = ()
@@ -144,6 +175,7 @@ class ReportFacts:
     remarks: Sequence[str] = ()
     main: MainFacts | None = None
     checks: Sequence[Check] = ()
+    details: DriveDetails | None = None
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -162,6 +194,7 @@ class LogOutcome:
     """How one log of a run ended, with which car; None where it was not read or nothing was estimated.
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
+    ``main``: the estimator that is the answer.
     """
 
     log: str
@@ -170,6 +203,10 @@ class LogOutcome:
     failed: str | None = None
     lost: Sequence[str] = ()
     car: CarFacts | None = None
+    signals_sha256: str | None = None
+    truth_sha256: str | None = None
+    mapping_sha256: str | None = None
+    main: str | None = None
 
     @property
     def outcome(self) -> str:
@@ -207,6 +244,7 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             "sha256": facts.vehicle_sha256,
             "file": facts.vehicle_file,
             "proven": facts.vehicle_proven,
+            "low_speed_blend_m_s": facts.low_speed_m_s,
         },
         "estimators": [
             {
@@ -238,7 +276,24 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
         "versions": dict(facts.versions),
     }
     document = {key: jsonable(value) for key, value in document.items()}
-    return {**document, "answer": None if facts.main is None else answer_of(document, facts.main)}
+    document["answer"] = None if facts.main is None else answer_of(document, facts.main)
+    if facts.main is not None and (details := facts.details) is not None:
+        document |= _detailed(details)
+        document["verdicts"] = verdicts_of(document, facts.main.name, details.standings, details.limits)
+    return document
+
+
+def _detailed(details: DriveDetails) -> dict[str, Any]:
+    """Return the keys that only a run writes; readers of older reports do without them."""
+    space = {"speed_edges_m_s": SPEED_EDGES_M_S, "ay_edges_m_s2": AY_EDGES_M_S2, "cells": details.operating_space}
+    found = {
+        "faults": details.faults,
+        "innovations": details.innovations,
+        "error_budget": details.error_budget,
+        "operating_space": space,
+        "metadata": dict(details.metadata),
+    }
+    return {key: jsonable(value) for key, value in found.items()}
 
 
 def build_run(
@@ -263,7 +318,17 @@ def build_run(
         "config": dict(config),
         "model": None if model is None else dict(model),
         "logs": [
-            {"log": o.log, "file": PurePath(o.file).name, "sha256": o.sha256, "outcome": o.outcome, "car": o.car}
+            {
+                "log": o.log,
+                "file": PurePath(o.file).name,
+                "sha256": o.sha256,
+                "signals_sha256": o.signals_sha256,
+                "truth_sha256": o.truth_sha256,
+                "mapping_sha256": o.mapping_sha256,
+                "outcome": o.outcome,
+                "main": o.main,
+                "car": o.car,
+            }
             for o in outcomes
         ],
     }

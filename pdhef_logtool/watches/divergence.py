@@ -27,7 +27,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
+from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -44,8 +44,6 @@ LEAST_SPEED_BLENDS = 3.0
 SAMPLE_HOLD_S = 0.1
 #: So many identical samples in a row are a stuck sensor, or a coarse one that says nothing yet.
 STUCK_SAMPLES = 5
-#: Beyond this step between stamps the memory starts anew.
-RESTART_GAP_S = 0.5
 
 # Entries of the memory.
 D, FLAG, HAS_LAST, VY, VX, AY, GYRO, AY_AGE, GYRO_AGE, AY_RUN, GYRO_RUN, AY_SLOW, GRIP, FRICTION, VAR = range(15)

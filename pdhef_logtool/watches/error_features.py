@@ -32,7 +32,7 @@ from pdhef_logtool.car.vehicle import GRAVITY_M_S2
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.reasons import BURST_AY, DEAD_AY, MISSING_AY, SPIKE_AY, STUCK_AY
-from pdhef_logtool.records.release import StepColumns, last_stamp_ns, release, step_durations_s
+from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, last_stamp_ns, release, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -44,8 +44,6 @@ GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.05, 0.5
 KINEMATIC_S, SLOW_MEAN_S = 0.3, 3.0
 YAW_SMOOTHING_S = 0.15
 MEMORY_S = 1.0
-#: Beyond this step between stamps the memory starts anew.
-RESTART_GAP_S = 0.5
 MIN_SPEED_M_S = 3.0
 #: Without a friction from log or estimator.
 ASSUMED_FRICTION = 1.0

@@ -26,7 +26,7 @@ import numpy as np
 
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.readings import without_impossible
-from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
+from pdhef_logtool.records.release import RESTART_GAP_S, last_stamp_ns, step_durations_s
 from pdhef_logtool.records.signals import FloatArray, Signals
 
 #: A speed that changes by this much more or less than the accelerometer says is contradicted: no hill is so steep.
@@ -57,8 +57,6 @@ ZERO_M_S, PULSE_FLOOR_M_S = 0.05, 1.0
 BRAKING_M_S2, BRAKING_SMOOTHING_S = 0.5, 0.1
 #: Locked wheels do not time out above this v̂.
 LOCKED_SPEED_M_S = 1.0
-#: Beyond such a step, or so long without speed or a_x, all starts anew.
-RESTART_GAP_S = 0.5
 
 # Entries of the memory. Last samples of speed, a_x, yaw rate; since the last speed sample: time, what a_x says of the
 # speed, what is allowed beyond it; time since a_x.

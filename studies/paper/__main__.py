@@ -2,8 +2,9 @@
 
     python -m studies.paper [--cars CAR ...] [-o DOCS] [--noise-seeds N]
 
-Without ``--cars`` they are the shipped one (training seed 0) and two more whose networks are of the same training with
-other seeds, which are trained first where they are not there yet (``python -m studies.defaults.train_default``).
+Without ``--cars`` they are the shipped one (training seed 0), two more whose networks are of the same training with
+other seeds, and one that never saw a lane change or a sine sweep; what is not there yet is trained first
+(``python -m studies.defaults.train_default``).
 """
 
 from __future__ import annotations
@@ -20,9 +21,12 @@ from studies.paper.experiment import FIRST_NOISE_SEED, NOISE_SEEDS
 from studies.paper.figures import draw
 from studies.paper.page import write_page
 from studies.paper.results import document, gather
+from studies.paper.withheld import Withheld, counts, withheld_car
 
 #: Further training seeds are trained into folders here; ignored by git.
 TRAINED = ROOT / "out" / "paper"
+#: Drives and residuals of the shipped network's training.
+WORK = ROOT / "out" / "train-default"
 TRAINING_SEEDS = (0, 1, 2)
 
 
@@ -34,6 +38,7 @@ def default_cars() -> dict[int, Car]:
         if not (folder / NETWORK_FILE).is_file():
             print(f"training the network of seed {seed} ...", file=sys.stderr)
             command = [sys.executable, "-m", "studies.defaults.train_default", "--seed", str(seed), "-o", str(folder)]
+            command += ["--work", str(WORK)]
             subprocess.run(command, cwd=ROOT, check=True)
         cars[seed] = Car.load(folder)
     return cars
@@ -56,8 +61,11 @@ def main() -> int:
     if arguments.noise_seeds < 1:
         parser.error("--noise-seeds needs at least one")
     try:
+        cars = named_cars(arguments.cars) if arguments.cars else default_cars()
+        withheld = None if arguments.cars else Withheld(counts(WORK), withheld_car(WORK, TRAINED / "car-withheld"))
         results = gather(
-            named_cars(arguments.cars) if arguments.cars else default_cars(),
+            cars,
+            withheld=withheld,
             noise_seeds=range(FIRST_NOISE_SEED, FIRST_NOISE_SEED + arguments.noise_seeds),
             progress=lambda text: print(text, file=sys.stderr),
         )

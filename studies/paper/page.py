@@ -9,10 +9,11 @@ import numpy as np
 
 from studies.pages import table
 from studies.paper import published
-from studies.paper.comparison import BOOTSTRAP_DRAWS, LEVEL, Improvement, Spread
+from studies.paper.comparison import BOOTSTRAP_DRAWS, LEVEL, Improvement, Spread, spread
 from studies.paper.experiment import BURST, BURST_S, GRAVITY_M_S2, A, B
 from studies.paper.results import BASELINES, SCENARIOS, Results
 from studies.paper.schemes import DRAWN, HYBRID, SCHEMES
+from studies.paper.withheld import WITHHELD
 from truthsim.manoeuvres import PATH_STEP_M, iso_3888_2_line_m
 from truthsim.sensors import SensorNoise
 from truthsim.suite import is_held_out
@@ -451,6 +452,31 @@ def _result_table(r: Results, scenario: str) -> str:
     return table(("scheme", *(head for head, _, _ in TABLE)), rows)
 
 
+def _withheld(r: Results) -> str:
+    """Say what training held, and what is left where it held neither manoeuvre."""
+    if r.withheld is None or r.without is None:
+        return ""
+    held = ", ".join(f"{n} {m}" for m, n in sorted(r.withheld.drives.items(), key=lambda item: -item[1]))
+    rows = []
+    unseen = f"`{HYBRID}`, its network trained without them"
+    for shown, scheme, source in (
+        ("`physics`", "physics", r.experiment),
+        (f"`{HYBRID}`", HYBRID, r.experiment),
+        (unseen, HYBRID, r.without),
+    ):
+        found = [spread(source, s.name, scheme, "sideslip_deg") for s in (A, B)]
+        rows.append([shown, *("–" if s is None else ranged(s) for s in found)])
+    return f"""### What training held
+
+The figures of this page are of networks that saw the shipped car, on other drives: {held}. The same training
+without {", ".join(f"`{m}`" for m in WITHHELD)} (trust {r.withheld.car.allowed_trust.cap:g} by the same evidence)
+gives, sideslip in degrees:
+
+{table(("scheme", "A", "B"), rows)}
+
+"""
+
+
 def _gain_table(r: Results) -> str:
     rows = []
     for scenario in SCENARIOS:
@@ -576,7 +602,7 @@ after the true pose; a lag above 0 is late.
 
 {_result_table(r, BURST.name)}
 
-### `{HYBRID}` against the others
+{_withheld(r)}### `{HYBRID}` against the others
 
 By how much its RMSE, pooled over the seeds, is lower; in brackets the {percent(LEVEL)} bounds of a bootstrap that
 draws noise seeds in pairs ({BOOTSTRAP_DRAWS} draws of {len(seeds)}; so few make the bounds rather too narrow). Each

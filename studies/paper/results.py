@@ -36,6 +36,7 @@ from studies.paper.probes import (
 )
 from studies.paper.schemes import HYBRID, SCHEMES
 from studies.paper.step_time import StepTime, step_times
+from studies.paper.withheld import Withheld
 from truthsim.suite import is_held_out
 
 SCENARIOS: tuple[Scenario, ...] = (A, B, BURST)
@@ -55,6 +56,7 @@ class Results:
     ran : schemes in the order of the tables.
     cars, histories : by training seed. fits : residual fits by scenario, one a car.
     curves : β over |a_y| by scenario and scheme. inflations : of R by scheme.
+    without : A and B with the network that had no lane change and no sweep, None where there is none.
     """
 
     experiment: Experiment
@@ -64,6 +66,8 @@ class Results:
     curves: Mapping[str, Mapping[str, TrustCurve]]
     inflations: Mapping[str, Inflation]
     times: Mapping[str, StepTime]
+    withheld: Withheld | None = None
+    without: Experiment | None = None
 
     @property
     def networks(self) -> dict[int, ModelBundle]:
@@ -96,7 +100,11 @@ class Results:
 
 
 def gather(
-    cars: Mapping[int, Car], *, noise_seeds: Sequence[int], progress: Callable[[str], None] = lambda _text: None
+    cars: Mapping[int, Car],
+    *,
+    noise_seeds: Sequence[int],
+    withheld: Withheld | None = None,
+    progress: Callable[[str], None] = lambda _text: None,
 ) -> Results:
     """Run the whole experiment.
 
@@ -112,7 +120,12 @@ def gather(
     progress("step times")
     names = [n for n in SCHEMES if n not in experiment.missing]
     times = step_times(experiment.drives[B.name], on_the_road(next(iter(cars.values())), B.friction), names)
-    return Results(experiment, cars, histories, fits, curves, inflations, times)
+    without = None
+    if withheld is not None:
+        progress("the network without lane changes and sweeps")
+        seeds = {0: withheld.car}
+        without = run_experiment(seeds, scenarios=(A, B), noise_seeds=noise_seeds, names=(HYBRID,))
+    return Results(experiment, cars, histories, fits, curves, inflations, times, withheld, without)
 
 
 def _plain(value: Any) -> Any:

@@ -9,7 +9,7 @@ from itertools import permutations, product
 import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray
-from studies.strangers.cars import Series, drive
+from studies.strangers.cars import Car, Series, drive
 from studies.strangers.containers import Topic, register
 from studies.strangers.recordings import (
     DEG,
@@ -200,7 +200,7 @@ def missing_things() -> Iterator[Recording]:
         right=answers(car, "imu", "speed", "truth", "truth rate"),
         cause=r"definition",
     )
-    yield _nameless()
+    yield from _nameless()
     yield Recording(
         name="no-imu",
         group="fault",
@@ -319,12 +319,12 @@ def _forward(body: Series) -> Series:
     return Series(body.stamps_ns, body.arrival_ns, np.column_stack([body.values[:, 0], 0.0 * body.values[:, 0]]))
 
 
-def _nameless() -> Recording:
-    """Columns without a name that says anything, in an order without sense, with what is no signal between them."""
-    car = drive("bends")
+def _columns(car: Car) -> dict[str, FloatArray]:
+    """Return sensors and what is no signal, without order and under names that say nothing."""
     clock = car.force
     rng = np.random.default_rng(5)
-    columns = {
+    count = np.arange(len(clock.stamps_ns))
+    return {
         "c": car.rate.values[:, 2],
         "k": car.force.values[:, 1],
         "a": car.steer.along(clock).values,
@@ -333,15 +333,30 @@ def _nameless() -> Recording:
         "b": car.rate.values[:, 0],
         "f": car.force.values[:, 0],
         "d": car.rate.values[:, 1],
-        "g": 40.0 + 0.01 * np.arange(len(clock.stamps_ns)) + rng.normal(0.0, 0.2, len(clock.stamps_ns)),
-        "i": np.arange(len(clock.stamps_ns)) % 256.0,
+        "g": 40.0 + 0.01 * count + rng.normal(0.0, 0.2, len(count)),
+        "i": np.asarray(count % 256, dtype=np.float64),
     }
-    return Recording(
+
+
+def _nameless() -> Iterator[Recording]:
+    """Columns of one topic by letter, at one speed, which decides nothing, and by number, on a road that does."""
+    car = drive("bends")
+    yield Recording(
         name="shuffled-names",
         group="fault",
-        what="one JSON topic whose fields are called a to k",
+        what="one JSON topic whose fields are called a to k, at almost one speed",
         container="mcap-json",
-        topics=(message("/q", "Row", clock, columns, stamp=None),),
+        topics=(message("/q", "Row", car.force, _columns(car), stamp=None),),
+        right=answers(car, "imu", "steer", "speed"),
+    )
+    car = drive("sedan")
+    numbers = np.stack(list(_columns(car).values()), axis=1)
+    yield Recording(
+        name="numbered",
+        group="fault",
+        what="one std_msgs/Float32MultiArray, on a road with stops",
+        container="rosbag2",
+        topics=(message("/array", "std_msgs/msg/Float32MultiArray", car.force, {"data": numbers}, stamp=None),),
         right=answers(car, "imu", "steer", "speed"),
     )
 

@@ -13,7 +13,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
-    *("inspect", "map", "estimators", "run", "metrics", "view", "simulate", "simulate suite", "simulate conditions"),
+    *("inspect", "map", "estimators", "run", "metrics", "report", "compare", "view"),
+    *("simulate", "simulate suite", "simulate conditions"),
     *("identify", "extract", "train", "tune", "trust", "calibrate", "learn"),
 )
 

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.drive.frames import angles_deg
+from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import Mounting, find_mounting, survey_log
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, plan_drive
 from pdhef_logtool.inspection.report import inspect_drive_log, write_mapping
@@ -64,7 +66,7 @@ def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles: tupl
     for names in (ACCELERATIONS, RATES):
         turned = np.stack([signals[n].values for n in names], axis=1) @ turn
         signals |= {n: replace(signals[n], values=turned[:, i]) for i, n in enumerate(names)}
-    found = find_mounting(signals, {}, None, triads, mapping)
+    found = find_mounting(measure(signals), triads, mapping)
     assert found is not None
     assert found.confident
     assert np.allclose(found.rotation, turn, atol=1e-9)
@@ -150,16 +152,16 @@ def test_a_drive_that_says_nothing_turns_nothing(sample_logs_dir: Path) -> None:
     found = survey_log(log, mapping, clocks, (log.start_ns, log.start_ns + 2_000_000_000))
     log.close()
     assert found.mapping is mapping
-    assert found.checks == ()
+    assert found.mounted == ()
 
 
 def test_angles_are_those_of_the_sensor_in_the_car() -> None:
     mounting = Mounting(rotation(10, -20, 30), np.eye(3), "", confident=True)
-    assert mounting.degrees == pytest.approx((10, -20, 30))
+    assert angles_deg(mounting.rotation) == pytest.approx((10, -20, 30))
     assert mounting.text == "the IMU is mounted with roll 10, pitch -20, yaw 30 deg"
 
 
 @pytest.mark.parametrize("angles", [(0, 90, 30), (0, -90, -120), (170, 20, -30)])
 def test_angles_give_the_rotation_back(angles: tuple[float, float, float]) -> None:
     mounting = Mounting(rotation(*angles), np.eye(3), "", confident=True)
-    assert np.allclose(rotation(*mounting.degrees), mounting.rotation, atol=1e-6)
+    assert np.allclose(rotation(*angles_deg(mounting.rotation)), mounting.rotation, atol=1e-6)

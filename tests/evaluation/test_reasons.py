@@ -9,7 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pdhef_logtool.evaluation.reasons import MERGE_S, NAMED_INTERVALS, Interval, ReasonIntervals, summarise_reasons
+from pdhef_logtool.evaluation.reasons import (
+    LISTED_INTERVALS,
+    MERGE_S,
+    NAMED_INTERVALS,
+    Interval,
+    ReasonIntervals,
+    sensor_faults,
+    summarise_reasons,
+)
 from pdhef_logtool.records.reasons import MISSING_AY, REASONS, SPIKE_AY, STUCK_AY, STUCK_YAW_RATE
 from pdhef_logtool.records.tracks import make_track
 
@@ -106,3 +114,17 @@ def test_every_bit_is_one_of_its_own_with_its_pair_beside_it() -> None:
     for ay, rate in zip(REASONS[::2], REASONS[1::2], strict=True):
         assert rate.bit == ay.bit << 1
         assert (ay.name.removesuffix("_ay"), "gyro") == (rate.name.removesuffix("_yaw_rate"), rate.text.split()[0])
+
+
+def test_faults_are_told_by_sensor_and_kind_with_the_longest_intervals() -> None:
+    n = 40_000
+    reason = np.zeros(n, dtype=np.int64)
+    reason[np.arange(0, 35_000, 500)] |= SPIKE_AY  # 70 single ones
+    reason[1_000:1_400] |= STUCK_YAW_RATE
+    spike, stuck = sensor_faults(make_track("x", stamps(n), reason=reason)) or ()
+    assert (spike.sensor, spike.kind, spike.count, len(spike.intervals)) == ("ay_m_s2", "spike", 70, LISTED_INTERVALS)
+    assert [i.start_ns for i in spike.intervals] == sorted(i.start_ns for i in spike.intervals)
+    assert (stuck.sensor, stuck.kind, stuck.count) == ("yaw_rate_rad_s", "stuck", 1)
+    assert stuck.seconds == pytest.approx(3.99)
+    assert sensor_faults(make_track("x", stamps(3))) is None
+    assert sensor_faults(make_track("x", stamps(3), reason=np.zeros(3, dtype=np.int64))) == ()

@@ -88,7 +88,7 @@ def test_a_drive_is_loaded_without_what_the_file_takes_off(monkeypatch: pytest.M
 
     def load(_log: Any, used: Car, _mapping: Any, options: ReadOptions) -> tuple[DriveRecord, Any]:
         asked.append((used.vehicle, options))
-        plan = SimpleNamespace(dependent=dependent, mapping=SimpleNamespace(signals=mapped))
+        plan = SimpleNamespace(dependent=dependent, mapping=SimpleNamespace(signals=mapped), placed=None)
         return DriveRecord("a", "a.mcap"), SimpleNamespace(
             signals=DRIVE.signals, truth=truth, plan=plan, log_start_ns=7
         )

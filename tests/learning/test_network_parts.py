@@ -132,7 +132,14 @@ def write_dataset(folder: Path, **drives: tuple[str, ResidualRows]) -> None:
             writer.append(replace(rows, **{k: getattr(rows, k)[a : a + 35] for k in rows.__slots__}))
         entries.append(entry_of(log, split, rows, 0.02 if log == "z" else 0.01))
         writer.finish(entries[-1])
-    write_manifest(folder, entries, [], settings=SETTINGS, seed=3, vehicles={"f" * 64: vehicle_entry("f" * 64, CAR)})
+    write_manifest(
+        folder,
+        entries,
+        [],
+        settings=SETTINGS,
+        seed=3,
+        vehicles={"f" * 64: vehicle_entry("f" * 64, CAR, identified=True)},
+    )
 
 
 def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
@@ -158,6 +165,7 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
     assert read_entry(drive_file(tmp_path, "z")) == entry_of("z", "train", rows, 0.02)
     data = read_dataset(tmp_path)
     assert data.vehicle_name == "test car" and data.vehicle(data.drives[0]) == CAR
+    assert data.identified_share == 1.0
     found = data.drives[2].arrays
     kept = np.delete(np.arange(120), 5)
     np.testing.assert_array_equal(found.stamps_ns, rows.stamps_ns[kept])
@@ -645,7 +653,8 @@ def arrays(count: int = 200, **changes: Any) -> DriveArrays:
 def dataset(**drives: tuple[str, DriveArrays]) -> Any:
     held = tuple(SimpleNamespace(name=n, split=s, arrays=a) for n, (s, a) in drives.items())
     slow = SimpleNamespace(low_speed_blend_m_s=3.0)
-    about = {"model": "physics", "physics_sha256": "e" * 64, "vehicle_name": "a car"}
+    about: dict[str, Any] = {"model": "physics", "physics_sha256": "e" * 64, "vehicle_name": "a car"}
+    about["identified_share"] = 0.5
     return SimpleNamespace(drives=held, sha256="d" * 64, vehicle=lambda _drive: slow, **about)
 
 
@@ -731,7 +740,8 @@ def test_a_training_tells_epochs_and_writes_history_plot_and_where_it_is_from(
     assert asked == [(2, 1, "residual_rates", tmp_path, BUNDLE, "cuda")]
     assert found.test_loss == 0.5 and saved == [tmp_path]
     assert found.bundle.provenance == {
-        "epochs": 2, "dataset_sha256": "d" * 64, "vehicle": "a car", "fine_tuned_from": BUNDLE.sha256,
+        "epochs": 2, "dataset_sha256": "d" * 64, "vehicle": "a car",
+        "identified_share": 0.5, "fine_tuned_from": BUNDLE.sha256,
         "fine_tuned_on": "a car", "test_loss": 0.5, "training_hours": 0.002,
     }  # fmt: skip
     assert not (tmp_path / CHECKPOINT).exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pdhef_logtool.logs.definitions import read_definitions
+from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.mapping import auto_map
@@ -114,8 +116,47 @@ def test_an_empty_topic_is_said_to_be_empty(tmp_path: Path) -> None:
 def test_a_folder_without_definitions_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="without any"):
         read_definitions(tmp_path)
-    with pytest.raises(UsageError, match="no folder"):
+    with pytest.raises(UsageError, match="neither folder nor archive"):
         read_definitions(tmp_path / "none")
+
+
+@pytest.mark.parametrize("name", ["definitions.zip", "car_msgs-1.0-py3-none-any.whl"])
+def test_definitions_of_a_zip_file_or_a_wheel(tmp_path: Path, name: str) -> None:
+    import zipfile
+
+    path = bag(tmp_path / "b", {"/steer": ("dbw_msgs/msg/Steer", {"dbw_msgs/msg/Steer": STEER})})
+    with zipfile.ZipFile(tmp_path / name, "w") as archive:
+        archive.writestr("source-1.0/dbw_msgs/msg/Steer.msg", STEER)
+        archive.writestr("source-1.0/other_msgs/msg/Steer.msg", "float64 of_another\n")
+    log = open_log(path, msgs=tmp_path / name)
+    assert [f.path for f in log.fields("/steer")] == ["steering_wheel_angle"]
+    assert log.borrowed("/steer") == ()
+
+
+@pytest.mark.parametrize("variable", ["AMENT_PREFIX_PATH", "ROS_PACKAGE_PATH"])
+def test_an_installed_ros_is_looked_in_and_named(
+    tmp_path: Path, variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag(tmp_path / "b", {"/steer": ("dbw_msgs/msg/Steer", {"dbw_msgs/msg/Steer": STEER})})
+    folder = tmp_path / "ros" / ("share" if variable == "AMENT_PREFIX_PATH" else "stack") / "dbw_msgs" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "Steer.msg").write_text(STEER)
+    monkeypatch.setenv(variable, f"{tmp_path / 'nowhere'}{os.pathsep}{tmp_path / 'ros'}")
+    log = open_log(path)
+    assert [f.path for f in log.fields("/steer")] == ["steering_wheel_angle"]
+    assert log.borrowed("/steer") == (folder / "Steer.msg",)
+    said: list[str] = []
+    choose_mapping(log, None, said.append, said.append, prefer_truth="perfect")
+    assert any("Steer.msg of this machine, as the log does not define its type" in text for text in said)
+
+
+def test_first_messages_come_whole(tmp_path: Path) -> None:
+    path = bag(tmp_path / "b", {"/imu": ("sensor_msgs/msg/Temperature", {})})
+    log = open_log(path)
+    found = log.first_messages("/imu", 2)
+    assert len(found) == 2
+    assert value_at(found[0], ("header", "frame_id")) == ""
+    assert log.first_messages("/none", 1) == []
 
 
 def test_looking_makes_no_losses(tmp_path: Path) -> None:

@@ -379,6 +379,19 @@ def test_a_documented_trap_is_left_out_with_its_reason() -> None:
     assert any("per sample" in n for n in auto.mapping.notes)
 
 
+def test_an_export_is_told_by_its_fields() -> None:
+    vbo = {"satellites": 9.0 + 0.0 * S, "latitude": 60.0 * WHERE["latitude"], "longitude": -60.0 * WHERE["longitude"],
+           "velocity kmh": 3.6 * V, "heading": (90.0 - np.degrees(np.cumsum(RATE) * 0.01)) % 360.0,
+           "Long accel g": AX / G, "Lat accel g": AY / G, "Yaw_rate deg/s": RATE / DEG}  # fmt: skip
+    fields = {k: np.asarray(v, dtype=np.float64) for k, v in vbo.items()}
+    auto = auto_map(FakeLog({"/vbo": FakeTopic("", T, fields, encoding="json")}))
+    got = taken(auto)
+    assert got["speed_m_s"] == ("/vbo.velocity kmh", round(1 / 3.6, 6))
+    assert got["ay_m_s2"] == ("/vbo.Lat accel g", G)
+    assert got["yaw_rate_rad_s"] == ("/vbo.Yaw_rate deg/s", round(DEG, 6))
+    assert {auto.mapping.truth[n].scale for n in ("lat_deg", "lon_deg")} == {1 / 60.0, -1 / 60.0}
+
+
 def test_every_shipped_entry_names_its_page() -> None:
     vendors = load_vendors()
     assert len(vendors.types) > 20

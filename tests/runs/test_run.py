@@ -20,7 +20,7 @@ from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
 
-OUTPUTS = {"annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.json"}
+OUTPUTS = {"annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json"}
 
 NO_TRUTH_MAPPING = """
 [signals.steer_rad]

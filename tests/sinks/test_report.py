@@ -94,7 +94,13 @@ def test_report_follows_its_schema_and_keeps_what_it_was_told(tmp_path):
     ]
     assert report["mapping"]["missing"] == ["friction"]
     assert report["mapping"]["signals"][0]["source"] == "/imu.linear_acceleration.y"
-    assert report["vehicle"] == {"name": "sedan", "sha256": SHA, "file": None, "proven": False}
+    assert report["vehicle"] == {
+        "name": "sedan",
+        "sha256": SHA,
+        "file": None,
+        "proven": False,
+        "low_speed_blend_m_s": None,
+    }
     assert [(e["name"], e["outcome"], e["reason"]) for e in report["estimators"]] == [
         ("phy-ukf", "ran", None),
         ("pd-hef", "skipped", "no model"),

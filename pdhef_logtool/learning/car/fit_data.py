@@ -21,6 +21,7 @@ from pdhef_logtool.drive.truth import (
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.mapping.frames import Placement
 from pdhef_logtool.records.signals import SIGNAL_UNITS, Channel, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
@@ -35,6 +36,7 @@ class FitDrive:
     ``signals`` are as measured: no bias and no offset of a vehicle file is taken off.
     ``independent_yaw_rate`` tells that the truth's yaw rate is not the gyro itself, ``steering_wheel`` that the log
     has the steering wheel's angle in place of the road wheels'. ``gyro_latency_s`` was taken off the gyro's stamps.
+    ``placed`` is where recorded frames put the IMU.
     """
 
     name: str
@@ -44,6 +46,7 @@ class FitDrive:
     log_start_ns: int
     steering_wheel: bool = False
     gyro_latency_s: float = 0.0
+    placed: Placement | None = None
 
     @property
     def span_s(self) -> tuple[float, float]:
@@ -77,7 +80,14 @@ def load_fit_drive(
     gyro = whole.plan.mapping.signals.get("yaw_rate_rad_s")
     latency_s = 0.0 if gyro is None else gyro.latency_s
     return record, FitDrive(
-        record.name, whole.signals, whole.truth, independent, whole.log_start_ns, by_wheel, latency_s
+        record.name,
+        whole.signals,
+        whole.truth,
+        independent,
+        whole.log_start_ns,
+        by_wheel,
+        latency_s,
+        whole.plan.placed,
     )
 
 
@@ -98,7 +108,7 @@ def _sensors_of(drive: FitDrive, vehicle: VehicleParameters) -> tuple[Proposal, 
     rate = yaw_rate_channel(truth)
     if drive.independent_yaw_rate and len(rate) and len(channels["yaw_rate_rad_s"]):
         latency = booked_on_the_late(estimate_truth_latency(channels["yaw_rate_rad_s"], rate), None)
-    return car_proposals(channels, truth, latency, drive.gyro_latency_s, vehicle)
+    return car_proposals(channels, truth, latency, drive.gyro_latency_s, vehicle, drive.placed)
 
 
 def period_s(drive: FitDrive) -> float:

@@ -34,6 +34,8 @@ from pdhef_logtool.sinks.schema import arrow_schema
 FORMAT = "pdhef.residual-dataset"
 FORMAT_VERSION = 3
 MANIFEST = "manifest.json"
+#: Of more vehicles a bundle names the number.
+NAMED_VEHICLES = 4
 DRIVES = "drives"
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
 TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
@@ -152,9 +154,10 @@ def write_manifest(
     return document
 
 
-def vehicle_entry(sha256: str, vehicle: VehicleParameters) -> dict[str, Any]:
-    """Return what the manifest says of a vehicle."""
-    return {"name": vehicle.name, "sha256": sha256, "parameters": vehicle.model_dump(mode="json")}
+def vehicle_entry(sha256: str, vehicle: VehicleParameters, *, identified: bool) -> dict[str, Any]:
+    """Return what the manifest says of a vehicle; ``identified``: whether driving gave its values."""
+    parameters = vehicle.model_dump(mode="json")
+    return {"name": vehicle.name, "sha256": sha256, "parameters": parameters, "identified": identified}
 
 
 def _sha256(path: Path) -> str:
@@ -273,7 +276,14 @@ class Dataset:
     @property
     def vehicle_name(self) -> str:
         """Names of the vehicles whose models the residuals were taken against."""
-        return ", ".join(sorted({str(v["name"]) for v in self.manifest["vehicles"]}))
+        names = sorted({str(v["name"]) for v in self.manifest["vehicles"]})
+        return ", ".join(names) if len(names) <= NAMED_VEHICLES else f"{len(names)} vehicles"
+
+    @property
+    def identified_share(self) -> float | None:
+        """Share of the vehicles whose values identification found; None where the manifest is of before it was kept."""
+        found = [v.get("identified") for v in self.manifest["vehicles"]]
+        return None if None in found else sum(found) / len(found)
 
     def vehicle(self, drive: DatasetDrive) -> VehicleParameters:
         """Return the vehicle whose model a drive's residuals were taken against."""

@@ -255,7 +255,9 @@ def extract(
             with writing(output):
                 (output / MANIFEST).unlink(missing_ok=True)
         results = _extract_all(work, jobs, progress, warn)
-        vehicles |= {sha: vehicle_entry(sha, v) for sha, v in (job.physics for job in work)}
+        for job in work:
+            sha, vehicle = job.physics
+            vehicles[sha] = vehicle_entry(sha, vehicle, identified=job.car.fitted_physics is not None)
         manifest = write(results)
     if settings.split is None and manifest["drives"] and not all(manifest["splits"][s]["drives"] for s in SPLITS):
         empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]

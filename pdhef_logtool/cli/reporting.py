@@ -1,0 +1,65 @@
+"""``pdhef report``: the pages of a finished run."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from typer import Argument, Option
+
+from pdhef_logtool.cli import console, options
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pdhef_logtool.reports.pages import WrittenPages
+
+commands = typer.Typer()
+
+
+@options.command(commands, "pdhef report out", "pdhef report out --open", "pdhef report out --png --json")
+def report(
+    output: Annotated[Path, Argument(metavar="OUT", help="Folder of a run.")],
+    show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,
+    png: Annotated[bool, Option("--png", help="Each figure as a picture too, in logs/LOG/figures.")] = False,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Write the pages of a run: report.html of each log.
+
+    They are made from what the run left, as at the end of run itself.
+    """
+    from pdhef_logtool.records.outputs import OutputFolder
+    from pdhef_logtool.reports.pages import write_pages
+    from pdhef_logtool.results.opened_run import LOGS, open_run
+
+    open_run(output)  # before the folder is held, which would make it where it is missing
+    with OutputFolder(output, (LOGS,)), console.progress() as bar:
+        result = write_pages(open_run(output), bar, png=png)
+    console.show(result, _render, as_json)
+    for line in result.wrong:
+        console.warn(line)
+    if show:
+        open_page(result)
+    raise typer.Exit(result.exit_code)
+
+
+def open_page(result: WrittenPages) -> None:
+    """Open the first page in the browser, or say where it is."""
+    import webbrowser
+
+    page = next((p.file for p in result.pages if p.file is not None), None)
+    if page is None:
+        return
+    has_display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    if not has_display or not webbrowser.open(page.resolve().as_uri()):
+        console.say(f"there is no browser to open it in: {page.resolve()} is one file, to be opened anywhere")
+
+
+def _render(result: WrittenPages, out: Console) -> None:
+    for page in result.pages:
+        if page.file is not None:
+            pictures = f" and {len(page.pictures)} pictures in {page.pictures[0].parent}" if page.pictures else ""
+            out.print(f"{page.file}{pictures}", soft_wrap=True)

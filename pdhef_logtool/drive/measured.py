@@ -1,0 +1,113 @@
+"""Signals and truth of a drive on one grid, and what kinematics says of them: computed once for all that asks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.drive.columns import columns_on_grid, derivative, moving_at
+from pdhef_logtool.drive.relations import Relation, measured_relations
+from pdhef_logtool.drive.truth import TruthTrack, channel_of
+from pdhef_logtool.records.signals import WHEELS, Channel, FloatArray
+
+#: Name of the column that is the mean of the wheel speeds.
+WHEEL_SPEEDS = "wheel_speeds"
+
+_TRUTH = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "x_m", "y_m")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Columns of the grid by name, those of truth with ``truth.``, and the relations that they allow.
+
+    Attributes
+    ----------
+    speed_name : the column that stands for the speed. topics : of the signals, by name.
+    """
+
+    columns: Mapping[str, FloatArray]
+    speed_name: str | None
+    relations: tuple[Relation, ...]
+    topics: Mapping[str, str]
+
+    def without_truth(self) -> Measured:
+        """Return what the signals alone say."""
+        columns = {n: c for n, c in self.columns.items() if not n.startswith("truth.")}
+        kept = tuple(r for r in self.relations if not any(n.startswith("truth.") for n in r.powers))
+        return replace(self, columns=columns, speed_name=_own(self.speed_name), relations=kept)
+
+    def without(self, names: Iterable[str]) -> Measured:
+        """Return it without columns that no relation is about."""
+        gone = set(names)
+        columns = {n: c for n, c in self.columns.items() if n not in gone}
+        return replace(self, columns=columns, topics={n: t for n, t in self.topics.items() if n not in gone})
+
+    def groups(self, *, mounting_is_known: bool) -> list[tuple[str, ...]]:
+        """Return the signals whose signs or units are wrong together: those of one topic, and of the truth."""
+        columns = self.columns
+        topics: dict[str, list[str]] = {}
+        for name, topic in () if mounting_is_known else self.topics.items():
+            if name in columns and not name.startswith("wheel_speed_"):
+                topics.setdefault(topic, []).append(name)
+        wheels = [n for n in columns if n.startswith("wheel_speed")]
+        truth = [
+            n for n in ("truth.yaw_rate_rad_s", "truth.vy_m_s", "truth.sideslip_rad", "truth.ay_m_s2") if n in columns
+        ]
+        speeds = [n for n in ("truth.vx_m_s", "truth.vy_m_s", "truth.position_speed_m_s") if n in columns]
+        groups = [tuple(g) for g in (*topics.values(), truth, speeds) if 2 <= len(g) <= 6]
+        return [*groups, *([tuple(wheels)] if len(wheels) > 1 else [])]
+
+
+def _own(speed_name: str | None) -> str | None:
+    return None if speed_name is None or speed_name.startswith("truth.") else speed_name
+
+
+def measure(
+    signals: Mapping[str, Channel], truth: Mapping[str, Channel] | None = None, derived: TruthTrack | None = None
+) -> Measured:
+    """Bring signals and truth, as mapped, to one grid and relate them. ``derived`` : the truth at the CG."""
+    columns, speed_name = drive_columns(signals, truth or {}, derived)
+    topics = {n: c.source.split(".")[0] for n, c in signals.items()}
+    return Measured(columns, speed_name, tuple(measured_relations(columns, speed_name)), topics)
+
+
+def drive_columns(
+    signals: Mapping[str, Channel], truth: Mapping[str, Channel], derived: TruthTrack | None
+) -> tuple[dict[str, FloatArray], str | None]:
+    """Return signals and truth on one grid, and the name of the column that stands for the speed."""
+    channels = {n: c for n, c in signals.items() if c.values.ndim == 1}
+    if derived is not None:
+        for name in _TRUTH:
+            channels[f"truth.{name}"] = channel_of(derived, name)
+        # As mapped: a wrong unit is wrapped away in what is derived of it, and a derived a_y says nothing new.
+        channels |= {f"truth.{n}": truth[n] for n in ("sideslip_rad", "ay_m_s2") if n in truth}
+    columns = columns_on_grid(channels)
+    if "truth.x_m" in columns and "truth.y_m" in columns:
+        vx, vy = derivative(columns.pop("truth.x_m")), derivative(columns.pop("truth.y_m"))
+        columns["truth.position_speed_m_s"] = np.hypot(vx, vy)
+        columns["truth.course_rate_rad_s"] = _turning(vx, vy)
+    return columns, _speed_of(columns)
+
+
+def _speed_of(columns: dict[str, FloatArray]) -> str | None:
+    """Return the name of the column that stands for the speed; the wheels' is added, since one alone turns in bends."""
+    if "speed_m_s" in columns:
+        return "speed_m_s"
+    for unit in ("m_s", "rad_s"):
+        wheels = [columns[n] for w in WHEELS if (n := f"wheel_speed_{w}_{unit}") in columns]
+        if wheels:
+            columns[WHEEL_SPEEDS] = np.asarray(np.mean(wheels, axis=0))
+            return WHEEL_SPEEDS
+    return "truth.vx_m_s" if "truth.vx_m_s" in columns else None
+
+
+def _turning(vx: FloatArray, vy: FloatArray) -> FloatArray:
+    ax, ay = derivative(vx), derivative(vy)
+    speed = np.hypot(vx, vy)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rate = (vx * ay - vy * ax) / speed**2
+    # Slower, the noise of a position turns the path.
+    with np.errstate(invalid="ignore"):
+        return np.where(moving_at(speed) & (speed > 1.0), rate, np.nan)

@@ -1,0 +1,91 @@
+"""Where a drive went in speed and lateral acceleration: seconds and sideslip error by cell of a fixed grid.
+
+Lateral acceleration and speed are those of the segments (:mod:`~pdhef_logtool.evaluation.segments`): of the truth where
+it has them, else of the sensors, the acceleration smoothed to 1 Hz. The grid is the same for all drives, so that the
+cells of a fleet add up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.evaluation.blocks import blocks_with_halo, median_step_ns
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.evaluation.segments import (
+    MANOEUVRE_SMOOTHING_HZ,
+    RUN_GAP_S,
+    known_of,
+    reach_rows,
+    smooth,
+    speed_and_ay,
+)
+from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.tracks import StateTrack
+
+#: Lower edges of the cells; what is beyond the last one lies in the last cell. 60 m/s are 216 km/h.
+SPEED_EDGES_M_S = tuple(float(5 * i) for i in range(13))
+AY_EDGES_M_S2 = tuple(float(i) for i in range(13))
+#: A longer step between stamps counts as this long.
+MAX_STEP_S = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """A cell of the grid that the drive was in.
+
+    ``speed`` and ``ay`` number its lower edges; ``scored`` stamps of it have the mean squared sideslip error of the
+    answer, NaN without one.
+    """
+
+    speed: int
+    ay: int
+    seconds: float
+    scored: int
+    sideslip_mse_rad2: float
+
+
+def operating_space(
+    signals: Signals, truth: StateTrack | None, estimate: StateTrack, low_speed_m_s: float
+) -> tuple[Cell, ...]:
+    """Return the cells that a drive was in, in order.
+
+    Parameters
+    ----------
+    signals, truth, estimate : at the same stamps [N]; truth None: sensors alone, and no error.
+    """
+    shape = len(SPEED_EDGES_M_S), len(AY_EDGES_M_S2)
+    size = shape[0] * shape[1]
+    totals = np.zeros((3, size))
+    step_ns = median_step_ns(signals)
+    taken = known_of(truth)
+    for first, a, b, end in blocks_with_halo(signals, RUN_GAP_S, reach_rows(step_ns, MANOEUVRE_SMOOTHING_HZ)):
+        part = signals.rows(first, end)
+        of_truth = None if truth is None else truth.rows(first, end)
+        speed, lateral = speed_and_ay(part, of_truth, taken)
+        ay = np.abs(smooth(part.stamps_ns, lateral, MANOEUVRE_SMOOTHING_HZ, step_ns))
+        steps = np.diff(part.stamps_ns, append=part.stamps_ns[-1:]) * 1e-9
+        steps = np.minimum(np.where(steps > 0.0, steps, step_ns * 1e-9), MAX_STEP_S)
+        core = slice(a - first, b - first)
+        known = (np.isfinite(speed) & np.isfinite(ay))[core]
+        i = np.searchsorted(SPEED_EDGES_M_S, speed[core][known], side="right") - 1
+        j = np.searchsorted(AY_EDGES_M_S2, ay[core][known], side="right") - 1
+        cell = np.maximum(i, 0) * shape[1] + j
+        totals[0] += np.bincount(cell, weights=steps[core][known], minlength=size)
+        if truth is not None:
+            error = signal_error(estimate.rows(a, b), truth.rows(a, b), "sideslip_rad", low_speed_m_s)[known]
+            scored = np.isfinite(error)
+            totals[1] += np.bincount(cell[scored], minlength=size)
+            totals[2] += np.bincount(cell[scored], weights=error[scored] ** 2, minlength=size)
+    seconds, counts, squares = totals
+    return tuple(
+        Cell(
+            speed=int(at // shape[1]),
+            ay=int(at % shape[1]),
+            seconds=float(seconds[at]),
+            scored=int(counts[at]),
+            sideslip_mse_rad2=float(squares[at] / counts[at]) if counts[at] else float("nan"),
+        )
+        for at in np.flatnonzero(seconds)
+    )

@@ -1,0 +1,95 @@
+"""Where a recorded tree of frames (``/tf_static``) puts a sensor in the car."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.message_schema import value_at
+from pdhef_logtool.records.geometry import rotation_from_quat
+from pdhef_logtool.records.signals import FloatArray
+
+#: Names of the frame of a car itself, without what stands before a slash.
+BASES = ("base_link", "base_footprint", "ego_vehicle", "vehicle", "base", "car", "chassis")
+_TYPES = frozenset({"tf2_msgs/TFMessage", "tf/tfMessage"})
+#: Messages of fixed frames that are read, and frames between a sensor and its car.
+MOST_MESSAGES = 500
+MOST_STEPS = 16
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placement:
+    """A sensor in a car's frame: the rotation [3, 3] of its axes to the frame's, and its position [3] there in m."""
+
+    frame: str
+    base: str
+    rotation: FloatArray
+    position_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Step:
+    """A frame in its parent."""
+
+    parent: str
+    rotation: FloatArray
+    position_m: FloatArray
+
+
+def placement_of(log: DriveLog, topic: str) -> Placement | None:
+    """Return where the recorded frames put what sends a topic; None where they do not reach from it to a car."""
+    frame = next((f for m in log.first_messages(topic, 1) if (f := _name(m, "header", "frame_id"))), "")
+    steps = _fixed_frames(log) if frame else {}
+    if frame not in steps:
+        return None
+    at, rotation, position = frame, np.eye(3), np.zeros(3)
+    for _ in range(MOST_STEPS):
+        step = steps.get(at)
+        if step is None or at.rpartition("/")[2] in BASES:
+            break
+        rotation, position = step.rotation @ rotation, step.rotation @ position + step.position_m
+        at = step.parent
+    return Placement(frame, at, rotation, position) if at.rpartition("/")[2] in BASES and at != frame else None
+
+
+def _fixed_frames(log: DriveLog) -> Mapping[str, _Step]:
+    """Return the frames that never move, by name; one that is told twice in different places is none."""
+    found: dict[str, _Step] = {}
+    moved: set[str] = set()
+    for topic in log.topics:
+        if topic.type_name.replace("/msg/", "/") not in _TYPES or not topic.name.endswith("tf_static"):
+            continue
+        for message in log.first_messages(topic.name, MOST_MESSAGES):
+            transforms = value_at(message, ("transforms",))
+            for one in transforms if isinstance(transforms, list | tuple) else ():
+                name, step = _name(one, "child_frame_id"), _step(one)
+                if step is None:
+                    continue
+                known = found.setdefault(name, step)
+                same = known.parent == step.parent and np.allclose(known.rotation, step.rotation, atol=1e-6)
+                if not (same and np.allclose(known.position_m, step.position_m, atol=1e-6)):
+                    moved.add(name)
+    return {name: step for name, step in found.items() if name not in moved}
+
+
+def _step(transform: object) -> _Step | None:
+    quaternion = _numbers(transform, "rotation", "wxyz")
+    position = _numbers(transform, "translation", "xyz")
+    if not (np.isfinite(quaternion).all() and np.isfinite(position).all()):
+        return None
+    if abs(float(np.linalg.norm(quaternion)) - 1.0) > 0.01:
+        return None
+    return _Step(_name(transform, "header", "frame_id"), rotation_from_quat(quaternion[None, :])[0], position)
+
+
+def _numbers(transform: object, part: str, axes: str) -> FloatArray:
+    values = [value_at(transform, ("transform", part, axis)) for axis in axes]
+    return np.array([v if isinstance(v, int | float) else np.nan for v in values], dtype=np.float64)
+
+
+def _name(message: object, *steps: str) -> str:
+    value = value_at(message, steps)
+    return value.lstrip("/") if isinstance(value, str) else ""

@@ -1,0 +1,105 @@
+"""The speed as the length of a velocity over ground, where nothing measures it forward: it is the same in any frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.candidates import source_found, sources_found
+from pdhef_logtool.mapping.checking import has_path, stamp_path_of
+from pdhef_logtool.mapping.evidence import Pieces, fit, ratio
+from pdhef_logtool.mapping.fields import CLEAR, Fields
+from pdhef_logtool.mapping.naming import is_command, words_of
+from pdhef_logtool.mapping.path import path_speed
+from pdhef_logtool.mapping.records import SignalSource
+from pdhef_logtool.records.signals import FloatArray
+
+#: How near it must be to the speed of positions, and its change to a_x: the road climbs, the car pitches.
+NEAR_PATH = 0.08
+NEAR_A_X = (0.6, 1.6)
+SLOW_M_S = 1.0
+#: What is said of every speed that is a length.
+NEVER_NEGATIVE = "the length of a velocity over ground, which is never negative: in reverse it has the wrong sign"
+
+
+def length_of(velocity: SignalSource) -> SignalSource:
+    """Return the speed that a velocity of truth has: the length of its level part, of three in ECEF."""
+    level = len(velocity.paths) if velocity.name == "ecef_velocity_m_s" else 2
+    scale = velocity.scale[:level] if isinstance(velocity.scale, tuple) else (velocity.scale,) * level
+    return SignalSource(
+        "speed_m_s",
+        velocity.topic,
+        velocity.paths[:level],
+        velocity.stamp,
+        scale,
+        latency_s=velocity.latency_s,
+        stamp_unit=velocity.stamp_unit,
+        clock=velocity.clock,
+        combine="norm",
+    )
+
+
+def speed_over_ground(
+    log: DriveLog,
+    topics: Sequence[tuple[TopicInfo, str]],
+    signals: Mapping[str, SignalSource],
+    truth: Mapping[str, SignalSource],
+) -> tuple[SignalSource, str] | None:
+    """Return a velocity whose length is the car's speed, as positions or a_x say, and the evidence.
+
+    Parameters
+    ----------
+    topics : with the struct of a velocity's x and y where the type tells it, else empty: names tell it then.
+    signals, truth : what is mapped already.
+    """
+    vectors = [v for topic, base in topics for v in _vectors(log, topic, base)]
+    known = [s for n, s in signals.items() if n == "ax_m_s2"]
+    known += [s for n, s in truth.items() if n in ("lat_deg", "lon_deg", "x_m", "y_m")]
+    if not vectors or not known:
+        return None
+    pieces = Pieces(log)
+    requests: dict[str, list[str]] = {}
+    for source in (*vectors, *known):
+        paths = requests.setdefault(source.topic, [])
+        paths += [p for p in source.paths if p not in paths]
+    read = pieces.read(requests)
+    anchors = sources_found(log, known, read)
+    fields = Fields(pieces, {}, [], [f for f in anchors if f.meaning.quantity != "acceleration"])
+    path = path_speed(fields)
+    ax = next((f for s in known if s.name == "ax_m_s2" and (f := source_found(s, anchors)) is not None), None)
+    for source in vectors:
+        x, y = (read.get((source.topic, p)) for p in source.paths)
+        if x is None or y is None or not (x.changes and y.changes):
+            continue
+        speed = np.hypot(x.cells, y.cells)
+        evidence = _evidence(pieces, speed, path, None if ax is None else ax.si)
+        if evidence:
+            return source, evidence
+    return None
+
+
+def _vectors(log: DriveLog, topic: TopicInfo, base: str) -> Iterator[SignalSource]:
+    """Yield the x and y of the velocities of a topic."""
+    fields = log.fields(topic.name, quiet=True)
+    bases = [base] if base else []
+    for info in () if base else fields:
+        struct, _, leaf = info.path.rpartition(".")
+        said = {*words_of(struct), *words_of(topic.name)}
+        if leaf == "x" and said & {"velocity", "vel"} and not said & {"angular", "gyro", "rate"}:
+            bases.append(struct)
+    for struct in bases:
+        paths = (f"{struct}.x", f"{struct}.y") if struct else ("x", "y")
+        if all(has_path(fields, p) for p in paths) and not is_command(topic.name, struct):
+            yield SignalSource("speed_m_s", topic.name, paths, stamp_path_of(fields), (1.0, 1.0), combine="norm")
+
+
+def _evidence(pieces: Pieces, speed: FloatArray, path: FloatArray | None, ax: FloatArray | None) -> str:
+    times = None if path is None else ratio(path, speed, SLOW_M_S)
+    if times is not None:
+        return f"positions move {times:.3g} times as fast" if abs(times - 1.0) < NEAR_PATH else ""
+    relation = None if ax is None else fit(pieces.smooth(ax), pieces.rate_of(speed))
+    if relation is None or relation.correlation < CLEAR or not NEAR_A_X[0] < relation.slope < NEAR_A_X[1]:
+        return ""
+    return f"a_x is {relation.slope:.2f} times its change, with a correlation of {relation.correlation:.2f}"

@@ -1,0 +1,316 @@
+"""Fields whose names say nothing (``data[3]``, ``ch7``, ``k``): what they are by how they move with one another.
+
+Speed, yaw rate and the accelerations are believed where one choice of columns alone satisfies a_y = v r and a_x = v̇ at
+once, with slopes that units explain: the second slope gives the units of speed and accelerations, the ratio of the two
+that of the yaw rate. A steering angle looks like a yaw rate over a speed too, but for that ratio. Left and right
+nothing tells. What is not believed is a candidate that is not taken.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
+from pdhef_logtool.mapping.candidates import MOST_FIELDS, Found, Role, stamp_of
+from pdhef_logtool.mapping.evidence import Fit, Pieces, fit, is_of_both_signs, ratio, spread
+from pdhef_logtool.mapping.fields import EXCITED_A_M_S2, Fields
+from pdhef_logtool.mapping.naming import G_M_S2, Meaning, is_command, meaning_of, says_nothing
+from pdhef_logtool.mapping.path import path_speed
+from pdhef_logtool.records.signals import FloatArray
+
+#: Columns that are looked at, and of one array.
+MOST_NAMELESS = 40
+MOST_OF_ARRAY = 32
+#: Correlations of a_y with v r, and of a_x with v̇, that are believed; others may do with less, and decide nothing.
+TURNS, SPEEDS_UP = 0.92, 0.75
+LOOSE_TURNS, LOOSE_SPEEDS_UP = 0.8, 0.6
+#: How much nearer to 1 than that of any other choice their product must be.
+CLEARER = 0.05
+#: v r leaves at most these shares of what r alone and what r √v leave of a_y: a steering angle makes more of a yaw rate
+#: the faster the car is, but less than in proportion, as cars understeer.
+BY_SPEED, BY_ROOT = 0.6, 0.85
+#: a_y is ahead of v r by more than this, as a car's sideslip grows first; a yaw rate is behind its steering.
+AHEAD_S = 0.05
+#: Slopes of a unit: roll and grade are in the accelerations.
+SLOPE, LOOSE_SLOPE = 1.25, 1.6
+#: A yaw rate in rad/s that is taken for an acceleration is smaller (standard deviation).
+LEAST_AY_M_S2 = 0.4
+#: Correlations from here on make one column a copy of another.
+COPY = 0.98
+#: A steering angle follows the path's curvature so well.
+STEERS = 0.9
+#: Strength of a name that values give without deciding.
+WEAK = 0.3
+_UNITS = {
+    "speed": (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)),
+    "rate": (("rad/s", 1.0), ("deg/s", math.radians(1.0))),
+    "acceleration": (("m/s²", 1.0), ("g", G_M_S2)),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """Columns that are speed, yaw rate, a_y and a_x, the relations between them, and the units of the first three.
+
+    ``x`` and ``speeding`` are None where no column is the speed's change.
+    """
+
+    v: Found
+    r: Found
+    y: Found
+    x: Found | None
+    turning: Fit
+    speeding: Fit | None
+    units: tuple[tuple[str, float], tuple[str, float], tuple[str, float]]
+    is_strict: bool
+    ahead_s: float
+
+    @property
+    def columns(self) -> tuple[Found, ...]:
+        """All that there are."""
+        return (self.v, self.r, self.y, *([] if self.x is None else [self.x]))
+
+    @property
+    def score(self) -> float:
+        """How well the relations hold."""
+        return abs(self.turning.correlation) * (0.0 if self.speeding is None else abs(self.speeding.correlation))
+
+    @property
+    def evidence(self) -> str:
+        """The relations in words."""
+        first = f"{self.y.path} goes with {self.v.path} times {self.r.path} ({self.turning.correlation:.2f})"
+        if self.x is None or self.speeding is None:
+            return f"{first}, but nothing with the change of {self.v.path}"
+        second = f"{self.x.path} with the change of {self.v.path} ({self.speeding.correlation:.2f})"
+        return f"{first} and {second}, and units explain both slopes"
+
+
+def nameless_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pieces: Pieces) -> list[Found]:
+    """Return the columns of sensors' topics whose names say nothing, with what stands in them."""
+    requests: dict[str, list[str]] = {}
+    for topic, role in topics:
+        fields = log.fields(topic.name, quiet=True)
+        if role not in ("sensor", "device") or len(fields) > MOST_FIELDS or is_command(topic.name):
+            continue
+        numbers = [f.path for f in fields if f.kind == "number"]
+        for path in numbers:
+            alone = topic.name if len(numbers) == 1 and not path.endswith("[]") else ""
+            if path.count("[]") > path.endswith("[]") or meaning_of(topic.name, topic.type_name, path) is not None:
+                continue
+            if says_nothing(path) and says_nothing(alone):
+                requests.setdefault(topic.name, []).append(path.removesuffix("[]"))
+    if not requests:
+        return []
+    read = pieces.read(requests, MOST_OF_ARRAY)
+    by_name = {topic.name: (topic, role) for topic, role in topics}
+    found: list[Found] = []
+    for (name, path), seen in read.items():
+        if seen.changes and len(found) < MOST_NAMELESS:
+            topic, role = by_name[name]
+            stamp = stamp_of(log.fields(name, quiet=True), path)
+            meaning = Meaning("", "", 0.5, "", None, f"{path!r} says nothing")
+            found.append(Found(topic, path, meaning, role, stamp, seen, (("", 1.0),)))
+    return found
+
+
+def identified(fields: Fields, nameless: Sequence[Found]) -> tuple[list[Found], str]:
+    """Return what nameless columns are, those that are not believed with a weak name, and what is to be said of them.
+
+    Parameters
+    ----------
+    nameless : columns with a meaning that is empty; fields that names tell serve as what they are.
+    """
+    order = sorted(_choices(fields, nameless), key=lambda c: (-c.score, -abs(c.turning.correlation)))
+    choices = [c for c in order if c.is_strict] or order
+    if not choices:
+        return [], ""
+    best = choices[0]
+    # What is behind v r is no a_y, where there is one ahead of it.
+    rivals = [c for c in order if c.x is not None and c.ahead_s > 0.0 and not _same(best, c)]
+    rivals = [c for c in rivals if c.score > best.score - CLEARER]
+    sure = best.is_strict and not rivals
+    why = f"{best.evidence}; but {rivals[0].evidence} as well" if rivals else best.evidence
+    speed_unit, rate_unit, unit = best.units
+    speed_is_sure = sure and _speed_is_sure(fields, best.v, speed_unit)
+    speed_why = why if speed_is_sure else f"{why}; a wheel that turns in rad/s may look the same"
+    told = [
+        (best.v, Meaning("speed", "x", 1.0, *speed_unit, speed_why), 1.0, speed_is_sure),
+        (best.r, Meaning("rate", "z", 1.0, *rate_unit, why), 1.0, sure),
+        (best.y, Meaning("acceleration", "y", 1.0, *unit, why), math.copysign(1.0, best.turning.slope), sure),
+    ]
+    if best.x is not None and best.speeding is not None:
+        sign = math.copysign(1.0, best.speeding.slope)
+        told.append((best.x, Meaning("acceleration", "x", 1.0, *unit, why), sign, sure))
+    found = [_named(one, meaning, sign, sure=believed) for one, meaning, sign, believed in told if _open(one)]
+    rest = [f for f in nameless if not any(f is c for c in best.columns)]
+    found += _steering(fields, rest, _values(best.v) * speed_unit[1], _values(best.r) * rate_unit[1], sure=sure)
+    if not sure:
+        return found, ""
+    topic = next(f.topic.name for f in best.columns if _open(f))
+    note = f"the names of {topic} say nothing: {why}"
+    return found, f"{note}; left and right may be exchanged in all of it, which nothing tells"
+
+
+def _choices(fields: Fields, nameless: Sequence[Found]) -> Iterator[_Choice]:
+    """Yield the choices that satisfy the relations with slopes that units explain."""
+    signed = [f for f in nameless if is_of_both_signs(f.seen.values)]
+    forward = [f for f in nameless if _is_forward(f)]
+    others = {"speed": forward, "rate": signed, "ay": signed, "ax": list(nameless)}
+    speeds, rates, ays, axs = (_known(fields, n) or columns for n, columns in others.items())
+    smooth = {id(f): fields.pieces.smooth(_values(f)) for f in {id(f): f for f in (*ays, *axs)}.values()}
+    for v in speeds:
+        change = fields.pieces.rate_of(_values(v))
+        ways: list[tuple[Found | None, Fit | None]] = [(None, None)]
+        for other in axs:
+            relation = fit(change, smooth[id(other)])
+            if other is not v and relation is not None and abs(relation.correlation) > LOOSE_SPEEDS_UP:
+                # The slope the way round in which grade and noise of a_x do not make it smaller.
+                ways.append((other, replace(relation, slope=relation.correlation**2 / relation.slope)))
+        for r, y in itertools.product(rates, ays):
+            if r is y or v is r or v is y:
+                continue
+            turning, by_speed, ahead_s = _turning(fields, v, r, smooth[id(y)])
+            for x, speeding in ways if turning is not None else ():
+                explained = None if turning is None or x is r or x is y else _explained((v, r, y, x), turning, speeding)
+                if turning is None or explained is None:
+                    continue
+                units, off = explained
+                strict = by_speed and off < math.log(SLOPE) and spread(smooth[id(y)]) * units[2][1] > LEAST_AY_M_S2
+                strict &= speeding is not None and abs(speeding.correlation) > SPEEDS_UP
+                yield _Choice(v, r, y, x, turning, speeding, units, strict, ahead_s)
+
+
+def _turning(fields: Fields, v: Found, r: Found, ay: FloatArray) -> tuple[Fit | None, bool, float]:
+    """Fit a_y to v r; return whether it is as an a_y, not other powers of the speed, and how far it is ahead, s."""
+    smooth, speed = fields.pieces.smooth, _values(v)
+    with np.errstate(invalid="ignore"):
+        relation, root, alone = (fit(ay, smooth(np.maximum(speed, 0.0) ** p * _values(r))) for p in (1.0, 0.5, 0.0))
+    if relation is None or root is None or alone is None or abs(relation.correlation) < LOOSE_TURNS:
+        return None, False, 0.0
+    left, of_root, of_alone = (1.0 - f.correlation**2 for f in (relation, root, alone))
+    strict = abs(relation.correlation) > TURNS and left < BY_SPEED * of_alone and left < BY_ROOT * of_root
+    ahead_s = fields.pieces.ahead_s(ay, smooth(speed * _values(r)))
+    return relation, strict and ahead_s > AHEAD_S, ahead_s
+
+
+def _explained(
+    columns: tuple[Found, Found, Found, Found | None], turning: Fit, speeding: Fit | None
+) -> tuple[tuple[tuple[str, float], tuple[str, float], tuple[str, float]], float] | None:
+    """Return the units of speed, yaw rate and accelerations that explain the slopes, and the logarithm of how far off.
+
+    None where none do.
+    """
+    v, r, y, x = columns
+    ways = []
+    for speed, rate, unit in itertools.product(_units(v, "speed"), _units(r, "rate"), _units(y, "acceleration")):
+        off = [abs(math.log(abs(turning.slope) * unit[1] / (speed[1] * rate[1])))]
+        if x is not None and speeding is not None:
+            off.append(abs(math.log(abs(speeding.slope) * (unit[1] if _open(x) else 1.0) / speed[1])))
+        if max(off) < math.log(LOOSE_SLOPE):
+            ways.append((sum(off), (speed, rate, unit), max(off)))
+    return min(ways)[1:] if ways else None
+
+
+def _units(one: Found, quantity: str) -> tuple[tuple[str, float], ...]:
+    return _UNITS[quantity] if _open(one) else (("", 1.0),)
+
+
+def _open(one: Found) -> bool:
+    """Return whether a column is one without a name."""
+    return not one.meaning.quantity
+
+
+def _values(one: Found) -> FloatArray:
+    return one.seen.cells if _open(one) else one.si
+
+
+def _known(fields: Fields, what: str) -> list[Found]:
+    """Return the surest field that a name says to be a quantity and whose unit is known."""
+    kind = {"speed": ("speed", None), "rate": ("rate", "z"), "ay": ("acceleration", "y"), "ax": ("acceleration", "x")}
+    every = [f for f in fields.all(*kind[what]) if (f.known or f.fixed) and f.seen.changes]
+    return every[:1]
+
+
+def _is_forward(one: Found) -> bool:
+    """Return whether a column may be a speed: hardly ever negative, and never still for long."""
+    finite = one.seen.values[np.isfinite(one.seen.values)]
+    if finite.shape[0] == 0:
+        return False
+    low, high = np.quantile(finite, [0.02, 0.98])
+    return bool(high > 0.0 and low > -0.1 * high)
+
+
+def _same(a: _Choice, b: _Choice) -> bool:
+    """Return whether two choices are the same, or take copies of one another's columns."""
+    for one, other in zip(a.columns, b.columns, strict=True):
+        relation = None if one is other else fit(_values(one), _values(other))
+        if one is not other and (relation is None or abs(relation.correlation) < COPY):
+            return False
+    return True
+
+
+def _speed_is_sure(fields: Fields, speed: Found, unit: tuple[str, float]) -> bool:
+    """Return whether no wheel that turns in rad/s can be taken for a speed."""
+    path = path_speed(fields)
+    times = None if path is None else ratio(path, _values(speed) * unit[1], 1.0)
+    return unit[0] == "m/s" if times is None else abs(times - 1.0) < 0.08
+
+
+def _named(one: Found, meaning: Meaning, sign: float, *, sure: bool) -> Found:
+    """Return a column as what it was found to be; with a weak name where it is not believed."""
+    meaning = replace(meaning, strength=1.0 if sure else WEAK)
+    factors = ((meaning.unit, meaning.scale or 1.0),)
+    named = replace(one, meaning=meaning, factors=factors, sign=sign, known=sure, reasons=[], doubts=[])
+    if not sure:
+        named.is_weak = True
+        named.doubts.append("its name says nothing, and its values do not decide")
+    return named
+
+
+def _steering(
+    fields: Fields, columns: Sequence[Found], speed: FloatArray, rate: FloatArray, *, sure: bool
+) -> list[Found]:
+    """Return the column that follows the path's curvature far better than others, as a steering angle."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slow = max(1.0, 0.25 * float(np.nanquantile(speed, 0.95)))
+        curve = fields.pieces.smooth(np.where(speed > slow, rate / speed, np.nan))
+    if not spread(curve * speed**2) > EXCITED_A_M_S2:
+        return []
+    ranked: list[tuple[float, Found]] = []
+    for one in columns:
+        relation = fit(fields.pieces.smooth(one.seen.cells), curve)
+        if relation is not None and abs(relation.correlation) > STEERS:
+            ranked.append((abs(relation.correlation), one))
+    ranked.sort(key=lambda c: -c[0])
+    if not ranked:
+        return []
+    first, best = ranked[0]
+    rivals = [o for c, o in ranked[1:] if c > first - CLEARER and not _is_copy(best, o)]
+    kinds = (("rad", 1.0), ("deg", math.radians(1.0)))
+    why = f"it follows the path's curvature (correlation {first:.2f})"
+    meaning = Meaning("steering", "", 1.0 if sure and not rivals else WEAK, "", None, why)
+    found = replace(best, meaning=meaning, factors=kinds, reasons=[], doubts=[], is_weak=not sure or bool(rivals))
+    if not sure:
+        found.doubts.append("its name says nothing, and its values do not decide")
+    if rivals:
+        found.doubts.append(f"its name says nothing, and {rivals[0].path} follows the path's curvature as well")
+    return [found]
+
+
+def _is_copy(a: Found, b: Found) -> bool:
+    relation = fit(a.seen.cells, b.seen.cells)
+    return relation is not None and abs(relation.correlation) > COPY
+
+
+def wanted_nameless(signals: Mapping[str, object], named: Sequence[Meaning]) -> bool:
+    """Return whether neither what is mapped nor a name gives the speed, the yaw rate or an acceleration."""
+    kinds = {(m.quantity, m.part) for m in named}
+    missing = {
+        "yaw_rate_rad_s": ("rate", "z"), "ax_m_s2": ("acceleration", "x"), "ay_m_s2": ("acceleration", "y"),
+    }  # fmt: skip
+    return any(name not in signals and kind not in kinds for name, kind in missing.items())

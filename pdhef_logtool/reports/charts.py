@@ -1,0 +1,356 @@
+"""The figures of a page as records, and the document that the page's script draws them from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.records.shown import all_shown
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.reports.encoding import Grid, encode
+
+#: Intervals that a row of a strip shows at most; those closest to each other are joined for the picture.
+_MOST_SPANS = 1500
+_LABEL_SIGNS = 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Series:
+    """A line over a page's grid: ``values`` [cells] or, from an envelope, [cells, 2].
+
+    ``dash``: lengths of strokes and gaps in pixels. A ``group`` is shown when its box on the page is ticked.
+    """
+
+    label: str
+    colour: str
+    values: FloatArray
+    width: float = 1.5
+    dash: tuple[int, ...] = ()
+    group: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Band:
+    """An area between ``low`` and ``high``, [cells] each."""
+
+    label: str
+    colour: str
+    low: FloatArray
+    high: FloatArray
+    group: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """A numbered place on a time figure, in seconds from the log's start, at ``value`` of its unit."""
+
+    label: str
+    at_s: float
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Something that lasted, in seconds from the log's start."""
+
+    start_s: float
+    end_s: float
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of a strip."""
+
+    label: str
+    colour: str
+    spans: Sequence[Span]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points ``x``, ``y`` [M]; those with ``at_s`` [M], seconds from the log's start, follow the page's zoom."""
+
+    label: str
+    colour: str
+    x: FloatArray
+    y: FloatArray
+    at_s: FloatArray | None = None
+    line: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """A figure with its interval; unknown bounds are NaN."""
+
+    label: str
+    low: float
+    middle: float
+    high: float
+    colour: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimeFigure:
+    """Lines over time. ``level``: a value that is drawn across; ``resolution``: what nobody sees, in the unit."""
+
+    title: str
+    unit: str
+    series: Sequence[Series]
+    bands: Sequence[Band] = ()
+    marks: Sequence[Mark] = ()
+    log: bool = False
+    level: float | None = None
+    resolution: float = 0.0
+    height: int = 190
+
+    @property
+    def heading(self) -> str:
+        """What stands over the figure."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+
+@dataclass(frozen=True, slots=True)
+class StripFigure:
+    """Rows of intervals over time."""
+
+    title: str
+    rows: Sequence[Row]
+
+    @property
+    def heading(self) -> str:
+        """What stands over the figure."""
+        return self.title
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PointsFigure:
+    """Points in a plane. ``equal``: one scale on both axes; ``log``: both are logarithmic."""
+
+    title: str
+    x_label: str
+    y_label: str
+    clouds: Sequence[Cloud]
+    equal: bool = False
+    log: bool = False
+
+    @property
+    def heading(self) -> str:
+        """What stands over the figure."""
+        return self.title
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalsFigure:
+    """Figures with their intervals, one below the other; ``zero`` is drawn across."""
+
+    title: str
+    unit: str
+    intervals: Sequence[Interval]
+    zero: float | None = None
+
+    @property
+    def heading(self) -> str:
+        """What stands over the figure."""
+        return self.title
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BarsFigure:
+    """A histogram: ``counts`` [B] between ``edges`` [B + 1]."""
+
+    title: str
+    unit: str
+    edges: FloatArray
+    counts: FloatArray
+    colour: str = "#0072b2"
+
+    @property
+    def heading(self) -> str:
+        """What stands over the figure."""
+        return self.title
+
+
+Figure = TimeFigure | StripFigure | PointsFigure | IntervalsFigure | BarsFigure
+
+
+@dataclass(slots=True, eq=False)
+class Charts:
+    """The figures of one page by key, in order. ``grid`` and ``origin_ns`` (0 s): of those over time, None without."""
+
+    grid: Grid | None = None
+    origin_ns: int = 0
+    figures: dict[str, Figure] = field(default_factory=dict)
+
+    def time(self, key: str, title: str, unit: str, series: Sequence[Series], **options: Any) -> None:
+        """Add a :class:`TimeFigure`."""
+        self.figures[key] = TimeFigure(title, unit, series, **options)
+
+    def strip(self, key: str, title: str, rows: Sequence[Row]) -> None:
+        """Add a :class:`StripFigure`."""
+        self.figures[key] = StripFigure(title, [Row(r.label, r.colour, _joined(r.spans)) for r in rows])
+
+    def points(
+        self, key: str, title: str, x_label: str, y_label: str, clouds: Sequence[Cloud], **options: bool
+    ) -> None:
+        """Add a :class:`PointsFigure`."""
+        self.figures[key] = PointsFigure(title, x_label, y_label, clouds, **options)
+
+    def intervals(
+        self, key: str, title: str, unit: str, intervals: Sequence[Interval], zero: float | None = None
+    ) -> None:
+        """Add an :class:`IntervalsFigure`."""
+        self.figures[key] = IntervalsFigure(title, unit, intervals, zero)
+
+    def bars(self, key: str, title: str, unit: str, edges: FloatArray, counts: FloatArray) -> None:
+        """Add a :class:`BarsFigure`."""
+        self.figures[key] = BarsFigure(title, unit, edges, counts)
+
+    def start_s(self) -> float:
+        """Return the start of the grid in seconds from the origin."""
+        return 0.0 if self.grid is None else (self.grid.start_ns - self.origin_ns) * 1e-9
+
+    def document(self) -> tuple[dict[str, Any], dict[str, str]]:
+        """Return what the page's script draws, and the blocks of text that it names, by name."""
+        packed = _Blocks()
+        figures = {key: _of_figure(figure, packed) for key, figure in self.figures.items()}
+        grid = self.grid
+        time = None if grid is None else {"start": self.start_s(), "cell": grid.cell_s, "cells": grid.cells}
+        return {"time": time, "figures": figures}, packed.texts
+
+
+class _Blocks:
+    """The encoded series of a page; the same array is held once."""
+
+    def __init__(self) -> None:
+        self.texts: dict[str, str] = {}
+        self._known: dict[tuple[int, float], dict[str, Any]] = {}
+
+    def add(self, values: FloatArray, resolution: float = 0.0) -> dict[str, Any]:
+        """Return where the script finds a series."""
+        key = (id(values), resolution)
+        if key not in self._known:
+            made = encode(values, resolution)
+            name = f"b{len(self.texts)}"
+            self.texts[name] = made.base64
+            self._known[key] = {"block": name, "low": made.low, "step": made.step, "count": made.count}
+        return self._known[key]
+
+
+def _of_figure(figure: Figure, blocks: _Blocks) -> dict[str, Any]:
+    if isinstance(figure, TimeFigure):
+        return _of_time(figure, blocks)
+    if isinstance(figure, StripFigure):
+        rows = [
+            {
+                "label": _label(r.label),
+                "colour": r.colour,
+                "spans": [[round(s.start_s, 4), round(s.end_s, 4), all_shown(s.text[:200])] for s in r.spans],
+            }
+            for r in figure.rows
+        ]
+        return {"kind": "strip", "title": _label(figure.title), "rows": rows}
+    if isinstance(figure, PointsFigure):
+        clouds = [
+            {
+                "label": _label(c.label),
+                "colour": c.colour,
+                "line": c.line,
+                "x": blocks.add(c.x),
+                "y": blocks.add(c.y),
+                "at": None if c.at_s is None else blocks.add(c.at_s),
+            }
+            for c in figure.clouds
+        ]
+        return {
+            "kind": "points",
+            "title": _label(figure.title),
+            "xLabel": _label(figure.x_label),
+            "yLabel": _label(figure.y_label),
+            "clouds": clouds,
+            "equal": figure.equal,
+            "log": figure.log,
+        }
+    if isinstance(figure, IntervalsFigure):
+        intervals = [
+            {"label": _label(i.label), "colour": i.colour, "of": [_known(v) for v in (i.low, i.middle, i.high)]}
+            for i in figure.intervals
+        ]
+        return {
+            "kind": "intervals",
+            "title": _label(figure.title),
+            "unit": figure.unit,
+            "intervals": intervals,
+            "zero": figure.zero,
+        }
+    return {
+        "kind": "bars",
+        "title": _label(figure.title),
+        "unit": figure.unit,
+        "colour": figure.colour,
+        "edges": [float(v) for v in figure.edges],
+        "counts": [float(v) for v in figure.counts],
+    }
+
+
+def _of_time(figure: TimeFigure, blocks: _Blocks) -> dict[str, Any]:
+    return {
+        "kind": "time",
+        "title": _label(figure.title),
+        "unit": figure.unit,
+        "log": figure.log,
+        "level": figure.level,
+        "height": figure.height,
+        "series": [
+            {
+                "label": _label(s.label),
+                "colour": s.colour,
+                "width": s.width,
+                "dash": list(s.dash),
+                "group": _label(s.group),
+                "data": blocks.add(s.values, figure.resolution),
+            }
+            for s in figure.series
+        ],
+        "bands": [
+            {
+                "label": _label(b.label),
+                "colour": b.colour,
+                "group": _label(b.group),
+                "low": blocks.add(b.low, figure.resolution),
+                "high": blocks.add(b.high, figure.resolution),
+            }
+            for b in figure.bands
+        ],
+        "marks": [{"label": _label(m.label), "at": m.at_s, "value": m.value} for m in figure.marks],
+    }
+
+
+def _label(text: str) -> str:
+    cut = text if len(text) <= _LABEL_SIGNS else f"{text[: _LABEL_SIGNS - 1]}…"
+    return all_shown(cut)
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def _joined(spans: Sequence[Span]) -> list[Span]:
+    """Return the spans in order of time, at most :data:`_MOST_SPANS`: the narrowest gaps between them are closed."""
+    ordered = sorted(spans, key=lambda s: (s.start_s, s.end_s))
+    if len(ordered) <= _MOST_SPANS:
+        return ordered
+    gaps = np.array([b.start_s - a.end_s for a, b in pairwise(ordered)])
+    kept = set(np.argsort(-gaps, kind="stable")[: _MOST_SPANS - 1].tolist())
+    made = [ordered[0]]
+    for i, span in enumerate(ordered[1:]):
+        if i in kept:
+            made.append(span)
+        else:
+            last = made[-1]
+            made[-1] = Span(last.start_s, max(last.end_s, span.end_s), last.text or span.text)
+    return made

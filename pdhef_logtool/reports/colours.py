@@ -1,0 +1,30 @@
+"""Colours of a page: those of every other output, dark enough for a white ground."""
+
+from __future__ import annotations
+
+from pdhef_logtool.estimators.table import SPECS
+from pdhef_logtool.sinks.base import TRUTH
+from pdhef_logtool.sinks.palette import colour_rgb
+
+INK = "#1a1a1a"
+#: Of what is wrong, of what is only told, and of what goes on; safe beside each other for the colour-blind.
+FAULT, NOTE, PLAIN = "#b2182b", "#7a5195", "#6b7785"
+#: Of lines on white, as WCAG 2.1 asks of graphics.
+_LEAST_CONTRAST = 3.0
+_COLOURS = {s.name: s.colour for s in SPECS}
+
+
+def colour(name: str) -> str:
+    """Return ``#rrggbb`` of an estimator or of the truth, the same on every page."""
+    if name == TRUTH:
+        return INK
+    rgb = colour_rgb(name, _COLOURS)
+    while contrast(rgb) < _LEAST_CONTRAST:
+        rgb = (rgb[0] * 15 // 16, rgb[1] * 15 // 16, rgb[2] * 15 // 16)
+    return "#{:02x}{:02x}{:02x}".format(*rgb)
+
+
+def contrast(rgb: tuple[int, int, int]) -> float:
+    """Return the contrast to white by WCAG 2.1, 1 to 21."""
+    red, green, blue = (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb))
+    return 1.05 / (0.2126 * red + 0.7152 * green + 0.0722 * blue + 0.05)

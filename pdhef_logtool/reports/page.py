@@ -1,0 +1,150 @@
+"""A whole HTML file from a template and figures: nothing in it is fetched, and nothing of a log in it can run.
+
+Texts go through jinja's escaping and :func:`~pdhef_logtool.records.shown.shown`, series are base64; the page's
+Content-Security-Policy allows its own scripts and its own style by their digests and forbids everything else.
+"""
+
+from __future__ import annotations
+
+import base64
+import datetime as dt
+import hashlib
+import json
+import math
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.version import __version__
+from pdhef_logtool.reports.charts import Charts
+
+_HERE = Path(__file__).parent
+#: Scripts in order: ours before uPlot tells it how fine to draw.
+_SCRIPTS = ("before.js", "uplot.min.js", "report.js")
+_STYLES = ("uplot.min.css", "report.css")
+#: A text in a paragraph or a table's cell.
+_MOST_SIGNS = 300
+DASH = "–"
+
+
+def render(template: str, charts: Charts | None = None, **texts: Any) -> bytes:
+    """Return a page.
+
+    Parameters
+    ----------
+    template : file of ``templates/`` that extends ``base.html``. charts : what its ``figure(key)`` places show.
+    texts : what the template prints.
+    """
+    charts = Charts() if charts is None else charts
+    document, blocks = charts.document()
+    scripts = [_asset(name) for name in _SCRIPTS]
+    style = "\n".join(_asset(name) for name in _STYLES)
+    page = (
+        _environment()
+        .get_template(template)
+        .render(
+            **texts,
+            figure=partial(_place, charts),
+            policy=_policy(scripts, style),
+            scripts=[Markup(s) for s in scripts],  # noqa: S704 (files of this package)
+            style=Markup(style),  # noqa: S704
+            licence=Markup(_asset("UPLOT-LICENSE")),  # noqa: S704
+            document=_embedded(document),
+            blocks={name: Markup(text) for name, text in blocks.items()},  # noqa: S704 (base64)
+            tool=f"pdhef-logtool {__version__}",
+        )
+    )
+    return page.encode("utf-8", "backslashreplace")
+
+
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=FileSystemLoader(_HERE / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        finalize=_printed,
+    )
+    made.filters |= {"number": number, "degrees": degrees, "percent": percent, "stamp": stamp, "seconds": seconds}
+    return made
+
+
+@cache
+def _asset(name: str) -> str:
+    return (_HERE / "assets" / name).read_text(encoding="utf-8").replace("\r\n", "\n")
+
+
+def _place(charts: Charts, key: str) -> Markup:
+    """Return where the script draws a figure; nothing where the page has none of the name."""
+    if key not in charts.figures:
+        return Markup()
+    return Markup(
+        '<figure class="figure" data-figure="{0}"><figcaption>{1}</figcaption><div class="legend"></div>'
+        '<div class="canvas"></div></figure>'
+    ).format(key, shown(charts.figures[key].heading, _MOST_SIGNS))
+
+
+def _policy(scripts: list[str], style: str) -> Markup:
+    of_scripts = " ".join(f"'sha256-{_digest(s)}'" for s in scripts)
+    return Markup(  # noqa: S704 (digests)
+        f"default-src 'none'; script-src {of_scripts}; style-src 'sha256-{_digest(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+
+
+def _digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+
+
+def _embedded(document: dict[str, Any]) -> Markup:
+    """Return JSON that may stand in a script element: it holds no sign that HTML could read."""
+    text = json.dumps(document, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))  # noqa: S704
+
+
+def _printed(value: Any) -> Any:
+    """Return what a template prints: a dash for nothing, texts in one line without signs that move others."""
+    if value is None:
+        return DASH
+    if isinstance(value, str) and not isinstance(value, Markup):
+        return shown(value, _MOST_SIGNS)
+    return value
+
+
+def number(value: float | None, factor: float = 1.0) -> str:
+    """Return a figure with four digits, a dash for none."""
+    return DASH if value is None or not math.isfinite(value) else f"{value * factor:.4g}"
+
+
+def degrees(value_rad: float | None) -> str:
+    """Return an angle with as many digits as a person reads."""
+    if value_rad is None or not math.isfinite(value_rad):
+        return DASH
+    value = math.degrees(value_rad)
+    return f"{value:.3f}°" if abs(value) < 1.0 else f"{value:.2f}°"
+
+
+def percent(share: float | None) -> str:
+    """Return a share in percent."""
+    return DASH if share is None or not math.isfinite(share) else f"{share:.1%}"
+
+
+def seconds(value_s: float | None) -> str:
+    """Return seconds with milliseconds."""
+    return DASH if value_s is None else f"{value_s:.3f} s"
+
+
+def stamp(stamp_ns: int) -> str:
+    """Return a stamp in nanoseconds as RFC 3339 in UTC, exact; as its number where no calendar reaches."""
+    whole, rest = divmod(int(stamp_ns), 1_000_000_000)
+    try:
+        moment = dt.datetime.fromtimestamp(whole, dt.UTC)
+    except (OverflowError, ValueError, OSError):
+        return str(stamp_ns)
+    return f"{moment:%Y-%m-%dT%H:%M:%S}.{rest:09d}Z"

@@ -1,0 +1,491 @@
+"""Two finished runs held against each other: what changed, by how much over drives that are in both, and the gate."""
+
+from __future__ import annotations
+
+import filecmp
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+
+from pdhef_logtool.evaluation.segments import SEGMENTS
+from pdhef_logtool.evaluation.thresholds import SIGNALS
+from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
+from pdhef_logtool.results.changed_signals import ChangedSignal, changed_signals
+from pdhef_logtool.results.gate import MAIN, Figure, Gate
+from pdhef_logtool.results.opened_run import METRICS_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.results.paired_change import PairedChange, Verdict, holm, log_ratios, paired_change
+from pdhef_logtool.results.pairing import Pair, Pairing, pair_logs
+from pdhef_logtool.results.run_differences import run_differences
+
+if TYPE_CHECKING:
+    import polars as pl
+
+#: ``no figure``: no drive has it on both sides.
+FigureVerdict: TypeAlias = Verdict | Literal["no figure"]
+
+#: Of the drives whose figure changed most, so many are followed into their tracks.
+MOST_FOLLOWED = 10
+#: The graver verdict is that of the whole.
+_GRAVITY: tuple[FigureVerdict, ...] = ("worse", "no figure", "cannot tell", "not worse", "better", "equal")
+#: Rows of metrics.parquet that are in memory at once.
+_ROWS = 1 << 18
+_FIGURE = ["estimator", "signal", "segment", "metric", "value", "n", "unit"]
+#: Shown beside what was asked for: what else a change of an estimator shows in.
+_OTHERS = (
+    *(Figure(signal=signal) for signal in SIGNALS if signal not in ("sideslip_rad", "state")),
+    *(Figure(metric=metric) for metric in ("p95_abs", "max_abs")),
+    *(Figure(segment=segment) for segment in SEGMENTS if segment != "all"),
+    Figure(signal="vy_m_s", metric="d2"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveFigure:
+    """A figure of one drive in both runs, in the unit of metrics.parquet; ``n``: stamps behind it.
+
+    ``change``: b / a − 1, None from a figure of 0.
+    """
+
+    drive: str
+    drive_b: str
+    a: float
+    b: float
+    n_a: int
+    n_b: int
+    change: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedFigure:
+    """One figure over all drives.
+
+    Attributes
+    ----------
+    drives : those that have it on both sides, the one that became worst first. unit : of it, that of metrics.parquet.
+    only_a, only_b : drives of both runs that have it on one side. neither : how many have it on none.
+    notes : what makes it less than it seems.
+    corrected_p : sign test, corrected for all figures that are shown beside those asked for; None for those.
+    """
+
+    figure: Figure
+    verdict: FigureVerdict
+    change: PairedChange
+    unit: str
+    drives: tuple[DriveFigure, ...]
+    only_a: tuple[str, ...] = ()
+    only_b: tuple[str, ...] = ()
+    neither: int = 0
+    notes: tuple[str, ...] = ()
+    corrected_p: float | None = None
+
+    @property
+    def detectable(self) -> float:
+        """The smallest worsening (a share) that would have been found in 80 % of all cases; NaN: unknown."""
+        return self.change.detectable(self.figure.limit or 0.0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON-able values; changes are shares: 0.05 is 5 % more."""
+        found = self.change
+        bounds = {k: math.expm1(getattr(found, k)) for k in ("median", "low", "high", "least", "most")}
+        return {
+            **asdict(self.figure),
+            "unit": self.unit,
+            "verdict": self.verdict,
+            "drives": found.drives,
+            "clusters": found.clusters,
+            **bounds,
+            "detectable": self.detectable,
+            "sign_p": found.sign_p,
+            "corrected_p": self.corrected_p,
+            "only_a": self.only_a,
+            "only_b": self.only_b,
+            "neither": self.neither,
+            "notes": self.notes,
+            "of_drives": [asdict(d) for d in self.drives],
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Run B against run A.
+
+    Attributes
+    ----------
+    a, b : the folders. pairs : how many drives are in both, by what said so. only_a, only_b : drives in one alone.
+    differences : what else may have changed figures, a line each. changed : drives with any figure that is not the
+        same bit for bit.
+    figures : those that were asked for or that the gate has. others : shown beside them; none where nothing changed.
+    signals : where the tracks of the most changed drives part. followed : how many drives were looked at for it.
+    gated, allow_unpaired, strict : what closes the gate.
+    """
+
+    a: str
+    b: str
+    pairs: Mapping[str, int]
+    only_a: tuple[str, ...]
+    only_b: tuple[str, ...]
+    differences: tuple[str, ...]
+    changed: int
+    figures: tuple[ComparedFigure, ...]
+    others: tuple[ComparedFigure, ...] = ()
+    signals: tuple[ChangedSignal, ...] = ()
+    followed: int = 0
+    cluster: str | None = None
+    gated: bool = False
+    allow_unpaired: bool = False
+    strict: bool = False
+
+    @property
+    def equal(self) -> bool:
+        """Whether all figures of all pairs are the same bit for bit."""
+        return self.changed == 0
+
+    @property
+    def verdict(self) -> FigureVerdict:
+        """The gravest verdict of the figures."""
+        if self.equal and not any(f.verdict == "no figure" for f in self.figures):
+            return "equal"
+        return min((f.verdict for f in self.figures), key=_GRAVITY.index)
+
+    @property
+    def unpaired(self) -> tuple[str, ...]:
+        """What is on one side only, a line a side and figure."""
+        sides = [("drives", "", self.only_a, self.only_b)]
+        sides += [("figures", f": {f.figure.label}", f.only_a, f.only_b) for f in self.figures]
+        return tuple(
+            f"{what} in {side} only{label}: {_named(names)}"
+            for what, label, a, b in sides
+            for side, names in (("A", a), ("B", b))
+            if names
+        )
+
+    @property
+    def failures(self) -> tuple[str, ...]:
+        """Why the gate is closed, a line each; empty: it is open, or there is none."""
+        found = []
+        if self.gated:
+            found += [f"{f.figure.label}: {f.verdict}" for f in self.figures if f.verdict in ("worse", "no figure")]
+            found += () if self.allow_unpaired else self.unpaired
+        if self.strict:
+            told = ("cannot tell",) if self.gated else ("cannot tell", "no figure")
+            found += [
+                f"{f.figure.label}: {f.verdict}, which --strict refuses" for f in self.figures if f.verdict in told
+            ]
+        return tuple(found)
+
+    @property
+    def exit_code(self) -> int:
+        """4 where the gate is closed, 3 for drives without partner and no gate, else 0."""
+        if self.failures:
+            return EXIT_GATE
+        return EXIT_PARTIAL if self.unpaired and not self.gated and not self.allow_unpaired else EXIT_OK
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the comparison as one JSON-able document."""
+        return {
+            "format": "pdhef.comparison",
+            "version": 1,
+            "a": self.a,
+            "b": self.b,
+            "verdict": self.verdict,
+            "exit_code": self.exit_code,
+            "failures": self.failures,
+            "differences": self.differences,
+            "pairs": dict(self.pairs),
+            "only_a": self.only_a,
+            "only_b": self.only_b,
+            "changed": self.changed,
+            "cluster": self.cluster,
+            "figures": [f.to_dict() for f in self.figures],
+            "others": [f.to_dict() for f in self.others],
+            "signals": [asdict(s) for s in self.signals],
+            "followed": self.followed,
+        }
+
+
+def compare_runs(
+    a: OpenedRun, b: OpenedRun, gate: Gate, *, cluster: str | None = None, strict: bool = False
+) -> Comparison:
+    """Compare two runs.
+
+    Parameters
+    ----------
+    gate : the figures; those without a limit are no gate.
+    cluster : ``car``, ``day`` or a key of the logs' metadata: drives that share it are no independent witnesses.
+    strict : "cannot tell" closes the gate.
+
+    Raises
+    ------
+    OutputError : No drive is in both runs, or a file is damaged.
+    UsageError : No drive knows the estimator, or the key.
+    """
+    pairing = pair_logs(a.logs, b.logs)
+    if not pairing.pairs:
+        raise OutputError(
+            expected="a drive that is in both runs",
+            got=f"none of {len(a.logs)} and {len(b.logs)} by signals, content or name",
+            where=f"{a.folder} and {b.folder}",
+            remedy="run both on the same drives",
+        )
+    gated = any(f.limit is not None for f in gate.figures)
+    tables = _Tables(a, b, pairing.pairs)
+    changed = tables.changed()
+    found = Comparison(
+        a=str(a.folder),
+        b=str(b.folder),
+        pairs=Counter(pair.by for pair in pairing.pairs),
+        only_a=tuple(log.label for log in pairing.only_a),
+        only_b=tuple(log.label for log in pairing.only_b),
+        differences=run_differences(a, b, pairing.pairs),
+        changed=len(changed),
+        figures=(),
+        cluster=cluster,
+        gated=gated,
+        allow_unpaired=gate.allow_unpaired,
+        strict=strict,
+    )
+    if not changed and not gated:
+        return found
+    clusters = None if cluster is None else _clusters(pairing, cluster)
+    figures = tuple(tables.compared(gate.figures, clusters))
+    tables.check_estimators(figures)
+    if not changed:
+        return replace(found, figures=figures)
+    others = _corrected(tables.compared(_beside(gate.figures), clusters))
+    followed = _most_changed(pairing.pairs, changed, figures[0])
+    main = figures[0].figure.estimator
+    with _reading("estimates.parquet"):
+        signals = tuple(s for pair in followed for s in changed_signals(pair, tables.name_of(pair, main)))
+    return replace(found, figures=figures, others=others, signals=signals, followed=len(followed))
+
+
+class _Tables:
+    """The figures of two runs for their pairs, of which only what is asked for is read."""
+
+    def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
+        self._runs = (a, b)
+        self._pairs = pairs
+        self._main = [_main_of(pair.a) for pair in pairs]
+
+    def name_of(self, pair: Pair, estimator: str) -> str:
+        """Return what ``estimator`` is called for a pair."""
+        return self._main[self._pairs.index(pair)] if estimator == MAIN else estimator
+
+    def changed(self) -> frozenset[str]:
+        """Return the drives of A of which any figure is not the same bit for bit."""
+        import polars as pl
+
+        a_file, b_file = (run.folder / METRICS_FILE for run in self._runs)
+        if all(pair.a.label == pair.b.label for pair in self._pairs) and filecmp.cmp(a_file, b_file, shallow=False):
+            return frozenset()
+
+        def hashed(rows: pl.LazyFrame) -> pl.LazyFrame:
+            return rows.select("log", row=pl.struct(_FIGURE).hash()).group_by("log").agg(pl.col("row").sum(), pl.len())
+
+        with _reading(METRICS_FILE):
+            a, b = (_by_parts(run, hashed).group_by("log").agg(pl.col("row", "len").sum()) for run in self._runs)
+        pairs = pl.DataFrame({"log": [p.a.label for p in self._pairs], "b": [p.b.label for p in self._pairs]})
+        both = pairs.join(a, on="log", how="left").join(b, left_on="b", right_on="log", how="left", suffix="_b")
+        differs = pl.col("row").ne_missing(pl.col("row_b")) | pl.col("len").ne_missing(pl.col("len_b"))
+        return frozenset(both.filter(differs)["log"])
+
+    def compared(self, figures: Sequence[Figure], clusters: Sequence[object] | None) -> list[ComparedFigure]:
+        """Return figures over all pairs; nothing else is read."""
+        rows = self._rows(figures)
+        return [self._compared(figure, rows, clusters) for figure in figures]
+
+    def _compared(
+        self, figure: Figure, tables: Sequence[pl.DataFrame], clusters: Sequence[object] | None
+    ) -> ComparedFigure:
+        import polars as pl
+
+        names = self._main if figure.estimator == MAIN else [figure.estimator] * len(self._pairs)
+        wanted = pl.DataFrame(
+            {
+                "a": [p.a.label for p in self._pairs],
+                "b": [p.b.label for p in self._pairs],
+                "estimator": names,
+                "place": range(len(self._pairs)),
+            }
+        )
+        of_figure = {"signal": figure.signal, "segment": figure.segment}
+        is_it = [pl.col(k) == v for k, v in of_figure.items()]
+        sides = []
+        for side, table in zip(("a", "b"), tables, strict=True):
+            rows = table.filter(pl.col("metric") == figure.metric, *is_it).select(
+                pl.col("log").alias(side),
+                "estimator",
+                *(pl.col(c).alias(f"{c}_{side}") for c in ("value", "n", "unit")),
+            )
+            tainted = table.filter(pl.col("metric") == "not_independent", is_it[0])
+            rows = rows.join(
+                tainted.select(pl.col("log").alias(side), "estimator", pl.lit(value=True).alias(f"tainted_{side}")),
+                on=[side, "estimator"],
+                how="left",
+            )
+            sides.append(rows.unique([side, "estimator"]))
+        both = wanted.join(sides[0], on=["a", "estimator"], how="left").join(
+            sides[1], on=["b", "estimator"], how="left"
+        )
+        return _of_rows(figure, both.sort("place"), clusters)
+
+    def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
+        """Raise UsageError for an estimator that no drive of either run has."""
+        for name in {f.figure.estimator for f in figures if f.verdict == "no figure"} - {MAIN}:
+            with _reading(METRICS_FILE):
+                frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
+            known = {name for frame in frames for name in frame["estimator"]}
+            if name not in known:
+                raise UsageError(
+                    expected=f"an estimator of these runs: {', '.join(sorted(known))}", got=name, where="estimator"
+                )
+
+    def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
+        """Return the rows of figures, and of what is said of their truth, of both runs."""
+        import polars as pl
+
+        named = {f.estimator for f in figures} - {MAIN}
+        asked = {
+            "estimator": named if named == {f.estimator for f in figures} else named | set(self._main),
+            "signal": {f.signal for f in figures},
+            "segment": {"all", *(f.segment for f in figures)},
+            "metric": {"not_independent", *(f.metric for f in figures)},
+        }
+        with _reading(METRICS_FILE):
+            wanted = [pl.col(key).is_in(sorted(values)) for key, values in asked.items()]
+            return [_by_parts(run, lambda rows: rows.filter(*wanted).select("log", *_FIGURE)) for run in self._runs]
+
+
+def _by_parts(run: OpenedRun, query: Callable[[pl.LazyFrame], pl.LazyFrame]) -> pl.DataFrame:
+    """Return a query over a run's figures, made of each part of the file by itself: few rows are in memory at once."""
+    import polars as pl
+    import pyarrow.parquet as pq
+
+    texts = ["log", *(c for c in _FIGURE if c not in ("value", "n"))]
+    found = []
+    with pq.ParquetFile(run.folder / METRICS_FILE, read_dictionary=texts) as file:
+        for batch in file.iter_batches(_ROWS, columns=["log", *_FIGURE]):
+            rows = pl.DataFrame(pl.from_arrow(batch)).lazy().with_columns(pl.col(texts).cast(pl.String))
+            found.append(query(rows).collect())
+    return pl.concat(found) if found else query(run.metrics()).collect()
+
+
+def _of_rows(figure: Figure, both: pl.DataFrame, clusters: Sequence[object] | None) -> ComparedFigure:
+    import polars as pl
+
+    known_a, known_b = (both[f"value_{side}"].is_not_null() & both[f"value_{side}"].is_finite() for side in "ab")
+    known_a, known_b = known_a.fill_null(value=False), known_b.fill_null(value=False)
+    used = both.filter(known_a & known_b)
+    a, b = used["value_a"].to_numpy(), used["value_b"].to_numpy()
+    ratios = log_ratios(a, b, figure.floor)
+    change = paired_change(ratios, None if clusters is None else [clusters[i] for i in used["place"]])
+    same = bool(np.array_equal(a, b)) and bool(np.array_equal(used["n_a"].to_numpy(), used["n_b"].to_numpy()))
+    verdict: FigureVerdict = change.verdict(figure.limit or 0.0)
+    if same:
+        verdict = "equal" if len(used) else "no figure"
+    order = np.argsort(-ratios, kind="stable")
+    drives = [
+        DriveFigure(r["a"], r["b"], r["value_a"], r["value_b"], r["n_a"], r["n_b"], _share(r["value_a"], r["value_b"]))
+        for r in (used.row(int(i), named=True) for i in order)
+    ]
+    tainted = used.filter(pl.col("tainted_a").fill_null(value=False) | pl.col("tainted_b").fill_null(value=False))
+    return ComparedFigure(
+        figure,
+        verdict,
+        change,
+        unit=str(used["unit_a"][0]) if len(used) else "",
+        drives=tuple(drives),
+        only_a=tuple(both.filter(known_a & ~known_b)["a"]),
+        only_b=tuple(both.filter(known_b & ~known_a)["b"]),
+        neither=len(both.filter(~known_a & ~known_b)),
+        notes=tuple(_notes(drives, len(tainted))),
+    )
+
+
+def _notes(drives: Sequence[DriveFigure], tainted: int) -> Iterator[str]:
+    other = [d for d in drives if d.n_a != d.n_b]
+    if other:
+        share = _share(sum(d.n_a for d in drives), sum(d.n_b for d in drives)) or 0.0
+        yield f"other stamps are scored in {len(other)} of {len(drives)} drives, {share:+.2%} in all"
+    if tainted:
+        yield f"in {tainted} of {len(drives)} drives the truth is one of the estimator's inputs"
+
+
+def _share(a: float, b: float) -> float | None:
+    return None if a == 0.0 else b / a - 1.0
+
+
+def _beside(asked: Sequence[Figure]) -> list[Figure]:
+    keys = {(f.signal, f.metric, f.segment) for f in asked}
+    return [
+        replace(f, estimator=asked[0].estimator)
+        for f in (Figure(), *_OTHERS)
+        if (f.signal, f.metric, f.segment) not in keys
+    ]
+
+
+def _corrected(found: Sequence[ComparedFigure]) -> tuple[ComparedFigure, ...]:
+    there = [f for f in found if f.drives]
+    return tuple(replace(f, corrected_p=p) for f, p in zip(there, holm([f.change.sign_p for f in there]), strict=True))
+
+
+def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: ComparedFigure) -> list[Pair]:
+    """Return the changed pairs whose figure changed most, those without one last, at most :data:`MOST_FOLLOWED`."""
+    by_drive = {d.drive: abs(float(log_ratios(np.array([d.a]), np.array([d.b]))[0])) for d in figure.drives}
+    known = [pair for pair in pairs if pair.a.label in changed]
+    return sorted(known, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
+
+
+def _main_of(log: OpenedLog) -> str:
+    """Return the estimator that is a drive's answer; empty where there is none."""
+    if "main" in log.entry:
+        return str(log.entry["main"] or "")
+    return str((((log.report() or {}).get("answer")) or {}).get("main", ""))  # a run of an older version
+
+
+def _clusters(pairing: Pairing, key: str) -> list[object]:
+    """Return what each pair is of; a drive that does not say is its own."""
+    found = [_cluster(pair.a, key) for pair in pairing.pairs]
+    if all(value is None for value in found):
+        known = {k for pair in pairing.pairs for k in ((pair.a.report() or {}).get("metadata") or {})}
+        raise UsageError(
+            expected=f"a key of the drives: {', '.join(['car', 'day', *sorted(known)])}", got=key, where="--cluster"
+        )
+    return [value if value is not None else ("alone", i) for i, value in enumerate(found)]
+
+
+def _cluster(log: OpenedLog, key: str) -> str | None:
+    if key == "car":
+        car = log.entry.get("car") or {}
+        return str(car["name"]) if "name" in car else None
+    report = log.report() or {}
+    if key == "day":
+        start_ns = (report.get("log") or {}).get("start_ns")
+        return None if start_ns is None else datetime.fromtimestamp(start_ns * 1e-9, UTC).date().isoformat()
+    value = (report.get("metadata") or {}).get(key)
+    return None if value is None else str(value)
+
+
+def _named(names: Sequence[str], most: int = 5) -> str:
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+@contextmanager
+def _reading(name: str) -> Iterator[None]:
+    """Turn what is said of a damaged file into an OutputError."""
+    import polars as pl
+    import pyarrow as pa
+
+    try:
+        yield
+    except (pl.exceptions.PolarsError, pa.ArrowException, OSError) as error:
+        raise OutputError(
+            expected=f"the {name} of a run", got=str(error).split("\n")[0], where=name, remedy="run the logs again"
+        ) from error

@@ -1,0 +1,563 @@
+"""The figures of a whole run: how drives are spread, which estimator ranks where, and where nobody drove.
+
+Reports are read one after the other and metrics lazily: of a drive a few figures stay, never a series. What is said of
+an estimator is said of the drives whose truth is independent of it; those without such a truth stand apart. Drives
+count as independent of one another.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import combinations, pairwise
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdhef_logtool.records.errors import PdhefError
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.results.opened_run import OpenedLog, OpenedRun
+from pdhef_logtool.results.paired_change import holm, log_ratios
+
+if TYPE_CHECKING:
+    import polars as pl
+
+#: Name of the estimate that each drive's report calls its answer.
+ANSWER = "answer"
+#: Errors that are told, in order: signal and unit.
+SIGNALS = {"sideslip_rad": "rad", "vy_m_s": "m/s", "yaw_rate_rad_s": "rad/s", "vx_m_s": "m/s"}
+JUDGED = "sideslip_rad"
+#: Of fewer drives no interval is told.
+LEAST_DRIVES = 5
+#: A difference counts as one below this corrected p-value.
+SIGNIFICANT = 0.05
+WORST = 20
+#: Values of a key that are told one by one; numbers beyond them are told by quarters.
+MOST_VALUES = 12
+_QUARTERS = 4
+#: Labels that a group of failures names, and groups that are told.
+NAMED, _MOST_GROUPS = 10, 50
+_PLACE = re.compile(r"\s*\([^()]*\)\s*$")
+_NUMBER = re.compile(r"\d+(\.\d+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Median:
+    """A median over drives with its 95 % interval by the bootstrap over them; NaN below :data:`LEAST_DRIVES`."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class FleetDrive:
+    """One drive with a report.
+
+    Attributes
+    ----------
+    seconds : length. main : the answer's estimator, empty without one.
+    truth : whether its sideslip is scored against an independent truth. unscored : why not, else empty.
+    errors : RMSE by estimator and signal, where the truth is independent of both.
+    nis, d2, naive_d2 : what needs no truth: NIS over its degrees of freedom and d2 of the answer, d2 of sideslip 0.
+    verdict : of sideslip: ``better``, ``worse`` and so on; empty in older reports. coverage : of the 95 % band.
+    failed_checks : those that count. lost : what could not be used, empty for nothing. keys : what it can be told by.
+    """
+
+    label: str
+    seconds: float
+    main: str
+    truth: bool
+    unscored: str
+    errors: Mapping[tuple[str, str], float]
+    coverage: float
+    nis: float
+    d2: float
+    naive_d2: float
+    verdict: str
+    failed_checks: int
+    lost: str
+    keys: Mapping[str, str]
+
+    def error(self, estimator: str = ANSWER, signal: str = JUDGED) -> float:
+        """Return the RMSE of an estimator; NaN where there is none."""
+        return self.errors.get((self.main if estimator == ANSWER else estimator, signal), math.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """Errors of one estimator in one signal over drives: ``values`` ascending, in ``unit``."""
+
+    estimator: str
+    signal: str
+    unit: str
+    median: Median
+    values: FloatArray
+
+    @property
+    def drives(self) -> int:
+        """Drives with the figure."""
+        return len(self.values)
+
+    def quantile(self, share: float) -> float:
+        """Return a quantile of the errors."""
+        return float(np.quantile(self.values, share))
+
+
+@dataclass(frozen=True, slots=True)
+class Rank:
+    """The place of an estimator: those that it is shown to be better than and worse than, pair by pair.
+
+    ``against_answer``: the median of its error over the answer's, less 1; None for one that is always the answer.
+    """
+
+    place: int
+    estimator: str
+    drives: int
+    better_than: tuple[str, ...]
+    worse_than: tuple[str, ...]
+    against_answer: Median | None
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Drives of which a key says the same: how many, and how many of them are scored, with the answer's error."""
+
+    value: str
+    drives: int
+    scored: int
+    median: Median
+    worst: float
+
+
+@dataclass(frozen=True, slots=True)
+class Breakdown:
+    """The drives by what a key says; ``explains``: share of the spread of log errors that lies between groups."""
+
+    key: str
+    groups: tuple[Group, ...]
+    explains: float
+
+
+@dataclass(frozen=True, slots=True)
+class Failures:
+    """Logs that ended alike: ``labels`` of the first :data:`NAMED` of ``count``."""
+
+    reason: str
+    count: int
+    labels: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Space:
+    """Seconds and RMSE of sideslip in rad by cell of speed and |a_y|, [speeds, accelerations]; NaN: not scored."""
+
+    speed_edges_m_s: FloatArray
+    ay_edges_m_s2: FloatArray
+    seconds: FloatArray
+    rmse_rad: FloatArray
+    drives: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fleet:
+    """All of a run: ``logs`` in it, ``drives`` with a report, ``failed`` ones by reason, ``losses`` of the others."""
+
+    logs: int
+    drives: tuple[FleetDrive, ...]
+    distributions: tuple[Distribution, ...]
+    ranking: tuple[Rank, ...]
+    breakdowns: tuple[Breakdown, ...]
+    space: Space | None
+    failed: tuple[Failures, ...]
+    losses: tuple[Failures, ...]
+
+    @property
+    def scored(self) -> tuple[FleetDrive, ...]:
+        """Drives whose answer is scored."""
+        return tuple(d for d in self.drives if d.truth)
+
+    @property
+    def worst(self) -> tuple[FleetDrive, ...]:
+        """The scored drives with the largest errors, the largest first."""
+        return tuple(sorted(self.scored, key=lambda d: (-d.error(), d.label))[:WORST])
+
+    @property
+    def without_truth(self) -> tuple[FleetDrive, ...]:
+        """The other ones; those first whose answer contradicts its sensors most."""
+
+        def contradiction(drive: FleetDrive) -> tuple[bool, float, str]:
+            against = drive.d2 / drive.naive_d2 if drive.naive_d2 > 0.0 else math.nan
+            return not math.isfinite(against), -against if math.isfinite(against) else 0.0, drive.label
+
+        return tuple(sorted((d for d in self.drives if not d.truth), key=contradiction))
+
+
+def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
+    """Return the figures of a run.
+
+    Parameters
+    ----------
+    by : keys to break the drives down by; none: every key that tells drives apart.
+
+    Raises
+    ------
+    OutputError
+        metrics.parquet is damaged.
+    """
+    figures = _figures(run)
+    gathered = _Gathered()
+    for log in run.logs:
+        gathered.add(log, figures.get(log.label, {}))
+    drives = tuple(gathered.drives)
+    scored = [d for d in drives if d.truth]
+    names = _estimators(scored)
+    return Fleet(
+        logs=len(run.logs),
+        drives=drives,
+        distributions=tuple(_distributions(scored, names)),
+        ranking=tuple(_ranking(scored, names)),
+        breakdowns=tuple(_breakdowns(drives, by)),
+        space=gathered.space(),
+        failed=_grouped(gathered.failed),
+        losses=_grouped(gathered.lost),
+    )
+
+
+def exact_median(values: FloatArray) -> Median:
+    """Return the median of values [N] with its interval by the bootstrap, of infinitely many resamples.
+
+    The k-th of N is the median of a resample or above it as often as half of N draws lie among the first k (Maritz and
+    Jarrett 1978), so that nothing need be drawn. With an even N the outer one of the two middles counts.
+    """
+    n = len(values)
+    if n == 0:
+        return Median(math.nan, math.nan, math.nan)
+    middle = float(np.median(values))
+    if n < LEAST_DRIVES:
+        return Median(middle, math.nan, math.nan)
+    from scipy.stats import binom
+
+    ordered = np.sort(values)
+    share = np.arange(1, n + 1) / n
+    below_lower = binom.sf((n + 1) // 2 - 1, n, share)
+    below_upper = binom.sf(n // 2, n, share)
+    low, high = np.searchsorted(below_lower, 0.025), np.searchsorted(below_upper, 0.975)
+    return Median(middle, float(ordered[low]), float(ordered[min(int(high), n - 1)]))
+
+
+@dataclass(slots=True)
+class _Gathered:
+    """What reports leave behind, one after the other."""
+
+    drives: list[FleetDrive] = field(default_factory=list)
+    failed: list[tuple[str, str]] = field(default_factory=list)
+    lost: list[tuple[str, str]] = field(default_factory=list)
+    edges: tuple[FloatArray, FloatArray] | None = None
+    cells: FloatArray = field(default_factory=lambda: np.zeros((3, 0, 0)))
+    mapped: int = 0
+
+    def add(self, log: OpenedLog, figures: Mapping[tuple[str, str, str], float]) -> None:
+        kind, _, reason = log.outcome.partition(": ")
+        try:
+            report = log.report()
+        except PdhefError as error:
+            self.failed.append((log.label, f"its report cannot be read: {error.expected}, got {error.got}"))
+            return
+        if kind == "failed" or report is None:
+            self.failed.append((log.label, reason or "its report is not there any more"))
+            return
+        if kind == "lost":
+            self.lost += [(log.label, part) for part in reason.split("; ")]
+        try:
+            drive = _drive(log, report, figures)
+            self._add_space(report.get("operating_space"))
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            self.failed.append((log.label, f"its report is none of this tool: {type(error).__name__}"))
+            return
+        self.drives.append(drive)
+
+    def _add_space(self, space: Mapping[str, Any] | None) -> None:
+        if not space:
+            return
+        edges = np.array(space["speed_edges_m_s"]), np.array(space["ay_edges_m_s2"])
+        if self.edges is None:
+            self.edges, self.cells = edges, np.zeros((3, len(edges[0]), len(edges[1])))
+        elif not all(map(np.array_equal, edges, self.edges)):
+            return  # of another version's grid
+        self.mapped += 1
+        for cell in space["cells"]:
+            scored = cell["scored"] if cell["sideslip_mse_rad2"] is not None else 0
+            share = cell["seconds"], scored, scored * (cell["sideslip_mse_rad2"] or 0.0)
+            self.cells[:, cell["speed"], cell["ay"]] += share
+
+    def space(self) -> Space | None:
+        if self.edges is None:
+            return None
+        seconds, counts, squares = self.cells
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return Space(*self.edges, seconds, np.sqrt(squares / counts), self.mapped)
+
+
+def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
+    """Return the figures of whole drives by log, then by estimator, signal and metric."""
+    import polars as pl
+
+    rows = (
+        run.metrics()
+        .filter(
+            (pl.col("segment") == "all")
+            & (
+                (pl.col("metric").is_in(["rmse", "not_independent"]) & pl.col("signal").is_in(list(SIGNALS)))
+                | ((pl.col("metric") == "coverage95") & (pl.col("signal") == JUDGED))
+                | pl.col("metric").is_in(["nis", "nis_dof", "d2"])
+            )
+        )
+        .select("log", "estimator", "signal", "metric", "value")
+    )
+    found: dict[str, dict[tuple[str, str, str], float]] = {}
+    for log, estimator, signal, metric, value in _collected(rows, run).iter_rows():
+        found.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
+    return found
+
+
+def _collected(rows: pl.LazyFrame, run: OpenedRun) -> pl.DataFrame:
+    import polars as pl
+
+    from pdhef_logtool.records.errors import OutputError
+    from pdhef_logtool.results.opened_run import METRICS_FILE
+
+    try:
+        return rows.collect()
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise OutputError(
+            expected="the metrics of a run",
+            got=" ".join(str(error).split())[:200],
+            where=str(run.folder / METRICS_FILE),
+            remedy="run the logs again",
+        ) from None
+
+
+def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float]) -> FleetDrive:
+    answer = report.get("answer") or {}
+    main = answer.get("main") or ""
+    names = {e for e, _, _ in figures}
+    main = main or (next(iter(sorted(names)), "") if len(names) == 1 else "")
+    errors = {
+        (e, s): value
+        for (e, s, metric), value in figures.items()
+        if metric == "rmse" and math.isfinite(value) and (e, s, "not_independent") not in figures
+    }
+    dof = figures.get((main, "state", "nis_dof"), math.nan)
+    nis = figures.get((main, "state", "nis"), math.nan)
+    verdicts = {v["signal"]: v for v in report.get("verdicts") or ()}
+    kind, _, reason = log.outcome.partition(": ")
+    return FleetDrive(
+        label=log.label,
+        seconds=float(report["log"]["duration_s"]),
+        main=main,
+        truth=(main, JUDGED) in errors,
+        unscored="" if (main, JUDGED) in errors else _why_unscored(report, verdicts.get(JUDGED, {})),
+        errors=errors,
+        coverage=figures.get((main, JUDGED, "coverage95"), math.nan),
+        nis=nis / dof if dof and dof > 0.0 else math.nan,
+        d2=figures.get((main, "vy_m_s", "d2"), math.nan),
+        naive_d2=figures.get((answer.get("naive") or "", "vy_m_s", "d2"), math.nan),
+        verdict=verdicts.get(JUDGED, {}).get("outcome", ""),
+        failed_checks=sum(c["verdict"] == "failed" and not c["waived"] for c in report.get("checks", ())),
+        lost=reason if kind == "lost" else "",
+        keys=_keys(log, report, main),
+    )
+
+
+def _why_unscored(report: Mapping[str, Any], verdict: Mapping[str, Any]) -> str:
+    if not report["truth"]["available"]:
+        return "the log has no truth"
+    if JUDGED in report["truth"]["not_independent"]:
+        return "its truth is no independent one"
+    return str(verdict.get("text", "nothing of it is scored")).partition(": ")[2] or "nothing of it is scored"
+
+
+def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str]:
+    """Return what a drive can be told by: what its log says of itself, and what the run knows."""
+    friction = report.get("friction") or {}
+    car = log.entry.get("car") or {}
+    own = {
+        "car": car.get("name") or report["vehicle"]["name"],
+        "log format": report["log"]["kind"],
+        "answer": main,
+        "friction source": "estimated"
+        if friction.get("estimated")
+        else str(friction.get("source", "")).partition(",")[0],
+        "length": _length(float(report["log"]["duration_s"])),
+        "sensor faults": _fault_text(report),
+    }
+    return {
+        **{str(k): str(v) for k, v in (report.get("metadata") or {}).items()},
+        **{k: v for k, v in own.items() if v},
+    }
+
+
+def _length(seconds: float) -> str:
+    for text, end in (("below 10 s", 10.0), ("10 to 60 s", 60.0), ("1 to 10 min", 600.0), ("10 to 60 min", 3600.0)):
+        if seconds < end:
+            return text
+    return "above an hour"
+
+
+def _fault_text(report: Mapping[str, Any]) -> str:
+    faults = report.get("faults")
+    if faults is None:
+        return ""
+    return ", ".join(sorted({f["kind"] for f in faults})) or "none"
+
+
+def _estimators(drives: Iterable[FleetDrive]) -> list[str]:
+    """Return the estimators with an error in the judged signal, the most frequent first."""
+    counts = Counter(e for d in drives for e, s in d.errors if s == JUDGED)
+    return sorted(counts, key=lambda e: (-counts[e], e))
+
+
+def _distributions(drives: Sequence[FleetDrive], names: Sequence[str]) -> Iterable[Distribution]:
+    for signal, unit in SIGNALS.items():
+        for name in (ANSWER, *names):
+            values = np.array([d.error(name, signal) for d in drives])
+            values = np.sort(values[np.isfinite(values)])
+            if values.size:
+                yield Distribution(name, signal, unit, exact_median(values), values)
+
+
+def _ranking(drives: Sequence[FleetDrive], names: Sequence[str]) -> list[Rank]:
+    """Return the estimators in order of how many others they beat, pair by pair on the drives of both."""
+    errors = {name: np.array([d.error(name) for d in drives]) for name in (ANSWER, *names)}
+
+    def ratios(a: str, b: str) -> FloatArray:
+        both = np.isfinite(errors[a]) & np.isfinite(errors[b])
+        return log_ratios(errors[a][both], errors[b][both])
+
+    pairs = [*combinations(names, 2)]
+    changes = [ratios(a, b) for a, b in pairs]
+    beats: dict[str, set[str]] = {name: set() for name in names}
+    for (a, b), change, p in zip(pairs, changes, holm([*map(_sign_p, changes)]), strict=True):
+        if p < SIGNIFICANT:
+            better, worse = (a, b) if np.sum(np.sign(change)) > 0.0 else (b, a)
+            beats[better].add(worse)
+    lost = {name: {other for other in names if name in beats[other]} for name in names}
+    medians = {name: float(np.nanmedian(errors[name])) for name in names}
+    order = sorted(names, key=lambda n: (len(lost[n]) - len(beats[n]), medians[n], n))
+    mains = {d.main for d in drives}
+    return [
+        Rank(
+            # Equal places where nothing tells them apart.
+            place=1 + sum(len(lost[o]) - len(beats[o]) < len(lost[name]) - len(beats[name]) for o in names),
+            estimator=name,
+            drives=int(np.isfinite(errors[name]).sum()),
+            better_than=tuple(n for n in order if n in beats[name]),
+            worse_than=tuple(n for n in order if n in lost[name]),
+            against_answer=None if mains == {name} else _share(exact_median(ratios(ANSWER, name))),
+        )
+        for name in order
+    ]
+
+
+def _sign_p(ratios: FloatArray) -> float:
+    """Return the two-sided p-value of "as many drives rise as fall"; those without a change do not vote."""
+    from scipy.stats import binomtest
+
+    up, down = int(np.count_nonzero(ratios > 0.0)), int(np.count_nonzero(ratios < 0.0))
+    return float(binomtest(up, up + down).pvalue) if up + down else 1.0
+
+
+def _share(of_logs: Median) -> Median:
+    return Median(*(math.expm1(x) for x in (of_logs.value, of_logs.low, of_logs.high)))
+
+
+def _breakdowns(drives: Sequence[FleetDrive], by: Sequence[str]) -> list[Breakdown]:
+    """Return the drives by each key that tells them apart, the one that explains most first; by ``by`` in its order."""
+    known = {key: None for d in drives for key in d.keys}
+    found = []
+    for key in by or known:
+        values = _told(key, drives)
+        count = len({v for v in values if v is not None})
+        if by or (2 <= count <= MOST_VALUES + 1 and count < len(drives)):
+            found.append(_breakdown(key, drives, values))
+    if by:
+        return found
+    same: dict[tuple[tuple[int, float], ...], Breakdown] = {}
+    for one in sorted(found, key=lambda b: (-b.explains if math.isfinite(b.explains) else 1.0, b.key)):
+        # Two keys that part the drives alike say it once.
+        same.setdefault(tuple((g.drives, g.median.value) for g in one.groups if g.scored), one)
+    return [*same.values()]
+
+
+def _told(key: str, drives: Sequence[FleetDrive]) -> list[str | None]:
+    """Return what is told of each drive by a key: its text, a quarter of its numbers, or that it is rare."""
+    texts = [d.keys.get(key) for d in drives]
+    counts = Counter(t for t in texts if t is not None)
+    if len(counts) <= MOST_VALUES:
+        return list(texts)
+    numbers = [_as_number(t) for t in texts]
+    finite = np.array([x for x in numbers if math.isfinite(x)])
+    if len(finite) == sum(counts.values()):
+        edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, _QUARTERS + 1)))
+        at = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
+        names = [f"{a:g} to {b:g}" for a, b in pairwise(edges)] or [f"{edges[0]:g}"]
+        return [names[i] if math.isfinite(x) else None for i, x in zip(at, numbers, strict=True)]
+    common = {value for value, _ in counts.most_common(MOST_VALUES)}
+    rest = f"{len(counts) - MOST_VALUES} others"
+    return [t if t is None or t in common else rest for t in texts]
+
+
+def _as_number(text: str | None) -> float:
+    try:
+        return math.nan if text is None else float(text)
+    except ValueError:
+        return math.nan
+
+
+def _breakdown(key: str, drives: Sequence[FleetDrive], values: Sequence[str | None]) -> Breakdown:
+    members: dict[str, list[FleetDrive]] = {}
+    for drive, value in zip(drives, values, strict=True):
+        members.setdefault("not told" if value is None else value, []).append(drive)
+    groups = []
+    logs: list[FloatArray] = []
+    for value, of_group in sorted(members.items(), key=lambda item: _in_order(item[0])):
+        errors = np.array([d.error() for d in of_group if d.truth])
+        worst = float(errors.max()) if errors.size else math.nan
+        groups.append(Group(value, len(of_group), len(errors), exact_median(errors), worst))
+        logs.append(np.log(errors[errors > 0.0]))
+    return Breakdown(key, tuple(groups), _explained([x for x in logs if x.size]))
+
+
+def _in_order(value: str) -> tuple[bool, float, str]:
+    number = _as_number(value.partition(" to ")[0])
+    return math.isnan(number), 0.0 if math.isnan(number) else number, value
+
+
+def _explained(groups: Sequence[FloatArray]) -> float:
+    """Return the share of variance between groups, less what chance puts there; NaN where it cannot be told."""
+    n, k = sum(g.size for g in groups), len(groups)
+    if k < 2 or n <= k + 1:
+        return math.nan
+    together = np.concatenate(groups)
+    total = float(((together - together.mean()) ** 2).sum())
+    within = sum(float(((g - g.mean()) ** 2).sum()) for g in groups)
+    return 1.0 - (within / (n - k)) / (total / (n - 1)) if total > 0.0 else 0.0
+
+
+def _grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
+    """Return reasons with their logs, the most frequent first; numbers and places do not tell reasons apart."""
+    members: dict[str, dict[str, None]] = {}
+    for label, reason in found:
+        members.setdefault(_kind_of(reason), {})[label] = None
+    groups = [Failures(reason, len(labels), tuple(labels)[:NAMED]) for reason, labels in members.items()]
+    return tuple(sorted(groups, key=lambda g: (-g.count, g.reason))[:_MOST_GROUPS])
+
+
+def _kind_of(reason: str) -> str:
+    _, expected, rest = reason.partition(": expected ")
+    text = f"expected {rest}" if expected else _PLACE.sub("", reason)
+    return _NUMBER.sub("N", text)

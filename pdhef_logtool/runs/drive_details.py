@@ -1,0 +1,103 @@
+"""What the page of a drive shows and no table holds, gathered while the drive's tracks are still at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from pdhef_logtool.drive.reading import Drive
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.evaluation.blocks import row_blocks
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.evaluation.operating_space import operating_space
+from pdhef_logtool.evaluation.reasons import SensorFault, sensor_faults
+from pdhef_logtool.evaluation.segments import moving_mask
+from pdhef_logtool.evaluation.standing import standings
+from pdhef_logtool.evaluation.thresholds import Verdict
+from pdhef_logtool.logs.open_log import metadata_of
+from pdhef_logtool.records.shown import shown
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.runs.drive_sample import sample_drive
+from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget, no_budget
+from pdhef_logtool.runs.guard import PHYSICS
+from pdhef_logtool.runs.innovations import channel_innovations
+from pdhef_logtool.sinks.base import TRUTH
+from pdhef_logtool.sinks.report import DriveDetails
+
+#: Entries of a log's metadata that a report keeps, and signs of each.
+_MOST_METADATA, _MOST_SIGNS = 64, 200
+
+_Read = Callable[[str], StateTrack | None]
+
+
+def drive_details(
+    drive: Drive, ready: Sequence[Estimator], main: str, read: _Read, signals: Signals, limits: Sequence[Verdict]
+) -> DriveDetails:
+    """Return the details of a drive.
+
+    Parameters
+    ----------
+    ready : the estimators that ran. main : the name of the answer. read : returns the track of a name, ``truth`` too.
+    signals : what the estimators saw. limits : how the figures stand against the thresholds.
+    """
+    truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
+    answer = read(main)
+    assert answer is not None
+    by_name = {e.name: e for e in ready}
+    asked = [by_name[n] for n in dict.fromkeys((main, PHYSICS)) if n in by_name]
+    sample = sample_drive(signals, None, np.where(moving_mask(signals, truth, drive.car.vehicle), 1.0, np.nan))
+    return DriveDetails(
+        faults=next((f for e in asked if (f := _faults(read, e.name)) is not None), None),
+        innovations=[] if sample is None else channel_innovations(asked, sample),
+        standings=[] if truth is None else standings(main, _rivals(ready, by_name[main]), read, truth, slow),
+        limits=limits,
+        error_budget=_budget(drive, by_name.get(PHYSICS), read, signals),
+        operating_space=operating_space(signals, truth, answer, slow),
+        metadata=_metadata(drive),
+    )
+
+
+def _faults(read: _Read, name: str) -> tuple[SensorFault, ...] | None:
+    track = read(name)
+    return None if track is None else sensor_faults(track)
+
+
+def _rivals(ready: Sequence[Estimator], main: Estimator) -> list[str]:
+    """Return the estimators on the car's model alone that the answer is held against; none sees more of the log."""
+    found = []
+    for estimator in ready:
+        algorithm = resolve(estimator)
+        physics = algorithm.physics_sha256 is not None and algorithm.network_sha256 is None
+        if physics and estimator.name != main.name and (estimator.causal or not main.causal):
+            found.append(estimator.name)
+    return found
+
+
+def _budget(drive: Drive, physics: Estimator | None, read: _Read, signals: Signals) -> ErrorBudget:
+    truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
+    if truth is None:
+        return no_budget("the log has no truth")
+    if physics is None:
+        return no_budget(f"{PHYSICS} did not run")
+    if "sideslip_rad" in drive.plan.dependent:
+        return no_budget("the truth of sideslip is an input or an estimate, and no independent one")
+    track = read(PHYSICS)
+    assert track is not None
+    sample = sample_drive(signals, truth, _squared_error(track, truth, slow))  # where there is most to explain
+    return no_budget("nothing is scored") if sample is None else error_budget(physics, sample, slow)
+
+
+def _squared_error(track: StateTrack, truth: StateTrack, low_speed_m_s: float) -> FloatArray:
+    parts = ((track.rows(a, b), truth.rows(a, b)) for a, b in row_blocks(len(truth)))
+    return np.concatenate([signal_error(e, t, "sideslip_rad", low_speed_m_s) ** 2 for e, t in parts])
+
+
+def _metadata(drive: Drive) -> dict[str, str]:
+    """Return what the log says of itself by key, and by ``record.key`` where records differ, as far as it is short."""
+    found = metadata_of(drive.log, drive.options.limits)
+    found = {k: v for k, v in found.items() if k.partition(".")[2] not in found or found[k.partition(".")[2]] != v}
+    short = {shown(k, _MOST_SIGNS): v for k, v in sorted(found.items()) if len(v) <= _MOST_SIGNS}
+    return {k: shown(v) for k, v in [*short.items()][:_MOST_METADATA]}

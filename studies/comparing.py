@@ -1,0 +1,180 @@
+"""How ``pdhef compare`` decides: false alarms, what it finds, and what a comparison of many drives costs.
+
+    python -m studies.comparing [--times 5000] [--planted 2000] [--drives 10000] [--out docs]
+
+The paired log ratios of drives are drawn from a normal and a heavy-tailed distribution (Student's t with 3 degrees of
+freedom, scaled to the same standard deviation), 0.2 wide. A relabelling changes the sign of each at random: nothing
+changed. For the cost a run of many drives is made up, with as many figures a drive as a real one has.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.results.paired_change import paired_change
+from pdhef_logtool.sinks.parquet import write_metrics
+from studies.pages import DOCS, options, table, write
+
+LIMIT, PLANTED, SPREAD = 0.05, 0.10, 0.2
+COUNTS = (5, 10, 30, 100)
+#: Figures a drive that a run with three estimators writes: these make as many.
+_ESTIMATORS = ("zero", "physics", "pd-hef")
+_SIGNALS = ("sideslip_rad", "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2")
+_SEGMENTS = ("all", "linear", "nonlinear", "straight", "cornering-left", "cornering-right", "slalom", "braking")
+_METRICS = ("rmse", "mae", "bias", "p95_abs", "max_abs", "coverage95")
+_TAIL_DEGREES = 3.0
+
+#: ``draw(rng, shape)`` of log ratios.
+Draw = Callable[[np.random.Generator, tuple[int, int]], FloatArray]
+
+
+def normal(rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:
+    """Return log ratios [times, drives] of a normal distribution."""
+    return rng.normal(0.0, SPREAD, shape)
+
+
+def heavy_tailed(rng: np.random.Generator, shape: tuple[int, int]) -> FloatArray:
+    """Return log ratios [times, drives] with some drives that go wild."""
+    scale = SPREAD / math.sqrt(_TAIL_DEGREES / (_TAIL_DEGREES - 2.0))
+    return np.asarray(scale * rng.standard_t(_TAIL_DEGREES, shape))
+
+
+def share_closed(draw: Draw, drives: int, times: int, planted: float, seed: int) -> float:
+    """Return how often the gate closes, of drives that are all worse by ``planted`` beside their spread."""
+    rng = np.random.default_rng(seed)
+    signs = rng.choice((-1.0, 1.0), (times, drives))
+    ratios = signs * draw(rng, (times, drives)) + math.log1p(planted)
+    return float(np.mean([paired_change(one).verdict(LIMIT) == "worse" for one in ratios]))
+
+
+def share_of_means(draw: Draw, drives: int, times: int, seed: int) -> float:
+    """Return how often a ratio of mean RMSE above the limit, the naive gate, closes on a relabelling."""
+    rng = np.random.default_rng(seed)
+    level = np.exp(rng.normal(0.0, 0.5, (times, drives)))
+    other = level * np.exp(rng.choice((-1.0, 1.0), level.shape) * draw(rng, (times, drives)))
+    return float(np.mean(other.mean(axis=1) / level.mean(axis=1) > 1.0 + LIMIT))
+
+
+def make_run(folder: Path, drives: int) -> int:
+    """Write run.json and metrics.parquet of a run of made-up drives; return the number of figures."""
+    rng = np.random.default_rng(5)
+    labels = [f"drive_{i:05d}" for i in range(drives)]
+    logs = [
+        {
+            "log": label,
+            "file": f"{label}.mcap",
+            "outcome": "ok",
+            "main": "pd-hef",
+            **{f"{key}sha256": f"{i:064x}" for key in ("", "signals_", "truth_")},
+            "car": {"file": "golf", "name": "golf", "sha256": "0" * 64, "network_sha256": None},
+        }
+        for i, label in enumerate(labels)
+    ]
+    document = {"format": "pdhef.run", "version": 1, "config": {}, "model": None, "versions": {}, "logs": logs}
+    (folder / "run.json").write_text(json.dumps(document, indent=2))
+    rows = [
+        MetricRow(label, estimator, signal, segment, metric, float(value), "rad", 1000)
+        for label in labels
+        for value, (estimator, signal, segment, metric) in zip(rng.random(_PER_DRIVE), _names(), strict=True)
+    ]
+    write_metrics(folder / "metrics.parquet", rows)
+    return len(rows)
+
+
+def _names() -> Iterator[tuple[str, str, str, str]]:
+    return ((e, s, g, m) for e in _ESTIMATORS for s in _SIGNALS for g in _SEGMENTS for m in _METRICS)
+
+
+_PER_DRIVE = len(_ESTIMATORS) * len(_SIGNALS) * len(_SEGMENTS) * len(_METRICS)
+
+
+def cost(drives: int) -> list[str]:
+    """Return the table row of a run of many drives compared with itself by the command line."""
+    code = (
+        "import resource, sys\nfrom pdhef_logtool.cli.app import app\n"
+        "app(sys.argv[1:], prog_name='pdhef', standalone_mode=False)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    with tempfile.TemporaryDirectory() as place:
+        made = subprocess.run(
+            [sys.executable, "-c", f"from studies.comparing import make_run\nfrom pathlib import Path\n"
+             f"print(make_run(Path({place!r}), {drives}))"],
+            check=True, capture_output=True, text=True,
+        )  # fmt: skip
+        before = _processor_s()
+        done = subprocess.run(
+            [sys.executable, "-c", code, "compare", place, place, "--max-regression", "5%"],
+            check=True, capture_output=True, text=True,
+        )  # fmt: skip
+        seconds = _processor_s() - before
+    *_, verdict, peak_kib = done.stdout.strip().split("\n")
+    equal = "equal" if "Verdict: equal" in verdict else verdict
+    return [f"{drives:,}", f"{int(made.stdout):,}", equal, f"{seconds:.1f}", f"{int(peak_kib) / 1024:.0f}"]
+
+
+def _processor_s() -> float:
+    """Return the processor time of all commands so far: that of a core that has nothing else to do."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def page(times: int, planted: int, drives: int) -> str:
+    """Return the page of results."""
+    false_alarms, found = [], []
+    for count in COUNTS:
+        alarms = [share_closed(draw, count, times, 0.0, 1) for draw in (normal, heavy_tailed)]
+        hits = [share_closed(draw, count, planted, PLANTED, 2) for draw in (normal, heavy_tailed)]
+        naive = share_of_means(normal, count, times, 3)
+        false_alarms.append([str(count), *(f"{x:.1%}" for x in (*alarms, naive))])
+        found.append([str(count), *(f"{x:.1%}" for x in hits)])
+    return "\n".join(
+        (
+            "# How surely `pdhef compare` finds a regression",
+            "",
+            "`python -m studies.comparing` writes this page. What the command does: [compare.md](compare.md).",
+            "",
+            f"## Nothing changed: how often the gate closes, of {times:,} relabellings",
+            "",
+            f"The paired log ratio of drives has a spread of {SPREAD}, the limit is {LIMIT:.0%}. The last column is "
+            "the gate that one would think of first: the ratio of the mean RMSE of both runs above the limit.",
+            "",
+            table(["drives", "normal", "heavy tails", "ratio of means"], false_alarms, right_from=0),
+            "",
+            f"## Every drive is worse by {PLANTED:.0%} beside that spread: how often the gate closes, of {planted:,}",
+            "",
+            table(["drives", "normal", "heavy tails"], found, right_from=0),
+            "",
+            "## A run compared with itself",
+            "",
+            "The whole command, from its start to its end; processor time is that of an idle core.",
+            "",
+            table(["drives", "figures", "verdict", "processor s", "MiB at most"], [cost(drives)], right_from=0),
+            "",
+        )
+    )
+
+
+def main() -> None:
+    """Write docs/comparing.md."""
+    parser = options("comparing", __doc__)
+    parser.add_argument("--times", type=int, default=5000)
+    parser.add_argument("--planted", type=int, default=2000)
+    parser.add_argument("--drives", type=int, default=10_000)
+    parser.add_argument("--out", type=Path, default=DOCS)
+    given = parser.parse_args()
+    write(given.out / "comparing.md", page(given.times, given.planted, given.drives))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,72 @@
+"""``pdhef compare`` as it is called and as it is seen."""
+
+from __future__ import annotations
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from pdhef_logtool.cli.app import app
+from pdhef_logtool.records.errors import UsageError
+from tests.results.made_run import write_estimates, write_run
+
+TEN = {f"drive_{i}": 0.001 * (1 + i) for i in range(10)}
+
+
+def _pdhef(*arguments: str) -> tuple[int, str]:
+    result = CliRunner(env={"COLUMNS": "80"}).invoke(app, list(arguments), prog_name="pdhef")
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> tuple[str, str]:
+    a = write_run(tmp_path / "a", TEN)
+    worse = {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())}
+    b = write_run(tmp_path / "b", worse, config={"friction": 0.3})
+    for folder, slip in ((a, np.zeros(50)), (b, np.full(50, 0.01))):
+        write_estimates(folder, "drive_9", pd_hef={"sideslip_rad": slip})
+    return str(a), str(b)
+
+
+def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[str, str]) -> None:
+    code, text = _pdhef("compare", *runs, "--max-regression", "5%")
+    assert code == 4
+    assert all(len(line) <= 80 for line in text.splitlines()[1:])
+    assert "configuration: friction auto → 0.3" in text
+    assert re.search(r"drive_9 +0\.573 +0\.6818 +\+19\.0 %", text)
+    assert "0.573 °" in text  # the largest difference of the tracks
+    assert "Verdict: B is worse" in text
+    assert "gate closed: sideslip_rad rmse (all) of main: worse" in text
+
+
+def test_the_same_run_is_equal(runs: tuple[str, str]) -> None:
+    code, text = _pdhef("compare", runs[0], runs[0], "--max-regression", "0.05", "--strict")
+    assert code == 0
+    assert text.splitlines()[-1] == "Verdict: equal: all figures of all pairs are the same bit for bit"
+
+
+def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> None:
+    gate = tmp_path / "gate.toml"
+    gate.write_text('[[figure]]\nmax_regression = "5%"\n[[figure]]\nmetric = "max_abs"\nmax_regression = 0.1\n')
+    code, text = _pdhef("compare", *runs, "--gate", str(gate), "--json", "--junit", str(tmp_path / "gate.xml"))
+    document = json.loads(text)
+    assert code == document["exit_code"] == 4
+    assert [f["verdict"] for f in document["figures"]] == ["worse", "no figure"]
+    suites = ET.parse(tmp_path / "gate.xml").getroot()
+    assert (suites.get("tests"), suites.get("failures")) == ("3", "2")
+
+
+def test_a_gate_file_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[str, str]) -> None:
+    with pytest.raises(UsageError, match="--gate and --metric"):
+        _pdhef("compare", *runs, "--gate", "gate.toml", "--metric", "mae")
+    with pytest.raises(UsageError, match=r"a figure of which less is better, got metric = bias"):
+        _pdhef("compare", *runs, "--metric", "bias")
+    with pytest.raises(UsageError, match=r"a share such as 5% or 0\.05, got five"):
+        _pdhef("compare", *runs, "--max-regression", "five")

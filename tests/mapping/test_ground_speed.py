@@ -1,0 +1,114 @@
+"""A speed that nobody measured forward, and joints of a vehicle's model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_drive_log import FakeLog, FakeTopic
+
+from pdhef_logtool.mapping import AutoMapping, SignalSource, auto_map
+from pdhef_logtool.mapping.channels import si_values
+from pdhef_logtool.mapping.mapping_file import load_mapping, mapping_from_dict, mapping_to_toml
+from pdhef_logtool.records.errors import MappingFileError
+
+N = 3000
+START = 1_700_000_000_000_000_000
+T = START + np.arange(N, dtype=np.int64) * 10_000_000
+S = np.arange(N) * 0.01
+V = 15.0 + 3.0 * np.sin(0.3 * S)
+RATE = 0.25 * np.sin(0.9 * S)
+YAW = np.cumsum(RATE) * 0.01
+EAST, NORTH = V * np.cos(YAW), V * np.sin(YAW)
+FIX = {"latitude": 48.0 + np.cumsum(NORTH) * 0.01 / 111_200.0,
+       "longitude": 11.0 + np.cumsum(EAST) * 0.01 / (111_200.0 * np.cos(np.radians(48.0)))}  # fmt: skip
+IMU = {"linear_acceleration.x": np.gradient(V, 0.01), "linear_acceleration.y": V * RATE,
+       "linear_acceleration.z": 9.81 + 0.0 * S, "angular_velocity.z": RATE}  # fmt: skip
+
+
+def topic(type_name: str, fields: dict[str, np.ndarray], *examples: object) -> FakeTopic:
+    return FakeTopic(type_name, T + 2_000_000, {"header.stamp": T} | fields, examples=examples)
+
+
+def found(**contents: FakeTopic) -> AutoMapping:
+    imu = topic("sensor_msgs/msg/Imu", IMU)
+    return auto_map(FakeLog({"/imu": imu} | {f"/{k}": v for k, v in contents.items()}))
+
+
+def speed_of(auto: AutoMapping, east: np.ndarray = EAST, north: np.ndarray = NORTH) -> np.ndarray:
+    source = auto.mapping.signals["speed_m_s"]
+    log = FakeLog({source.topic: topic("x/msg/X", dict(zip(source.paths, (east, north), strict=True)))})
+    return si_values(log.read({source.topic: source.paths})[source.topic], source)
+
+
+def twist(factor: float = 1.0) -> FakeTopic:
+    return topic("geometry_msgs/msg/TwistStamped", {"twist.linear.x": factor * EAST, "twist.linear.y": factor * NORTH})
+
+
+@pytest.mark.parametrize("witness", [{}, {"fix": topic("sensor_msgs/msg/NavSatFix", FIX)}])
+def test_a_velocity_east_and_north_gives_the_speed(witness: dict[str, FakeTopic]) -> None:
+    auto = found(vel=twist(), **witness)
+    np.testing.assert_allclose(speed_of(auto), V)
+    assert any("/vel" in n and "never negative" in n for n in auto.mapping.notes)
+    assert not auto.ambiguities
+
+
+def test_a_velocity_in_another_unit_is_not_taken() -> None:
+    auto = found(vel=twist(3.6), fix=topic("sensor_msgs/msg/NavSatFix", FIX))
+    assert "speed_m_s" not in auto.mapping.signals
+    assert any("/vel" in str(a) for a in auto.ambiguities)
+
+
+def test_the_truths_velocity_stands_in_with_a_mark() -> None:
+    pva = {"north_velocity": NORTH, "east_velocity": EAST, "up_velocity": 0.0 * S}
+    place = {"latitude": FIX["latitude"], "longitude": FIX["longitude"], "height": 0.0 * S}
+    auto = found(ins=topic("novatel_oem7_msgs/msg/INSPVA", pva | place))
+    np.testing.assert_allclose(speed_of(auto), V)
+    assert any("is the truth too" in n for n in auto.mapping.notes)
+
+
+def test_a_vector_of_unknown_frame_needs_evidence() -> None:
+    vector = topic("geometry_msgs/msg/Vector3Stamped", {"vector.x": EAST, "vector.y": NORTH})
+    np.testing.assert_allclose(speed_of(found(filter_velocity=vector)), V)
+    noise = np.random.default_rng(1).normal(size=(2, N))
+    other = topic("geometry_msgs/msg/Vector3Stamped", {"vector.x": noise[0], "vector.y": noise[1]})
+    assert "speed_m_s" not in found(filter_velocity=other).mapping.signals
+
+
+def test_a_length_is_written_and_read_back(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    mapping = found(vel=twist()).mapping
+    (tmp_path / "m.toml").write_text(mapping_to_toml(mapping))
+    assert load_mapping(tmp_path / "m.toml").signals == mapping.signals
+    for table in ({"field": "a"}, {"field": ["a"], "scale": [1.0]}):
+        with pytest.raises(MappingFileError, match="length of two or more fields"):
+            mapping_from_dict({"signals": {"speed_m_s": {"topic": "/t", "combine": "norm", **table}}}, where="m")
+
+
+NAMES = ("front_left_steering_joint", "rear_left_wheel_joint", "front_right_steering_joint", "rear_right_wheel_joint")
+
+
+def joints(*examples: object) -> FakeTopic:
+    steer = 2.7 * RATE / V
+    position = np.stack([1.03 * steer, np.cumsum(V) * 0.033, 0.97 * steer, np.cumsum(V) * 0.033], axis=1)
+    velocity = np.stack([0.0 * V, V / 0.3, 0.0 * V, V / 0.3], axis=1)
+    return topic("sensor_msgs/msg/JointState", {"position": position, "velocity": velocity}, *examples)
+
+
+def test_joints_by_the_names_in_the_messages() -> None:
+    auto = found(joint_states=joints({"name": list(NAMES)}, {"name": list(NAMES)}))
+    signals = auto.mapping.signals
+    steer = signals["steer_rad"]
+    assert (steer.paths, steer.scale) == (("position[0]", "position[2]"), (0.5, 0.5))
+    assert signals["wheel_speed_rl_rad_s"].field == "velocity[1]"
+    assert signals["wheel_speed_rr_rad_s"].field == "velocity[3]"
+    assert isinstance(signals["wheel_speed_rl_rad_s"], SignalSource)
+
+
+def test_joints_that_change_their_order_are_not_used_and_said() -> None:
+    auto = found(joint_states=joints({"name": list(NAMES)}, {"name": list(reversed(NAMES))}))
+    assert not {"steer_rad", "wheel_speed_rl_rad_s"} & set(auto.mapping.signals)
+    assert any("/joint_states" in n and "another order" in n for n in auto.mapping.notes)
+
+
+def test_joints_of_a_command_are_no_sensor() -> None:
+    auto = found(joint_command=joints({"name": list(NAMES)}))
+    assert "steer_rad" not in auto.mapping.signals

@@ -1,0 +1,162 @@
+"""A headless Chromium, spoken to over its debugging pipe: no port is opened and nothing but the file is loaded."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import fcntl
+import json
+import os
+import select
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+CHROMIUM = next((p for n in ("chromium", "chromium-browser", "google-chrome") if (p := shutil.which(n))), None)
+WHY_NOT = "there is no Chromium on this machine (apt-get install chromium)"
+_FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-extensions", "--disable-dev-shm-usage",
+    "--hide-scrollbars", "--force-device-scale-factor=1", "--remote-debugging-pipe",
+)  # fmt: skip
+
+
+class Browser:
+    """One page of a browser; ``messages`` are those of its console, ``requests`` every address that it asked for."""
+
+    def __init__(self, width: int = 1280, height: int = 900) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="pdhef-chromium-")
+        ours_in, theirs_out = os.pipe()
+        theirs_in, ours_out = os.pipe()
+        high = [fcntl.fcntl(fd, fcntl.F_DUPFD, 60) for fd in (theirs_in, theirs_out)]  # clear of 3 and 4
+        os.close(theirs_in)
+        os.close(theirs_out)
+        theirs_in, theirs_out = high
+        self._in, self._out = ours_in, ours_out
+        command = [CHROMIUM, *_FLAGS, f"--user-data-dir={self._folder.name}", f"--window-size={width},{height}"]
+        shell = f'exec "$@" 3<&{theirs_in} 4>&{theirs_out} '
+        self._process = subprocess.Popen(
+            ["bash", "-c", shell, "bash", *command, "about:blank"],
+            pass_fds=(theirs_in, theirs_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        os.close(theirs_in)
+        os.close(theirs_out)
+        self._buffer, self._number, self._session = b"", 0, None
+        self.messages: list[str] = []
+        self.requests: list[str] = []
+        self._loaded = False
+        targets = self.call("Target.getTargets")["targetInfos"]
+        target = next(t["targetId"] for t in targets if t["type"] == "page")
+        self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Network", "Log", "Performance"):
+            self.call(f"{domain}.enable")
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with contextlib.suppress(Exception):
+            self._session = None
+            self.call("Browser.close", wait_s=5)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(5)
+        self._process.kill()
+        self._process.wait()
+        os.close(self._in)
+        os.close(self._out)
+        self._folder.cleanup()
+
+    def call(self, method: str, wait_s: float = 60.0, **parameters: object) -> dict:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._out, json.dumps(message).encode() + b"\0")
+        number, end = self._number, time.monotonic() + wait_s
+        while True:
+            answer = self._next(end)
+            if answer.get("id") == number:
+                if "error" in answer:
+                    raise RuntimeError(f"{method}: {answer['error']}")
+                return answer["result"]
+
+    def _next(self, end: float) -> dict:
+        while b"\0" not in self._buffer:
+            if not select.select([self._in], [], [], max(0.0, end - time.monotonic()))[0]:
+                raise TimeoutError("Chromium says nothing")
+            read = os.read(self._in, 1 << 20)
+            if not read:
+                raise RuntimeError("Chromium has ended")
+            self._buffer += read
+        text, self._buffer = self._buffer.split(b"\0", 1)
+        answer = json.loads(text)
+        self._note(answer.get("method"), answer.get("params", {}))
+        return answer
+
+    def _note(self, event: str | None, of: dict) -> None:
+        if event == "Runtime.consoleAPICalled":
+            self.messages.append(" ".join(str(a.get("value", a.get("description"))) for a in of["args"]))
+        elif event == "Runtime.exceptionThrown":
+            details = of["exceptionDetails"]
+            self.messages.append(str(details.get("exception", {}).get("description", details["text"])))
+        elif event == "Log.entryAdded":
+            self.messages.append(of["entry"]["text"])
+        elif event == "Network.requestWillBeSent":
+            self.requests.append(of["request"]["url"][:200])
+        elif event == "Page.javascriptDialogOpening":
+            self.messages.append(f"dialog: {of['message']}")
+            self._session and os.write(
+                self._out,
+                json.dumps({"id": 0, "method": "Page.handleJavaScriptDialog", "params": {"accept": True},
+                            "sessionId": self._session}).encode() + b"\0",
+            )  # fmt: skip
+        elif event == "Page.loadEventFired":
+            self._loaded = True
+
+    def open(self, path: Path, wait_s: float = 60.0) -> None:
+        """Open a file and wait until all of its figures are drawn."""
+        self._loaded = False
+        end = time.monotonic() + wait_s
+        self.call("Page.navigate", url=path.resolve().as_uri())
+        while not self._loaded:
+            self._next(end)
+        self.wait_for("document.documentElement.dataset.drawn !== undefined", end - time.monotonic())
+
+    def wait_for(self, expression: str, wait_s: float = 30.0) -> None:
+        end = time.monotonic() + wait_s
+        while not self.value(expression):
+            if time.monotonic() > end:
+                raise TimeoutError(f"{expression}; {self.messages}")
+            time.sleep(0.02)
+
+    def value(self, expression: str):
+        answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        if "exceptionDetails" in answer:
+            raise RuntimeError(str(answer["exceptionDetails"]))
+        return answer["result"].get("value")
+
+    def busy_s(self) -> float:
+        """Seconds that the main thread has worked for this page."""
+        metrics = {m["name"]: m["value"] for m in self.call("Performance.getMetrics")["metrics"]}
+        return metrics["TaskDuration"]
+
+    def screenshot(self, path: Path, *, whole: bool = True) -> None:
+        options: dict[str, object] = {}
+        if whole:
+            size = self.call("Page.getLayoutMetrics")["cssContentSize"]
+            options = {
+                "captureBeyondViewport": True,
+                "clip": {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1},
+            }
+        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png", **options)["data"]))
+
+    def pdf(self, path: Path) -> None:
+        """Print on A4 as the page asks for."""
+        made = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
+        path.write_bytes(base64.b64decode(made["data"]))

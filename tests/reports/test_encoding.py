@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+
+from pdhef_logtool.reports.encoding import MOST_CELLS, decode, encode, envelope, first_known, grid_of, largest, least
+
+
+def stamps(n, step_ns=10_000_000, start=1_700_000_000_000_000_000):
+    return start + np.arange(n, dtype=np.int64) * step_ns
+
+
+def test_what_is_encoded_is_decoded_to_a_level_and_gaps_stay_gaps():
+    values = np.random.default_rng(0).normal(size=5000) * 7 - 3
+    values[100:200] = np.nan
+    values[-1] = np.inf
+    back = decode(encode(values))
+    assert np.array_equal(np.isnan(back), ~np.isfinite(values))
+    known = np.isfinite(values)
+    assert np.abs(back - values)[known].max() <= np.ptp(values[known]) / 65_534
+
+
+@pytest.mark.parametrize("values", [[], [np.nan, np.nan], [4.0, 4.0], [0.0], [-1e300, 1e300]])
+def test_odd_series_are_encoded(values):
+    values = np.array(values, dtype=float)
+    back = decode(encode(values))
+    assert np.allclose(back, values, rtol=1e-4, equal_nan=True)
+
+
+def test_what_nobody_sees_is_not_stored():
+    values = np.cumsum(np.random.default_rng(0).normal(size=20_000)) * 1e-4
+    assert len(encode(values, 0.01).base64) < 0.5 * len(encode(values).base64)
+    assert np.abs(decode(encode(values, 0.01)) - values).max() <= 0.005 + 1e-9
+
+
+def test_an_envelope_has_the_extremes_of_each_cell_in_the_order_in_which_they_came():
+    at = stamps(1000)
+    values = np.random.default_rng(1).normal(size=1000)
+    values[300:420] = np.nan
+    values[505] = np.nan
+    grid = grid_of(at)
+    made = envelope(grid, at, values)
+    cell = (at - grid.start_ns) // grid.cell_ns
+    for i in range(grid.cells):
+        inside = values[(cell == i)]
+        known = inside[np.isfinite(inside)]
+        if not known.size:
+            assert np.isnan(made[i]).all()
+            continue
+        low, high = known.min(), known.max()
+        falls = np.flatnonzero(inside == high)[0] < np.flatnonzero(inside == low)[0]
+        assert made[i].tolist() == ([high, low] if falls else [low, high])
+    assert np.array_equal(largest(grid, at, values), np.max(made, axis=1), equal_nan=True)
+    assert np.array_equal(least(grid, at, values), np.min(made, axis=1), equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("n", "step_ns", "cell_s"),
+    [(360_001, 10_000_000, 0.1), (30_001, 10_000_000, 0.05), (1001, 10_000_000, 0.025), (4000, 200_000_000, 0.5)],
+)
+def test_cells_are_a_tenth_of_a_second_finer_for_short_drives_and_never_emptied_by_the_rate(n, step_ns, cell_s):
+    at = stamps(n, step_ns) + np.random.default_rng(0).integers(-step_ns // 5, step_ns // 5, n)
+    grid = grid_of(at)
+    assert grid.cell_s == pytest.approx(cell_s, rel=0.02)
+    assert grid.cells <= MOST_CELLS
+    assert np.isfinite(envelope(grid, at, np.ones(n))).all()
+
+
+def test_ten_hours_have_no_more_cells_than_one():
+    at = stamps(3_600_000)
+    assert grid_of(at).cells == pytest.approx(MOST_CELLS, abs=2)
+
+
+def test_one_stamp_is_one_cell():
+    at = stamps(1)
+    assert envelope(grid_of(at), at, np.array([2.0])).tolist() == [[2.0, 2.0]]
+
+
+def test_points_are_the_first_known_stamp_of_each_cell():
+    at = stamps(100)
+    grid = grid_of(at)
+    known = np.ones(100, dtype=bool)
+    known[:7] = False
+    rows = first_known(grid, at, known)
+    assert rows[0] == 7
+    assert len(np.unique((at[rows] - at[0]) // grid.cell_ns)) == len(rows)

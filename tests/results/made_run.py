@@ -1,0 +1,77 @@
+"""Folders of finished runs whose figures a test makes up."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
+
+START_NS = 1_700_000_000_000_000_000
+
+
+def digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def entry(label: str, **changed: Any) -> dict[str, Any]:
+    car = {"file": "golf", "name": "golf", "sha256": digest("golf"), "network_sha256": None}
+    return {
+        "log": label,
+        "file": f"{label}.mcap",
+        "outcome": "ok",
+        "main": "pd-hef",
+        "sha256": digest(f"file {label}"),
+        "signals_sha256": digest(f"signals {label}"),
+        "truth_sha256": digest(f"truth {label}"),
+        "mapping_sha256": digest("mapping"),
+        "car": car,
+        **changed,
+    }
+
+
+def row(label: str, value: float, **changed: Any) -> MetricRow:
+    known = {
+        "estimator": "pd-hef",
+        "signal": "sideslip_rad",
+        "segment": "all",
+        "metric": "rmse",
+        "unit": "rad",
+        "n": 99,
+    }
+    return MetricRow(log=label, value=value, **{**known, **changed})
+
+
+def write_run(
+    folder: Path,
+    rmse: Mapping[str, float],
+    *,
+    entries: Sequence[dict[str, Any]] | None = None,
+    rows: Sequence[MetricRow] = (),
+    **document: Any,
+) -> Path:
+    """Write a run of drives with such RMSE of ``pd-hef``; ``entries`` and more ``rows`` as they are."""
+    folder.mkdir(parents=True, exist_ok=True)
+    logs = [entry(label) for label in rmse] if entries is None else list(entries)
+    known = {"format": "pdhef.run", "version": 1, "config": {"friction": "auto"}, "versions": {"numpy": "2.0"}}
+    (folder / "run.json").write_text(json.dumps({**known, "logs": logs, **document}))
+    write_metrics(folder / "metrics.parquet", [*(row(label, value) for label, value in rmse.items()), *rows])
+    return folder
+
+
+def write_estimates(folder: Path, label: str, **tracks: Mapping[str, Any]) -> None:
+    """Write a log's estimates.parquet, of columns of tracks by name; ``stamps_ns`` is at 100 Hz if it is not given."""
+    sink = EstimatesSink(folder / "logs" / label / "estimates.parquet")
+    for name, columns in tracks.items():
+        known = dict(columns)
+        n = len(next(iter(known.values())))
+        stamps = known.pop("stamps_ns", START_NS + 10_000_000 * np.arange(n, dtype=np.int64))
+        sink.append(make_track(name.replace("_", "-"), stamps, **known))
+    sink.finish({})

@@ -1,0 +1,223 @@
+"""Two runs held against each other."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.results.comparing import Comparison, compare_runs
+from pdhef_logtool.results.gate import Figure, Gate, gate_from_dict
+from pdhef_logtool.results.opened_run import open_run
+from tests.results.made_run import digest, entry, row, write_estimates, write_run
+
+ASKED = Gate((Figure(),))
+GATE = Gate((Figure(limit=0.05),))
+TEN = {f"d{i}": 0.01 * (1 + i) for i in range(10)}
+
+
+def _compare(a: Path, b: Path, gate: Gate = ASKED, **options: Any) -> Comparison:
+    return compare_runs(open_run(a), open_run(b), gate, **options)
+
+
+def _scaled(factor: float, **changed: float) -> dict[str, float]:
+    return {label: changed.get(label, value * factor * (1 + 0.001 * i)) for i, (label, value) in enumerate(TEN.items())}
+
+
+def test_the_same_run_is_equal_and_nothing_else_is_looked_at(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "a", TEN)
+    for gate in (ASKED, GATE):
+        found = _compare(run, run, gate, strict=True)
+        assert (found.verdict, found.exit_code, found.changed) == ("equal", 0, 0)
+        assert found.pairs == {"signals": 10}
+        assert found.others == found.signals == found.differences == ()
+
+
+def test_drives_pair_by_signals_then_content_then_name(tmp_path: Path) -> None:
+    a = [entry("slim"), entry("moved"), entry("same"), entry("gone"), entry("twin1"), entry("twin2")]
+    b = [
+        entry("full", signals_sha256=digest("signals slim")),
+        entry("renamed", signals_sha256=None, sha256=digest("file moved")),
+        entry("same", signals_sha256=None, sha256=None),
+        entry("new"),
+        entry("twin1"),
+        entry("twin2"),
+    ]
+    for twins in (a, b):
+        for twin in twins[4:]:
+            twin.update(signals_sha256=digest("twin"))
+    rmse = {"slim": 0.1, "moved": 0.1, "same": 0.1, "twin1": 0.1, "twin2": 0.2}
+    other = {"full": 0.1, "renamed": 0.1, "same": 0.1, "twin1": 0.1, "twin2": 0.2}
+    found = _compare(write_run(tmp_path / "a", rmse, entries=a), write_run(tmp_path / "b", other, entries=b))
+    assert found.pairs == {"signals": 1, "content": 3, "name": 1}
+    assert (found.only_a, found.only_b, found.changed) == (("gone",), ("new",), 0)
+    assert (found.verdict, found.exit_code) == ("equal", 3)
+    assert any(line.startswith("drives: nothing but their name") for line in found.differences)
+
+
+def test_a_removed_drive_closes_the_gate_unless_it_is_allowed(tmp_path: Path) -> None:
+    a, b = write_run(tmp_path / "a", TEN), write_run(tmp_path / "b", {k: v for k, v in TEN.items() if k != "d3"})
+    assert _compare(a, b).exit_code == 3
+    found = _compare(a, b, GATE)
+    assert (found.exit_code, found.failures) == (4, ("drives in A only: d3",))
+    assert _compare(b, a, GATE).failures == ("drives in B only: d3",)
+    assert _compare(a, b, Gate(GATE.figures, allow_unpaired=True)).exit_code == 0
+
+
+def test_a_figure_that_vanished_closes_the_gate_too(tmp_path: Path) -> None:
+    a, b = write_run(tmp_path / "a", TEN), write_run(tmp_path / "b", {**TEN, "d3": float("nan")})
+    found = _compare(a, b, GATE)
+    assert found.failures == ("figures in A only: sideslip_rad rmse (all) of main: d3",)
+    assert found.exit_code == 4
+    assert _compare(a, b).exit_code == 3
+
+
+def test_the_gate_closes_on_a_regression_and_not_on_an_improvement(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    worse = _compare(a, write_run(tmp_path / "b", _scaled(1.2)), GATE)
+    assert (worse.verdict, worse.exit_code) == ("worse", 4)
+    assert worse.figures[0].drives[0].drive == "d9"
+    assert worse.figures[0].drives[0].change == pytest.approx(0.2 * 1.009 + 0.009)
+    assert _compare(a, tmp_path / "b").exit_code == 0  # no gate
+    assert _compare(a, write_run(tmp_path / "c", _scaled(1.02)), GATE).verdict == "not worse"
+    assert _compare(a, write_run(tmp_path / "d", _scaled(0.9)), GATE).verdict == "better"
+    json.dumps(jsonable(worse.to_dict()), allow_nan=False)
+
+
+def test_cannot_tell_is_an_answer_and_strict_refuses_it(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    b = write_run(tmp_path / "b", {k: v * (1.5 if i % 2 else 0.7) for i, (k, v) in enumerate(TEN.items())})
+    for gate in (ASKED, GATE):
+        assert (_compare(a, b, gate).verdict, _compare(a, b, gate).exit_code) == ("cannot tell", 0)
+        assert _compare(a, b, gate, strict=True).exit_code == 4
+    assert _compare(a, b).figures[0].detectable > 0.3
+
+
+def test_clusters_are_drawn_whole(tmp_path: Path) -> None:
+    entries = [entry(label, car={"name": f"car{i // 5}", "sha256": "a"}) for i, label in enumerate(TEN)]
+    a, b = write_run(tmp_path / "a", TEN, entries=entries), write_run(tmp_path / "b", _scaled(1.2), entries=entries)
+    found = _compare(a, b, GATE, cluster="car")
+    assert (found.figures[0].change.clusters, found.verdict) == (2, "cannot tell")
+    with pytest.raises(UsageError, match="--cluster: expected a key of the drives: car, day, got colour"):
+        _compare(a, b, cluster="colour")
+
+
+def test_each_figure_of_a_gate_has_its_limit_and_floor(tmp_path: Path) -> None:
+    others = [row(label, 0.5, signal="vy_m_s", unit="m/s") for label in TEN]
+    worse = [row(label, 0.6, signal="vy_m_s", unit="m/s") for label in TEN]
+    a, b = write_run(tmp_path / "a", TEN, rows=others), write_run(tmp_path / "b", _scaled(1.2), rows=worse)
+    figures = [
+        {"max_regression": "25%"},
+        {"signal": "vy_m_s", "max_regression": 0.1},
+        {"metric": "max_abs", "max_regression": 0},
+        {"segment": "all", "estimator": "pd-hef", "max_regression": 0.01, "floor": 30.0, "unit": "deg"},
+    ]
+    found = _compare(a, b, gate_from_dict({"figure": figures}, where="gate.toml"))
+    assert [f.verdict for f in found.figures] == ["not worse", "worse", "no figure", "not worse"]
+    assert found.failures == ("vy_m_s rmse (all) of main: worse", "sideslip_rad max_abs (all) of main: no figure")
+    assert "lateral_1s_m" not in {f.figure.signal for f in found.others}  # there is no such figure
+
+
+def test_the_others_are_corrected_for_being_several(tmp_path: Path) -> None:
+    def rows(factor: float) -> list[Any]:
+        signals = ("vx_m_s", "ay_m_s2", "yaw_rate_rad_s")
+        return [row(k, factor, signal=s) for k in TEN for s in signals] + [row(k, 1, signal="vy_m_s") for k in TEN]
+
+    a, b = write_run(tmp_path / "a", TEN, rows=rows(1.0)), write_run(tmp_path / "b", _scaled(1.1), rows=rows(1.1))
+    by_signal = {f.figure.signal: f for f in _compare(a, b).others}
+    assert by_signal["vx_m_s"].change.sign_p == pytest.approx(2 * 0.5**10)
+    assert by_signal["vx_m_s"].corrected_p == pytest.approx(4 * 2 * 0.5**10)
+    assert (by_signal["vy_m_s"].corrected_p, by_signal["vy_m_s"].verdict) == (1.0, "equal")
+
+
+def test_what_else_differs_is_said(tmp_path: Path) -> None:
+    changed = {
+        "d0": {"car": {"name": "golf", "sha256": digest("tuned"), "network_sha256": digest("net")}},
+        "d1": {"truth_sha256": digest("rtk")},
+        "d2": {"mapping_sha256": digest("scaled"), "signals_sha256": digest("scaled signals")},
+        "d3": {"main": "physics"},
+        "d4": {"outcome": "lost: a chunk"},
+    }
+    b = [entry(label, **changed.get(label, {})) for label in TEN]
+    other = write_run(tmp_path / "b", TEN, entries=b, config={"friction": 0.3}, versions={"numpy": "2.1"})
+    found = _compare(write_run(tmp_path / "a", TEN), other)
+    text = "\n".join(found.differences)
+    assert f"car: golf {digest('golf')[:8]} → golf {digest('tuned')[:8]}, 1 of 10 drives" in text
+    assert f"network: none → {digest('net')[:8]}, 1 of 10 drives" in text
+    assert "truth: another one (what it held), 1 of 10 drives: d1" in text
+    assert "mapping: another one" in text
+    assert "signals: they held something else, 1 of 10 drives: d2" in text
+    assert "main estimator: pd-hef → physics, 1 of 10 drives" in text
+    assert "configuration: friction auto → 0.3" in text
+    assert "versions: numpy 2.0 → 2.1" in text
+    assert "outcome of d4: ok → lost: a chunk" in text
+
+
+def test_figures_over_other_stamps_or_of_a_truth_that_was_an_input_say_so(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    mark = [row("d1", 1.0, metric="not_independent", unit="1")]
+    fewer = [row(label, value * 0.9, n=90 if label == "d2" else 99) for label, value in TEN.items()]
+    b = write_run(tmp_path / "b", {}, entries=[entry(label) for label in TEN], rows=[*fewer, *mark])
+    assert _compare(a, b).figures[0].notes == (
+        "other stamps are scored in 1 of 10 drives, -0.91% in all",
+        "in 1 of 10 drives the truth is one of the estimator's inputs",
+    )
+
+
+def test_where_tracks_part_is_the_first_stamp_that_is_not_the_same(tmp_path: Path) -> None:
+    slip = np.linspace(0.0, 0.1, 500)
+    late, missing = slip.copy(), slip.copy()
+    late[120:130] += 1e-3
+    late[300] -= 5e-3
+    missing[:10] = np.nan
+    a, b = write_run(tmp_path / "a", {"d": 0.1}), write_run(tmp_path / "b", {"d": 0.2})
+    write_estimates(a, "d", truth={"sideslip_rad": slip}, pd_hef={"sideslip_rad": slip, "vx_m_s": missing})
+    write_estimates(b, "d", truth={"sideslip_rad": slip}, pd_hef={"sideslip_rad": late, "vx_m_s": missing})
+    (found,) = _compare(a, b).signals
+    assert (found.drive, found.track, found.signal, found.stamps, found.of) == ("d", "pd-hef", "sideslip_rad", 11, 500)
+    assert found.first_s == pytest.approx(1.2)
+    assert found.largest == pytest.approx(5e-3)
+    write_estimates(b, "d", truth={"sideslip_rad": late}, pd_hef={"sideslip_rad": slip[:400], "vx_m_s": slip[:400]})
+    truth, column, speed, _valid = _compare(a, b).signals
+    assert (truth.track, truth.stamps) == ("truth", 11)
+    assert (column.signal, column.stamps, column.first_s, column.largest) == ("sideslip_rad", 100, 4.0, None)
+    assert (speed.signal, speed.stamps, speed.first_s) == ("vx_m_s", 110, 0.0)
+
+
+def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    b = write_run(tmp_path / "b", {"other": 0.1})
+    with pytest.raises(OutputError, match="none of 10 and 1 by signals, content or name") as error:
+        _compare(a, b)
+    assert error.value.exit_code == 1
+    c = write_run(tmp_path / "c", _scaled(1.1))
+    with pytest.raises(UsageError, match="an estimator of these runs: pd-hef, got pd-hof"):
+        _compare(a, c, Gate((Figure(estimator="pd-hof", limit=0.1),)))
+    (tmp_path / "c" / "metrics.parquet").write_bytes(b"PAR1 no")
+    with pytest.raises(OutputError, match=r"the metrics\.parquet of a run"):
+        _compare(a, c)
+
+
+@pytest.mark.parametrize(
+    ("raw", "problem"),
+    [
+        ({}, "give at least one"),
+        ({"figure": [{}]}, "max_regression: is missing"),
+        ({"figure": [{"max_regression": "much"}]}, "a share such as '5%' or 0.05"),
+        ({"figure": [{"max_regression": -0.1}]}, "a share such as"),
+        ({"figure": [{"max_regression": 0.1, "metric": "coverage95"}]}, "metric = coverage95"),
+        ({"figure": [{"max_regression": 0.1, "signal": "beta"}]}, "signal = beta"),
+        ({"figure": [{"max_regression": 0.1, "floor": 1.0, "unit": "m"}]}, "is in rad or deg, not 'm'"),
+        ({"figure": [{"max_regression": 0.1}] * 2}, "is there twice"),
+        ({"figure": [{"max_regression": 0.1}], "allow_unpaird": True}, "did you mean allow_unpaired"),
+    ],
+)
+def test_a_wrong_gate_file_is_refused_with_every_problem(raw: dict[str, Any], problem: str) -> None:
+    with pytest.raises(UsageError, match=r"gate\.toml") as error:
+        gate_from_dict(raw, where="gate.toml")
+    assert problem in str(error.value)

@@ -1,0 +1,199 @@
+"""The figures of a fleet: exact intervals, rankings that need evidence, and nothing scored without truth."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pdhef_logtool.results.fleet import ANSWER, Fleet, exact_median, read_fleet
+from pdhef_logtool.results.opened_run import open_run
+
+NO_TRUTH = {"available": False, "not_independent": []}
+
+
+def report(label: str, **changes: Any) -> dict[str, Any]:
+    cells = [{"speed": 4, "ay": 1, "seconds": 5.0, "scored": 100, "sideslip_mse_rad2": 1e-4}]
+    made = {
+        "format": "pdhef.report",
+        "log": {"name": label, "duration_s": 12.0, "kind": "mcap"},
+        "vehicle": {"name": "golf"},
+        "truth": {"available": True, "not_independent": []},
+        "answer": {"main": "pd-hef", "naive": "zero"},
+        "friction": {"source": "option, 0.9", "estimated": False},
+        "checks": [],
+        "faults": [],
+        "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],
+        "operating_space": {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells},
+        "metadata": {},
+    }
+    return {**made, **changes}
+
+
+class Run:
+    """A run's folder that a test fills."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.logs: list[dict[str, Any]] = []
+        self.rows: list[tuple[Any, ...]] = []
+
+    def add(self, label: str, errors: Mapping[str, float] | None = None, outcome: str = "ok", **changes: Any) -> None:
+        self.logs.append({"log": label, "outcome": outcome, "car": {"name": "golf"}})
+        if outcome.startswith("failed"):
+            return
+        folder = self.folder / "logs" / label
+        folder.mkdir(parents=True)
+        (folder / "report.json").write_text(json.dumps(report(label, **changes)))
+        for name, value in (errors or {}).items():
+            self.rows.append((label, name, "sideslip_rad", "all", "rmse", value))
+            self.rows.append((label, name, "sideslip_rad", "linear", "rmse", 99.0))
+
+    def row(self, label: str, *figure: Any) -> None:
+        estimator, signal, metric, value = figure
+        self.rows.append((label, estimator, signal, "all", metric, value))
+
+    def read(self, **options: Any) -> Fleet:
+        columns = ["log", "estimator", "signal", "segment", "metric", "value"]
+        schema = {c: pl.Float64 if c == "value" else pl.String for c in columns}
+        pl.DataFrame(self.rows, schema=schema, orient="row").write_parquet(self.folder / "metrics.parquet")
+        (self.folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "logs": self.logs}))
+        return read_fleet(open_run(self.folder), **options)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    return Run(tmp_path)
+
+
+@pytest.mark.parametrize("n", [5, 8, 21, 60])
+def test_the_interval_of_a_median_is_that_of_many_resamples(n: int) -> None:
+    rng = np.random.default_rng(n)
+    values = rng.lognormal(size=n)
+    medians = np.median(rng.choice(values, (40_000, n)), axis=1)
+    found = exact_median(values)
+    assert found.value == np.median(values)
+    ordered = np.sort(values)
+
+    def place(x: float) -> int:
+        return int(np.searchsorted(ordered, x))
+
+    low, high = np.percentile(medians, [2.5, 97.5])
+    assert abs(place(found.low) - place(low)) <= 1 and found.low <= low * 1.0001
+    assert abs(place(found.high) - place(high)) <= 1 and found.high >= high * 0.9999
+
+
+def test_few_drives_have_a_median_and_no_interval() -> None:
+    found = exact_median(np.array([3.0, 1.0, 2.0, 9.0]))
+    assert found.value == 2.5 and np.isnan(found.low) and np.isnan(found.high)
+    assert np.isnan(exact_median(np.empty(0)).value)
+
+
+def test_ranking_follows_the_drives_and_one_wild_drive_decides_nothing(run: Run) -> None:
+    rng = np.random.default_rng(0)
+    for i in range(30):
+        level = float(rng.lognormal())
+        wild = 100.0 if i == 0 else 1.0
+        run.add(f"d{i}", {"pd-hef": 0.8 * level * wild, "physics": level, "zero": 5.0 * level})
+    found = run.read()
+    assert [(r.place, r.estimator) for r in found.ranking] == [(1, "pd-hef"), (2, "physics"), (3, "zero")]
+    assert found.ranking[0].better_than == ("physics", "zero") and found.ranking[0].against_answer is None
+    against = found.ranking[1].against_answer
+    assert against is not None and against.value == pytest.approx(0.25) and against.low == pytest.approx(0.25)
+
+
+def test_what_chance_can_do_ranks_nobody(run: Run) -> None:
+    rng = np.random.default_rng(1)
+    for i in range(12):
+        run.add(f"d{i}", {name: float(rng.lognormal()) for name in ("pd-hef", "b", "c", "d", "e")})
+    assert {r.place for r in run.read().ranking} == {1}
+
+
+def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run) -> None:
+    run.add("good", {"pd-hef": 0.01})
+    run.add("none", truth=NO_TRUTH)
+    run.add("own", {"pd-hef": 0.0}, truth={"available": True, "not_independent": ["sideslip_rad"]})
+    run.row("own", "pd-hef", "sideslip_rad", "not_independent", 1.0)
+    for name, d2 in (("pd-hef", 0.3), ("zero", 0.1)):
+        run.row("none", name, "vy_m_s", "d2", d2)
+    found = run.read()
+    assert [d.label for d in found.scored] == ["good"]
+    assert [(d.label, d.unscored) for d in found.without_truth] == [
+        ("none", "the log has no truth"),
+        ("own", "its truth is no independent one"),
+    ]
+    (answer, _) = found.distributions
+    assert (answer.estimator, answer.drives) == (ANSWER, 1)
+
+
+def test_failures_are_told_by_reason_and_bad_reports_among_them(run: Run) -> None:
+    run.add("ok", {"pd-hef": 0.01}, outcome="lost: 12 samples of /imu are NaN (a.mcap); a gap of 3.5 s (/imu)")
+    for i in range(12):
+        run.add(f"f{i}", outcome=f"failed: /x/{i}.mcap: expected a log, got {i} bytes; copy it again")
+    run.add("bad", {})
+    (run.folder / "logs" / "bad" / "report.json").write_text("{")
+    run.add("other", {})
+    (run.folder / "logs" / "other" / "report.json").write_text('{"format": "other"}')
+    found = run.read()
+    first = found.failed[0]
+    assert (first.count, first.reason) == (12, "expected a log, got N bytes; copy it again")
+    assert len(found.failed[0].labels) == 10
+    assert sum(f.count for f in found.failed) == 14 and found.logs == 15 and len(found.drives) == 1
+    assert [f.reason for f in found.losses] == ["N samples of /imu are NaN", "a gap of N s"]
+
+
+def test_a_key_that_parts_the_drives_comes_first_and_numbers_are_told_by_quarters(run: Run) -> None:
+    rng = np.random.default_rng(2)
+    for i in range(40):
+        wet = i % 2
+        metadata = {"road": "wet" if wet else "dry", "odometer": str(1000 + i), "tyre": "ab"[i % 3 == 0], "same": "1"}
+        run.add(f"d{i}", {"pd-hef": float((3.0 if wet else 1.0) * rng.lognormal(0.0, 0.2))}, metadata=metadata)
+    found = run.read()
+    by_key = {b.key: b for b in found.breakdowns}
+    assert found.breakdowns[0].key == "road" and found.breakdowns[0].explains > 0.8
+    assert [(g.value, g.drives) for g in by_key["road"].groups] == [("dry", 20), ("wet", 20)]
+    assert by_key["odometer"].groups[0].value == "1000 to 1009.75"
+    assert sum(g.drives for g in by_key["odometer"].groups) == 40
+    assert "same" not in by_key and abs(by_key["tyre"].explains) < 0.15
+    (only,) = run.read(by=["same"]).breakdowns
+    assert [(g.value, g.scored) for g in only.groups] == [("1", 40)]
+    (nothing,) = run.read(by=["no such key"]).breakdowns
+    assert [g.value for g in nothing.groups] == ["not told"]
+
+
+def test_the_operating_space_adds_up_and_empty_cells_are_empty(run: Run) -> None:
+    cells = [{"speed": 0, "ay": 2, "seconds": 1.0, "scored": 300, "sideslip_mse_rad2": 9e-4}]
+    space = {"speed_edges_m_s": [0, 5, 10, 15, 20], "ay_edges_m_s2": [0, 1, 2], "cells": cells}
+    run.add("a", {"pd-hef": 0.1})
+    run.add("b", {"pd-hef": 0.1})
+    run.add("c", {"pd-hef": 0.1}, operating_space=space)
+    run.add("older", {"pd-hef": 0.1}, operating_space=None)
+    found = run.read().space
+    assert found is not None and found.drives == 3
+    assert found.seconds[4, 1] == 10.0 and found.seconds.sum() == 11.0
+    assert found.rmse_rad[4, 1] == pytest.approx(0.01) and found.rmse_rad[0, 2] == pytest.approx(0.03)
+    assert np.isnan(found.rmse_rad[1, 1])
+
+
+def test_a_run_of_nothing_is_told_too(run: Run) -> None:
+    run.add("a", outcome="failed: empty")
+    found = run.read()
+    assert found.drives == () and found.space is None and found.ranking == () and found.worst == ()
+
+
+@pytest.mark.slow
+def test_ten_thousand_drives_are_read_while_one_waits(run: Run) -> None:
+    rng = np.random.default_rng(3)
+    for i in range(10_000):
+        level = float(rng.lognormal())
+        run.add(f"d{i}", {"pd-hef": level, "physics": 1.1 * level, "zero": 5.0 * level}, metadata={"k": str(i % 7)})
+    start = time.process_time()
+    found = run.read()
+    assert time.process_time() - start < 20.0
+    assert len(found.worst) == 20 and found.worst[0].error() >= found.worst[1].error()

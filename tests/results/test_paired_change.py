@@ -1,0 +1,79 @@
+"""The paired change of a figure over drives, its bounds and its verdict."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pdhef_logtool.results.paired_change import holm, log_ratios, paired_change
+
+
+def _share_worse(drives: int, planted: float, times: int, seed: int = 3) -> float:
+    rng = np.random.default_rng(seed)
+    ratios = rng.normal(math.log1p(planted), 0.2, (times, drives))
+    return float(np.mean([paired_change(one).verdict(0.05) == "worse" for one in ratios]))
+
+
+def test_false_alarms_are_few_and_a_planted_regression_is_found() -> None:
+    assert _share_worse(10, 0.0, 300) <= 0.09  # 7 % in 5,000: studies/comparing.py
+    assert _share_worse(100, 0.0, 100) <= 0.05
+    assert _share_worse(100, 0.1, 100) >= 0.9
+
+
+def test_few_drives_cannot_tell_whatever_they_show() -> None:
+    found = paired_change(np.full(4, 0.5))
+    assert found.verdict(0.05) == "cannot tell"
+    assert math.isnan(found.low)
+    assert math.isnan(found.detectable(0.05))
+    assert paired_change(np.full(5, 0.5)).verdict(0.05) == "worse"
+    assert paired_change(np.empty(0)).verdict() == "cannot tell"
+
+
+def test_a_change_below_the_limit_is_not_worse_and_one_the_other_way_is_better() -> None:
+    rng = np.random.default_rng(1)
+    ratios = 0.02 + 0.001 * rng.normal(size=20)
+    assert paired_change(ratios).verdict(0.05) == "not worse"
+    assert paired_change(ratios).verdict(0.01) == "worse"
+    assert paired_change(-ratios).verdict(0.05) == "better"
+    assert paired_change(ratios).detectable(0.05) == pytest.approx(0.05, abs=0.01)
+
+
+def test_drives_of_one_cluster_are_one_witness() -> None:
+    rng = np.random.default_rng(2)
+    ratios = np.repeat(rng.normal(0.06, 0.1, 6), 20)
+    alone, together = paired_change(ratios), paired_change(ratios, np.repeat(np.arange(6), 20).tolist())
+    assert (alone.clusters, together.clusters) == (120, 6)
+    assert together.median == alone.median
+    assert together.high - together.low > 1.5 * (alone.high - alone.low)
+    assert together.sign_p >= 2 * 0.5**6
+
+
+def test_bounds_are_those_of_resampled_medians() -> None:
+    ratios = np.random.default_rng(4).normal(0.0, 0.2, 31)
+    found = paired_change(ratios)
+    reference = stats.bootstrap((ratios,), np.median, n_resamples=9999, method="percentile", rng=1).confidence_interval
+    assert found.median == np.median(ratios)
+    assert (found.low, found.high) == pytest.approx(tuple(reference), abs=0.02)
+    assert found.low <= found.least <= found.median <= found.most <= found.high
+
+
+def test_the_sign_test_is_that_of_scipy_and_the_unchanged_do_not_vote() -> None:
+    ratios = np.array([0.1] * 9 + [-0.1] * 3 + [0.0] * 5)
+    assert paired_change(ratios).sign_p == pytest.approx(stats.binomtest(3, 12).pvalue)
+    assert paired_change(np.zeros(8)).sign_p == 1.0
+
+
+def test_holm_corrects_for_being_several() -> None:
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+
+
+def test_what_is_below_the_floor_and_zero_against_zero_is_no_change() -> None:
+    a, b = np.array([0.01, 0.0, 0.1, 0.0]), np.array([0.02, 0.0, 0.2, 0.1])
+    np.testing.assert_allclose(log_ratios(a, b), [math.log(2), 0.0, math.log(2), math.inf])
+    np.testing.assert_allclose(log_ratios(a, b, 0.05), [0.0, 0.0, math.log(2), math.log(2)])
+    wild = paired_change(np.array([math.inf, -math.inf, 0.1, 0.1, 0.1, 0.1]))
+    assert wild.median == pytest.approx(0.1)

@@ -1,0 +1,60 @@
+"""What a run writes for the pages: planted faults, verdicts against the limits, and reasons without truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.sinks.schema import load_schema
+
+pytestmark = pytest.mark.slow
+
+
+def run(log: str, sample_logs_dir: Path, out: Path, **changes: Any) -> dict[str, Any]:
+    config = RunConfig(car=Path("saloon"), annotate="none", **changes)
+    run_logs([str(sample_logs_dir / f"{log}.mcap")], out, config)
+    report = json.loads((out / "logs" / log / "report.json").read_text())
+    jsonschema.validate(report, load_schema("report.schema.json"))
+    return report
+
+
+def test_a_drive_with_truth_has_all_of_it(sample_logs_dir: Path, tmp_path: Path) -> None:
+    limits = tmp_path / "limits.toml"
+    limits.write_text('[[threshold]]\nsignal = "sideslip_rad"\nmetric = "rmse"\nmax = 90.0\nunit = "deg"\n')
+    report = run("road", sample_logs_dir, tmp_path / "out", thresholds=limits, start="+60", end="+130")
+    assert [v["signal"] for v in report["verdicts"]] == ["sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s"]
+    first = report["verdicts"][0]
+    figure = {(m["estimator"], m["signal"], m["metric"], m["segment"]): m["value"] for m in report["metrics"]}
+    assert first["rmse"]["value"] == pytest.approx(figure["pd-hef", "sideslip_rad", "rmse", "all"])
+    assert first["rival"] == "physics" and "keeps the limit" in first["text"]
+    assert {i["estimator"] for i in report["innovations"]} == {"pd-hef", "physics"}
+    assert {i["channel"] for i in report["innovations"]} == {"ay_m_s2", "yaw_rate_rad_s", "speed_m_s"}
+    assert report["error_budget"]["reason"] == "" and len(report["error_budget"]["causes"]) == 5
+    seconds = sum(c["seconds"] for c in report["operating_space"]["cells"])
+    assert seconds == pytest.approx(report["log"]["duration_s"], rel=0.05)
+    assert report["metadata"]
+
+
+def test_without_truth_there_is_a_reason_and_no_verdict(sample_logs_dir: Path, tmp_path: Path) -> None:
+    report = run("no_truth", sample_logs_dir, tmp_path / "out")
+    assert {v["outcome"] for v in report["verdicts"]} == {"none"}
+    assert report["error_budget"]["reason"] == "the log has no truth"
+    assert report["innovations"] and report["operating_space"]["cells"]
+
+
+def test_faults_stand_where_they_were_planted(sample_logs_dir: Path, tmp_path: Path) -> None:
+    report = run("faults", sample_logs_dir, tmp_path / "out")
+    start_ns = report["log"]["start_ns"]
+    for sensor, kind, start_s, end_s in (("ay_m_s2", "stuck", 12.0, 14.0), ("yaw_rate_rad_s", "burst", 5.0, 8.0)):
+        (fault,) = [f for f in report["faults"] if (f["sensor"], f["kind"]) == (sensor, kind)]
+        assert any(
+            (i["start_ns"] - start_ns) * 1e-9 == pytest.approx(start_s, abs=0.6)
+            and (i["end_ns"] - start_ns) * 1e-9 == pytest.approx(end_s, abs=0.6)
+            for i in fault["intervals"]
+        )
