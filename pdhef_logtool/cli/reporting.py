@@ -72,5 +72,6 @@ def open_page(result: WrittenPages) -> None:
 def _render(result: WrittenPages, out: Console) -> None:
     for page in (*result.pages, result.fleet):
         if page.file is not None:
-            pictures = f" and {len(page.pictures)} pictures in {page.pictures[0].parent}" if page.pictures else ""
+            number = f"{len(page.pictures)} picture{'s' if len(page.pictures) > 1 else ''}"
+            pictures = f" and {number} in {page.pictures[0].parent}" if page.pictures else ""
             out.print(f"{page.file}{pictures}", soft_wrap=True)

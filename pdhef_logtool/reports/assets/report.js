@@ -277,6 +277,7 @@
   // ---- the strip --------------------------------------------------------------------------------------------------
 
   const ROW = 17;
+  const WHOLE = [1, 2, 5].flatMap((k) => [1, 1e1, 1e2, 1e3, 1e4, 1e5].map((d) => k * d)).sort((a, b) => a - b);
 
   function drawStrip(figure) {
     const rows = figure.data.rows;
@@ -422,7 +423,7 @@
       }
       pen.stroke();
     } else {
-      const size = (x.length > 3000 ? 1.4 : x.length > 300 ? 2 : 4) * r;
+      const size = (x.length > 3000 ? 1.4 : x.length > 300 ? 2 : 5) * r;
       pen.globalAlpha = x.length > 3000 ? 0.5 : 0.75;
       for (let i = 0; i < x.length; i++) {
         if (x[i] === null || y[i] === null || (at && !(at[i] >= first && at[i] <= last))) continue;
@@ -490,7 +491,7 @@
     figure.chart = new uPlot({
       width: widthOf(figure), height: 220, legend: { show: false },
       scales: { x: { time: false, range: [edges[0], edges[edges.length - 1]] }, y: { range: [0, 1.06 * most] } },
-      axes: [axis(unit, { size: 26 }), axis("number", { size: 46 })],
+      axes: [axis(unit, { size: 26 }), axis("number", { size: 46, incrs: WHOLE })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
       cursor: { show: false },
       hooks: { draw: [(u) => {
