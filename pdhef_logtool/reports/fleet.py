@@ -170,7 +170,7 @@ def _paired(fleet: Fleet) -> str:
     """Return how the answer stands against the rival over drives, in words; empty without one."""
     rival = _rival(fleet)
     rank = next((r for r in fleet.ranking if r.estimator == rival), None)
-    if rank is None or rank.against_answer is None or not math.isfinite(rank.against_answer.value):
+    if rank is None or rank.against_answer is None or len(fleet.scored) < 2:
         return ""
     found = rank.against_answer
     side = "above" if found.value >= 0.0 else "below"
