@@ -56,7 +56,8 @@ def drive_tracks(
         }  # fmt: skip
         tracks.append(
             make_track(name, stamps, vx_m_s=vx, vy_m_s=vx * np.tan(own), sideslip_rad=own,
-                       ay_m_s2=ay + 0.1 * rng.normal(size=n), yaw_rate_rad_s=ay / np.maximum(vx, 1.0), **pose, **filtered)
+                       ay_m_s2=ay + 0.1 * rng.normal(size=n), yaw_rate_rad_s=ay / np.maximum(vx, 1.0),
+                       **pose, **filtered)
         )  # fmt: skip
     return tracks
 
@@ -84,16 +85,19 @@ def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) ->
         "mapping": {"signals": [], "missing": []},
         "vehicle": {"name": "sedan", "sha256": "1" * 64, "file": None, "proven": False, "low_speed_blend_m_s": 3.0},
         "estimators": [
-            {"name": n, "causal": n != "pd-hef-smoothed", "outcome": "ran", "reason": None, "notes": [], "intervals": [],
-             "reasons": [], "algorithm": {"sha256": "2" * 64, "physics_sha256": None if n == "zero" else "3" * 64,
-                                          "network_sha256": "4" * 64 if "hef" in n else None}}
+            {"name": n, "causal": n != "pd-hef-smoothed", "outcome": "ran", "reason": None, "notes": [],
+             "intervals": [], "reasons": [],
+             "algorithm": {"sha256": "2" * 64, "physics_sha256": None if n == "zero" else "3" * 64,
+                           "network_sha256": "4" * 64 if "hef" in n else None}}
             for n in names
         ],
         "truth": {"available": truth, "quantities": [], "latency_s": None, "notes": [], "not_independent": []},
         "friction": None,
         "self_calibration": None,
         "metrics": metrics,
-        "segments": [{"name": "straight", "start_ns": int(stamps[0]), "end_ns": int(stamps[len(stamps) // 3]), "text": ""}],
+        "segments": [
+            {"name": "straight", "start_ns": int(stamps[0]), "end_ns": int(stamps[len(stamps) // 3]), "text": ""}
+        ],
         "losses": [],
         "ledger": {"bytes": [], "samples": []},
         "warnings": [],
