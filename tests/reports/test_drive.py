@@ -44,7 +44,7 @@ def test_a_page_has_its_figures_and_needs_nothing_else(tmp_path):
         figures(page)
     )
     assert page.count("<script") == page.count("</script>")
-    assert not re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page)
+    assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page) == ['href="../../report.html"']
     assert " style=" not in page
     assert "Leon Sorokin" in page
 
@@ -209,7 +209,7 @@ def test_hostile_names_are_text_and_nothing_is_written_outside(tmp_path):
     assert "x" * 2000 not in page
     assert {p.name for p in (tmp_path / "a").iterdir()} == {"b"}
     assert {p.name for p in (tmp_path / "a" / "b").iterdir()} == {"out"}
-    assert [p.name for p in inside.rglob("report.html")] == ["report.html"]
+    assert len(list(inside.rglob("report.html"))) == 2  # the drive's and the run's
 
 
 @pytest.mark.slow
