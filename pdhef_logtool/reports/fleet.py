@@ -75,7 +75,6 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     html = render(
         "fleet.html",
         charts,
-        title=run.folder.resolve().name or "run",
         fleet=fleet,
         pages=pages,
         hours=sum(d.seconds for d in fleet.drives) / 3600.0,

@@ -141,7 +141,7 @@ def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path, 
     run_logs(
         [str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full", estimators=("all",))
     )
-    for name in ("run.json", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
+    for name in ("run.json", "report.html", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
         assert (tmp_path / name).read_bytes() == (dlc_run / name).read_bytes(), name
 
 
