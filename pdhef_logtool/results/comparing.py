@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.consistency import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.thresholds import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
@@ -342,8 +343,9 @@ class _Tables:
                 frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
             known = {name for frame in frames for name in frame["estimator"]}
             if name not in known:
+                single = sorted(k for k in known if "~" not in k and k != SENSORS)
                 raise UsageError(
-                    expected=f"an estimator of these runs: {', '.join(sorted(known))}", got=name, where="estimator"
+                    expected=f"an estimator of these runs: {', '.join(single)}", got=name, where="--estimator"
                 )
 
     def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
