@@ -97,9 +97,9 @@ def _gate(
 
 @options.command(
     commands,
-    'pdhef events out --where "abs(sideslip_error_deg) > 2 and speed_m_s > 10 for 0.5s"',
+    'pdhef events out --where "abs(sideslip_error_deg) > 2 for 0.5s"',
     'pdhef events out --where "diverged or not valid" --json',
-    'pdhef events out --where "abs(physics.sideslip_deg - sideslip_deg) > 1" --clip --pad 3s',
+    'pdhef events out --where "abs(sideslip_deg) > 9" --clip --pad 3s',
     'pdhef events out --where "abs(ay_m_s2) > 6" --parquet events.parquet',
     notes="Columns of estimates.parquet, speed_m_s, and errors against the truth: sideslip_error_rad, vx_error_m_s, "
     "vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; _deg and _km_h in place of _rad and _m_s. They are of the main "
