@@ -49,7 +49,7 @@ class FoundEvents:
     ----------
     where : the condition. searched : drives that were looked at. events : in the order of the run's drives.
     left_out : drives that could not be looked at, with the reason; ``failed``: whether one of them is damaged.
-    clips : files that were written, from the run's folder.
+    clips : files that were written.
     """
 
     where: str
