@@ -49,7 +49,7 @@ class FoundEvents:
     ----------
     where : the condition. searched : drives that were looked at. events : in the order of the run's drives.
     left_out : drives that could not be looked at, with the reason; ``failed``: whether one of them is damaged.
-    clips : files that were written, from the run's folder.
+    clips : files that were written.
     """
 
     where: str
@@ -142,6 +142,12 @@ def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str |
 def _check_tracks(run: OpenedRun, condition: Condition, estimator: str | None) -> None:
     """Raise UsageError for an estimator that no drive has."""
     known = {name for log in run.logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
+    if known and estimator is None and not any(log.main() for log in run.logs):
+        raise UsageError(
+            expected=f"an estimator of this run: {', '.join(sorted(known))}",
+            got="none named, and none that is the answer",
+            where="--estimator",
+        )
     asked = {c.track for c in condition.columns() if c.track is not None} | ({estimator} if estimator else set())
     for name in sorted(asked - known - {TRUTH, None}, key=str):
         raise UsageError(

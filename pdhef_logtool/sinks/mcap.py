@@ -81,7 +81,7 @@ class AnnotatedMcapSink(Sink):
     OutputError : When the file cannot be written.
     """
 
-    def __init__(self, path: Path, source: DriveLog | None, span_ns: tuple[int, int] | None = None) -> None:
+    def __init__(self, path: Path, source: DriveLog | None, *, span_ns: tuple[int, int] | None = None) -> None:
         self._source = source
         self._topics: dict[str, str] = {}
         self._window: dict[str, list[TopicBatch]] = {}
