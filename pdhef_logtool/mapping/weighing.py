@@ -502,7 +502,7 @@ class _Weighing:
             self.checks.append(
                 Check(
                     f"{name}.candidate",
-                    name.removeprefix("truth."),
+                    name,
                     "undecided",
                     f"{one.topic.name}.{one.path} is taken, but {'; '.join(one.doubts)}",
                     f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"',

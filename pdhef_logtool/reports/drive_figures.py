@@ -404,5 +404,6 @@ def _mean_over(stamps: IntArray, values: FloatArray, span_s: float) -> FloatArra
     number = (stamps - stamps[0]) // int(span_s * 1e9)
     _, place = np.unique(number, return_inverse=True)
     sums, counts = (np.bincount(place, weights=w) for w in (np.where(known, values, 0.0), known.astype(np.float64)))
-    means = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=counts > 0)
+    enough = counts > 0.5 * np.median(counts[counts > 0])  # a few samples at the end of a log are no mean
+    means = np.divide(sums, counts, out=np.full(len(sums), np.nan), where=enough)
     return np.asarray(means[place], dtype=np.float64)

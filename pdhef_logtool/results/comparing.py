@@ -271,7 +271,7 @@ class _Tables:
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
         self._runs = (a, b)
         self._pairs = pairs
-        self._main = [_main_of(pair.a) for pair in pairs]
+        self._main = [pair.a.main() for pair in pairs]
 
     def name_of(self, pair: Pair, estimator: str) -> str:
         """Return what ``estimator`` is called for a pair."""
@@ -440,13 +440,6 @@ def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: Compar
     by_drive = {d.drive: abs(float(log_ratios(np.array([d.a]), np.array([d.b]))[0])) for d in figure.drives}
     known = [pair for pair in pairs if pair.a.label in changed]
     return sorted(known, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
-
-
-def _main_of(log: OpenedLog) -> str:
-    """Return the estimator that is a drive's answer; empty where there is none."""
-    if "main" in log.entry:
-        return str(log.entry["main"] or "")
-    return str((((log.report() or {}).get("answer")) or {}).get("main", ""))  # a run of an older version
 
 
 def _clusters(pairing: Pairing, key: str) -> list[object]:

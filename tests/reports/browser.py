@@ -160,3 +160,18 @@ class Browser:
         """Print on A4 as the page asks for."""
         made = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
         path.write_bytes(base64.b64decode(made["data"]))
+
+    def drag(self, selector: str, start: float, end: float) -> None:
+        """Drag across an element from one share of its width to another."""
+        box = self.value(
+            f"(() => {{ const n = document.querySelector({selector!r}); n.scrollIntoView({{block: 'center'}});"
+            " const b = n.getBoundingClientRect(); return [b.left, b.top + b.height / 2, b.width]; })()"
+        )
+        for kind, share in (
+            ("mouseMoved", start),
+            ("mousePressed", start),
+            ("mouseMoved", end),
+            ("mouseReleased", end),
+        ):
+            self.call("Input.dispatchMouseEvent", type=kind, x=box[0] + share * box[2], y=box[1], button="left",
+                      buttons=int(kind != "mouseReleased"), clickCount=1)  # fmt: skip

@@ -75,6 +75,20 @@ def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path)
     assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "run.json"}
 
 
+def test_the_largest_error_of_the_page_is_that_of_the_figures(dlc_run: Path) -> None:
+    from pdhef_logtool.reports.drive import drive_page
+    from pdhef_logtool.results.opened_run import open_run
+
+    (log,) = open_run(dlc_run).logs
+    report = log.report()
+    assert report is not None
+    errors = drive_page(log).charts.figures["error"]
+    figures = {m["estimator"]: m["value"] for m in report["metrics"]
+               if (m["signal"], m["segment"], m["metric"]) == ("sideslip_rad", "all", "max_abs")}  # fmt: skip
+    assert len(figures) > 5
+    assert {s.label: np.radians(np.nanmax(s.values)) for s in errors.series} == pytest.approx(figures)  # type: ignore[union-attr]
+
+
 def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
     import jsonschema
 

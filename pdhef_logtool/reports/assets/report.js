@@ -154,7 +154,7 @@
 
   const moves = (type) => type === "mousemove" || type === "mouseleave";
   const sync = { key: "time", setSeries: false, scales: ["x", null], filters: { pub: moves, sub: moves } };
-  const PADDING = [8, 12, 0, 0];
+  const PADDING = [8, 24, 0, 0];
 
   // ---- figures over time ------------------------------------------------------------------------------------------
 
@@ -366,17 +366,18 @@
     }
     figure.follows = clouds.some((c) => c.at);
     const [left, right] = extent(clouds.map((c) => c.x), spec.log), [low, high] = extent(clouds.map((c) => c.y), spec.log);
-    const height = 330;
+    const height = () => (printing ? 270 : 330);
+    figure.height = height;
     const ranges = () => {
       if (!spec.equal) return [[left, right], [low, high]];
-      const wide = widthOf(figure) - 66, tall = height - 52;
+      const wide = widthOf(figure) - 66, tall = height() - 52;
       const scale = Math.max((right - left) / wide, (high - low) / tall) || 1;
       const cx = (left + right) / 2, cy = (low + high) / 2;
       return [[cx - (scale * wide) / 2, cx + (scale * wide) / 2], [cy - (scale * tall) / 2, cy + (scale * tall) / 2]];
     };
     const scale = (k) => (spec.log ? { time: false, distr: 3, range: () => ranges()[k] } : { time: false, range: () => ranges()[k] });
     figure.chart = new uPlot({
-      width: widthOf(figure), height, legend: { show: false },
+      width: widthOf(figure), height: height(), legend: { show: false },
       scales: { x: scale(0), y: scale(1) },
       axes: [axis(spec.xLabel, { size: 26 }), axis(spec.yLabel, { size: 46 })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
@@ -541,7 +542,9 @@
   }
 
   function resizeAll() {
-    for (const figure of figures) if (figure.chart) figure.chart.setSize({ width: widthOf(figure), height: figure.chart.height });
+    for (const figure of figures) {
+      if (figure.chart) figure.chart.setSize({ width: widthOf(figure), height: figure.height ? figure.height() : figure.chart.height });
+    }
   }
 
   async function start() {
