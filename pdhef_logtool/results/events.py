@@ -13,7 +13,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.segments import RUN_GAP_S
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
-from pdhef_logtool.records.files import PendingFile, writing
+from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.results.expression import ERRORS, FLAGS, SPEED, Applied, Column, Condition, Node, Number
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
@@ -123,8 +123,8 @@ def write_events(path: Path, found: FoundEvents) -> None:
         "peak": pl.Float64,
         "peak_ns": pl.Int64,
     }
-    with PendingFile(path) as pending, writing(path):
-        pl.DataFrame([asdict(e) for e in found.events], schema=schema).write_parquet(pending.path)
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        pl.DataFrame([asdict(e) for e in found.events], schema=schema).write_parquet(file)
 
 
 def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
