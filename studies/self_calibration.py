@@ -93,7 +93,7 @@ def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> Vehicle
     return vehicle.model_copy(update={"tyres": tyres})
 
 
-def simulate(cars: int, seed: int) -> list[Simulated]:
+def simulate(cars: int, seed: int, driven: Sequence[tuple[str, float, float | None]] = DRIVEN) -> list[Simulated]:
     """Return the drives of the cars; one that cannot be driven is left out and told."""
     found = []
     for index in range(cars):
@@ -102,7 +102,7 @@ def simulate(cars: int, seed: int) -> list[Simulated]:
         front, rear = np.exp(rng.uniform(np.log(WRONG[0]), np.log(WRONG[1]), 2))
         friction = float(rng.choice(FRICTIONS))
         file = car.vehicle.model_copy(update={"friction": friction})
-        for manoeuvre, speed, duration_s in DRIVEN:
+        for manoeuvre, speed, duration_s in driven:
             try:
                 drive = simulate_drive(
                     manoeuvre,

@@ -146,17 +146,30 @@ class Browser:
         metrics = {m["name"]: m["value"] for m in self.call("Performance.getMetrics")["metrics"]}
         return metrics["TaskDuration"]
 
-    def screenshot(self, path: Path, *, whole: bool = True) -> None:
-        options: dict[str, object] = {}
-        if whole:
-            size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-            options = {
-                "captureBeyondViewport": True,
-                "clip": {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1},
-            }
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png", **options)["data"]))
+    def screenshot(self, path: Path, *, height: float | None = None) -> None:
+        """Take a picture of the whole page, or of its first ``height`` points."""
+        size = self.call("Page.getLayoutMetrics")["cssContentSize"]
+        tall = size["height"] if height is None else min(height, size["height"])
+        clip = {"x": 0, "y": 0, "width": size["width"], "height": tall, "scale": 1}
+        made = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
+        path.write_bytes(base64.b64decode(made["data"]))
 
     def pdf(self, path: Path) -> None:
         """Print on A4 as the page asks for."""
         made = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
         path.write_bytes(base64.b64decode(made["data"]))
+
+    def drag(self, selector: str, start: float, end: float) -> None:
+        """Drag across an element from one share of its width to another."""
+        box = self.value(
+            f"(() => {{ const n = document.querySelector({selector!r}); n.scrollIntoView({{block: 'center'}});"
+            " const b = n.getBoundingClientRect(); return [b.left, b.top + b.height / 2, b.width]; })()"
+        )
+        for kind, share in (
+            ("mouseMoved", start),
+            ("mousePressed", start),
+            ("mouseMoved", end),
+            ("mouseReleased", end),
+        ):
+            self.call("Input.dispatchMouseEvent", type=kind, x=box[0] + share * box[2], y=box[1], button="left",
+                      buttons=int(kind != "mouseReleased"), clickCount=1)  # fmt: skip
