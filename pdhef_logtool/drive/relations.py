@@ -231,11 +231,15 @@ def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
 
     A relation between two of them tells nothing until one is told; the truth's v_y has the unit of its v_x.
     """
-    # What is the mean of the wheels says nothing of a wheel.
-    means = {n for r in relations for n in r.powers if n.startswith("wheel_speed") and _sensor(n) == n}
-    open_, told = doubted | (means if any(n.startswith("wheel_speed_") for n in doubted) else set()), set[str]()
+    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never told.
+    open_, told = set(doubted), set[str]()
     while True:
-        found = {n for n in open_ if _is_told(n, [r for r in relations if not (set(r.powers) - {n}) & open_])}
+        found = {
+            n
+            for n in open_
+            if not n.startswith("wheel_speed")
+            and _is_told(n, [r for r in relations if not (set(r.powers) - {n}) & open_])
+        }
         if "truth.vx_m_s" in found | told:
             found |= open_ & {"truth.vy_m_s"}
         if not found:
