@@ -20,7 +20,7 @@ from pdhef_logtool.reports.pages import write_pages
 from pdhef_logtool.results.opened_run import open_run
 
 pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT), pytest.mark.slow]
-#: Main-thread time on a machine that does other things too; idle it is a half or less.
+#: Processor time of the main thread.
 FIRST_PICTURE_S, ZOOM_S = 2.0, 0.1
 #: A picture of one point.
 _DOT = base64.b64decode(
@@ -163,3 +163,12 @@ def test_print_is_a4_with_figures(browser, tmp_path):
     browser.value(_DRAWN)
     widths = browser.value("[...document.querySelectorAll('.canvas .uplot')].map(n => n.clientWidth)")
     assert max(widths) > 1000  # back on the screen
+
+
+def test_a_browser_that_cannot_draw_says_so(browser, tmp_path):
+    file = page_of(write_run(tmp_path, drive_tracks(3.0)))
+    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source="delete window.DecompressionStream")
+    browser.call("Page.navigate", url=file.resolve().as_uri())
+    browser.wait_for("document.querySelector('.note') !== null")
+    assert "too old" in browser.value("document.querySelector('.note').textContent")
+    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])

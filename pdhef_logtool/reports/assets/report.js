@@ -576,5 +576,11 @@
     document.documentElement.dataset.drawn = String(figures.length);
   }
 
-  start();
+  start().catch((error) => {
+    const said = typeof DecompressionStream === "undefined"
+      ? "This browser is too old to draw the figures: it has no DecompressionStream."
+      : "The figures cannot be drawn: " + error;
+    document.querySelector("h1").after(element("p", null, said, "note"));
+    throw error;
+  });
 })();
