@@ -20,7 +20,8 @@ from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
 
-OUTPUTS = {"annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json"}
+TABLES = {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json"}
+OUTPUTS = TABLES | {"annotated.mcap", "foxglove.json", "plotjuggler.xml"}
 
 NO_TRUTH_MAPPING = """
 [signals.steer_rad]
