@@ -113,7 +113,7 @@ def view(
     ] = None,
     web: Annotated[bool, Option("--web", help="In the browser, for machines without a display.")] = False,
 ) -> None:
-    """Open the recordings of a run in the Rerun viewer, as one dataset with a recording a log."""
+    """Open the recordings of a run in the Rerun viewer."""
     recordings = find_recordings(output, log or ())
     if not web and not _has_display():
         raise UsageError(
