@@ -51,6 +51,7 @@ demo: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --car $(CAR) --friction 0.3
 	@echo
 	@echo "Outputs: $(OUT)/ and $(OUT)-low-friction/"
+	@echo "  report.html, logs/<log>/report.html   the run and each drive, for a browser"
 	@echo "  logs/<log>/annotated.mcap   for Foxglove, PlotJuggler or ros2 bag"
 	@echo "  logs/<log>/recording.rrd    open it with: $(BIN)/pdhef view $(OUT)"
 	@echo "  logs/<log>/report.json, estimates.parquet; metrics.parquet and run.json for the whole run"
@@ -68,7 +69,8 @@ quick: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow"
 
 pages: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/python -m pytest tests/reports
+	$(BIN)/python -m pytest tests/reports tests/results
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
 	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
 
 # Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.

@@ -141,7 +141,9 @@ def events(
     if clip:
         from pdhef_logtool.results.clips import write_clips
 
-        found = write_clips(run, found, pad_s=pad_s, source=source, tell=console.warn)
+        named = {column.track for column in condition.columns() if column.track is not None}
+        named |= set() if estimator is None else {estimator}
+        found = write_clips(run, found, pad_s=pad_s, named=named, source=source, tell=console.warn)
     if parquet is not None:
         write_events(parquet, found)
     console.finish(found, render_events, as_json)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -11,14 +13,13 @@ import typer
 from typer import Argument, Option
 
 from pdhef_logtool.cli import console, options
-from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.errors import OutputError, UsageError
 
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
     from pdhef_logtool.runs.pipeline import RunResult
 
 commands = typer.Typer()
-RECORDING = "recording.rrd"
 
 
 @options.command(
@@ -104,15 +105,25 @@ def metrics(
     _finish(result, as_json)
 
 
-@options.command(commands, "pdhef view out", "pdhef view out/logs/drive/recording.rrd")
+@options.command(commands, "pdhef view out", "pdhef view out --log drive", "pdhef view out --web")
 def view(
     output: Annotated[Path, Argument(metavar="OUTPUT", help="Folder of a run or of one of its logs, or a .rrd file.")],
-    log: Annotated[str | None, Option(help="Which log of the run; default: the first.")] = None,
+    log: Annotated[
+        list[str] | None, Option(metavar="NAME", help="Which logs of the run, repeatable; default: all.")
+    ] = None,
+    web: Annotated[bool, Option("--web", help="In the browser, for machines without a display.")] = False,
 ) -> None:
-    """Open the recording of a run in the Rerun viewer."""
-    recording = find_recording(output, log)
-    console.say(f"opening {recording}")
-    raise typer.Exit(open_viewer(recording))
+    """Open the recordings of a run in the Rerun viewer."""
+    recordings = find_recordings(output, log or ())
+    if not web and not _has_display():
+        raise UsageError(
+            expected="a display to open the viewer on",
+            got="neither DISPLAY nor WAYLAND_DISPLAY",
+            where="pdhef view",
+            remedy="add --web and open the address that it prints, or copy the .rrd files to a machine with a display",
+        )
+    console.say(f"opening {recordings[0] if len(recordings) == 1 else f'{len(recordings)} recordings of {output}'}")
+    raise typer.Exit(open_viewer(recordings, web=web))
 
 
 def _finish(result: RunResult, as_json: bool) -> NoReturn:
@@ -134,36 +145,43 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
     raise typer.Exit(result.exit_code)
 
 
-def find_recording(output: Path, log: str | None) -> Path:
-    """Return the recording of one log of a run.
+def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
+    """Return the recordings of a run.
 
     Parameters
     ----------
     output : output folder of a run, the folder of one log, or the recording itself.
-    log : stem of the log; None takes the first in alphabetical order.
+    logs : names of logs; none takes all that have a recording, in the run's order.
 
     Raises
     ------
     OutputError
-        There is no such recording; the ones that there are get named.
+        There is no finished run, no recording, or none of a log that was named; the ones that there are get named.
     """
+    from pdhef_logtool.results.opened_run import RECORDING_FILE, open_run
+
     if output.is_file():
-        return output
-    if log is None and (output / RECORDING).is_file():
-        return output / RECORDING
-    recordings = {p.parent.name: p for p in sorted((output / "logs").glob(f"*/{RECORDING}"))}
-    if log is None and recordings:
-        return next(iter(recordings.values()))
-    if log is not None and log in recordings:
-        return recordings[log]
-    raise OutputError(
-        expected=RECORDING if log is None else f"a log named {log}",
-        got=", ".join(recordings) or "none",
-        where=str(output),
-        remedy="" if recordings else "pdhef run LOG -o OUT writes one",
-    )
+        return [output]
+    if not logs and (output / RECORDING_FILE).is_file():
+        return [output / RECORDING_FILE]
+    found = {one.label: path for one in open_run(output).logs if (path := one.file(RECORDING_FILE)) is not None}
+    missing = [name for name in logs if name not in found]
+    if not found or missing:
+        raise OutputError(
+            expected=f"a log named {missing[0]}" if missing else RECORDING_FILE,
+            got=", ".join(found) or "none",
+            where=str(output),
+            remedy="" if found else "pdhef run LOG -o OUT writes one",
+        )
+    return [found[name] for name in dict.fromkeys(logs)] if logs else list(found.values())
 
 
-def open_viewer(recording: Path) -> int:
-    """Open the recording in Rerun's viewer and return its exit code."""
-    return subprocess.call([sys.executable, "-m", "rerun", str(recording)])  # noqa: S603 (our own interpreter)
+def open_viewer(recordings: Sequence[Path], *, web: bool) -> int:
+    """Open recordings in one viewer, which nobody else on the network can reach, and return its exit code."""
+    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--new", *(["--web-viewer"] if web else [])]
+    return subprocess.call([*command, *map(str, recordings)])  # noqa: S603 (our own interpreter)
+
+
+def _has_display() -> bool:
+    """Whether a window can be opened; only Linux goes without one."""
+    return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -46,8 +46,8 @@ LEVER_M = 0.5
 GAIN_ERROR = 0.05
 #: What an accelerometer reads of the lateral acceleration: roll adds a tenth, banked bends take a quarter.
 AY_GAIN_RANGE = (0.65, 1.3)
-#: The delay of a_y is found in so many steps, and is none beyond.
-DELAY_STEPS, MOST_DELAY_S = 4, 0.5
+#: The delay of a_y is found in so many steps, the last of which is less than this, and is none beyond.
+DELAY_STEPS, DELAY_KNOWN_S, MOST_DELAY_S = 4, 0.005, 0.3
 #: A sensor's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
 SENSOR_DELAY_S = 0.03
 #: Understeer gradients that have opposite signs and are this far from neutral; rad per m/s^2. Cars have 0.002 to 0.006.
@@ -444,10 +444,10 @@ class SensorErrors:
     lever_error_m: float
     yaw_rate_gain: float
     gain_error: float
-    ay_gain: float
-    ay_gain_error: float
-    ay_delay_s: float
-    ay_delay_error_s: float
+    ay_gain: float = math.nan
+    ay_gain_error: float = math.inf
+    ay_delay_s: float = math.nan
+    ay_delay_error_s: float = math.inf
 
 
 def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
@@ -471,11 +471,15 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
         late_s = 0.0
         for _ in range(DELAY_STEPS):  # a lever's part is late too, so that one step is not all of it
             found = fit(earlier(ay, late_s), regressors, moving_at(vx))
-            if found is None or found[0][1] <= 0.0 or abs(late_s) > MOST_DELAY_S:
+            if found is None or found[0][1] <= 0.0:
                 break
             (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = found
-            late_s -= slope / scale
-            lever, ay_gain, delay = (place, place_error), (scale, scale_error), (late_s, slope_error / scale)
+            step_s = -slope / scale
+            late_s += step_s
+            known = abs(step_s) < DELAY_KNOWN_S and late_s < MOST_DELAY_S
+            delay = (late_s, slope_error / scale) if known else nothing
+            if lever == nothing or (known and late_s > SURE * delay[1]):
+                lever, ay_gain = (place, place_error), (scale, scale_error)
     return SensorErrors(*(float(x) for x in (*lever, *gain, *ay_gain, *delay)))
 
 
@@ -525,7 +529,7 @@ def ay_delay(errors: SensorErrors, latency: LatencyEstimate | None) -> tuple[flo
     low, high = AY_GAIN_RANGE
     if latency is None or not latency.reliable or latency.identical:
         return None
-    if not low < errors.ay_gain < high or abs(errors.ay_delay_s) > MOST_DELAY_S:
+    if not low < errors.ay_gain < high or not math.isfinite(errors.ay_delay_s):
         return None
     return errors.ay_delay_s + latency.latency_s, math.hypot(errors.ay_delay_error_s, latency.std_error_s)
 

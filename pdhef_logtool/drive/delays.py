@@ -27,11 +27,13 @@ YAW_RATE_AFTER_STEERING_S = (-0.02, 0.45)
 KNOWN_TO_S, SURE = 0.015, 4.0
 #: Where the car slides, wheels and gyro go apart; what goes together less than this tells no delay. Of exact ones more.
 LEAST_CORRELATION = (0.9, 0.95)
+#: Another peak of this share of the highest may as well be the right one.
+AS_HIGH = 0.8
 #: Both sides are averaged over as long, which shifts neither; no derivative spans more.
 SMOOTH_S = 0.1
 DERIVATIVE_S = 0.15
-#: What is left of both is thinned to this.
-THIN_S = 0.02
+#: What is left of both is thinned to this; a parabola finds the peak between.
+THIN_S = 0.04
 LONGEST_STEP_S = 0.3
 
 
@@ -59,7 +61,8 @@ def late_sensors(signals: Mapping[str, Channel]) -> tuple[LateSensor, ...]:
         if low - margin <= shift.latency_s <= high + margin:
             continue
         # A sine goes with itself a period later as well.
-        if has_peak_within(on_common_grid(one.stamps_ns, one.values, other.stamps_ns, other.values), low, high):
+        grid = on_common_grid(one.stamps_ns, one.values, other.stamps_ns, other.values)
+        if has_peak_within(grid, low, high, AS_HIGH * shift.correlation):
             continue
         name = names[0] if shift.latency_s < low else names[1]
         beyond_s = low - shift.latency_s if shift.latency_s < low else shift.latency_s - high
@@ -118,7 +121,7 @@ def _pairs(signals: Mapping[str, Channel]) -> list[_Pair]:
     steer = signals.get("steer_rad") or signals.get("steering_wheel_rad")
     if ax is not None:
         text = f"the derivative of {speed.name} follows ax_m_s2"
-        found.append((text, ax, _derivative(speed), ("ax_m_s2", speed.name), SPEED_AFTER_A_X_S, False))
+        found.append((text, ax, _derivative(_averaged(speed)), ("ax_m_s2", speed.name), SPEED_AFTER_A_X_S, False))
     if gyro is not None and len(gyro) and ay is not None:
         turning = replace(gyro, values=gyro.values * _at(speed, gyro))
         text = "ay_m_s2 follows yaw_rate_rad_s x speed"

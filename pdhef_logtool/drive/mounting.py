@@ -29,7 +29,7 @@ from pdhef_logtool.drive.frames import (
     rotation_text,
 )
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
+from pdhef_logtool.drive.relations import gentle_at, steering_references, units_told, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -349,12 +349,14 @@ class Survey:
         passed = {c.name for c in found if c.verdict == "passed"} - {
             f"{c.subject}.sign" for c in found if c.verdict != "passed"
         }
+        doubted = {c.name.removesuffix(".candidate") for c in self.mapping.checks if "unit" in c.evidence}
+        told = units_told(self.measured.relations, doubted)
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
             if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
                 continue
-            # A doubt about a unit stays: a gain that passes is wider than units that look alike.
-            if f"{signal}.sign" not in passed or "unit" in check.evidence:
+            # A doubt about a unit stays unless the drive rules out all others: a gain that passes is wider than some.
+            if f"{signal}.sign" not in passed or (signal in doubted and signal not in told):
                 yield check
 
 

@@ -226,6 +226,35 @@ def _sensor(name: str) -> str:
     return "wheel speeds" if name.startswith("wheel_speed_") else name
 
 
+def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
+    """Return those of the signals of doubtful unit for which relations to others rule out every other unit.
+
+    A relation between two of them tells nothing until one is told; the truth's v_y has the unit of its v_x.
+    """
+    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never told.
+    open_, told = set(doubted), set[str]()
+    while True:
+        found = {
+            n
+            for n in open_
+            if not n.startswith("wheel_speed")
+            and _is_told(n, [r for r in relations if not (set(r.powers) - {n}) & open_])
+        }
+        if "truth.vx_m_s" in found | told:
+            found |= open_ & {"truth.vy_m_s"}
+        if not found:
+            return told
+        told |= found
+        open_ -= found
+
+
+def _is_told(name: str, relations: Sequence[Relation]) -> bool:
+    mine = [r for r in relations if name in r.powers and r.tells]
+    others = [factor for factor, _ in _units(name.removeprefix("truth."))]
+    holds = bool(mine) and bool(others) and all(r.accepts() for r in mine)
+    return holds and all(any(not r.accepts(f ** r.powers[name]) for r in mine) for f in others)
+
+
 def best_explanation(
     relations: Sequence[Relation], explanations: Sequence[tuple[Mistake, ...]]
 ) -> tuple[Mistake, ...] | None:

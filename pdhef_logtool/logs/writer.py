@@ -46,6 +46,8 @@ from pdhef_logtool.records.version import __version__
 
 LIBRARY = f"pdhef-logtool {__version__}"
 _CHUNK_BYTES = 1 << 20
+#: Of zstd.
+_LEVEL = 6
 _LARGEST_ID = 0xFFFF
 _PACKED_HEAD = struct.Struct("<BQHIQQ")
 
@@ -363,7 +365,7 @@ class McapLogWriter:
                 mine = part_source == i
                 _scatter(content, at[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
             data = content.tobytes()
-            stored = zstandard.ZstdCompressor(level=3).compress(data)
+            stored = zstandard.ZstdCompressor(level=_LEVEL).compress(data)
             part_channel, part_time = channel[first:last], log_time[first:last]
             self._emit_chunk(RawChunk("zstd", stored, len(data), zlib.crc32(data), part_channel, part_time, at))
             first = last

@@ -42,6 +42,8 @@ SLOPE, LOOSE_SLOPE = 1.25, 1.6
 LEAST_AY_M_S2 = 0.4
 #: Correlations from here on make one column a copy of another.
 COPY = 0.98
+#: And from here on it is the same column sent twice.
+ITSELF = 0.999
 #: A steering angle follows the path's curvature so well.
 STEERS = 0.9
 #: Choices that are shown where none is believed.
@@ -209,6 +211,8 @@ def _turning(fields: Fields, v: Found, r: Found, ay: FloatArray) -> tuple[Fit | 
     with np.errstate(invalid="ignore"):
         relation, root, alone = (fit(ay, smooth(np.maximum(speed, 0.0) ** p * _values(r))) for p in (1.0, 0.5, 0.0))
     if relation is None or root is None or alone is None or abs(relation.correlation) < LOOSE_TURNS:
+        return None, False, 0.0
+    if abs(alone.correlation) > ITSELF:
         return None, False, 0.0
     left, of_root, of_alone = (1.0 - f.correlation**2 for f in (relation, root, alone))
     strict = abs(relation.correlation) > TURNS and left < BY_SPEED * of_alone and left < BY_ROOT * of_root

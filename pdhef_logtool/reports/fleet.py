@@ -75,7 +75,6 @@ def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
     html = render(
         "fleet.html",
         charts,
-        title=run.folder.resolve().name or "run",
         fleet=fleet,
         pages=pages,
         hours=sum(d.seconds for d in fleet.drives) / 3600.0,
@@ -170,7 +169,7 @@ def _paired(fleet: Fleet) -> str:
     """Return how the answer stands against the rival over drives, in words; empty without one."""
     rival = _rival(fleet)
     rank = next((r for r in fleet.ranking if r.estimator == rival), None)
-    if rank is None or rank.against_answer is None or not math.isfinite(rank.against_answer.value):
+    if rank is None or rank.against_answer is None or len(fleet.scored) < 2:
         return ""
     found = rank.against_answer
     side = "above" if found.value >= 0.0 else "below"

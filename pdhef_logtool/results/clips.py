@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -12,7 +12,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder
-from pdhef_logtool.results.events import FoundEvent, FoundEvents
+from pdhef_logtool.results.events import TRUTH, FoundEvent, FoundEvents
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
 from pdhef_logtool.sinks.parquet import list_estimators, read_track
@@ -27,6 +27,7 @@ def write_clips(
     found: FoundEvents,
     *,
     pad_s: float,
+    named: Collection[str] = (),
     source: Path | None = None,
     tell: Callable[[str], None] = lambda _text: None,
 ) -> FoundEvents:
@@ -35,6 +36,7 @@ def write_clips(
     Parameters
     ----------
     pad_s : what a clip has before and behind its event.
+    named : tracks that clips have beside the truth and those that the report shows.
     source : folder (or file) with the logs; None takes the full copies that the run wrote.
     tell : called with what a drive's clips lack.
 
@@ -54,7 +56,10 @@ def write_clips(
                 tell(f"{label}: no clip: {error}")
                 continue
             try:
-                names += [f"{CLIPS}/{name}" for name in _clips_of(logs[label], list(events), change, opened, pad_s)]
+                names += [
+                    str(run.folder / CLIPS / name)
+                    for name in _clips_of(logs[label], list(events), change, opened, pad_s, named)
+                ]
                 failed |= any(loss.severity == "lost" for loss in opened.lost)
             finally:
                 opened.close()
@@ -62,16 +67,22 @@ def write_clips(
 
 
 def _clips_of(
-    log: OpenedLog, events: list[FoundEvent], change: FolderTransaction, source: DriveLog, pad_s: float
+    log: OpenedLog,
+    events: list[FoundEvent],
+    change: FolderTransaction,
+    source: DriveLog,
+    pad_s: float,
+    named: Collection[str],
 ) -> Iterator[str]:
     """Write the clips of one drive; yield their names."""
     report, estimates = log.report() or {}, log.file(ESTIMATES_FILE)
     assert estimates is not None
-    tracks = [read_track(estimates, name) for name in list_estimators(estimates)]
+    wanted = {TRUTH, log.main(), *((report.get("answer") or {}).get("shown") or ()), *named}
+    tracks = [read_track(estimates, name) for name in list_estimators(estimates) if name in wanted]
     for event in events:
         span_ns = _span(source, event, pad_s)
         name = f"{log.label}_{event.start_s:.2f}s.mcap"
-        sink = AnnotatedMcapSink(change.file(name), source, span_ns)
+        sink = AnnotatedMcapSink(change.file(name), source, span_ns=span_ns)
         try:
             for track in tracks:
                 sink.append(track.between(*span_ns))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.consistency import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.thresholds import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
@@ -336,15 +337,19 @@ class _Tables:
         return _of_rows(figure, both.sort("place"), clusters)
 
     def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
-        """Raise UsageError for an estimator that no drive of either run has."""
-        for name in {f.figure.estimator for f in figures if f.verdict == "no figure"} - {MAIN}:
-            with _reading(METRICS_FILE):
-                frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
-            known = {name for frame in frames for name in frame["estimator"]}
-            if name not in known:
-                raise UsageError(
-                    expected=f"an estimator of these runs: {', '.join(sorted(known))}", got=name, where="estimator"
-                )
+        """Raise UsageError for an estimator that no drive of either run has, and for runs without a main one."""
+        missing = {f.figure.estimator for f in figures if f.verdict == "no figure"}
+        if any(self._main):
+            missing -= {MAIN}
+        if not missing:
+            return
+        with _reading(METRICS_FILE):
+            frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
+        known = {name for frame in frames for name in frame["estimator"]}
+        for name in sorted(missing - known):
+            single = sorted(k for k in known if "~" not in k and k != SENSORS)
+            got = "none named, and none that is the answer" if name == MAIN else name
+            raise UsageError(expected=f"an estimator of these runs: {', '.join(single)}", got=got, where="--estimator")
 
     def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
         """Return the rows of figures, and of what is said of their truth, of both runs."""

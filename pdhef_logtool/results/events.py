@@ -13,7 +13,7 @@ import numpy as np
 
 from pdhef_logtool.evaluation.segments import RUN_GAP_S
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
-from pdhef_logtool.records.files import PendingFile, writing
+from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.results.expression import ERRORS, FLAGS, SPEED, Applied, Column, Condition, Node, Number
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
@@ -49,7 +49,7 @@ class FoundEvents:
     ----------
     where : the condition. searched : drives that were looked at. events : in the order of the run's drives.
     left_out : drives that could not be looked at, with the reason; ``failed``: whether one of them is damaged.
-    clips : files that were written, from the run's folder.
+    clips : files that were written.
     """
 
     where: str
@@ -123,8 +123,8 @@ def write_events(path: Path, found: FoundEvents) -> None:
         "peak": pl.Float64,
         "peak_ns": pl.Int64,
     }
-    with PendingFile(path) as pending, writing(path):
-        pl.DataFrame([asdict(e) for e in found.events], schema=schema).write_parquet(pending.path)
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        pl.DataFrame([asdict(e) for e in found.events], schema=schema).write_parquet(file)
 
 
 def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
@@ -142,6 +142,12 @@ def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str |
 def _check_tracks(run: OpenedRun, condition: Condition, estimator: str | None) -> None:
     """Raise UsageError for an estimator that no drive has."""
     known = {name for log in run.logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
+    if known and estimator is None and not any(log.main() for log in run.logs):
+        raise UsageError(
+            expected=f"an estimator of this run: {', '.join(sorted(known))}",
+            got="none named, and none that is the answer",
+            where="--estimator",
+        )
     asked = {c.track for c in condition.columns() if c.track is not None} | ({estimator} if estimator else set())
     for name in sorted(asked - known - {TRUTH, None}, key=str):
         raise UsageError(

@@ -345,9 +345,8 @@ def _collected(rows: pl.LazyFrame, run: OpenedRun) -> pl.DataFrame:
 
 def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float]) -> FleetDrive:
     answer = report.get("answer") or {}
-    main = answer.get("main") or ""
-    names = {e for e, _, _ in figures}
-    main = main or (next(iter(sorted(names)), "") if len(names) == 1 else "")
+    ran = [e["name"] for e in report.get("estimators", ()) if e["outcome"] == "ran"]
+    main = answer.get("main") or next(iter(ran), "")  # without an answer the first of recorded estimates
     errors = {
         (e, s): value
         for (e, s, metric), value in figures.items()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,11 +45,11 @@ from pdhef_logtool.results.opened_run import (
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
-from pdhef_logtool.runs.guard import GUARDED, Distrust, choose_main, default_names, distrust
+from pdhef_logtool.runs.guard import GUARDED, PHYSICS, Distrust, choose_main, default_names, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
-from pdhef_logtool.sinks.base import Event, Sink
+from pdhef_logtool.sinks.base import TRUTH, Event, Shown, Sink
 from pdhef_logtool.sinks.report import (
     CarFacts,
     EstimatorFacts,
@@ -69,12 +71,22 @@ if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
     from pdhef_logtool.self_calibration.calibration import SelfCalibration
+    from pdhef_logtool.sinks.answer import MainFacts
 
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
 
 #: What a run writes into a log's folder.
-LOG_FILES = ("annotated.mcap", ESTIMATES_FILE, METRICS_FILE, RECORDING_FILE, REPORT_FILE, PAGE_FILE)
+LOG_FILES = (
+    "annotated.mcap",
+    "foxglove.json",
+    "plotjuggler.xml",
+    ESTIMATES_FILE,
+    METRICS_FILE,
+    RECORDING_FILE,
+    REPORT_FILE,
+    PAGE_FILE,
+)
 
 _SILENT = "{} has no valid row although the car moves"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
@@ -357,21 +369,24 @@ def _run_estimators(
     drive, car, ready = job.drive, job.car, job.ready
     algorithms = {e.name: resolve(e) for e in ready}
     intervals = calibrator(car, ready)
-    with outputs.begin(log_place(drive.name)) as change, _open_sinks(change, drive, config, car) as sinks:
-        with TrackStore(change.scratch / "tracks") as store:
-            signals = _estimate(drive, ready, intervals, sinks, store, progress)
-            sensors = log_sensors(drive.car.vehicle, job.calibration)
-            found = evaluate(drive, [e.name for e in ready], store.read, signals, sensors)
-            if drive.friction.bank is not None:
-                observable = friction_events(drive.friction, signals)
-                found = replace(found, events=sorted([*found.events, *observable], key=in_time))
-            if against := distrust(found.rows):
-                drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
-                if falls_back:
-                    raise _FallBackError(against)
-            main = choose_main(ready, found.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
-            limits = check_thresholds(job.thresholds, found.rows, log=drive.name)
-            details = drive_details(drive, ready, main.name, store.read, signals, limits)
+    with outputs.begin(log_place(drive.name)) as change, ExitStack() as opened:
+        store = opened.enter_context(TrackStore(change.scratch / "tracks"))
+        signals = _estimate(drive, ready, intervals, store, progress)
+        sensors = log_sensors(drive.car.vehicle, job.calibration)
+        found = evaluate(drive, [e.name for e in ready], store.read, signals, sensors)
+        if drive.friction.bank is not None:
+            observable = friction_events(drive.friction, signals)
+            found = replace(found, events=sorted([*found.events, *observable], key=in_time))
+        if against := distrust(found.rows):
+            drive.notes.append(f"WARNING: {against.text}")  # the answer's words say what comes of it
+            if falls_back:
+                raise _FallBackError(against)
+        main = choose_main(ready, found.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
+        limits = check_thresholds(job.thresholds, found.rows, log=drive.name)
+        details = drive_details(drive, ready, main.name, store.read, signals, limits)
+        shown = _shown(main, [e.name for e in ready])
+        sinks = opened.enter_context(_open_sinks(change, drive, config, car, shown, outputs.path))
+        _write(store, sinks)
         rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
         events = found.events
         if not found.moves:
@@ -443,27 +458,43 @@ def _choose_estimators(drive: Drive, config: RunConfig, car: Car) -> tuple[list[
     return estimators, skipped
 
 
+def _shown(main: MainFacts, ran: Sequence[str]) -> Shown:
+    """Return what recordings open on: the answer, and physics alone or else what is naive to hold it against."""
+    order = [PHYSICS, *([] if main.naive is None else [main.naive]), *main.shown]
+    return Shown(main.name, next((name for name in order if name in ran and name != main.name), None))
+
+
 @contextmanager
-def _open_sinks(change: Transaction, drive: Drive, config: RunConfig, car: Car) -> Iterator[list[Sink]]:
+def _open_sinks(
+    change: Transaction, drive: Drive, config: RunConfig, car: Car, shown: Shown, output: Path
+) -> Iterator[list[Sink]]:
     """Yield the outputs of a run that are fed window by window; on an exception they are aborted."""
+    from pdhef_logtool.sinks.layouts import LayoutsSink
     from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
     from pdhef_logtool.sinks.parquet import EstimatesSink
     from pdhef_logtool.sinks.rerun import RerunSink
 
     sinks: list[Sink] = []
+    colours = {s.name: s.colour for s in SPECS}
     try:
         sinks.append(EstimatesSink(change.file("estimates.parquet")))
         if config.annotate != "none":
             source = drive.log if config.annotate == "full" else None
-            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source))
+            names = None if config.estimators else frozenset({shown.main, TRUTH})
+            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names))
+            layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
+            sinks.append(LayoutsSink(*layouts, names, colours))
+        application_id = _application_id(output, config)
         sinks.append(
             RerunSink(
                 change.file("recording.rrd"),
+                application_id=application_id,
                 log_name=drive.name,
-                input_hash=drive.sha256,
+                input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
                 start_ns=drive.plan.start_ns,
+                shown=shown,
                 min_speed_m_s=car.vehicle.low_speed_blend_m_s,
-                colours={s.name: s.colour for s in SPECS},
+                colours=colours,
             )
         )
         yield sinks
@@ -473,31 +504,40 @@ def _open_sinks(change: Transaction, drive: Drive, config: RunConfig, car: Car) 
         raise
 
 
+def _application_id(output: Path, config: RunConfig) -> str:
+    """Return what the recordings of a run have in common, by which a viewer shows them as one dataset."""
+    told = json.dumps([config.to_dict(), tool_versions()], sort_keys=True)
+    return f"pdhef-{output.resolve().name}-{sha256(told.encode()).hexdigest()[:SHOWN_DIGITS]}"
+
+
 def _estimate(
     drive: Drive,
     estimators: Sequence[Estimator],
     intervals: TrackCalibrator,
-    sinks: Sequence[Sink],
     store: TrackStore,
     progress: Progress,
 ) -> Signals:
-    """Run all estimators over the drive, feeding sinks and store; return the drive's signals for segments."""
+    """Run all estimators over the drive into the store; return the drive's signals for segments."""
     for window in estimate_windows(drive, estimators, intervals=intervals):
         store.append_signals(window.signals)
-        for sink in sinks:
-            sink.append_signals(window.signals)
         if window.truth is not None:
             store.append(window.truth)
             assert window.drawn_truth is not None
-            for sink in sinks:
-                sink.append(window.drawn_truth)
+            store.append_drawn(window.drawn_truth)
         for track in window.tracks:
-            store.append(track)
-            for sink in sinks:
-                sink.append(track)
+            store.append(track, drawn=True)
         progress(drive.name, 0.8 * window.share_done)
     progress(drive.name, 0.8)
     return store.signals()
+
+
+def _write(store: TrackStore, sinks: Sequence[Sink]) -> None:
+    """Feed the outputs with what is stored, in the windows that it came in."""
+    for signals, tracks in store.windows():
+        for sink in sinks:
+            sink.append_signals(signals)
+            for track in tracks:
+                sink.append(track)
 
 
 def friction_events(friction: FrictionSource, signals: Signals) -> list[Event]:

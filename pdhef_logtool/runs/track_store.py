@@ -6,6 +6,8 @@ Ten hours at 100 Hz are 3.6 million rows: a track of them takes 0.8 GB, a column
 from __future__ import annotations
 
 import shutil
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
@@ -75,6 +77,18 @@ class _Stored:
         return type(self)(self._stored, self._start + start, min(self._start + end, self._end))
 
 
+@dataclass(slots=True)
+class _Window:
+    """Rows of the signals of a window, and which tracks of how many rows are drawn in it."""
+
+    rows: int
+    drawn: list[tuple[str, int]] = field(default_factory=list)
+
+
+def _in_memory(stored: _Columns, start: int, end: int, kind: type[Any]) -> Any:
+    return kind(**stored.others, **{name: column.read(start, end) for name, column in stored.columns.items()})
+
+
 class StoredTrack(_Stored, StateTrack):
     """A track on disk."""
 
@@ -101,14 +115,37 @@ class TrackStore:
         with writing(folder):
             folder.mkdir(parents=True)
         self._stored: dict[str, _Columns] = {}
+        self._windows: list[_Window] = []
 
-    def append(self, track: StateTrack) -> None:
-        """Add the next window of a track."""
-        self._append(f"track-{track.name}", track)
+    def append(self, track: StateTrack, *, drawn: bool = False) -> None:
+        """Add the next window of a track; :meth:`windows` gives back what is ``drawn``."""
+        key = f"track-{track.name}"
+        self._append(key, track)
+        if drawn:
+            self._windows[-1].drawn.append((key, len(track)))
 
     def append_signals(self, signals: Signals) -> None:
-        """Add the next window of the signals."""
+        """Add the next window of the signals, before its tracks."""
         self._append(_SIGNALS, signals)
+        self._windows.append(_Window(len(signals)))
+
+    def append_drawn(self, track: StateTrack) -> None:
+        """Add the next window of a track that :meth:`windows` gives back and :meth:`read` does not."""
+        key = f"drawn-{track.name}"
+        self._append(key, track)
+        self._windows[-1].drawn.append((key, len(track)))
+
+    def windows(self) -> Iterator[tuple[Signals, list[StateTrack]]]:
+        """Yield signals and drawn tracks window by window, as they were added, each in memory."""
+        at: Counter[str] = Counter()
+        for window in self._windows:
+            parts: list[Any] = []
+            for key, rows in [(_SIGNALS, window.rows), *window.drawn]:
+                parts.append(
+                    _in_memory(self._stored[key], at[key], at[key] + rows, Signals if not parts else StateTrack)
+                )
+                at[key] += rows
+            yield parts[0], parts[1:]
 
     def _append(self, key: str, record: StateTrack | Signals) -> None:
         stored = self._stored.setdefault(key, _Columns())

@@ -24,6 +24,14 @@ class Event:
     text: str
 
 
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """The estimators that a person is shown first; ``baseline`` is what the main one is held against, if anything."""
+
+    main: str
+    baseline: str | None = None
+
+
 class Sink(ABC):
     """One output of one log, fed window by window.
 

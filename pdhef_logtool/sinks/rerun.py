@@ -12,8 +12,10 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.records.errors import OutputError
@@ -22,11 +24,12 @@ from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import TRUTH, Event, Sink
+from pdhef_logtool.sinks.base import TRUTH, Event, Shown, Sink
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
 
-APPLICATION_ID = "pdhef-logtool"
+#: Estimators beside the main one and the baseline that the blueprint has places for, hidden until asked for.
+MOST_OTHERS = 6
 
 #: Half width of the 95 % interval of a normal distribution, in standard deviations.
 STD_OF_95_PERCENT = 1.959963985
@@ -51,11 +54,12 @@ _DEG = float(np.rad2deg(1.0))
 
 @dataclass(frozen=True, slots=True)
 class _Plot:
-    """One plotted quantity: entity, track column, factor to the plotted unit, and its standard deviation's column."""
+    """One plotted quantity: component, its title, track column, factor to the plotted unit, its deviation's column."""
 
-    entity: str
+    name: str
+    title: str
     column: str
-    factor: float
+    factor: float = 1.0
     std: str | None = None
     is_angle: bool = False
     sparse: bool = False
@@ -63,42 +67,49 @@ class _Plot:
 
 
 _STATES = (
-    _Plot("sideslip_deg", "sideslip_rad", _DEG, "sideslip_std_rad", is_angle=True, from_low_speed=False),
-    _Plot("yaw_rate_deg_s", "yaw_rate_rad_s", _DEG, "yaw_rate_std_rad_s"),
-    _Plot("vx_m_s", "vx_m_s", 1.0, "vx_std_m_s"),
-    _Plot("vy_m_s", "vy_m_s", 1.0, "vy_std_m_s"),
-    _Plot("ay_m_s2", "ay_m_s2", 1.0),
+    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", _DEG, "sideslip_std_rad", True, from_low_speed=False),
+    _Plot("yaw_rate_deg_s", "yaw rate [deg/s]", "yaw_rate_rad_s", _DEG, "yaw_rate_std_rad_s"),
+    _Plot("vx_m_s", "longitudinal velocity [m/s]", "vx_m_s", std="vx_std_m_s"),
+    _Plot("vy_m_s", "lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s"),
+    _Plot("ay_m_s2", "lateral acceleration [m/s²]", "ay_m_s2"),
 )
+#: Whose error is drawn; the other two errors say the same once more.
+_ERRORS = (_STATES[0], _STATES[1], _STATES[3])
 _HEALTH = (
-    _Plot("nis", "nis", 1.0, sparse=True),
-    _Plot("network_trust", "network_trust", 1.0),
-    _Plot("r_scale", "r_scale", 1.0),
-    _Plot("mixture_weight", "mixture_weight", 1.0),
-    _Plot("friction", "friction", 1.0),
+    _Plot("nis", "normalised innovation squared", "nis", sparse=True),
+    _Plot("network_trust", "network trust", "network_trust"),
+    _Plot("r_scale", "factor on R", "r_scale"),
+    _Plot("mixture_weight", "weight of the filters with a force scale or a bank", "mixture_weight"),
+    _Plot("friction", "friction", "friction"),
 )
 _INPUTS = (
-    ("steer_deg", "steer_rad", _DEG),
-    ("speed_m_s", "speed_m_s", 1.0),
-    ("ax_m_s2", "ax_m_s2", 1.0),
-    ("ay_m_s2", "ay_m_s2", 1.0),
-    ("yaw_rate_deg_s", "yaw_rate_rad_s", _DEG),
+    _Plot("speed_m_s", "speed [m/s]", "speed_m_s"),
+    _Plot("steer_deg", "road-wheel angle [deg]", "steer_rad", _DEG),
+    _Plot("ax_m_s2", "measured a_x [m/s²]", "ax_m_s2"),
+    _Plot("ay_m_s2", "measured a_y [m/s²]", "ay_m_s2"),
+    _Plot("yaw_rate_deg_s", "measured yaw rate [deg/s]", "yaw_rate_rad_s", _DEG),
 )
 _INPUT_RGB = (0x56, 0xB4, 0xE9)
+_TRACK, _SIGNALS = "track", "signals"
 _REASON_TEXTS = {r.name: r.text for r in REASONS}
 
 
 class RerunSink(Sink):
     """Writes recording.rrd window by window; memory does not grow with the log but for the thinned trajectories.
 
-    Errors are drawn at stamps that truth and estimate share.
+    Each track is one entity with a row a stamp and a component a quantity, which holds value and band. Entities are
+    named by what a track is for (``/truth``, ``/main``, ``/baseline``, ``/other/1``), so that one blueprint suits all
+    drives of a run whatever ran on them; the lines carry the estimators' names. Errors stand where truth and estimate
+    share a stamp.
 
     Parameters
     ----------
     path : where the finished recording stands.
+    application_id : the same for all logs of a run; the viewer shows them as one dataset with one blueprint.
     log_name : shown as the recording's name.
-    input_hash : hexadecimal hash of all that went into the run; names the recording, so that the viewer takes two
-        recordings of the same run as one and of different runs as two.
+    input_hash : hexadecimal hash of the log, by which the viewer tells the recordings of a run from one another.
     start_ns : zero of the timeline ``elapsed``.
+    shown : which estimators the recording opens on.
     min_speed_m_s : sideslip is not drawn below, where it has no meaning. colours : 0xRRGGBB by estimator.
 
     Raises
@@ -110,22 +121,27 @@ class RerunSink(Sink):
         self,
         path: Path,
         *,
+        application_id: str,
         log_name: str,
         input_hash: str,
         start_ns: int,
+        shown: Shown,
         min_speed_m_s: float = 1.0,
         colours: Mapping[str, int] | None = None,
     ) -> None:
         self._colours = colours or {}
         self._start_ns = start_ns
         self._min_speed_m_s = min_speed_m_s
-        self._lines: dict[str, _Line] = {}
+        self._places = {TRUTH: "truth", shown.main: "main"}
+        if shown.baseline is not None:
+            self._places[shown.baseline] = "baseline"
+        self._others = 0
+        self._rows: dict[str, _Rows] = {}
         self._paths: dict[str, _Trajectory] = {}
         self._window: dict[str, StateTrack] = {}
-        self._compared: set[str] = set()
         self._reasons: dict[str, ReasonIntervals] = {}
         self._pending = PendingFile(path)
-        self._recording = rr.RecordingStream(APPLICATION_ID, recording_id=input_hash[:32], send_properties=False)
+        self._recording = rr.RecordingStream(application_id, recording_id=input_hash[:32], send_properties=False)
         if not rr.is_enabled(self._recording):
             raise OutputError(
                 expected="Rerun switched on",
@@ -170,47 +186,74 @@ class RerunSink(Sink):
             self._append_signals(signals)
 
     def _append_signals(self, signals: Signals) -> None:
-        for entity, column, factor in _INPUTS:
-            values = np.asarray(getattr(signals, column)) * factor
-            self._draw(f"/inputs/{entity}", entity, _INPUT_RGB, signals.stamps_ns, values, sparse=True)
+        rows = self._rows.setdefault("inputs", _Rows())
+        columns = {plot.name: np.asarray(getattr(signals, plot.column))[:, None] * plot.factor for plot in _INPUTS}
+        self._send_rows("/inputs", rows, _SIGNALS, signals.stamps_ns, columns, frozenset(columns))
 
     def append(self, track: StateTrack) -> None:
-        """Draw one track of this window."""
-        with self._calling():
-            self._append(track)
-
-    def _append(self, track: StateTrack) -> None:
+        """Take one track of this window; it is drawn once the window is whole."""
         if track.name in self._window:
-            self._window.clear()
-            self._compared.clear()
-            # Without this the file falls behind and the difference waits in memory: 380 MB more after one hour.
-            self._recording.flush(timeout_sec=LONGEST_WAIT_S)
+            with self._calling():
+                self._draw_window()
         self._window[track.name] = track
-        rgb = colour_rgb(track.name, self._colours)
-        fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
-        for plot in _STATES + _HEALTH:
-            values = np.asarray(getattr(track, plot.column)) * plot.factor
-            if len(values) != len(track):
-                continue  # a column that this track has not
-            known = track.valid if plot.from_low_speed else track.valid & fast
-            values = np.where(known, values, np.nan)
-            entity = f"/{plot.entity}/{track.name}"
-            self._draw(entity, track.name, rgb, track.stamps_ns, values, sparse=plot.sparse)
-            if plot.std is not None:
-                half = STD_OF_95_PERCENT * plot.factor * np.asarray(getattr(track, plot.std))
-                labels = [f"{track.name} 95 % low", f"{track.name} 95 % high"]
-                style = rr.SeriesLines(names=labels, colors=[(*rgb, 110)] * 2, widths=[0.75] * 2)
-                edges = np.stack([values - half, values + half], axis=1)
-                self._draw_lines(f"{entity}/band95", style, track.stamps_ns, edges)
+
+    def _draw_window(self) -> None:
+        truth = self._window.get(TRUTH)
+        for track in self._window.values():
+            self._draw_track(track, truth)
+        self._window.clear()
+        # Without this the file falls behind and the difference waits in memory: 380 MB more after one hour.
+        self._recording.flush(timeout_sec=LONGEST_WAIT_S)
+
+    def _place(self, name: str) -> str:
+        if name not in self._places:
+            self._others += 1
+            self._places[name] = f"other/{self._others}"
+        return self._places[name]
+
+    def _draw_track(self, track: StateTrack, truth: StateTrack | None) -> None:
+        place, rgb = self._place(track.name), colour_rgb(track.name, self._colours)
+        if place not in self._rows:
+            self._rows[place] = _Rows()
+            band = [] if track.name == TRUTH else [f"{track.name} 95 %"] * 2
+            widths = [2.0 if track.name == TRUTH else 1.5, 0.75, 0.75]
+            colours = [rgb, *[(*rgb, 110)] * len(band)]
+            style = rr.SeriesLines(names=[track.name, *band], colors=colours, widths=widths[: len(colours)])
+            self._log_static(f"/{place}", style)
+        is_shown = place in ("main", "baseline")
+        columns = self._columns(track, _STATES + _HEALTH if is_shown else _STATES)
+        if is_shown:
+            columns |= _errors(track, truth, self._min_speed_m_s)
+        sparse = frozenset(p.name for p in _HEALTH if p.sparse)
+        self._send_rows(f"/{place}", self._rows[place], _TRACK, track.stamps_ns, columns, sparse)
         if len(track.reason) == len(track):
             self._reasons.setdefault(track.name, ReasonIntervals()).append(track.stamps_ns, track.reason)
-        self._draw_path(track, rgb)
-        self._draw_errors()
+        self._draw_path(track, place, rgb)
+
+    def _columns(self, track: StateTrack, plots: Sequence[_Plot]) -> dict[str, FloatArray]:
+        """Return by component what is drawn of a track, [N, 1] or, with its 95 % band, [N, 3]; NaN where unknown.
+
+        The blueprint asks for all components: what a track lacks is there as NaN.
+        """
+        fast = np.hypot(track.vx_m_s, track.vy_m_s) >= self._min_speed_m_s
+        columns = {}
+        for plot in plots:
+            values = np.asarray(getattr(track, plot.column), dtype=np.float64) * plot.factor
+            if len(values) != len(track):
+                values = np.full(len(track), np.nan)
+            known = track.valid if plot.from_low_speed else track.valid & fast
+            drawn = [np.where(known, values, np.nan)]
+            if plot.std is not None and track.name != TRUTH:
+                half = STD_OF_95_PERCENT * plot.factor * np.asarray(getattr(track, plot.std))
+                drawn += [drawn[0] - half, drawn[0] + half]
+            columns[plot.name] = np.stack(drawn, axis=1)
+        return columns
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:
         """Add trajectories, events and the text report, and give the recording its name."""
         try:
             with self._calling():
+                self._draw_window()
                 self._draw_whole(report, events)
                 self._recording.disconnect()
                 self._outlet.close()
@@ -229,7 +272,7 @@ class RerunSink(Sink):
     def _draw_whole(self, report: Mapping[str, Any], events: Sequence[Event]) -> None:
         for name, path in self._paths.items():
             self._log_static(
-                f"/plan/{name}",
+                f"/plan/{self._place(name)}",
                 rr.LineStrips2D(
                     path.strips(), colors=[colour_rgb(name, self._colours)], radii=[rr.Radius.ui_points(1.5)]
                 ),
@@ -249,7 +292,7 @@ class RerunSink(Sink):
             self._outlet.close()
         self._pending.discard()
 
-    def _send(self, entity: str, stamps_ns: IntArray, columns: Iterable[rr.ComponentColumn]) -> None:
+    def _send(self, entity: str, stamps_ns: IntArray, columns: Iterable[Any]) -> None:
         times = [
             rr.TimeColumn("time", timestamp=stamps_ns.astype("datetime64[ns]")),
             rr.TimeColumn("elapsed", duration=(stamps_ns - self._start_ns).astype("timedelta64[ns]")),
@@ -259,38 +302,32 @@ class RerunSink(Sink):
     def _log_static(self, entity: str, what: rr.AsComponents) -> None:
         self._recording.log(entity, what, static=True, strict=True)
 
-    def _draw(
+    def _send_rows(
         self,
         entity: str,
-        label: str,
-        rgb: tuple[int, int, int],
+        rows: _Rows,
+        archetype: str,
         stamps_ns: IntArray,
-        values: FloatArray,
-        *,
-        sparse: bool = False,
+        columns: Mapping[str, FloatArray],
+        sparse: frozenset[str],
     ) -> None:
-        """Send one line; [N] stamps and values, NaN where unknown."""
-        style = rr.SeriesLines(names=[label], colors=[rgb], widths=[2.0 if label == TRUTH else 1.5])
-        self._draw_lines(entity, style, stamps_ns, values[:, None], sparse=sparse)
+        """Send the rows of one entity: [N] stamps, and by component [N, k] values, NaN where unknown.
 
-    def _draw_lines(
-        self, entity: str, style: rr.SeriesLines, stamps_ns: IntArray, values: FloatArray, *, sparse: bool = False
-    ) -> None:
-        """Send the known rows of ``values`` [N, k]; an empty row, which breaks the line, stands for missing ones."""
-        line = self._lines.get(entity)
-        known: BoolArray = np.all(np.isfinite(values), axis=1)
-        if line is None:
-            if not known.any():
-                return
-            self._log_static(entity, style)
-            line = self._lines[entity] = _Line(LONGEST_BRIDGE_NS if sparse else 0)
-        stamps, rows, is_break = line.rows(stamps_ns, known)
-        if len(stamps) == 0:
+        Lines of ``sparse`` components go on over what is unknown for less than LONGEST_BRIDGE_NS.
+        """
+        if len(stamps_ns) == 0:
             return
-        lengths = np.where(is_break, 0, values.shape[1])
-        self._send(entity, stamps, rr.Scalars.columns(scalars=values[rows].reshape(-1)).partition(lengths))
+        gaps = rows.gaps(stamps_ns)
+        at = np.insert(stamps_ns, gaps, rows.before(stamps_ns)[gaps] + 1)
+        sent = []
+        for name, values in columns.items():
+            absent = rows.bridged(name, stamps_ns, ~np.isnan(values[:, 0])) if name in sparse else None
+            absent = None if absent is None else np.insert(absent, gaps, False)
+            sent.append(_Column(f"{archetype}:{name}", archetype, np.insert(values, gaps, np.nan, axis=0), absent))
+        rows.last_ns = int(stamps_ns[-1])
+        self._send(entity, at, sent)
 
-    def _draw_path(self, track: StateTrack, rgb: tuple[int, int, int]) -> None:
+    def _draw_path(self, track: StateTrack, place: str, rgb: tuple[int, int, int]) -> None:
         # North is drawn up: the y axis of Rerun's 2D views points down.
         plan = np.stack([track.x_m, -track.y_m], axis=1)
         known = np.isfinite(plan).all(axis=1) & track.valid
@@ -299,13 +336,13 @@ class RerunSink(Sink):
         if track.name not in self._paths:
             self._paths[track.name] = _Trajectory(MOST_TRAJECTORY_POINTS)
             style = rr.Points2D.from_fields(colors=[rgb], radii=[rr.Radius.ui_points(5.0)], labels=[track.name])
-            self._log_static(f"/plan/{track.name}/now", style)
+            self._log_static(f"/plan/{place}/now", style)
         self._paths[track.name].append(np.where(known[:, None], plan, np.nan))
         slot = track.stamps_ns // DOT_STEP_NS
         shown = known & (np.diff(slot, prepend=slot[:1] - 1) != 0)
         if shown.any():
             points = rr.Points2D.columns(positions=plan[shown])
-            self._send(f"/plan/{track.name}/now", track.stamps_ns[shown], points)
+            self._send(f"/plan/{place}/now", track.stamps_ns[shown], points)
 
     def _draw_reasons(self) -> list[Event]:
         """Draw each reason as a state that holds in its intervals; return the intervals as events."""
@@ -319,30 +356,21 @@ class RerunSink(Sink):
                 events += [Event(f"{name}: {text}", s.start_ns, s.end_ns, "") for s in spans]
         return events
 
-    def _draw_errors(self) -> None:
-        truth = self._window.get(TRUTH)
-        if truth is None:
-            return
-        for name, track in self._window.items():
-            if name == TRUTH or name in self._compared:
-                continue
-            self._compared.add(name)
-            _, of_track, of_truth = np.intersect1d(
-                track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True
-            )
-            valid = track.valid[of_track] & truth.valid[of_truth]
-            fast = np.hypot(truth.vx_m_s, truth.vy_m_s)[of_truth] >= self._min_speed_m_s
-            for plot in _STATES:
-                error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
-                error = plot.factor * (wrap_angle(error) if plot.is_angle else error)
-                known = valid if plot.from_low_speed else valid & fast
-                self._draw(
-                    f"/error/{plot.entity}/{name}",
-                    name,
-                    colour_rgb(name, self._colours),
-                    track.stamps_ns[of_track],
-                    np.where(known, error, np.nan),
-                )
+
+def _errors(track: StateTrack, truth: StateTrack | None, min_speed_m_s: float) -> dict[str, FloatArray]:
+    """Return the errors by component, [N, 1] each, NaN where truth or estimate is not known."""
+    columns = {f"error_{plot.name}": np.full((len(track), 1), np.nan) for plot in _ERRORS}
+    if truth is None:
+        return columns
+    _, of_track, of_truth = np.intersect1d(track.stamps_ns, truth.stamps_ns, assume_unique=True, return_indices=True)
+    valid = track.valid[of_track] & truth.valid[of_truth]
+    fast = np.hypot(truth.vx_m_s, truth.vy_m_s)[of_truth] >= min_speed_m_s
+    for plot in _ERRORS:
+        error = np.asarray(getattr(track, plot.column))[of_track] - getattr(truth, plot.column)[of_truth]
+        error = plot.factor * (wrap_angle(error) if plot.is_angle else error)
+        known = valid if plot.from_low_speed else valid & fast
+        columns[f"error_{plot.name}"][of_track, 0] = np.where(known, error, np.nan)
+    return columns
 
 
 class _Outlet:
@@ -411,38 +439,51 @@ class _Outlet:
             self.error, self._dropped = self.error or error, True
 
 
+class _Column:
+    """A component [N, k] as single precision floats; rows that are ``absent`` hold nothing, neither value nor gap."""
+
+    def __init__(self, component: str, archetype: str, values: FloatArray, absent: BoolArray | None) -> None:
+        self._descriptor = rr.ComponentDescriptor(component, archetype=archetype)
+        kept = values if absent is None else values[~absent]
+        lengths = np.full(len(values), values.shape[1]) if absent is None else np.where(absent, 0, values.shape[1])
+        offsets = pa.array(np.concatenate([[0], np.cumsum(lengths)]), pa.int32())
+        mask = None if absent is None else pa.array(absent)
+        flat = pa.array(kept.astype(np.float32).reshape(-1))
+        self._array = pa.ListArray.from_arrays(offsets, flat, mask=mask)
+
+    def component_descriptor(self) -> rr.ComponentDescriptor:
+        """Return its name and archetype."""
+        return self._descriptor
+
+    def as_arrow_array(self) -> pa.Array:
+        """Return its rows."""
+        return self._array
+
+
 @dataclass(slots=True)
-class _Line:
-    """Where a line stands between windows: its last known stamp, and whether unknown rows followed it."""
+class _Rows:
+    """Where an entity stands between windows: its last stamp, and when each sparse component was last known."""
 
-    bridge_ns: int
     last_ns: int | None = None
-    unknown_since: bool = False
+    known_ns: dict[str, int] = field(default_factory=dict)
 
-    def rows(self, stamps_ns: IntArray, known: BoolArray) -> tuple[IntArray, IntArray, BoolArray]:
-        """Choose the rows to send: stamps [M], indices of known rows, and which of the M are breaks.
+    def before(self, stamps_ns: IntArray) -> IntArray:
+        """Return the stamp before each one; the first of all has itself."""
+        first = stamps_ns[0] if self.last_ns is None else self.last_ns
+        return np.concatenate([[first], stamps_ns[:-1]])
 
-        A break stands 1 ns behind the last known stamp before a gap: where unknown rows lie between two known ones
-        that are further apart than ``bridge_ns``, or where they are further apart than LONGEST_BRIDGE_NS.
-        """
-        at = np.flatnonzero(known)
-        if len(at) == 0:
-            self.unknown_since |= len(known) > 0
-            return np.empty(0, dtype=np.int64), at, np.empty(0, dtype=np.bool_)
-        stamps = stamps_ns[at]
-        before = np.concatenate([[stamps[0] if self.last_ns is None else self.last_ns], stamps[:-1]])
-        unknown_between = np.diff(at, prepend=-1) > 1
-        unknown_between[0] |= self.unknown_since
-        step = stamps - before
-        gap = (unknown_between & (step > self.bridge_ns)) | (step > LONGEST_BRIDGE_NS)
-        if self.last_ns is None:
-            gap[0] = False
-        self.last_ns = int(stamps[-1])
-        self.unknown_since = bool(at[-1] < len(known) - 1)
-        places = np.flatnonzero(gap)
-        all_stamps = np.insert(stamps, places, before[places] + 1)
-        is_break = np.insert(np.zeros(len(stamps), dtype=np.bool_), places, True)
-        return all_stamps, at, is_break
+    def gaps(self, stamps_ns: IntArray) -> IntArray:
+        """Return the rows before which nothing stands for longer than LONGEST_BRIDGE_NS: lines must break there."""
+        return np.flatnonzero(stamps_ns - self.before(stamps_ns) > LONGEST_BRIDGE_NS)
+
+    def bridged(self, name: str, stamps_ns: IntArray, known: BoolArray) -> BoolArray:
+        """Tell the unknown rows that a line goes on over: all but one that is too long after the last known one."""
+        never = np.iinfo(np.int64).min
+        latest = np.maximum.accumulate(np.where(known, stamps_ns, self.known_ns.get(name, never)))
+        self.known_ns[name] = int(latest[-1])
+        since = np.where(latest == never, 0, stamps_ns - latest)
+        ends = ~known & (since > LONGEST_BRIDGE_NS)
+        return np.asarray(~known & ~ends, dtype=np.bool_)
 
 
 @dataclass(slots=True)
@@ -483,25 +524,19 @@ def _event_text(event: Event) -> str:
 
 
 def _blueprint() -> rrb.Blueprint:
-    """Open on the drive: sideslip with bands, yaw rate, a_y, inputs and the plan; errors, filter and report as tabs."""
+    """Open on the drive: sideslip with bands, yaw rate, a_y, inputs and the plan; errors, filter and report as tabs.
 
-    def plot(origin: str, name: str) -> rrb.TimeSeriesView:
-        return rrb.TimeSeriesView(origin=origin, name=name)
-
+    It names what tracks are for and no estimator, so that it suits every drive.
+    """
+    states = ("truth", "baseline", "main", *(f"other/{number}" for number in range(1, MOST_OTHERS + 1)))
     drive = rrb.Horizontal(
         rrb.Vertical(
-            plot("/sideslip_deg", "Sideslip [deg]"),
-            plot("/yaw_rate_deg_s", "Yaw rate [deg/s]"),
-            plot("/ay_m_s2", "Lateral acceleration [m/s²]"),
-            rrb.TimeSeriesView(
-                origin="/inputs",
-                contents=["$origin/speed_m_s", "$origin/steer_deg"],
-                name="Speed [m/s], road-wheel angle [deg]",
-            ),
-            row_shares=[3, 2, 2, 2],
+            *(_track_view(_STATES[i].name, _STATES[i].title, states, legend=i == 0) for i in (0, 1, 4)),
+            *(_input_view(plot) for plot in _INPUTS[:2]),
+            row_shares=[4, 2, 2, 1.5, 1.5],
         ),
         rrb.Vertical(
-            rrb.Spatial2DView(origin="/plan", name="Plan, north up [m]"),
+            rrb.Spatial2DView(origin="/plan", name="Plan, north up [m]", overrides={"/plan/other": _HIDDEN}),
             rrb.TextLogView(origin="/events", name="Events"),
             row_shares=[3, 1],
         ),
@@ -509,22 +544,19 @@ def _blueprint() -> rrb.Blueprint:
         name="Drive",
     )
     errors = rrb.Vertical(
-        *(plot(f"/error/{entity}", f"Error of {name}") for entity, name in _ERROR_NAMES), name="Errors"
+        *(_track_view(f"error_{plot.name}", f"error of {plot.title}", ("baseline", "main")) for plot in _ERRORS),
+        name="Errors",
     )
     filters = rrb.Vertical(
-        plot("/nis", "Normalised innovation squared"),
-        plot("/network_trust", "Network trust"),
-        plot("/r_scale", "Factor on R"),
-        plot("/mixture_weight", "Weight of the filters with a force scale or a bank"),
+        *(_track_view(plot.name, plot.title, ("baseline", "main"), legend=plot is _HEALTH[0]) for plot in _HEALTH[:-1]),
         rrb.StateTimelineView(origin="/reasons", name="Why samples were not used as usual"),
-        plot("/vx_m_s", "Longitudinal velocity [m/s]"),
-        plot("/vy_m_s", "Lateral velocity [m/s]"),
+        *(_track_view(plot.name, plot.title, states) for plot in _STATES[2:4]),
         name="Filter",
     )
     report = rrb.TextDocumentView(origin="/report", name="Report")
     return rrb.Blueprint(
         rrb.Tabs(drive, errors, filters, report, active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline="time"),
+        rrb.TimePanel(state="collapsed", timeline="elapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         auto_layout=False,
@@ -532,10 +564,34 @@ def _blueprint() -> rrb.Blueprint:
     )
 
 
-_ERROR_NAMES = (
-    ("sideslip_deg", "sideslip [deg]"),
-    ("yaw_rate_deg_s", "yaw rate [deg/s]"),
-    ("vx_m_s", "longitudinal velocity [m/s]"),
-    ("vy_m_s", "lateral velocity [m/s]"),
-    ("ay_m_s2", "lateral acceleration [m/s²]"),
-)
+_HIDDEN = rrb.EntityBehavior(visible=False)
+
+
+def _track_view(component: str, title: str, places: Sequence[str], *, legend: bool = False) -> rrb.TimeSeriesView:
+    """Plot one component of tracks; those that the recording does not open on are hidden."""
+    line = [_line_of(f"{_TRACK}:{component}")]
+    overrides = {f"/{place}": [*line, _HIDDEN] if "/" in place else line for place in places}
+    return _plot_view(title, overrides, legend=legend)
+
+
+def _input_view(plot: _Plot) -> rrb.TimeSeriesView:
+    style = rr.SeriesLines(names=[plot.title], colors=[_INPUT_RGB], widths=[1.5])
+    return _plot_view(plot.title, {"/inputs": [_line_of(f"{_SIGNALS}:{plot.name}", style)]}, legend=False)
+
+
+def _plot_view(title: str, overrides: dict[str, list[Any]], *, legend: bool) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=list(overrides),
+        name=title[0].upper() + title[1:],
+        overrides=overrides,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend(corner="RightTop", visible=legend),
+    )
+
+
+def _line_of(component: str, style: rr.SeriesLines | None = None) -> rrb.Visualizer:
+    """Draw a component as lines; names and colours are those of the entity where no style is given."""
+    source = ComponentSourceKind.SourceComponent
+    mapping = VisualizerComponentMapping("Scalars:scalars", source, source_component=component)
+    return (style or rr.SeriesLines()).visualizer(mappings=[mapping])

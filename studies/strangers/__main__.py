@@ -114,7 +114,10 @@ def first_run() -> str:
                 f"The {len(logs)} {what}. Run for the first time, {ends['right']} of their {ends.total()} items were "
                 f"right ({100.0 * ends['right'] / ends.total():.0f} %); {rest}.\n\n"
             )
-    return said
+    return (
+        said
+        and f"{said}What the tables say of these layouts is a later run, after the causes of the first were mended.\n\n"
+    )
 
 
 def others_without_answers() -> str:

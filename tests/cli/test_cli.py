@@ -292,21 +292,45 @@ def test_list_of_manoeuvres_names_the_demo_ones() -> None:
     assert "dlc" in _pdhef("simulate", "--list").stdout
 
 
+def _run_of(folder: Path, *names: str) -> Path:
+    """Make a run whose logs have empty recordings; the last one failed and has none."""
+    for name in names[:-1]:
+        (folder / "logs" / name).mkdir(parents=True)
+        (folder / "logs" / name / "recording.rrd").touch()
+    logs = [{"log": name, "outcome": "ok"} for name in names]
+    (folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "version": 1, "logs": logs}))
+    (folder / "metrics.parquet").touch()
+    return folder
+
+
 def test_view_says_what_is_missing(tmp_path: Path) -> None:
     result = _pdhef("view", str(tmp_path))
     assert result.returncode == 1
-    assert "recording.rrd" in _one_line_error(result)
+    assert "run.json" in _one_line_error(result)
+    result = _pdhef("view", str(_run_of(tmp_path / "out", "b", "a", "failed")), "--log", "failed")
+    assert "expected a log named failed, got b, a" in _one_line_error(result)
 
 
-def test_view_finds_the_recording(tmp_path: Path) -> None:
-    from pdhef_logtool.cli.running import find_recording
+def test_view_takes_all_recordings_of_a_run_or_the_named_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pdhef_logtool.cli import running
 
-    for name in ("b", "a"):
-        (tmp_path / "logs" / name).mkdir(parents=True)
-        (tmp_path / "logs" / name / "recording.rrd").touch()
-    assert find_recording(tmp_path, None).parent.name == "a"
-    assert find_recording(tmp_path, "b").parent.name == "b"
-    assert find_recording(tmp_path / "logs" / "b", None).parent.name == "b"
+    out = _run_of(tmp_path, "b", "a", "failed")
+    of = {name: out / "logs" / name / "recording.rrd" for name in ("a", "b")}
+    assert running.find_recordings(out, []) == [of["b"], of["a"]]
+    assert running.find_recordings(out, ["a", "a"]) == [of["a"]]
+    assert running.find_recordings(out / "logs" / "b", []) == running.find_recordings(of["b"], []) == [of["b"]]
+    called: list[list[str]] = []
+    monkeypatch.setattr(running.subprocess, "call", lambda command: called.append(command) or 0)
+    running.open_viewer([of["b"], of["a"]], web=True)
+    assert called[0][1:] == ["-m", "rerun", "--bind", "127.0.0.1", "--new", "--web-viewer", str(of["b"]), str(of["a"])]
+
+
+def test_view_without_a_display_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    result = _pdhef("view", str(_run_of(tmp_path, "a", "failed")))
+    assert result.returncode == 2
+    assert "add --web" in _one_line_error(result)
 
 
 @pytest.mark.slow

@@ -45,7 +45,7 @@ def test_gyro_and_wheels_are_told_apart_and_known_to_20_ms(dlc: MappedChannels, 
     assert {c.name for c in delay_checks([late])} == {f"{n}.delay" for n in names}
 
 
-@pytest.mark.parametrize(("name", "delay_s"), [("steer_rad", 0.12), ("ay_m_s2", 0.35)])
+@pytest.mark.parametrize(("name", "delay_s"), [("steer_rad", 0.12), ("ay_m_s2", 0.25)])
 def test_what_the_car_stands_between_is_late_by_at_least_so_much(
     dlc: MappedChannels, name: str, delay_s: float
 ) -> None:
@@ -63,8 +63,8 @@ def test_a_sine_that_goes_with_itself_a_period_later_tells_nothing() -> None:
         return np.sin(2 * np.pi * 2.2 * (time_ns * 1e-9 - late_s))
 
     grid = on_common_grid(time_ns, sine(0.0), time_ns, sine(0.4))
-    assert has_peak_within(grid, -0.1, 0.0)
-    assert not has_peak_within(grid, 0.0, 0.3)
+    assert has_peak_within(grid, -0.1, 0.0, 0.8)
+    assert not has_peak_within(grid, 0.0, 0.3, 0.8)
 
 
 def test_a_late_gyro_is_put_right_once_without_truth(sample_logs_dir: Path) -> None:

@@ -200,6 +200,10 @@ def test_no_pair_and_unknown_names_are_errors(tmp_path: Path) -> None:
     c = write_run(tmp_path / "c", _scaled(1.1))
     with pytest.raises(UsageError, match="an estimator of these runs: pd-hef, got pd-hof"):
         _compare(a, c, Gate((Figure(estimator="pd-hof", limit=0.1),)))
+    scored = write_run(tmp_path / "scored", _scaled(1.1), entries=[entry(label, main=None) for label in TEN])
+    with pytest.raises(UsageError, match="an estimator of these runs: pd-hef, got none named"):
+        _compare(scored, a)
+    assert _compare(scored, a, Gate((Figure(estimator="pd-hef"),))).figures[0].change.drives == 10
     (tmp_path / "c" / "metrics.parquet").write_bytes(b"PAR1 no")
     with pytest.raises(OutputError, match=r"the metrics\.parquet of a run"):
         _compare(a, c)

@@ -98,7 +98,7 @@ def test_an_error_is_known_only_where_it_is_scored(run: Path) -> None:
     assert {e.drive: round(e.end_s, 2) for e in unknown} == {"a": 6.99, "b": 2.04}
 
 
-def test_other_tracks_are_read_at_the_same_stamps(run: Path) -> None:
+def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> None:
     found = _find(run, "abs(sideslip_deg - physics.sideslip_deg) > 2.5")
     assert [e.drive for e in found.events] == ["a", "a"]
     assert found.left_out["b"] == "it has no estimator physics"
@@ -107,6 +107,11 @@ def test_other_tracks_are_read_at_the_same_stamps(run: Path) -> None:
         _find(run, "ukf.sideslip_deg > 1")
     with pytest.raises(UsageError, match="--estimator: expected an estimator of this run"):
         _find(run, "sideslip_deg > 1", estimator="ukf")
+    scored = write_run(tmp_path / "scored", {}, entries=[entry("a", main=None)])
+    write_estimates(scored, "a", esc={"vx_m_s": np.ones(9)})
+    with pytest.raises(UsageError, match="an estimator of this run: esc, got none named"):
+        _find(scored, "vx_m_s > 0")
+    assert len(_find(scored, "vx_m_s > 0", estimator="esc").events) == 1
     with pytest.raises(UsageError, match="a minus between columns needs spaces"):
         _find(run, "vx_m_s-truth.vx_m_s > 1")
 

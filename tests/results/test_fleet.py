@@ -134,6 +134,13 @@ def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run
     assert (answer.estimator, answer.drives) == (ANSWER, 1)
 
 
+def test_recorded_estimates_are_told_by_the_first_of_them(run: Run) -> None:
+    estimators = [{"name": n, "outcome": "ran"} for n in ("esc", "ins")]
+    run.add("a", {"ins": 0.02, "esc": 0.01}, answer=None, estimators=estimators)
+    (drive,) = run.read().scored
+    assert (drive.main, drive.error()) == ("esc", 0.01)
+
+
 def test_failures_are_told_by_reason_and_bad_reports_among_them(run: Run) -> None:
     run.add("ok", {"pd-hef": 0.01}, outcome="lost: 2 things", losses=[LOST, {**LOST, "severity": "note"}])
     for i in range(12):

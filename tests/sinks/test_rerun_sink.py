@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 import os
 import subprocess
 import sys
@@ -17,13 +16,15 @@ from rerun.chunk import RrdReader
 
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.sinks import rerun
-from pdhef_logtool.sinks.base import Event
+from pdhef_logtool.sinks.base import Event, Shown
 from pdhef_logtool.sinks.palette import colour_rgb
-from pdhef_logtool.sinks.rerun import LONGEST_BRIDGE_NS, RerunSink, _Line, _Trajectory
+from pdhef_logtool.sinks.rerun import LONGEST_BRIDGE_NS, MOST_OTHERS, RerunSink, _Rows, _Trajectory
 
 HASH = "0123456789abcdef" * 4
 #: Of one track only: the others have those of the palette.
 COLOURS = {"phy-ukf": 0x123456}
+#: The third track that is written, zero, is neither.
+SHOWN = Shown("phy-ukf")
 START_NS = 1_700_000_000_000_000_123
 REPORT = {
     "log": {"name": "drive", "file": "drive.mcap", "kind": "mcap", "duration_s": 6.0, "sha256": HASH},
@@ -41,50 +42,36 @@ EVENTS = (
     Event("start", START_NS, START_NS + 1, ""),
 )
 
-#: Every entity of the recording of two windows of 300 stamps of phy-ukf, zero and truth, with its number of rows.
-#: 12 of 600 rows are not valid, each of which breaks a line once; the very last one has nothing behind it.
-STATE_ROWS = 588 + 11
-ROWS = {
-    **{
-        f"/{quantity}/{name}": STATE_ROWS
-        for quantity in ("sideslip_deg", "yaw_rate_deg_s", "vx_m_s", "vy_m_s", "ay_m_s2", "friction")
-        for name in ("phy-ukf", "zero", "truth")
-    },
-    **{
-        f"/{quantity}/{name}/band95": STATE_ROWS
-        for quantity in ("sideslip_deg", "yaw_rate_deg_s", "vx_m_s", "vy_m_s")
-        for name in ("phy-ukf", "zero")
-    },
-    **{f"/{quantity}/{name}": STATE_ROWS for quantity in ("network_trust", "r_scale") for name in ("phy-ukf", "zero")},
-    **{
-        f"/error/{quantity}/{name}": STATE_ROWS
-        for quantity in ("sideslip_deg", "yaw_rate_deg_s", "vx_m_s", "vy_m_s", "ay_m_s2")
-        for name in ("phy-ukf", "zero")
-    },
-    "/nis/phy-ukf": 504,  # 588 valid rows without the 86 - 2 unknown ones, which are bridged
-    "/nis/zero": 504,
-    "/inputs/steer_deg": 600,
-    "/inputs/speed_m_s": 300,
-    "/inputs/ax_m_s2": 600,
-    "/inputs/ay_m_s2": 600,
-    "/inputs/yaw_rate_deg_s": 600,
-    "/plan/phy-ukf/now": 120,
-    "/plan/zero/now": 120,
-    "/plan/truth/now": 120,
-    "/events": 2,
+STATES = ("sideslip_deg", "yaw_rate_deg_s", "vx_m_s", "vy_m_s", "ay_m_s2")
+HEALTH = ("nis", "network_trust", "r_scale", "mixture_weight", "friction")
+ERRORS = ("error_sideslip_deg", "error_yaw_rate_deg_s", "error_vy_m_s")
+#: Every entity of the recording of two windows of 300 stamps of phy-ukf, truth and zero: rows and components.
+HELD = {
+    "/truth": (600, STATES),
+    "/main": (600, STATES + HEALTH + ERRORS),
+    "/other/1": (600, STATES),
+    "/inputs": (600, ("speed_m_s", "steer_deg", "ax_m_s2", "ay_m_s2", "yaw_rate_deg_s")),
+    "/plan/truth/now": (120, ()),
+    "/plan/main/now": (120, ()),
+    "/plan/other/1/now": (120, ()),
+    "/events": (2, ()),
 }
 STATIC = {
-    "/__properties",
-    "/plan/phy-ukf",
-    "/plan/zero",
-    "/plan/truth",
-    "/report",
-    *(e for e in ROWS if e != "/events"),
+    *("/__properties", "/report", "/truth", "/main", "/other/1"),
+    *(f"/plan/{place}{now}" for place in ("truth", "main", "other/1") for now in ("", "/now")),
 }
 
 
 def write(path: Path, circle, circle_signals, events=EVENTS) -> None:
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
     for k in range(2):
         sink.append_signals(circle_signals(300 * k, 300))
         for name in ("phy-ukf", "truth", "zero"):
@@ -99,10 +86,10 @@ def recording(tmp_path, circle, circle_signals) -> Path:
     return path
 
 
-def tables(path: Path, blueprint: bool = False) -> tuple[dict[str, pa.Table], dict[str, list[pa.RecordBatch]]]:
+def tables(path: Path) -> tuple[dict[str, pa.Table], dict[str, list[pa.RecordBatch]]]:
     """Return by entity what stands on the timelines and what is static."""
     reader = RrdReader(path)
-    store = (reader.blueprints() if blueprint else reader.recordings())[0]
+    store = reader.recordings()[0]
     timed: dict[str, list[pa.RecordBatch]] = defaultdict(list)
     static: dict[str, list[pa.RecordBatch]] = defaultdict(list)
     for chunk in reader.stream(store=store):
@@ -122,24 +109,30 @@ def plain(table: pa.Table | pa.RecordBatch) -> dict[str, list]:
     return columns
 
 
-def series(table: pa.Table) -> tuple[np.ndarray, list[list[float]]]:
+def series(table: pa.Table, component: str) -> tuple[np.ndarray, list[list[float]]]:
+    """Return stamps and values of the rows of a component that hold something."""
+    (name,) = [n for n in table.column_names if n.endswith(f":{component}")]
     order = np.argsort(table["time"].to_numpy().astype(np.int64), kind="stable")
-    values = table["Scalars:scalars"].to_pylist()
-    return table["time"].to_numpy().astype(np.int64)[order], [values[i] for i in order]
+    values = table[name].to_pylist()
+    held = [i for i in order if values[i] is not None]
+    return table["time"].to_numpy().astype(np.int64)[held], [values[i] for i in held]
 
 
-def test_every_entity_has_its_rows(recording):
+def test_every_entity_has_its_rows_and_each_track_is_there_once(recording):
     timed, static = tables(recording)
-    assert {e: t.num_rows for e, t in timed.items()} == ROWS
+    assert {e: t.num_rows for e, t in timed.items()} == {e: rows for e, (rows, _) in HELD.items()}
     assert set(static) == STATIC
-    for table in timed.values():
-        assert {"time", "elapsed"} <= set(table.column_names)
+    for entity, (_, components) in HELD.items():
+        names = timed[entity].column_names
+        assert {"time", "elapsed"} <= set(names)
+        if components:
+            assert {n.split(":")[1] for n in names if ":" in n} == set(components)
 
 
 def test_identity_and_footer(recording):
     reader = RrdReader(recording)
     (entry,) = reader.recordings()
-    assert (entry.application_id, entry.recording_id) == ("pdhef-logtool", HASH[:32])
+    assert (entry.application_id, entry.recording_id) == ("pdhef-x", HASH[:32])
     assert reader.store() is not None
     _, static = tables(recording)
     properties = {k: v for b in static["/__properties"] for k, v in b.to_pydict().items()}
@@ -147,74 +140,63 @@ def test_identity_and_footer(recording):
     assert properties["RecordingInfo:start_time"] == [[START_NS]]
 
 
-def test_blueprint_shows_every_view(recording):
+def blueprint_of(path: Path) -> dict[str, list]:
+    """Return all values of the blueprint by component."""
+    found: dict[str, list] = defaultdict(list)
+    reader = RrdReader(path)
+    for chunk in reader.stream(store=reader.blueprints()[0]):
+        for name, values in plain(chunk.to_record_batch()).items():
+            found[name] += [v for row in values if isinstance(row, list) for v in row]
+    return found
+
+
+def test_the_blueprint_opens_on_truth_main_and_baseline_and_names_no_estimator(recording):
     assert len(RrdReader(recording).blueprints()) == 1
-    timed, static = tables(recording, blueprint=True)
-    names, origins = [], []
-    for part in [*itertools.chain(*static.values()), *timed.values()]:
-        columns = plain(part)
-        if "ViewBlueprint:space_origin" in columns:
-            names += columns["ViewBlueprint:display_name"][0]
-            origins += columns["ViewBlueprint:space_origin"][0]
-    assert sorted(origins) == sorted(
-        [
-            "/sideslip_deg",
-            "/yaw_rate_deg_s",
-            "/ay_m_s2",
-            "/inputs",
-            "/plan",
-            "/events",
-            "/error/sideslip_deg",
-            "/error/yaw_rate_deg_s",
-            "/error/vx_m_s",
-            "/error/vy_m_s",
-            "/error/ay_m_s2",
-            "/nis",
-            "/network_trust",
-            "/r_scale",
-            "/mixture_weight",
-            "/reasons",
-            "/vx_m_s",
-            "/vy_m_s",
-            "/report",
-        ]
-    )
-    assert "Sideslip [deg]" in names
-    drawn = set(ROWS) | STATIC
-    for origin in set(origins) - {"/mixture_weight", "/reasons"}:  # of an adaptive estimator only
-        assert any(e == origin or e.startswith(origin + "/") for e in drawn), origin
+    blueprint = blueprint_of(recording)
+    titles = blueprint["ViewBlueprint:display_name"]
+    assert {"Sideslip [deg]", "Speed [m/s]", "Road-wheel angle [deg]", "Plan, north up [m]", "Report"} <= set(titles)
+    assert blueprint["TimePanelBlueprint:timeline"] == ["elapsed"]
+    entities = {line.strip("+ ") for query in blueprint["ViewContents:query"] for line in query.splitlines()}
+    drawn = {e for e in entities if not e.startswith(("/plan", "/events", "/reasons", "/report", "$"))}
+    others = {f"/other/{number}" for number in range(1, MOST_OTHERS + 1)}
+    assert drawn == {"/truth", "/baseline", "/main", "/inputs"} | others
+    assert not {"phy-ukf", "zero"} & {word for text in titles for word in text.split()}
+    sources = {m["source_component"] for m in blueprint["VisualizerInstruction:component_map"]}
+    timed, _ = tables(recording)
+    held = {n for e in ("/main", "/inputs") for n in timed[e].column_names}
+    assert sources <= held and len(sources) == 14
 
 
 def test_values_stamps_bands_and_errors(recording, circle):
     timed, _ = tables(recording)
     truth = circle("truth", 0, 600)
     track = circle("phy-ukf", 0, 600, bias=0.02)
-    stamps, values = series(timed["/sideslip_deg/phy-ukf"])
-    shown = np.array([len(v) == 1 for v in values])
-    np.testing.assert_array_equal(stamps[shown], track.stamps_ns[track.valid])
-    np.testing.assert_allclose([v[0] for v in values if v], np.degrees(track.sideslip_rad[track.valid]))
-    _, band = series(timed["/sideslip_deg/phy-ukf/band95"])
+    stamps, values = series(timed["/main"], "sideslip_deg")
+    np.testing.assert_array_equal(stamps, track.stamps_ns)
+    middle = np.where(track.valid, np.degrees(track.sideslip_rad), np.nan)
     half = np.degrees(1.959963985 * 0.03)
-    middle = np.degrees(track.sideslip_rad[track.valid])
-    np.testing.assert_allclose([b for b in band if b], np.stack([middle - half, middle + half], axis=1))
-    _, error = series(timed["/error/sideslip_deg/phy-ukf"])
-    expected = np.degrees(track.sideslip_rad - truth.sideslip_rad)[track.valid]
-    np.testing.assert_allclose([e[0] for e in error if e], expected, atol=1e-9)
-    elapsed = timed["/inputs/steer_deg"]["elapsed"].to_numpy().astype(np.int64)
+    np.testing.assert_allclose(values, np.stack([middle, middle - half, middle + half], axis=1), rtol=1e-6)
+    _, error = series(timed["/main"], "error_sideslip_deg")
+    expected = np.where(track.valid, np.degrees(track.sideslip_rad - truth.sideslip_rad), np.nan)
+    np.testing.assert_allclose([e[0] for e in error], expected, rtol=1e-6)
+    elapsed = timed["/inputs"]["elapsed"].to_numpy().astype(np.int64)
     np.testing.assert_array_equal(np.sort(elapsed), np.arange(600) * 10_000_000)
+    speed_stamps, speed = series(timed["/inputs"], "speed_m_s")  # every second one: no value and no gap between
+    assert speed_stamps.tolist() == track.stamps_ns[::2].tolist() and {v[0] for v in speed} == {10.0}
 
 
-def test_colours_are_the_same_in_every_plot(recording):
+def test_lines_carry_names_and_colours_of_estimators(recording):
     _, static = tables(recording)
-    for name in ("phy-ukf", "zero", "truth"):
+    for place, name in (("main", "phy-ukf"), ("other/1", "zero"), ("truth", "truth")):
         r, g, b = colour_rgb(name, COLOURS)
         assert name not in COLOURS or (r << 16) | (g << 8) | b == COLOURS[name]
         packed = (r << 24) | (g << 16) | (b << 8)
-        for entity in (f"/sideslip_deg/{name}", f"/vx_m_s/{name}"):
-            (batch,) = static[entity]
-            assert batch["SeriesLines:colors"].to_pylist() == [[packed | 0xFF]]
-            assert batch["SeriesLines:names"].to_pylist() == [[name]]
-        (strips,) = static[f"/plan/{name}"]
+        (batch,) = static[f"/{place}"]
+        band = [] if name == "truth" else [packed | 110] * 2
+        assert batch["SeriesLines:colors"].to_pylist() == [[packed | 0xFF, *band]]
+        assert batch["SeriesLines:names"].to_pylist() == [[name, *[f"{name} 95 %"] * len(band)]]
+        assert batch["SeriesLines:widths"].to_pylist() == [[2.0] if name == "truth" else [1.5, 0.75, 0.75]]
+        (strips,) = static[f"/plan/{place}"]
         assert strips["LineStrips2D:colors"].to_pylist() == [[packed | 0xFF]]
 
 
@@ -240,17 +222,25 @@ def test_events_and_report_are_text(recording):
 
 def test_weights_and_reasons_are_drawn_over_windows(tmp_path, circle):
     path = tmp_path / "recording.rrd"
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=Shown("pd-hef", "zero"),
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+    )
     for k in range(5):
         sink.append(circle("pd-hef", 120 * k, 120, adaptive=True))  # the gyro is stuck over the first cut
         sink.append(circle("zero", 120 * k, 120))
     sink.finish(REPORT)
     timed, _ = tables(path)
     track = circle("pd-hef", 0, 600, adaptive=True)
-    _, weights = series(timed["/mixture_weight/pd-hef"])
-    np.testing.assert_allclose([w[0] for w in weights if w], track.mixture_weight[track.valid])
-    assert {e for e in timed if e.startswith(("/mixture_weight", "/reasons"))} == {
-        *("/mixture_weight/pd-hef", "/reasons/pd-hef/stuck_yaw_rate", "/reasons/pd-hef/spike_ay")
+    _, weights = series(timed["/main"], "mixture_weight")
+    expected = np.where(track.valid, track.mixture_weight, np.nan)
+    np.testing.assert_allclose([w[0] for w in weights], expected, rtol=1e-6)
+    assert {e for e in timed if e.startswith("/reasons")} == {
+        *("/reasons/pd-hef/stuck_yaw_rate", "/reasons/pd-hef/spike_ay")
     }
     stuck = timed["/reasons/pd-hef/stuck_yaw_rate"]
     assert stuck["StateChange:state"].to_pylist() == [["gyro stuck"], [""]]
@@ -267,52 +257,78 @@ def test_same_input_gives_the_same_content(tmp_path, circle, circle_signals):
         write(tmp_path / name, circle, circle_signals)
         timed, static = tables(tmp_path / name)
         contents.append(({e: plain(t) for e, t in timed.items()}, {e: [*map(plain, bs)] for e, bs in static.items()}))
-    assert contents[0] == contents[1]
+    assert repr(contents[0]) == repr(contents[1])  # NaN equals itself in words
 
 
 def test_slow_sideslip_is_not_drawn(tmp_path, circle):
     path = tmp_path / "recording.rrd"
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, min_speed_m_s=11.0)
+    shown = Shown("phy-ukf", "zero")
+    sink = RerunSink(
+        path, application_id="x", shown=shown, log_name="drive", input_hash=HASH, start_ns=START_NS, min_speed_m_s=11.0
+    )
     sink.append(circle("zero"))
     sink.append(circle("truth"))
     sink.finish(REPORT)
     timed, _ = tables(path)
-    assert "/vx_m_s/zero" in timed
-    assert "/error/vx_m_s/zero" in timed
-    assert not {"/sideslip_deg/zero", "/sideslip_deg/zero/band95", "/error/sideslip_deg/zero", "/events"} & set(timed)
+    assert np.isfinite(series(timed["/baseline"], "vx_m_s")[1]).any()
+    for component in ("sideslip_deg", "error_sideslip_deg"):
+        assert np.isnan(series(timed["/baseline"], component)[1]).all()
+    assert "/events" not in timed
 
 
 def test_errors_stand_where_both_are_valid_and_share_a_stamp(tmp_path, circle):
     path = tmp_path / "recording.rrd"
-    track, truth = circle("zero", 0, 40), circle("truth", 5, 40)
+    track, truth = circle("phy-ukf", 0, 40), circle("truth", 5, 40)
     track.valid[20] = False
     truth.valid[25] = False  # stamp 30 of the track
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
+    sink = RerunSink(path, application_id="x", shown=SHOWN, log_name="drive", input_hash=HASH, start_ns=START_NS)
     sink.append(track)
     sink.append(truth)
     sink.finish(REPORT)
     timed, _ = tables(path)
-    stamps, values = series(timed["/error/sideslip_deg/zero"])
-    shown = [int(t) for t, v in zip(stamps, values, strict=True) if v]
+    stamps, values = series(timed["/main"], "error_sideslip_deg")
+    shown = [int(t) for t, v in zip(stamps, values, strict=True) if np.isfinite(v[0])]
     assert shown == track.stamps_ns[[i for i in range(5, 40) if i not in (20, 30)]].tolist()
-    drawn = [int(t) for t, v in zip(*series(timed["/vx_m_s/zero"]), strict=True) if v]
-    assert drawn == track.stamps_ns[[i for i in range(40) if i != 20]].tolist()
 
 
 def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
     path = tmp_path / "out" / "recording.rrd"
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
     sink.append(circle("zero"))
     assert not path.exists()
     sink.abort()
     sink.abort()
     assert list(path.parent.iterdir()) == []
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
     sink.append(circle("zero"))
     with pytest.raises(KeyError):
         sink.finish({})
     assert list(path.parent.iterdir()) == []
-    sink = RerunSink(path, log_name="drive", input_hash=HASH, start_ns=START_NS, colours=COLOURS)
+    sink = RerunSink(
+        path,
+        application_id="pdhef-x",
+        shown=SHOWN,
+        log_name="drive",
+        input_hash=HASH,
+        start_ns=START_NS,
+        colours=COLOURS,
+    )
     sink.finish(REPORT)
     sink.abort()
     assert [p.name for p in path.parent.iterdir()] == ["recording.rrd"]
@@ -321,16 +337,26 @@ def test_nothing_stands_under_the_final_name_before_finish(tmp_path, circle):
 def test_unwritable_place_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="expected a place to write to"):
-        RerunSink(tmp_path / "file" / "recording.rrd", log_name="drive", input_hash=HASH, start_ns=START_NS)
+        RerunSink(
+            tmp_path / "file" / "recording.rrd",
+            application_id="pdhef-x",
+            shown=SHOWN,
+            log_name="drive",
+            input_hash=HASH,
+            start_ns=START_NS,
+        )
 
 
 SCRIPT = """
 import sys
 from pathlib import Path
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.sinks.base import Shown
 from pdhef_logtool.sinks.rerun import RerunSink
 try:
-    RerunSink(Path(sys.argv[1]), log_name="d", input_hash="ab" * 32, start_ns=0).abort()
+    RerunSink(
+        Path(sys.argv[1]), application_id="x", shown=Shown("zero"), log_name="d", input_hash="ab" * 32, start_ns=0
+    ).abort()
 except OutputError as error:
     print(error)
 """
@@ -390,6 +416,7 @@ import numpy as np
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.sinks import rerun
+from pdhef_logtool.sinks.base import Shown
 
 class Hangs:
     left = int(sys.argv[2])
@@ -403,7 +430,9 @@ class Hangs:
 rerun.LONGEST_WAIT_S = 1.0
 rerun.open_new = lambda path: Hangs()
 try:
-    sink = rerun.RerunSink(Path(sys.argv[1]), log_name="d", input_hash="ab" * 32, start_ns=0)
+    sink = rerun.RerunSink(
+        Path(sys.argv[1]), application_id="x", shown=Shown("zero"), log_name="d", input_hash="ab" * 32, start_ns=0
+    )
     for k in range(6):
         stamps_ns = (np.arange(20000) + 20000 * k) * 10_000_000
         vy = np.sin(stamps_ns * 1.0)
@@ -429,29 +458,34 @@ def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
 @given(
     st.lists(st.booleans(), min_size=1, max_size=40),
     st.lists(st.integers(1, 3 * LONGEST_BRIDGE_NS // 2), min_size=40, max_size=40),
-    st.integers(0, 40),
-    st.sampled_from([0, LONGEST_BRIDGE_NS]),
+    st.integers(1, 40),
 )
-def test_line_breaks_do_not_depend_on_windows(known, steps, cut, bridge):
-    known_array = np.array(known)
+def test_line_breaks_do_not_depend_on_windows(known, steps, cut):
+    known_array, cut = np.array(known), min(cut, len(known))
     stamps = np.cumsum(np.array(steps[: len(known)], dtype=np.int64))
-    whole = _Line(bridge)
-    expected = whole.rows(stamps, known_array)
-    parted = _Line(bridge)
-    cut = min(cut, len(known))
-    a = parted.rows(stamps[:cut], known_array[:cut])
-    b = parted.rows(stamps[cut:], known_array[cut:])
-    np.testing.assert_array_equal(np.concatenate([a[0], b[0]]), expected[0])
-    np.testing.assert_array_equal(np.concatenate([a[2], b[2]]), expected[2])
-    np.testing.assert_array_equal(np.concatenate([a[1], b[1] + cut]), np.flatnonzero(known_array))
-    shown = np.flatnonzero(known_array)
-    gaps = [
-        j
-        for j, (p, q) in enumerate(itertools.pairwise(shown))
-        if (q - p > 1 and stamps[q] - stamps[p] > bridge) or stamps[q] - stamps[p] > LONGEST_BRIDGE_NS
-    ]
-    assert expected[2].sum() == len(gaps)
-    assert (np.diff(expected[0]) > 0).all() or 1 in steps
+    whole = _Rows()
+    gaps, bridged = whole.gaps(stamps), whole.bridged("nis", stamps, known_array)
+    parted, found, absent = _Rows(), [], []
+    for part in (slice(0, cut), slice(cut, len(known))):
+        if len(stamps[part]):
+            found += (parted.gaps(stamps[part]) + part.start).tolist()
+            absent += parted.bridged("nis", stamps[part], known_array[part]).tolist()
+            parted.last_ns = int(stamps[part][-1])
+    assert found == gaps.tolist() == (np.flatnonzero(np.diff(stamps) > LONGEST_BRIDGE_NS) + 1).tolist()
+    assert absent == bridged.tolist()
+    for i in np.flatnonzero(~known_array):
+        before = stamps[:i][known_array[:i]]
+        assert bridged[i] == (len(before) == 0 or stamps[i] - before[-1] <= LONGEST_BRIDGE_NS)
+
+
+def test_a_line_breaks_where_nothing_was_recorded(tmp_path, circle):
+    path = tmp_path / "recording.rrd"
+    sink = RerunSink(path, application_id="x", shown=SHOWN, log_name="drive", input_hash=HASH, start_ns=START_NS)
+    sink.append(circle("phy-ukf", 0, 40))
+    sink.append(circle("phy-ukf", 400, 40))
+    sink.finish(REPORT)
+    stamps, values = series(tables(path)[0]["/main"], "vx_m_s")
+    assert stamps[40] == circle("phy-ukf", 0, 40).stamps_ns[-1] + 1 and np.isnan(values[40]).all() and len(stamps) == 81
 
 
 @settings(max_examples=50, derandomize=True, deadline=None)
@@ -469,16 +503,3 @@ def test_a_trajectory_stays_small_and_evenly_spaced(lengths):
         assert strip[0, 0] == 0
         assert len(set(np.diff(strip[:, 0]))) == 1
         assert total - strip[-1, 0] <= np.diff(strip[:, 0])[0]
-
-
-def test_the_truth_stands_out_and_bands_stay_behind_the_lines(recording: Path) -> None:
-    _, static = tables(recording)
-
-    def widths(entity: str) -> list[float]:
-        (batch,) = static[entity]
-        (column,) = [n for n in batch.schema.names if n.endswith("widths")]
-        return list(batch.column(column).to_pylist()[0])
-
-    assert widths("/sideslip_deg/truth") == [2.0]
-    assert widths("/sideslip_deg/phy-ukf") == [1.5]
-    assert widths("/sideslip_deg/phy-ukf/band95") == [0.75, 0.75]

@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -20,7 +19,6 @@ from pdhef_logtool.sinks.mcap import _is_our_report
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.parquet import EstimatesSink, RowGroups
 from pdhef_logtool.sinks.report import diverged_line, json_bytes, report_markdown, tool_versions
-from pdhef_logtool.sinks.rerun import _Line
 
 SECOND = 10**9
 START_NS = 1_700_000_000 * SECOND
@@ -83,15 +81,6 @@ def test_colours_are_red_green_blue_and_a_names_own() -> None:
     found = [colour_rgb(f"recorded {i}", {"phy-ukf": 0}) for i in range(40)]
     assert set(found) == palette
     assert colour_rgb("recorded 7", {}) == found[7]
-
-
-def test_a_line_breaks_over_a_window_of_unknown_rows_and_not_over_an_empty_one() -> None:
-    for between, breaks in (([False], [True, False]), ([], [False])):
-        line = _Line(0)
-        line.rows(np.array([0]), np.array([True]))
-        line.rows(np.arange(10, 10 + len(between)), np.array(between, dtype=np.bool_))
-        stamps, at, is_break = line.rows(np.array([20]), np.array([True]))
-        assert (stamps.tolist(), at.tolist(), is_break.tolist()) == ([1, 20][-len(breaks) :], [0], breaks)
 
 
 def test_junit_is_laid_out_for_people_and_a_failure_says_all() -> None:
