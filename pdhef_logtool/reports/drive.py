@@ -16,6 +16,8 @@ from pdhef_logtool.sinks.report import reasons_line
 
 #: What reports of earlier versions do not say: the default of a vehicle file.
 _LOW_SPEED_M_S = 3.0
+#: The strongest filter on physics alone.
+_PHYSICS = "physics"
 #: Of a shorter drive nothing can be said with any certainty.
 _SHORT_S = 10.0
 #: The figures of a page, in the order in which they stand.
@@ -121,7 +123,10 @@ def roles_of(report: Mapping[str, Any]) -> Roles | None:
 
 
 def _best_physics(report: Mapping[str, Any], ran: Sequence[Mapping[str, Any]], main: str) -> str:
-    """Return the estimator on physics alone with the least error, else the first; the first of any where none is."""
+    """Return the estimator on physics alone with the least error, else the first; the first of any where none is.
+
+    Where nothing is scored, ``physics`` itself comes before others.
+    """
     errors = {m["estimator"]: m["value"] for m in report["metrics"] if _is_whole(m, "sideslip_rad", "rmse")}
     others = [e for e in ran if e["name"] != main]
     causal = next(e["causal"] for e in ran if e["name"] == main)
@@ -129,7 +134,7 @@ def _best_physics(report: Mapping[str, Any], ran: Sequence[Mapping[str, Any]], m
     known = [n for n in physics if errors.get(n) is not None]
     if known:
         return min(known, key=lambda n: float(errors[n]))
-    fallback: list[str] = [*physics, *(e["name"] for e in others), ""]
+    fallback: list[str] = [*(n for n in physics if n == _PHYSICS), *physics, *(e["name"] for e in others), ""]
     return fallback[0]
 
 

@@ -73,7 +73,7 @@ class Browser:
         os.close(self._out)
         self._folder.cleanup()
 
-    def call(self, method: str, wait_s: float = 60.0, **parameters: object) -> dict:
+    def call(self, method: str, wait_s: float = 180.0, **parameters: object) -> dict:
         self._number += 1
         message = {"id": self._number, "method": method, "params": parameters}
         if self._session is not None:
@@ -120,7 +120,7 @@ class Browser:
         elif event == "Page.loadEventFired":
             self._loaded = True
 
-    def open(self, path: Path, wait_s: float = 60.0) -> None:
+    def open(self, path: Path, wait_s: float = 180.0) -> None:
         """Open a file and wait until all of its figures are drawn."""
         self._loaded = False
         end = time.monotonic() + wait_s

@@ -97,6 +97,12 @@ def test_without_truth_the_page_says_why_there_is_no_score_and_shows_disagreemen
     assert [s["label"] for s in figures(page)["error"]["series"]] == ["physics", "zero"]
 
 
+def test_without_truth_physics_is_what_the_answer_is_compared_with(tmp_path):
+    folder = write_run(tmp_path, drive_tracks(names=("pd-hef", "open-loop", "physics"), truth=False))
+    assert roles_of(open_run(folder).logs[0].report()).rival == "physics"
+    assert "physics, to compare" in words(page_of(folder))
+
+
 def test_one_estimator_without_truth_has_a_page(tmp_path):
     page = page_of(write_run(tmp_path, drive_tracks(names=("zero",), truth=False)))
     assert "error" not in figures(page)

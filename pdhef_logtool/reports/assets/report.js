@@ -78,7 +78,7 @@
 
   function secondsShown(s, span) {
     const digits = span > 100 ? 0 : span > 10 ? 1 : span > 1 ? 2 : 3;
-    return s.toFixed(digits);
+    return s.toFixed(digits).replace(/^-(0\.?0*)$/, "$1");
   }
 
   function element(tag, parent, text, className) {
