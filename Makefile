@@ -9,13 +9,14 @@ CAR := saloon
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: help demo test quick mutants check lint format bench train-default samples conditions real switches torture \
+.PHONY: help demo test quick pages mutants check lint format bench train-default samples conditions real switches torture \
   docs docs-truthsim paper strangers clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
 	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
+	@echo "make pages    look at the pages in a browser: their tests, and the pictures of docs/report.md anew (needs Chromium)"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
 	@echo "make torture  damaged, hostile and odd input, counted: docs/reliability.md (two hours or less on two cores; resumable)"
@@ -50,6 +51,7 @@ demo: $(VENV)/installed $(VENV)/compiled
 	$(BIN)/pdhef run sample_logs/sweep.mcap -o $(OUT)-low-friction --car $(CAR) --friction 0.3
 	@echo
 	@echo "Outputs: $(OUT)/ and $(OUT)-low-friction/"
+	@echo "  report.html, logs/<log>/report.html   the run and each drive, for a browser"
 	@echo "  logs/<log>/annotated.mcap   for Foxglove, PlotJuggler or ros2 bag"
 	@echo "  logs/<log>/recording.rrd    open it with: $(BIN)/pdhef view $(OUT)"
 	@echo "  logs/<log>/report.json, estimates.parquet; metrics.parquet and run.json for the whole run"
@@ -65,6 +67,11 @@ test: $(VENV)/installed-dev $(VENV)/compiled
 
 quick: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow"
+
+pages: $(VENV)/installed-dev $(VENV)/compiled
+	$(BIN)/python -m pytest tests/reports tests/results
+	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
+	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
 
 # Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.
 SEED ?= 1

@@ -200,7 +200,7 @@ def page(found: Mapping[str, Mapping[str, Errors]], models: dict[str, ModelBundl
 
 Written by `python -m studies.many_cars_table`; networks by `make train-default` and by the same command with
 `--train`. Both networks at trust 1 whatever the evidence, so that the network is compared and not the caution.
-As served, a network has no trust on a car without evidence ([trust.md](trust.md)): `pd-hef` is then `physics`, bit for bit.
+As served, a network has no trust on a car without evidence ([trust.md](trust.md)): there `pd-hef` is `physics`.
 
 {networks}
 

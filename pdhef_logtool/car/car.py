@@ -169,6 +169,8 @@ class Car:
         if other := car._other_than_tried:
             stale.append(f"{NETWORK_FILE} allows no trust: it was found with {other}; pdhef trust makes it anew")
         own = intervals is None and folder is not None and (folder / INTERVALS_FILE).is_file()
+        if intervals is None and not own and car.varied_physics:
+            car = replace(car, intervals=None)  # what its own drives left open says more than another car's intervals
         if own and found is not None and found.physics_sha256 != car.physics_sha256:
             stale.append(f"{INTERVALS_FILE} was made with other physics; pdhef calibrate makes it anew")
         return replace(car, notes=tuple(stale))

@@ -259,14 +259,20 @@ class SideslipCoefficients(YawRateCoefficients):
     grip: NonNegative
     grip2: NonNegative
     kinematic: NonNegative
+    cure: NonNegative = 0.0
+    bank: NonNegative = 0.0
 
 
 class Inflation(Record):
-    """Coefficients of the calibrated 1-sigmas of one algorithm (:mod:`pdhef_logtool.watches.intervals`)."""
+    """Coefficients of the calibrated 1-sigmas of one algorithm (:mod:`pdhef_logtool.watches.intervals`).
+
+    ``grip_factors`` : on that of the sideslip, where little, some and much of the grip is used.
+    """
 
     sideslip: SideslipCoefficients
     yaw_rate: YawRateCoefficients
     vy_factor: NonNegative = 1.0
+    grip_factors: Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)] = (1.0, 1.0, 1.0)
 
 
 class Algorithm(Record):
@@ -298,7 +304,11 @@ class Algorithm(Record):
 
 
 class IntervalEntry(Record):
-    """Intervals of one algorithm; ``estimator`` is the name under which it ran, for people."""
+    """Intervals of one algorithm; ``estimator`` is the name under which it ran, for people.
+
+    ``wrong_vehicle_factor`` stands in files of older versions, ``unseen_factor`` says how much wider drives that a fit
+    had not seen asked the intervals to be, over all grip use.
+    """
 
     estimator: str
     algorithm: Algorithm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.results.gate import Gate
 
 commands = typer.Typer()
+#: Room around events: a threshold that is crossed to and fro is one event; a clip shows how it came about.
+_PAD_S, _CLIP_PAD_S = 0.25, 5.0
 
 
 @options.command(
@@ -29,6 +32,7 @@ commands = typer.Typer()
 def compare(
     a: Annotated[Path, Argument(metavar="A", help="Outputs of the run that is the yardstick.")],
     b: Annotated[Path, Argument(metavar="B", help="Outputs of the run that is held against it.")],
+    *,
     gate: Annotated[Path | None, Option(metavar="FILE", help="gate.toml: figures with their limits.")] = None,
     max_regression: Annotated[
         str | None, Option(metavar="SHARE", help="Gate of one figure: how much worse it may be, 5% or 0.05.")
@@ -50,14 +54,20 @@ def compare(
 ) -> None:
     """Say whether run B is better or worse than run A. Drives are paired; nobody can tell is an answer."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
+    from pdhef_logtool.records.outputs import check_no_input
     from pdhef_logtool.results.comparing import compare_runs
     from pdhef_logtool.results.opened_run import open_run
 
+    check_no_input([a, b, gate], [file for file in (html, junit) if file is not None])
     asked = _gate(gate, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
     found = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
     if junit is not None:
         write_comparison_junit(junit, found)
-    del html
+    if html is not None:
+        from pdhef_logtool.records.files import write_bytes
+        from pdhef_logtool.reports.comparison import comparison_page
+
+        write_bytes(html, comparison_page(found))
     console.finish(found, render_comparison, as_json)
 
 
@@ -83,3 +93,65 @@ def _gate(
     if problems := figure_problems(figure.signal, figure.metric, figure.segment):
         raise UsageError(expected="a figure of which less is better", got="; ".join(problems), where="--metric")
     return Gate((figure,), allow_unpaired)
+
+
+@options.command(
+    commands,
+    'pdhef events out --where "abs(sideslip_error_deg) > 2 for 0.5s"',
+    'pdhef events out --where "diverged or not valid" --json',
+    'pdhef events out --where "abs(sideslip_deg) > 9" --clip --pad 3s',
+    'pdhef events out --where "abs(ay_m_s2) > 6" --parquet events.parquet',
+    notes="Columns of estimates.parquet, speed_m_s, and errors against the truth: sideslip_error_rad, vx_error_m_s, "
+    "vy_error_m_s, yaw_rate_error_rad_s, ay_error_m_s2; _deg and _km_h in place of _rad and _m_s. They are of the main "
+    "estimator, or of truth. or NAME. before them. < <= > >= == !=, and or not, + - * /, abs(), (); for 0.5s: so long "
+    "at least.",
+)
+def events(
+    output: Annotated[Path, Argument(metavar="OUTPUT", help="Folder of a run.")],
+    *,
+    where: Annotated[str, Option(metavar="EXPR", help="What is to hold; docs/compare.md.")],
+    pad: Annotated[
+        str | None,
+        Option(
+            metavar="TIME", help="Room around an event; where it touches, two are one. Default: 0.25s, of clips 5s."
+        ),
+    ] = None,
+    estimator: Annotated[str | None, Option(help="Which estimator columns are of. Default: each drive's main.")] = None,
+    clip: Annotated[bool, Option("--clip", help="Write an MCAP an event, with the source's topics and ours.")] = False,
+    source: Annotated[
+        Path | None, Option(metavar="DIR", help="Where the logs are, for clips of a run without full copies.")
+    ] = None,
+    parquet: Annotated[Path | None, Option(metavar="FILE", help="Write the rows as Parquet.")] = None,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Find where in the drives of a run something holds. Each event can be cut out as a clip."""
+    from pdhef_logtool.cli.event_tables import render_events
+    from pdhef_logtool.records.outputs import check_no_input
+    from pdhef_logtool.results.events import find_events, write_events
+    from pdhef_logtool.results.expression import parse_condition
+    from pdhef_logtool.results.opened_run import open_run
+
+    condition = parse_condition(where)
+    pad_s = (_CLIP_PAD_S if clip else _PAD_S) if pad is None else _seconds(pad)
+    if source is not None and not clip:
+        raise UsageError(expected="--clip", got="--source alone", where="--source")
+    check_no_input([output], [] if parquet is None else [parquet])
+    run = open_run(output)
+    found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
+    if clip:
+        from pdhef_logtool.results.clips import write_clips
+
+        named = {column.track for column in condition.columns() if column.track is not None}
+        named |= set() if estimator is None else {estimator}
+        found = write_clips(run, found, pad_s=pad_s, named=named, source=source, tell=console.warn)
+    if parquet is not None:
+        write_events(parquet, found)
+    console.finish(found, render_events, as_json)
+
+
+def _seconds(text: str) -> float:
+    """Return the seconds of ``5s``, ``500ms`` or ``5``; raises UsageError."""
+    found = re.fullmatch(r"\s*([0-9]*\.?[0-9]+)\s*(ms|s)?\s*", text, re.ASCII)
+    if found is None or float(found[1]) > 1e6:
+        raise UsageError(expected="a time such as 5s", got=text, where="--pad")
+    return float(found[1]) * (1e-3 if found[2] == "ms" else 1.0)

@@ -20,14 +20,24 @@ if TYPE_CHECKING:
 commands = typer.Typer()
 
 
-@options.command(commands, "pdhef report out", "pdhef report out --open", "pdhef report out --png --json")
+@options.command(
+    commands,
+    "pdhef report out",
+    "pdhef report out --open",
+    "pdhef report out --by car --by vehicle_id",
+    "pdhef report out --png --json",
+)
 def report(
     output: Annotated[Path, Argument(metavar="OUT", help="Folder of a run.")],
     show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,
+    by: Annotated[
+        list[str] | None,
+        Option(metavar="KEY", help="Break drives down by this: a key of the logs' metadata, car, folder; repeatable."),
+    ] = None,
     png: Annotated[bool, Option("--png", help="Each figure as a picture too, in logs/LOG/figures.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Write the pages of a run: report.html of each log.
+    """Write the pages of a run: of all logs, and of each.
 
     They are made from what the run left, as at the end of run itself.
     """
@@ -37,7 +47,7 @@ def report(
 
     open_run(output)  # before the folder is held, which would make it where it is missing
     with OutputFolder(output, (LOGS,)), console.progress() as bar:
-        result = write_pages(open_run(output), bar, png=png)
+        result = write_pages(open_run(output), bar, png=png, by=by or ())
     console.show(result, _render, as_json)
     for line in result.wrong:
         console.warn(line)
@@ -47,10 +57,11 @@ def report(
 
 
 def open_page(result: WrittenPages) -> None:
-    """Open the first page in the browser, or say where it is."""
+    """Open the page of the run in the browser, that of the log where it is the only one, or say where it is."""
     import webbrowser
 
-    page = next((p.file for p in result.pages if p.file is not None), None)
+    pages = (*result.pages, result.fleet) if len(result.pages) == 1 else (result.fleet, *result.pages)
+    page = next((p.file for p in pages if p.file is not None), None)
     if page is None:
         return
     has_display = sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -59,7 +70,8 @@ def open_page(result: WrittenPages) -> None:
 
 
 def _render(result: WrittenPages, out: Console) -> None:
-    for page in result.pages:
+    for page in (*result.pages, result.fleet):
         if page.file is not None:
-            pictures = f" and {len(page.pictures)} pictures in {page.pictures[0].parent}" if page.pictures else ""
+            number = f"{len(page.pictures)} picture{'s' if len(page.pictures) > 1 else ''}"
+            pictures = f" and {number} in {page.pictures[0].parent}" if page.pictures else ""
             out.print(f"{page.file}{pictures}", soft_wrap=True)

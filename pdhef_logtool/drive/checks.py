@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, Sensors, VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.columns import derivative, earlier, independent_samples, moving_at
+from pdhef_logtool.drive.delays import LateSensor, delay_checks
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured, measure
 from pdhef_logtool.drive.relations import (
     Mistake,
     Relation,
     best_explanation,
+    contradicting,
     gentle_at,
     known_mistakes,
     smallest_explanations,
@@ -32,6 +34,8 @@ from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray
 #: (0.3 m/s^2), a production sensor's bias less than that; 0.8 m/s^2 is a tilt of 4.7 degrees, half of g another axis.
 LEVEL_M_S2 = 0.8
 OTHER_AXIS_M_S2 = 5.0
+#: Independent samples of gentle driving from which on a mean is a tilt or a bias, and no manoeuvre: 10 s.
+LEVEL_SAMPLES = 20.0
 #: Truth stands wrong by more than what tyres and crossfall make of straight driving, and is known to a third of it.
 SIDESLIP_OFFSET_RAD = math.radians(0.15)
 #: No car drives sideways: half of its moving time beyond that, the heading and the velocity do not belong together.
@@ -40,8 +44,12 @@ SIDEWAYS_RAD = math.radians(20.0)
 LEVER_M = 0.5
 #: Production gyros are good to 1 %, cheap ones to 3 %.
 GAIN_ERROR = 0.05
-#: A gyro's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
-GYRO_DELAY_S = 0.03
+#: What an accelerometer reads of the lateral acceleration: roll adds a tenth, banked bends take a quarter.
+AY_GAIN_RANGE = (0.65, 1.3)
+#: The delay of a_y is found in so many steps, the last of which is less than this, and is none beyond.
+DELAY_STEPS, DELAY_KNOWN_S, MOST_DELAY_S = 4, 0.005, 0.3
+#: A sensor's filter and a bus take 10 to 20 ms; at 0.5 Hz, 30 ms are 5 degrees of phase.
+SENSOR_DELAY_S = 0.03
 #: Understeer gradients that have opposite signs and are this far from neutral; rad per m/s^2. Cars have 0.002 to 0.006.
 NEUTRAL_RAD_PER_M_S2 = 0.0006
 #: Steering angle over what the file's ratio and wheelbase make of the curvature.
@@ -73,6 +81,7 @@ def check_drive(
     vehicle: VehicleParameters | None = None,
     *,
     latency: LatencyEstimate | None = None,
+    late: Sequence[LateSensor] = (),
     mounting_is_known: bool = False,
     measured: Measured | None = None,
 ) -> tuple[Check, ...]:
@@ -84,11 +93,11 @@ def check_drive(
     ----------
     signals, truth : by name, SI, as mapped. derived : truth at the CG.
     vehicle : its file is held against the drive; None, or the default car: there is none.
-    latency : of the truth against the gyro, or the gyro's own.
+    latency : of the truth against the gyro, or the gyro's own. late : sensors that are late without truth.
     mounting_is_known : gravity has shown that the IMU is not upside down.
     measured : what :func:`~pdhef_logtool.drive.measured.measure` makes of the channels, where that is known.
     """
-    asked = _Asked(vehicle, latency, mounting_is_known, derived is not None)
+    asked = _Asked(vehicle, latency, tuple(late), mounting_is_known, derived is not None)
     found = _all_checks(measure(signals, truth, derived) if measured is None else measured, asked)
     if all(check.verdict != "failed" for check in found):
         return found
@@ -103,6 +112,7 @@ def check_drive(
 class _Asked:
     vehicle: VehicleParameters | None
     latency: LatencyEstimate | None
+    late: tuple[LateSensor, ...]
     mounting_is_known: bool
     has_truth: bool
 
@@ -117,6 +127,8 @@ def _all_checks(measured: Measured, asked: _Asked) -> tuple[Check, ...]:
     if asked.has_truth:
         found += _sideslip_checks(columns)
         found += _sensor_error_checks(columns, asked.latency, vehicle, wrong)
+    by_truth = {c.name for c in found}
+    found += [c for c in delay_checks(asked.late) if c.name not in by_truth]
     if vehicle != default_vehicle():
         found += _vehicle_checks(columns, speed_name, vehicle)
     unique: dict[str, Check] = {}
@@ -165,29 +177,74 @@ def _by_relations(measured: Measured, *, mounting_is_known: bool) -> list[Check]
     if "truth.sideslip_rad" in names and "truth.vy_m_s" in names:  # which is v_x times its tangent
         names.remove("truth.vy_m_s")
     explanations = smallest_explanations(relations, known_mistakes(list(columns), groups))
-    blamed: dict[str, list[Mistake]] = {n: [] for n in columns}
-    for mistake in (m for chosen in explanations for m in chosen):
-        for name in mistake.factors:
-            blamed[name] += [mistake] if mistake not in blamed[name] else []
+    blamed, suspected = _mistakes_by_signal(explanations)
+    culprits = set() if explanations else contradicting(relations)
     checks: list[Check] = []
     for name in names:
         mine = [r for r in relations if name in r.powers]
         telling = [r for r in mine if r.tells]
         bad = [r for r in telling if not r.accepts()]
+        good = [r for r in telling if r.accepts()]
         stray = [r for r in mine if r.unrelated and not _is_cleared(name, r, relations)]
         if stray:
             checks.append(_stray(name, stray[0]))
-        if blamed[name]:
-            checks += _blamed(name, blamed[name], bad or telling)
-        elif bad and not explanations:
-            remedy = "no single mistake explains it: look at the field, unit and sign of " + " and ".join(bad[0].powers)
-            checks.append(Check(f"{name}.unit", name, "failed", bad[0].evidence, remedy))
-        elif telling:
-            best = max(telling, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
+        if name in blamed or name in suspected:
+            found = _blamed(name, blamed.get(name) or suspected[name], bad or telling)
+            is_sure = name in blamed and not (bad and all(r.is_vague for r in bad))
+            checks += found if is_sure else [replace(c, verdict="undecided") for c in found]
+        elif name in culprits:
+            checks.append(_unexplained(name, bad))
+        elif good or (bad and explanations):
+            best = max(telling if explanations else good, key=lambda r: (len(r.powers) > 1, abs(r.correlation)))
             checks += [Check(f"{name}.{aspect}", name, "passed", best.evidence) for aspect in ("sign", "unit")]
+        elif bad:
+            checks.append(_contradicted(name, bad[0], culprits))
         elif not stray:
             checks.append(_not_excited(name, mine))
     return checks
+
+
+def _mistakes_by_signal(
+    explanations: Sequence[tuple[Mistake, ...]],
+) -> tuple[dict[str, list[Mistake]], dict[str, list[Mistake]]]:
+    """Return by signal the mistakes of the likeliest explanations, and those of others that explain it as well."""
+    least = min((_likelihood(e) for e in explanations), default=())
+    blamed: dict[str, list[Mistake]] = {}
+    suspected: dict[str, list[Mistake]] = {}
+    for chosen in explanations:
+        found = blamed if _likelihood(chosen) == least else suspected
+        for mistake in chosen:
+            for name in mistake.factors:
+                if mistake not in found.setdefault(name, []):
+                    found[name].append(mistake)
+    return blamed, suspected
+
+
+def _likelihood(explanation: tuple[Mistake, ...]) -> tuple[int, int]:
+    """Return how many signals an explanation has wrong, the wheels as one, and how seldom those are."""
+    signals = {"wheels" if n.startswith("wheel_speed") else n for m in explanation for n in m.factors}
+    seldom = max((_OFTEN_WRONG.index(n) if n in _OFTEN_WRONG else len(_OFTEN_WRONG) for n in signals), default=0)
+    return len(signals), seldom
+
+
+#: Of signals that explain a contradiction equally well the first is blamed: no standard says how a steering angle
+#: counts, and an axis of an IMU is turned more often than the sign of a gyro that is read from the right one.
+_OFTEN_WRONG = ("steering_wheel_rad", "steer_rad", "wheels", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
+
+
+def _unexplained(name: str, bad: Sequence[Relation]) -> Check:
+    """Return the check of a signal that contradicts others by what is no known unit or sign."""
+    first = next((r for r in bad if not r.is_close), bad[0])
+    if first.is_close:
+        remedy = "no unit or sign explains it: the car may slide, or a sensor may fail for a while"
+        return Check(f"{name}.unit", name, "undecided", first.evidence, remedy)
+    remedy = "no single mistake explains it: look at the field, unit and sign of " + " and ".join(first.powers)
+    return Check(f"{name}.unit", name, "failed", first.evidence, remedy)
+
+
+def _contradicted(name: str, relation: Relation, culprits: set[str]) -> Check:
+    others = " and ".join(sorted(culprits & set(relation.powers)))
+    return Check(f"{name}.unit", name, "undecided", relation.evidence, f"needs {others} that is right")
 
 
 _JUDGED_TRUTH = (*(f"truth.{n}" for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2")),)
@@ -258,7 +315,7 @@ def _levels(
             rest, known = columns[name], np.isfinite(columns[name])
         if independent_samples(int(np.count_nonzero(known))) < 2.0:
             continue
-        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= 6.0
+        told = independent_samples(int(np.count_nonzero(known & at_ease))) >= LEVEL_SAMPLES
         use = known & at_ease if told else known
         bias = sensors.ax_bias_m_s2 if name == "ax_m_s2" else sensors.ay_bias_m_s2
         check = _level(name, float(np.mean(rest[use])) - bias, float(np.mean(columns[name][use])) - bias)
@@ -380,22 +437,27 @@ class SensorErrors:
     Attributes
     ----------
     lever_m : of the accelerometer ahead of the CG. yaw_rate_gain : what the gyro reads of 1.
+    ay_gain : what the accelerometer reads of 1, with the roll of the body. ay_delay_s : how late it is.
     """
 
     lever_m: float
     lever_error_m: float
     yaw_rate_gain: float
     gain_error: float
+    ay_gain: float = math.nan
+    ay_gain_error: float = math.inf
+    ay_delay_s: float = math.nan
+    ay_delay_error_s: float = math.inf
 
 
 def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     """Regress a_y and the gyro on the truth; NaN for what the drive does not tell.
 
     a_y is the truth's v̇_y + v_x r, as far as roll makes it larger; a lever adds the derivative of the yaw rate, a delay
-    takes the derivative of a_y off, a bias adds a constant.
+    takes the derivative of all that off, a bias adds a constant.
     """
     nothing = (math.nan, math.inf)
-    lever = gain = nothing
+    lever = gain = ay_gain = delay = nothing
     needed = [columns.get(f"truth.{n}") for n in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")]
     vx, vy, rate = needed
     gyro, ay = columns.get("yaw_rate_rad_s"), columns.get("ay_m_s2")
@@ -406,9 +468,19 @@ def sensor_errors(columns: Mapping[str, FloatArray]) -> SensorErrors:
     if vx is not None and vy is not None and rate is not None and ay is not None:
         lateral = derivative(vy) + vx * rate
         regressors = [derivative(rate), lateral, derivative(lateral), np.ones_like(rate)]
-        found = fit(ay, regressors, moving_at(vx))
-        lever = nothing if found is None else (found[0][0], found[1][0])
-    return SensorErrors(*(float(x) for x in (*lever, *gain)))
+        late_s = 0.0
+        for _ in range(DELAY_STEPS):  # a lever's part is late too, so that one step is not all of it
+            found = fit(earlier(ay, late_s), regressors, moving_at(vx))
+            if found is None or found[0][1] <= 0.0:
+                break
+            (place, scale, slope, _), (place_error, scale_error, slope_error, _), _ = found
+            step_s = -slope / scale
+            late_s += step_s
+            known = abs(step_s) < DELAY_KNOWN_S and late_s < MOST_DELAY_S
+            delay = (late_s, slope_error / scale) if known else nothing
+            if lever == nothing or (known and late_s > SURE * delay[1]):
+                lever, ay_gain = (place, place_error), (scale, scale_error)
+    return SensorErrors(*(float(x) for x in (*lever, *gain, *ay_gain, *delay)))
 
 
 def _sensor_error_checks(
@@ -430,6 +502,7 @@ def _sensor_error_checks(
             checks.append(Check(f"{name}.place", name, "failed", evidence, remedy))
         elif abs(off) + 2.0 * error < 2.0 * LEVER_M:
             checks.append(Check(f"{name}.place", name, "passed", evidence))
+        checks += _gain_and_delay_of_ay(errors, latency)
     name = "yaw_rate_rad_s"
     if math.isfinite(errors.yaw_rate_gain) and not wrong & {name, *truth}:
         gain, error = errors.yaw_rate_gain / vehicle.sensors.yaw_rate_gain, errors.gain_error
@@ -442,9 +515,44 @@ def _sensor_error_checks(
     if latency is not None and latency.reliable and not latency.identical:
         delay = latency.gyro_delay_s
         evidence = f"{delay * 1e3:.1f} +- {latency.std_error_s * 1e3:.1f} ms late against the truth"
-        late = delay > GYRO_DELAY_S
+        late = delay > SENSOR_DELAY_S
         remedy = f"latency_s = {delay:.4f} more in the mapping, or pdhef identify" if late else ""
         checks.append(Check(f"{name}.delay", name, "failed" if late else "passed", evidence, remedy))
+    return checks
+
+
+def ay_delay(errors: SensorErrors, latency: LatencyEstimate | None) -> tuple[float, float] | None:
+    """Return how late the accelerometer is, and its standard error; None where the truth does not tell.
+
+    A truth whose yaw rate is the gyro's own may have velocities of another time, and says nothing of a_y.
+    """
+    low, high = AY_GAIN_RANGE
+    if latency is None or not latency.reliable or latency.identical:
+        return None
+    if not low < errors.ay_gain < high or not math.isfinite(errors.ay_delay_s):
+        return None
+    return errors.ay_delay_s + latency.latency_s, math.hypot(errors.ay_delay_error_s, latency.std_error_s)
+
+
+def _gain_and_delay_of_ay(errors: SensorErrors, latency: LatencyEstimate | None) -> list[Check]:
+    name, gain, error = "ay_m_s2", errors.ay_gain, errors.ay_gain_error
+    (low, high), checks = AY_GAIN_RANGE, []
+    evidence = f"a_y reads {gain:.2f} +- {error:.2f} of the truth's lateral acceleration, with roll and bank"
+    if gain + SURE * error < low or gain - SURE * error > high:
+        remedy = f"divide its scale in the mapping by about {gain:.2f}"
+        checks.append(Check(f"{name}.gain", name, "failed", evidence, remedy))
+    elif low <= gain - 2.0 * error and gain + 2.0 * error <= high:
+        checks.append(Check(f"{name}.gain", name, "passed", evidence))
+    found = ay_delay(errors, latency)
+    if found is None:
+        return checks
+    delay, error = found
+    evidence = f"a_y is {delay * 1e3:.1f} +- {error * 1e3:.1f} ms late against the truth"
+    if delay > max(SENSOR_DELAY_S, SURE * error):
+        remedy = f"latency_s = {delay:.4f} more in the mapping"
+        checks.append(Check(f"{name}.delay", name, "failed", evidence, remedy))
+    elif abs(delay) + 2.0 * error < 2.0 * SENSOR_DELAY_S:
+        checks.append(Check(f"{name}.delay", name, "passed", evidence))
     return checks
 
 
@@ -504,7 +612,7 @@ def _steering_checks(steer: FloatArray, rate: FloatArray, speed: FloatArray, veh
         lacks = "needs bends to both sides at low and at high speed"
         return [Check(n, "vehicle", "undecided", "too little driving in bends", lacks) for n in names]
     (share, gradient, _), (share_error, error, _), left = found
-    if left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
+    if share <= 0.0 or left > UNEXPLAINED_STEERING * float(np.std(steer[gentle & np.isfinite(steer)])):
         lacks = "needs bends that the car does not slide through"
         evidence = "curvature and lateral acceleration do not explain the steering"
         return [Check(n, "vehicle", "undecided", evidence, lacks) for n in names]

@@ -44,6 +44,12 @@ def derivative(column: FloatArray) -> FloatArray:
     return out
 
 
+def earlier(column: FloatArray, by_s: float) -> FloatArray:
+    """Return a column of the grid as it would be had it come earlier; NaN where that is not known."""
+    cell = np.arange(column.shape[0]) + by_s / GRID_S
+    return column if by_s == 0.0 else np.interp(cell, np.arange(column.shape[0]), column, left=np.nan, right=np.nan)
+
+
 def moving_at(speed: FloatArray) -> BoolArray:
     """Return where the car drives: by the drive's own fast speeds, so that a 1:10 car counts as a car does."""
     finite = np.abs(speed[np.isfinite(speed)])

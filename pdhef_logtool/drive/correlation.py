@@ -72,6 +72,14 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
     return Shift((best - reach + refined) * grid.step_s, peak, True)
 
 
+def has_peak_within(grid: CommonGrid, low_s: float, high_s: float, least: float) -> bool:
+    """Return whether the correlation has a peak of ``least`` or more inside of a range, and not only beyond it."""
+    shifts = range(round(low_s / grid.step_s) - 1, round(high_s / grid.step_s) + 2)
+    found = np.array([_correlation(grid.a, grid.b, k) for k in shifts])
+    inner = found[1:-1]
+    return bool(((inner > found[:-2]) & (inner >= found[2:]) & (inner >= least)).any())
+
+
 def parabolic_peak(before: float, at: float, after: float) -> float:
     """Return the place of the vertex of the parabola through values at −1, 0, 1; 0 when it has no maximum."""
     curvature = before - 2.0 * at + after

@@ -17,6 +17,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.drive.checks import check_drive, explained_factors
 from pdhef_logtool.drive.columns import derivative, independent_samples, moving_at
+from pdhef_logtool.drive.delays import LateSensor, late_sensors
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.frames import (
     IS_GRAVITY_M_S2,
@@ -28,7 +29,7 @@ from pdhef_logtool.drive.frames import (
     rotation_text,
 )
 from pdhef_logtool.drive.measured import Measured, measure
-from pdhef_logtool.drive.relations import gentle_at, steering_references, yaw_references
+from pdhef_logtool.drive.relations import gentle_at, steering_references, units_told, yaw_references
 from pdhef_logtool.drive.truth import (
     LatencyEstimate,
     TruthPlan,
@@ -142,7 +143,7 @@ def _named_rows(mapping: Mapping, accelerations: Triad, rates: Triad) -> FloatAr
 class _Turn:
     """A rotation for one choice of the vertical, and how well it explains the drive.
 
-    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells; ``along``: the speed alone says
+    ``sign``: correlation of the yaw rate with another measurement of it, 0: none tells. ``along``: the speed alone says
     which way is forward.
     """
 
@@ -320,6 +321,7 @@ class Survey:
             self.truth,
             self.vehicle,
             latency=self.latency,
+            late=self.late,
             mounting_is_known=self.is_mounted,
             measured=self.measured,
         )
@@ -333,17 +335,28 @@ class Survey:
             )
         return (*self.mounted, *self._of_names(found), *found)
 
+    @cached_property
+    def late(self) -> tuple[LateSensor, ...]:
+        """The sensors whose stamps are late by what the signals alone say; a sensor that fails for a while is none."""
+        found = late_sensors(self.channels.signals)
+        if not found:
+            return ()
+        sound, shares = without_faulty_samples(self.channels.signals, self.vehicle)
+        return late_sensors(sound) if shares else found
+
     def _of_names(self, found: tuple[Check, ...]) -> Iterator[Check]:
         """Yield what the mapping's names left undecided and the drive has not settled since."""
         passed = {c.name for c in found if c.verdict == "passed"} - {
             f"{c.subject}.sign" for c in found if c.verdict != "passed"
         }
+        doubted = {c.name.removesuffix(".candidate") for c in self.mapping.checks if "unit" in c.evidence}
+        told = units_told(self.measured.relations, doubted)
         for check in self.mapping.checks:
             signal = check.name.removesuffix(".candidate")
             if check.name in ("imu.mounting", "mapping.sign") and self.mounting is not None and self.mounting.confident:
                 continue
-            # A doubt about a unit stays: a gain that passes is wider than units that look alike.
-            if f"{signal}.sign" not in passed or "unit" in check.evidence:
+            # A doubt about a unit stays unless the drive rules out all others: a gain that passes is wider than some.
+            if f"{signal}.sign" not in passed or (signal in doubted and signal not in told):
                 yield check
 
 

@@ -18,6 +18,7 @@ from pdhef_logtool.drive.checks import (
     LEVER_M,
     SURE,
     SensorErrors,
+    ay_delay,
     explained_factors,
     is_turned,
     sensor_errors,
@@ -33,6 +34,8 @@ from pdhef_logtool.records.signals import Channel
 #: A gain or a lever that is smaller changes no estimate by what can be seen; it stays as it is.
 LEAST_GAIN = 0.01
 LEAST_LEVER_M = 0.3 * LEVER_M
+#: Less is within what the roll of the body does.
+LEAST_AY_DELAY_S = 0.015
 #: Beyond, it is no gain but a unit, and no place in a car.
 MOST_GAIN = 0.25
 #: As well as recorded frames know a place.
@@ -98,12 +101,28 @@ def mapping_proposals(survey: Survey) -> tuple[Proposal, ...]:
             found.append(Proposal("mapping", subject, evidence, section[name]))
     if not factors and not is_turned_imu:
         found += _of_a_turned_truth(survey)
-    delay = 0.0 if survey.latency is None else survey.latency.gyro_delay_s
-    gyro = signals.get("yaw_rate_rad_s")
-    if gyro is not None and delay >= LATE_GYRO_S and survey.latency is not None:
-        late = replace(gyro, latency_s=round(gyro.latency_s + delay, 4))
-        found.append(Proposal("mapping", gyro.name, survey.latency.reason, late))
+    for name, (delay_s, evidence) in _delays(survey).items():
+        late = replace(signals[name], latency_s=round(signals[name].latency_s + delay_s, 4))
+        found.append(Proposal("mapping", name, evidence, late))
     return tuple(found)
+
+
+def _delays(survey: Survey) -> dict[str, tuple[float, str]]:
+    """Return by signal what its stamps are late by, with the evidence: by truth, else by another sensor."""
+    found: dict[str, tuple[float, str]] = {}
+    latency = survey.latency
+    if latency is not None and latency.gyro_delay_s >= LATE_GYRO_S:
+        found["yaw_rate_rad_s"] = latency.gyro_delay_s, latency.reason
+    # From another axis nothing is told of a_y.
+    is_mounted = survey.mounting is None or survey.mounting.is_as_named
+    by_truth = ay_delay(sensor_errors(survey.measured.columns), latency) if is_mounted else None
+    if by_truth is not None and by_truth[0] > max(LEAST_AY_DELAY_S, SURE * by_truth[1]):
+        found["ay_m_s2"] = by_truth[0], f"a_y is {by_truth[0] * 1e3:.1f} ms late against the truth"
+    for sensor in survey.late:
+        told_by_truth = sensor.names[0] == "yaw_rate_rad_s" and latency is not None and latency.reliable
+        for name in sensor.names if sensor.exact and not told_by_truth else ():
+            found.setdefault(name, (sensor.delay_s, sensor.evidence))
+    return found
 
 
 def _of_a_turned_truth(survey: Survey) -> list[Proposal]:

@@ -27,6 +27,10 @@ MIN_SAMPLES = 6.0
 UNRELATED_CORRELATION = 0.25
 MOVES_M_S2 = 1.0
 MOVES_RAD_S = 0.06
+#: A gain that is off by less, or of a correlation below, may be the car's: it slides, a wheel spins, a brake locks.
+CLOSE, CLOSE_CORRELATION = 2.5, 0.8
+#: A wrong unit leaves the correlation of a right one.
+CLEAR_CORRELATION = 0.9
 #: Gains between these are tyres, roll, bank, grade and noise; beyond them they are units.
 GAIN_RANGE = (0.55, 1.8)
 #: The same quantity measured twice.
@@ -59,6 +63,8 @@ _TYPICAL = (*(f for t in (TYPICAL_STEERING_RATIO, TYPICAL_WHEEL_RADIUS_M) for f 
 CLEARLY_NEARER = 0.25
 #: No more mistakes than this are looked for at once.
 MAX_MISTAKES = 2
+#: And no more signals for those that no mistake explains.
+MAX_CULPRITS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +94,18 @@ class Relation:
         return abs(self.correlation) >= self.least_correlation and self._chance_z >= MIN_CHANCE_Z
 
     @property
+    def is_close(self) -> bool:
+        """Return whether a gain that is not plausible is off by less than known mistakes make, or hardly known."""
+        low, high = self.expected
+        wide = replace(self, expected=(low / CLOSE, high * CLOSE))
+        return abs(self.correlation) < CLOSE_CORRELATION or wide.accepts()
+
+    @property
+    def is_vague(self) -> bool:
+        """Return whether it is close and its sides go with one another as they do with noise or sliding in between."""
+        return self.is_close and abs(self.correlation) < CLEAR_CORRELATION
+
+    @property
     def unrelated(self) -> bool:
         """Return whether the sides move, and not with one another."""
         return self.moves and self.samples >= 4.0 * MIN_SAMPLES and abs(self.correlation) < UNRELATED_CORRELATION
@@ -104,7 +122,7 @@ class Relation:
         """
         gain, known = self.gain * factor, abs(self.correlation)
         gain = abs(gain) if self.signless else gain
-        return gain / known >= self.expected[0] and gain * known <= self.expected[1]
+        return known > 0.0 and gain / known >= self.expected[0] and gain * known <= self.expected[1]
 
     @property
     def evidence(self) -> str:
@@ -184,6 +202,59 @@ def smallest_explanations(relations: Sequence[Relation], mistakes: Sequence[Mist
     return []
 
 
+def contradicting(relations: Sequence[Relation]) -> set[str]:
+    """Return the signals that must be wrong where relations contradict one another and no mistake explains it.
+
+    As few as possible, and of them those that the fewest other relations show to be right; the wheels are one.
+    """
+    bad = [r for r in relations if r.tells and not r.accepts()]
+    good = [r for r in relations if r.tells and r.accepts()]
+    sets = [{_sensor(n) for n in r.powers} for r in bad]
+    names = sorted({n for s in sets for n in s})
+    best: tuple[int, tuple[str, ...]] | None = None
+    for size in range(1, min(len(names), MAX_CULPRITS) + 1):
+        for chosen in combinations(names, size):
+            if all(s & set(chosen) for s in sets):
+                cost = size + sum(bool({_sensor(n) for n in r.powers} & set(chosen)) for r in good)
+                if best is None or cost < best[0]:
+                    best = cost, chosen
+    found = set(names if best is None else best[1])
+    return {n for r in bad for n in r.powers if _sensor(n) in found}
+
+
+def _sensor(name: str) -> str:
+    return "wheel speeds" if name.startswith("wheel_speed_") else name
+
+
+def units_told(relations: Sequence[Relation], doubted: set[str]) -> set[str]:
+    """Return those of the signals of doubtful unit for which relations to others rule out every other unit.
+
+    A relation between two of them tells nothing until one is told; the truth's v_y has the unit of its v_x.
+    """
+    # Rim speed in m/s and in rad/s look alike where the radius is not known: wheels are never told.
+    open_, told = set(doubted), set[str]()
+    while True:
+        found = {
+            n
+            for n in open_
+            if not n.startswith("wheel_speed")
+            and _is_told(n, [r for r in relations if not (set(r.powers) - {n}) & open_])
+        }
+        if "truth.vx_m_s" in found | told:
+            found |= open_ & {"truth.vy_m_s"}
+        if not found:
+            return told
+        told |= found
+        open_ -= found
+
+
+def _is_told(name: str, relations: Sequence[Relation]) -> bool:
+    mine = [r for r in relations if name in r.powers and r.tells]
+    others = [factor for factor, _ in _units(name.removeprefix("truth."))]
+    holds = bool(mine) and bool(others) and all(r.accepts() for r in mine)
+    return holds and all(any(not r.accepts(f ** r.powers[name]) for r in mine) for f in others)
+
+
 def best_explanation(
     relations: Sequence[Relation], explanations: Sequence[tuple[Mistake, ...]]
 ) -> tuple[Mistake, ...] | None:
@@ -211,6 +282,9 @@ def _cost(chosen: tuple[Mistake, ...]) -> int:
     return sum(2 if m.kind == "sign and unit" else 1 for m in chosen)
 
 
+_NEVER_TURNED = frozenset({"speed_m_s", "steer_rad", "steering_wheel_rad"})
+
+
 def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = ()) -> list[Mistake]:
     """List the mistakes that mappings are known to make with these signals.
 
@@ -233,7 +307,9 @@ def known_mistakes(names: Sequence[str], together: Sequence[tuple[str, ...]] = (
         for size in range(2, len(present) + 1):
             for part in combinations(present, size):
                 words = f"{' and '.join(part)} have the wrong sign"
-                out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
+                # A sensor is mounted upside down or backwards, or a truth has another convention; speeds count ahead.
+                if not _NEVER_TURNED & set(part):
+                    out.append(Mistake(dict.fromkeys(part, -1.0), words, "sign"))
                 shared = dict(_units(part[0].removeprefix("truth.")))
                 for name in part[1:]:
                     own = dict(_units(name.removeprefix("truth.")))
@@ -373,7 +449,7 @@ def _steering(columns: Mapping[str, FloatArray], speed_name: str, speed: FloatAr
             for r in compare(f"{name} against yaw_rate_rad_s / speed", powers, curvature, steer, use, lengths)
         ]
         # Sliding front tyres break the relation, and so does noise where there is little of it.
-        found += sorted(either, key=lambda r: abs(r.correlation))[-1:]
+        found += sorted(either, key=lambda r: (r.tells and r.accepts(), abs(r.correlation)))[-1:]
         if "ay_m_s2" in columns:
             powers = {"ay_m_s2": 1, name: -1, speed_name: -2}
             text = f"ay_m_s2 against {name} x speed^2"
@@ -496,7 +572,8 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     it and go with the derivative of the yaw rate, with v_x r and with nothing. In gentle driving sideslip is the
     curvature times a lever, less a_y times the compliance of the rear tyres.
     """
-    names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", "truth.yaw_rate_rad_s")
+    turning = next((n for n in ("truth.yaw_rate_rad_s", "yaw_rate_rad_s") if n in columns), "")
+    names = ("ay_m_s2", "truth.vx_m_s", "truth.vy_m_s", turning)
     if not all(n in columns for n in names):
         return []
     ay, vx, vy, rate = (columns[n] for n in names)
@@ -513,7 +590,7 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     gentle = gentle_at(vx * rate, moving)
     handling = _partial(text, {subject: 1, "ay_m_s2": -1}, -ay, sideslip, [curvature, one], gentle)
     text = f"{subject} against curvature, apart from a_y"
-    powers = {subject: 1, "truth.yaw_rate_rad_s": -1}
+    powers = {subject: 1, turning: -1}
     rolling = _partial(text, powers, curvature, sideslip, [ay, one], gentle)
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),

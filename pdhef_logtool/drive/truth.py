@@ -40,6 +40,8 @@ DIFFERENTIATION_HALF_S = 0.2
 GAP_PERIODS = 3.0
 #: Latency is searched for within this range.
 MAX_LATENCY_S = 0.5
+#: And known to this, 1-sigma.
+MAX_LATENCY_ERROR_S = 0.005
 #: A truth that leads the gyro by more than this does not: the gyro's stamps are late.
 LATE_GYRO_S = 0.005
 #: Two channels are the same if this share of their samples agrees to ``SAME_RELATIVE``.
@@ -332,13 +334,15 @@ def booked_on_the_late(found: LatencyEstimate, speed: LatencyEstimate | None) ->
     return replace(found, latency_s=0.0, gyro_delay_s=leads, reason=reason)
 
 
-def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) -> LatencyEstimate:
+def estimate_truth_latency(
+    sensor_yaw_rate: Channel, truth_yaw_rate: Channel, *, max_error_s: float = MAX_LATENCY_ERROR_S
+) -> LatencyEstimate:
     """Estimate the truth's latency against the gyro by cross-correlation of detrended yaw rates.
 
     Both are sampled on a common grid, linear trends removed; the correlation coefficient is computed at each shift
     within ± ``MAX_LATENCY_S`` over the samples that both have, and its peak refined by a parabola. The standard error
     is that of a shift, σ_residual / (rms(ṙ) √N), with N counted at 10 Hz as if the residual were coloured up to there.
-    Reliable: correlation of at least 0.8, standard error of at most 5 ms, peak inside the range.
+    Reliable: correlation of at least 0.8, standard error of at most ``max_error_s``, peak inside the range.
 
     Parameters
     ----------
@@ -369,7 +373,7 @@ def estimate_truth_latency(sensor_yaw_rate: Channel, truth_yaw_rate: Channel) ->
         return refuse("no peak within the range searched", shift.correlation, error)
     if shift.correlation < 0.8:
         return refuse("gyro and truth yaw rate correlate too little", shift.correlation, error)
-    if error > 0.005:
+    if error > max_error_s:
         return refuse("too little yaw motion", shift.correlation, error)
     return LatencyEstimate(shift.shift_s, shift.correlation, error, True, False, "gyro against truth yaw rate")
 

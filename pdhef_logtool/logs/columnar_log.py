@@ -74,6 +74,7 @@ class ColumnarLog:
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
+        self._wanted: set[tuple[int, int]] = set()  # and of these the ones whose messages somebody wanted
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
@@ -149,7 +150,7 @@ class ColumnarLog:
     def _undecodable_losses(self, c: int, container: Container) -> Iterator[Loss]:
         counts: Counter[int] = Counter()
         for (of, channel, _), rows in self._undecodable.items():
-            if of == c and (of, channel) in self._asked:
+            if of == c and (of, channel) in self._wanted:
                 counts[channel] += len(rows)
         for channel, n in sorted(counts.items()):
             what = f"{n} messages do not fit the type of their topic"
@@ -223,7 +224,9 @@ class ColumnarLog:
         """
         plans = {topic: self._plan(topic, tuple(dict.fromkeys(paths))) for topic, paths in requests.items()}
         if not quiet:
-            self._asked |= {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
+            wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
+            self._asked |= wanted
+            self._wanted |= wanted
         return self._collect(plans, start_ns, end_ns)
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:

@@ -71,6 +71,13 @@ def find_logs(arguments: Logs) -> list[LogInput]:
     return _with_stems(list(found.values()))
 
 
+def folders_of(inputs: Sequence[LogInput]) -> list[str]:
+    """Return the folder of each log below the one that holds all of them, ``car/day``; empty for those right in it."""
+    folders = [os.path.realpath(i.path.parent) for i in inputs]
+    common = os.path.commonpath(folders) if folders else ""
+    return [Path(os.path.relpath(f, common)).as_posix().removeprefix(".") for f in folders]
+
+
 def hash_log(path: Path) -> str:
     """Return the sha256 of a log file, or of the names and contents of a log folder's files in order.
 

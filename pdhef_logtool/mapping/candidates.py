@@ -30,6 +30,8 @@ Named: TypeAlias = tuple[TopicInfo, Role, FieldInfo, Meaning, bool]
 
 #: Words of a field that a navigation system gives beside others' sensors.
 _NAVIGATION = frozenset({"gps", "gnss", "ins", "rtk"})
+#: Words of axes that are the car's, whose sign alone is open.
+_CAR_AXES = frozenset({"lat", "lateral", "long", "longitudinal", "lng", "trans", "transverse", "transversal", "down"})
 #: A topic with more numeric fields than this is no sensor's; looking at its names alone would take long.
 MOST_FIELDS = 3000
 #: Fields that are read at most; the best names first.
@@ -139,7 +141,12 @@ class Found:
     def is_axis(self) -> bool:
         """Return whether an axis letter names it: where its axes point is a question of its mounting."""
         own = words_of(self.path.rpartition(".")[2])
-        return "yaw" not in own and not {"lat", "lateral", "long", "longitudinal", "lng"} & set(own)
+        return "yaw" not in own and not _CAR_AXES & set(own)
+
+    @property
+    def is_downward(self) -> bool:
+        """Return whether its name says that it counts about, or along, the downward axis."""
+        return "down" in words_of(self.path.rpartition(".")[2]) and self.meaning.part == "z"
 
     @property
     def score(self) -> float:
@@ -246,7 +253,11 @@ def look(
             stamp = stamp_of(log.fields(topic.name, quiet=True), name)
             if role == "sensor" and set(words_of(name)) & _NAVIGATION:
                 role = "navigation"
-            one = Found(topic, name, its, role, stamp, seen, _factors(its, seen))
+            factors = _factors(its, seen)
+            if its.quantity == "wheel speed" and not factors:  # too large for a speed: it turns
+                its = replace(its, quantity="wheel rate")
+                factors = _factors(its, seen)
+            one = Found(topic, name, its, role, stamp, seen, factors)
             if _is_nested_imu(topic, log.fields(topic.name, quiet=True), name):
                 one.known = True
                 one.reasons.append("a nested sensor_msgs/Imu, in SI units")
@@ -255,6 +266,9 @@ def look(
             elif its.scale is not None:
                 one.known = True
                 one.reasons.append(f"unit {UNIT_TEXTS.get(its.unit, its.unit)}")
+            if one.is_downward and not documented:
+                one.sign = -1.0
+                one.reasons.append("positive downward, as its name says")
             if one.factors:
                 found.append(one)
     return pieces, found + sources_found(log, sources, read)

@@ -42,8 +42,12 @@ SLOPE, LOOSE_SLOPE = 1.25, 1.6
 LEAST_AY_M_S2 = 0.4
 #: Correlations from here on make one column a copy of another.
 COPY = 0.98
+#: And from here on it is the same column sent twice.
+ITSELF = 0.999
 #: A steering angle follows the path's curvature so well.
 STEERS = 0.9
+#: Choices that are shown where none is believed.
+MOST_DOUBTFUL = 3
 #: Strength of a name that values give without deciding.
 WEAK = 0.3
 _UNITS = {
@@ -57,7 +61,9 @@ _UNITS = {
 class _Choice:
     """Columns that are speed, yaw rate, a_y and a_x, the relations between them, and the units of the first three.
 
-    ``x`` and ``speeding`` are None where no column is the speed's change.
+    ``x`` and ``speeding`` are None where no column is the speed's change. ``is_plausible``: its slopes are near to what
+    units explain, and a_y is as large as one; ``is_strict``: both relations hold so well that it is believed if no
+    other is as near. ``ahead_s`` : how far a_y is ahead of v r.
     """
 
     v: Found
@@ -68,12 +74,18 @@ class _Choice:
     speeding: Fit | None
     units: tuple[tuple[str, float], tuple[str, float], tuple[str, float]]
     is_strict: bool
+    is_plausible: bool
     ahead_s: float
 
     @property
     def columns(self) -> tuple[Found, ...]:
         """All that there are."""
         return (self.v, self.r, self.y, *([] if self.x is None else [self.x]))
+
+    @property
+    def conversions(self) -> int:
+        """How many of the units are not SI."""
+        return sum(factor != 1.0 for _, factor in self.units)
 
     @property
     def score(self) -> float:
@@ -87,7 +99,7 @@ class _Choice:
         if self.x is None or self.speeding is None:
             return f"{first}, but nothing with the change of {self.v.path}"
         second = f"{self.x.path} with the change of {self.v.path} ({self.speeding.correlation:.2f})"
-        return f"{first} and {second}, and units explain both slopes"
+        return f"{first} and {second}" + (", and units explain both slopes" if self.is_strict else "")
 
 
 def nameless_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pieces: Pieces) -> list[Found]:
@@ -118,42 +130,49 @@ def nameless_columns(log: DriveLog, topics: Sequence[tuple[TopicInfo, Role]], pi
     return found
 
 
-def identified(fields: Fields, nameless: Sequence[Found]) -> tuple[list[Found], str]:
-    """Return what nameless columns are, those that are not believed with a weak name, and what is to be said of them.
+def identified(fields: Fields, nameless: Sequence[Found]) -> tuple[list[Found], str, str]:
+    """Return what nameless columns are, or may be with weak names; topic and evidence of what is believed.
 
     Parameters
     ----------
     nameless : columns with a meaning that is empty; fields that names tell serve as what they are.
     """
     order = sorted(_choices(fields, nameless), key=lambda c: (-c.score, -abs(c.turning.correlation)))
-    choices = [c for c in order if c.is_strict] or order
-    if not choices:
-        return [], ""
-    best = choices[0]
+    best = next((c for c in order if c.is_strict), None)
     # What is behind v r is no a_y, where there is one ahead of it.
-    rivals = [c for c in order if c.x is not None and c.ahead_s > 0.0 and not _same(best, c)]
-    rivals = [c for c in rivals if c.score > best.score - CLEARER]
-    sure = best.is_strict and not rivals
-    why = f"{best.evidence}; but {rivals[0].evidence} as well" if rivals else best.evidence
-    speed_unit, rate_unit, unit = best.units
-    speed_is_sure = sure and _speed_is_sure(fields, best.v, speed_unit)
+    others = [c for c in order if best is not None and c.x is not None and c.ahead_s > 0.0 and not _same(best, c)]
+    rivals = [c for c in others if best is not None and c.score > best.score - CLEARER]
+    if best is not None and not rivals:
+        found = _as_chosen(fields, nameless, best, best.evidence, sure=True)
+        return found, next(f.topic.name for f in best.columns if _open(f)), best.evidence
+    likely = sorted(order, key=lambda c: (not c.is_plausible, c.conversions, -abs(c.turning.correlation)))
+    likely = likely if best is None else [best, *rivals]
+    found = []
+    for choice in likely[:MOST_DOUBTFUL]:
+        for one in _as_chosen(fields, nameless, choice, choice.evidence, sure=False):
+            known = ((f.meaning.quantity, f.meaning.part, f.path) for f in found)
+            if (one.meaning.quantity, one.meaning.part, one.path) not in known:
+                found.append(one)
+    return found, "", ""
+
+
+def _as_chosen(fields: Fields, nameless: Sequence[Found], choice: _Choice, why: str, *, sure: bool) -> list[Found]:
+    """Return the columns of a choice as what they are in it, and the one that steers."""
+    speed_unit, rate_unit, unit = choice.units
+    speed_is_sure = sure and _speed_is_sure(fields, choice.v, speed_unit)
     speed_why = why if speed_is_sure else f"{why}; a wheel that turns in rad/s may look the same"
     told = [
-        (best.v, Meaning("speed", "x", 1.0, *speed_unit, speed_why), 1.0, speed_is_sure),
-        (best.r, Meaning("rate", "z", 1.0, *rate_unit, why), 1.0, sure),
-        (best.y, Meaning("acceleration", "y", 1.0, *unit, why), math.copysign(1.0, best.turning.slope), sure),
+        (choice.v, Meaning("speed", "x", 1.0, *speed_unit, speed_why), 1.0, speed_is_sure),
+        (choice.r, Meaning("rate", "z", 1.0, *rate_unit, why), 1.0, sure),
+        (choice.y, Meaning("acceleration", "y", 1.0, *unit, why), math.copysign(1.0, choice.turning.slope), sure),
     ]
-    if best.x is not None and best.speeding is not None:
-        sign = math.copysign(1.0, best.speeding.slope)
-        told.append((best.x, Meaning("acceleration", "x", 1.0, *unit, why), sign, sure))
+    if choice.x is not None and choice.speeding is not None:
+        sign = math.copysign(1.0, choice.speeding.slope)
+        told.append((choice.x, Meaning("acceleration", "x", 1.0, *unit, why), sign, sure))
     found = [_named(one, meaning, sign, sure=believed) for one, meaning, sign, believed in told if _open(one)]
-    rest = [f for f in nameless if not any(f is c for c in best.columns)]
-    found += _steering(fields, rest, _values(best.v) * speed_unit[1], _values(best.r) * rate_unit[1], sure=sure)
-    if not sure:
-        return found, ""
-    topic = next(f.topic.name for f in best.columns if _open(f))
-    note = f"the names of {topic} say nothing: {why}"
-    return found, f"{note}; left and right may be exchanged in all of it, which nothing tells"
+    rest = [f for f in nameless if not any(f is c for c in choice.columns)]
+    speed, rate = _values(choice.v) * speed_unit[1], _values(choice.r) * rate_unit[1]
+    return found + _steering(fields, rest, speed, rate, sure=sure)
 
 
 def _choices(fields: Fields, nameless: Sequence[Found]) -> Iterator[_Choice]:
@@ -180,9 +199,10 @@ def _choices(fields: Fields, nameless: Sequence[Found]) -> Iterator[_Choice]:
                 if turning is None or explained is None:
                     continue
                 units, off = explained
-                strict = by_speed and off < math.log(SLOPE) and spread(smooth[id(y)]) * units[2][1] > LEAST_AY_M_S2
-                strict &= speeding is not None and abs(speeding.correlation) > SPEEDS_UP
-                yield _Choice(v, r, y, x, turning, speeding, units, strict, ahead_s)
+                plausible = off < math.log(SLOPE) and spread(smooth[id(y)]) * units[2][1] > LEAST_AY_M_S2
+                speeds_up = speeding is not None and abs(speeding.correlation) > SPEEDS_UP
+                strict = by_speed and plausible and speeds_up
+                yield _Choice(v, r, y, x, turning, speeding, units, strict, plausible, ahead_s)
 
 
 def _turning(fields: Fields, v: Found, r: Found, ay: FloatArray) -> tuple[Fit | None, bool, float]:
@@ -191,6 +211,8 @@ def _turning(fields: Fields, v: Found, r: Found, ay: FloatArray) -> tuple[Fit | 
     with np.errstate(invalid="ignore"):
         relation, root, alone = (fit(ay, smooth(np.maximum(speed, 0.0) ** p * _values(r))) for p in (1.0, 0.5, 0.0))
     if relation is None or root is None or alone is None or abs(relation.correlation) < LOOSE_TURNS:
+        return None, False, 0.0
+    if abs(alone.correlation) > ITSELF:
         return None, False, 0.0
     left, of_root, of_alone = (1.0 - f.correlation**2 for f in (relation, root, alone))
     strict = abs(relation.correlation) > TURNS and left < BY_SPEED * of_alone and left < BY_ROOT * of_root

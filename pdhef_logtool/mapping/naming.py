@@ -170,12 +170,14 @@ _COMMANDS = _set(
 _CORNERS = {
     "fl": "fl", "lf": "fl", "fr": "fr", "rf": "fr", "rl": "rl", "lr": "rl", "rr": "rr", "bl": "rl", "br": "rr",
     "frontleft": "fl", "frontright": "fr", "rearleft": "rl", "rearright": "rr",
+    "lb": "rl", "rb": "rr",
 }  # fmt: skip
 #: Front and rear as German data bases write them; too short to say it of anything but wheels.
 _GERMAN = {"vl": "fl", "vr": "fr", "hl": "rl", "hr": "rr"}
 _AXES = {
     "x": "x", "y": "y", "z": "z", "ax": "x", "ay": "y", "az": "z", "wx": "x", "wy": "y", "wz": "z", "long": "x",
     "lng": "x", "longitudinal": "x", "forward": "x", "lat": "y", "lateral": "y", "vert": "z", "vertical": "z",
+    "trans": "y", "transverse": "y", "transversal": "y", "down": "z",
 }  # fmt: skip
 _AXIS_LETTERS = frozenset("xyz")
 _ROLLS = frozenset({"roll", "pitch"})
@@ -186,7 +188,7 @@ _BARE = _set(
     """
     data value val angle ang rad deg degrees radians position pos actual measured v x y z mps kmh kph mph ms
     rpm fl fr rl rr lf rf lr front rear left right rate speed g s mps2 ms2 delta velocity current average avg
-    filtered
+    filtered output
     """
 )
 
@@ -305,6 +307,7 @@ def _quantity(
         ("delta" in own and set(own) <= _OF_DELTA)
         or {"road", "wheel", "angle"} <= have
         or {"hand", "wheel", "angle"} <= have
+        or (bool(corner) and {"wheel", "angle"} <= have)
     )
     if have & _ROLLS & set(own) and not accelerates:
         return None
@@ -359,9 +362,9 @@ def _motion(
         return None  # north or forward: a vector of a velocity does not say
     if speeds:
         return {"y": ("velocity", "y", "speed"), "z": None}.get(axis, ("speed", axis, "speed"))
-    if set(own) & {"latitude"}:
+    if have & {"latitude"}:
         return "latitude", "", "position"
-    if set(own) & {"longitude"}:
+    if have & {"longitude"}:
         return "longitude", "", "position"
     if set(own) & {"course", "cog"} or {"track", "angle"} <= have:
         return "course", "", "angle"
@@ -378,6 +381,8 @@ def _corner(words: tuple[str, ...], own: tuple[str, ...]) -> str:
             if word in _GERMAN and {"wheel", "whl"} & set(words):
                 return _GERMAN[word]
         ends = {"front": "f", "rear": "r", "back": "r"}, {"left": "l", "right": "r"}
+        if "axle" in group:
+            ends[0].update({"1": "f", "2": "r"})
         found = ["".join({e[w] for w in group if w in e}) for e in ends]
         if all(len(f) == 1 for f in found):
             return "".join(found)
@@ -391,6 +396,8 @@ def corner_of(words: tuple[str, ...]) -> str:
 
 def _steering_kind(have: set[str]) -> str:
     if have & {"road", "tire", "tyre", "tires", "tyres", "roadwheel", "roadwheels", "axle", "delta"}:
+        return "road"
+    if _corner(tuple(have), ()):
         return "road"
     if have & {"hand", "handwheel", "swa", "pinion"} or {"steering", "wheel"} <= have or {"steer", "wheel"} <= have:
         return "wheel"

@@ -30,8 +30,10 @@ def _path(fields: Fields) -> _Steps | None:
     pairs = {"latitude": "longitude", "position": "position"}
     for north in (f for f in fields.positions if f.meaning.quantity in pairs and f.meaning.part in ("", "y")):
         wanted = (pairs[north.meaning.quantity], "x" if north.meaning.part else "")
-        same = [f for f in fields.positions if f.topic.name == north.topic.name]
-        east = next((f for f in same if (f.meaning.quantity, f.meaning.part) == wanted), None)
+        others = [f for f in fields.positions if (f.meaning.quantity, f.meaning.part) == wanted]
+        same = [f for f in others if f.topic.name == north.topic.name]
+        # Recorders of one number a topic have latitude and longitude apart.
+        east = same[0] if same else others[0] if len(others) == 1 else None
         if east is None or not (north.seen.changes or east.seen.changes):
             continue
         up, right = _step(fields, north.si), _step(fields, east.si)

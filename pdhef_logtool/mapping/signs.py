@@ -81,6 +81,7 @@ def judge_signs(
         votes["rate", "gravity"] = upright(fields, rate) * rate.sign
     votes = {pair: vote for pair, vote in votes.items() if vote}
     absolute = any(source in {*truly, "gravity"} for _, source in votes)
+    absolute |= any(one is not None and _sign_is_said(one) for one in trio.values())
     against = [f"{_word(a)} and {_word(b)}" for (a, b), vote in votes.items() if vote < 0.0]
     if not against:
         return Signs(absolute=absolute)
@@ -96,9 +97,14 @@ def judge_signs(
 
 def may_turn(one: Found) -> bool:
     """Return whether the sign of a field is free: neither documented nor a matter of its mounting."""
-    if one.anchor or one.fixed:
+    if one.anchor or _sign_is_said(one):
         return False
     return one.meaning.quantity == "steering" or not one.is_axis
+
+
+def _sign_is_said(one: Found) -> bool:
+    """Return whether documentation or a name says the sign; of a well-known type it depends on the mounting."""
+    return not one.anchor and (one.fixed or one.is_downward)
 
 
 def upright(fields: Fields, rate: Found) -> float:

@@ -48,6 +48,10 @@ WHEEL_UNIT = 0.04
 #: Metres by which curvature becomes an angle: wheelbases of model cars to lorries, and those times a steering ratio.
 ROAD_WHEEL_M = (0.15, 8.0)
 STEERING_WHEEL_M = (12.0, 160.0)
+#: Units of wheel speeds, and the usual radius of wheels that turn.
+SPEEDS = (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704))
+RPM = 2.0 * math.pi / 60.0
+USUAL_RADIUS_M = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,11 +94,11 @@ def weigh(
     fields = Fields(pieces, anchors, [f for f in found if not f.anchor], places)
     decide_units(fields)
     nameless = nameless_columns(log, topics, pieces) if without_names else []
-    meant, note = identified(fields, nameless) if nameless else ([], "")
+    meant, named, evidence = identified(fields, nameless) if nameless else ([], "", "")
     fields.found += meant
     at_work = _Weighing(fields, "" if truth else truth_topic(fields.found))
-    if note:
-        at_work.say_nameless(note)
+    if named:
+        at_work.say_nameless(named, evidence)
     at_work.choose_signals(set(signals))
     if not truth:
         at_work.choose_truth()
@@ -116,6 +120,8 @@ def _is_wanted(
     """Return whether a field can fill a gap, or tell something of one that does."""
     if quantity == "acceleration" and part == "z":  # tells gravity
         return not {"ax_m_s2", "ay_m_s2"} <= set(signals)
+    if quantity in ("latitude", "longitude") and not {"lat_deg", "x_m"} & set(truth):  # show the path
+        return True
     names = names_of(quantity, part)
     steered = {"steer_rad", "steering_wheel_rad"} & set(signals)
     open_ = any(n not in signals and not (n.startswith("steer") and steered) for n in names)
@@ -161,11 +167,12 @@ class _Weighing:
         for name, one in self.taken.items():
             self._tell(name, one)
 
-    def say_nameless(self, note: str) -> None:
-        """Say that values alone told what fields are."""
-        self.notes.append(note)
+    def say_nameless(self, topic: str, evidence: str) -> None:
+        """Say that values alone told what the fields of a topic are."""
+        self.notes.append(f"values alone tell what {topic} holds: left and right may be exchanged in all of it")
+        evidence = f"the names of {topic} say nothing; {evidence}; nothing tells left from right"
         remedy = 'look at them (pdhef inspect --fields), name them in a mapping file, or --waive "mapping.names"'
-        self.checks.append(Check("mapping.names", "mapping", "undecided", note, remedy))
+        self.checks.append(Check("mapping.names", "mapping", "undecided", evidence, remedy))
 
     def _take(self, name: str, candidates: Sequence[Found]) -> None:
         if name == "speed_m_s":
@@ -254,7 +261,11 @@ class _Weighing:
         first = next(iter(wheels.values()))
         kind, doubt, reason = first.meaning.quantity, "", ""
         if not (first.known or first.fixed):
-            kind, unit, reason, doubt = _wheel_unit(mean, reference)
+            times = None if reference is None else ratio(mean, reference.si, SLOW_M_S)
+            if times is None and reference is None:
+                kind, unit, reason, doubt = self._wheel_unit_by_turning(mean)
+            else:
+                kind, unit, reason, doubt = _wheel_unit(times, reference)
             for one in wheels.values():
                 one.factors = ((unit[0], unit[1]),)
                 one.known = not doubt
@@ -262,6 +273,22 @@ class _Weighing:
             one.reasons += [reason] if reason else []
             one.doubts += [doubt] if doubt else []
             self.taken[f"wheel_speed_{corner}_{'rad_s' if kind == 'wheel rate' else 'm_s'}"] = one
+
+    def _wheel_unit_by_turning(self, mean: FloatArray) -> tuple[str, tuple[str, float], str, str]:
+        """Return what :func:`_wheel_unit` does, by a_y ≈ v r, which tells less: roll is in a_y."""
+        rate, ay = self._chosen("yaw_rate_rad_s"), self._chosen("ay_m_s2")
+        relation = None if rate is None or ay is None else self.fields.turning(ay.si, rate.si, mean)
+        if relation is None or abs(relation.correlation) < CLEAR:
+            return _wheel_unit(None, None)
+        metres = abs(relation.slope)
+        ways = [(abs(math.log(metres / unit[1])) / math.log(1.3), "wheel speed", unit) for unit in SPEEDS]
+        for turning in (("rad/s", 1.0), ("rpm", RPM)):  # a name of a speed is a speed first
+            off = abs(math.log(metres / turning[1] / USUAL_RADIUS_M)) / math.log(1.3)
+            ways.append((1.0 + off, "wheel rate", turning))
+        (_, kind, taken), (_, _, other) = sorted(ways)[:2]
+        said = f"{1.0 / metres:.4g} of it is 1 m/s by a_y ≈ v r"
+        doubt = f"the unit of the wheel speeds is not said: by a_y ≈ v r {taken[0]} is likeliest, then {other[0]}"
+        return kind, taken, said, doubt
 
     # --------------------------------------------------------------------------------------------- steering
 
@@ -475,7 +502,7 @@ class _Weighing:
             self.checks.append(
                 Check(
                     f"{name}.candidate",
-                    name.removeprefix("truth."),
+                    name,
                     "undecided",
                     f"{one.topic.name}.{one.path} is taken, but {'; '.join(one.doubts)}",
                     f'look at it (pdhef inspect --fields), name it in a mapping file, or --waive "{name}.candidate"',
@@ -554,16 +581,19 @@ def _unlikely(name: str, metres: float) -> float:
     return abs(math.log(metres / (2.7 if name == "steer_rad" else 43.0)))
 
 
-def _wheel_unit(mean: FloatArray, reference: Found | None) -> tuple[str, tuple[str, float], str, str]:
-    """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit, by the speed if there is one."""
-    rpm = 2.0 * math.pi / 60.0
-    times = None if reference is None else ratio(mean, reference.si, SLOW_M_S)
+def _wheel_unit(times: float | None, reference: Found | None) -> tuple[str, tuple[str, float], str, str]:
+    """Return quantity, unit, reason and doubt of wheel speeds whose name has no unit.
+
+    Parameters
+    ----------
+    times : how many of them are 1 m/s by the reference, a speed; None where there is none, or no one number.
+    """
     if times is None or reference is None:
         doubt = "the unit of the wheel speeds is not said, and no speed tells it; taken as m/s"
         return "wheel speed", ("m/s", 1.0), "", doubt
     unsure = "" if reference.known else "the unit of the speed that tells theirs is unsure itself"
     said = f"{times:.4g} of it is 1 m/s of speed"
-    for unit, factor in (("m/s", 1.0), ("km/h", 1 / 3.6), ("mph", 0.44704)):
+    for unit, factor in SPEEDS:
         off = abs(times * factor - 1.0)
         if off < WHEEL_UNIT:
             also = (
@@ -572,8 +602,8 @@ def _wheel_unit(mean: FloatArray, reference: Found | None) -> tuple[str, tuple[s
             return "wheel speed", (unit, factor), said, unsure or also
     if RADII_M[0] < 1 / times < RADII_M[1]:
         return "wheel rate", ("rad/s", 1.0), f"{said}: a radius of {1 / times:.3f} m", unsure
-    if RADII_M[0] < 1 / (times * rpm) < RADII_M[1]:
-        return "wheel rate", ("rpm", rpm), f"{said}: a radius of {1 / (times * rpm):.3f} m in rpm", unsure
+    if RADII_M[0] < 1 / (times * RPM) < RADII_M[1]:
+        return "wheel rate", ("rpm", RPM), f"{said}: a radius of {1 / (times * RPM):.3f} m in rpm", unsure
     return "wheel speed", ("m/s", 1.0), "", f"{said}, which is no unit of wheel speeds; taken as m/s"
 
 

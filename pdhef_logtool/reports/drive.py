@@ -9,6 +9,7 @@ from typing import Any
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.reports.charts import Charts
 from pdhef_logtool.reports.drive_figures import DriveFigures, Roles, drive_figures
+from pdhef_logtool.reports.drive_tables import HEADS, by_segment, consistency, disagreements, residuals, scores
 from pdhef_logtool.reports.page import render
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog
 from pdhef_logtool.sinks.report import reasons_line
@@ -23,25 +24,24 @@ IN_PLANE = ("path", "ay_sideslip", "phase")
 FIGURES = (*OVER_TIME, *IN_PLANE)
 #: Rows of tables that a log can make as long as it likes.
 _MOST_ROWS = 200
-_CLASSES = {"better": "good", "same": "", "worse": "bad"}
-_SIGNALS = {
-    "sideslip_rad": "sideslip",
-    "vy_m_s": "v_y",
-    "yaw_rate_rad_s": "yaw rate",
-    "vx_m_s": "v_x",
-    "ay_m_s2": "a_y",
+#: Outcomes of verdicts: a word, and the class of the style.
+_OUTCOMES = {
+    "better": ("better", "good"),
+    "same": ("as good", ""),
+    "worse": ("worse", "bad"),
+    "undecided": ("cannot tell", ""),
+    "alone": ("alone", ""),
+    "none": ("no verdict", ""),
 }
-#: Figures of a signal over the whole drive, as columns: metric, head.
-_SCORES = (("rmse", "RMSE"), ("mae", "mean"), ("p95_abs", "95 %"), ("max_abs", "largest"), ("bias", "bias"))
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """A sentence on one signal; ``kind``: class of the style."""
+    """A sentence on one signal, and the word that sums it up; ``kind``: class of the style."""
 
-    signal: str
+    word: str
     text: str
-    kind: str
+    kind: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,9 +87,12 @@ def drive_page(log: OpenedLog, back: str = "") -> DrivePage:
         drawn=figures,
         why_none=why_none,
         notices=_notices(report, figures, low_speed),
-        scores=_scores(report, roles),
-        segments=_by_segment(report, roles),
-        without_truth=_without_truth(report, roles),
+        scores=[] if roles is None else scores(report, roles),
+        segments=[] if roles is None else by_segment(report, roles),
+        consistency=consistency(report, roles),
+        residuals=residuals(report),
+        apart={} if roles is None else disagreements(report, roles),
+        heads=HEADS,
         estimators=_estimators(report),
         checks=sorted(report.get("checks") or (), key=lambda c: ("failed", "undecided", "passed").index(c["verdict"])),
         losses=(report.get("losses") or ())[:_MOST_ROWS],
@@ -145,15 +148,14 @@ def _told(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def verdicts_of(report: Mapping[str, Any]) -> list[Verdict]:
     """Return the sentences at the head of a page; those of an older report are the words of its answer."""
-    told = [
-        Verdict(_SIGNALS.get(v.get("signal", ""), str(v.get("signal", ""))), str(v.get("text", "")),
-                _CLASSES.get(str(v.get("outcome")), ""))
-        for v in _told(report)
-    ]  # fmt: skip
+    told = []
+    for v in _told(report):
+        word, kind = _OUTCOMES.get(str(v.get("outcome")), (str(v.get("outcome")), ""))
+        told.append(Verdict(word, str(v.get("text", "")), kind))
     answer = report.get("answer")
     if told or answer is None:
         return told
-    return [Verdict("sideslip", str(answer["texts"]["result"]), "")]
+    return [Verdict("sideslip", str(answer["texts"]["result"]))]
 
 
 def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed: float | None) -> list[str]:
@@ -184,97 +186,6 @@ def _notices(report: Mapping[str, Any], figures: DriveFigures | None, low_speed:
             "the default of cars."
         )
     return said
-
-
-def _scores(report: Mapping[str, Any], roles: Roles | None) -> list[dict[str, Any]]:
-    """Return a table a signal: rows of estimators, the answer first, with factor and unit for people."""
-    tables = []
-    order = () if roles is None else (roles.main, roles.rival, *roles.others)
-    causal = {e["name"]: e["causal"] for e in report["estimators"]}
-    for signal, name in _SIGNALS.items():
-        by_name: dict[str, dict[str, Any]] = {}
-        for m in report["metrics"]:
-            if m["signal"] == signal and m["segment"] == "all" and m["estimator"] in causal:
-                by_name.setdefault(m["estimator"], {})[m["metric"]] = m
-        rows = [(n, by_name[n]) for n in order if "rmse" in by_name.get(n, {})]
-        if not rows:
-            continue
-        unit = rows[0][1]["rmse"]["unit"]
-        factor, shown = {"rad": (57.29577951308232, "°"), "rad/s": (57.29577951308232, "°/s")}.get(unit, (1.0, unit))
-        tables.append({
-            "name": name, "unit": shown, "heads": [h for _, h in _SCORES],
-            "independent": signal not in report["truth"]["not_independent"],
-            "rows": [
-                {
-                    "name": n, "causal": causal[n], "n": own["rmse"]["n"],
-                    "values": [_scaled(own, metric, factor) for metric, _ in _SCORES],
-                    "coverage": _scaled(own, "coverage95", 1.0), "availability": _scaled(own, "availability", 1.0),
-                }
-                for n, own in rows
-            ],
-        })  # fmt: skip
-    return tables
-
-
-def _scaled(figures: Mapping[str, Mapping[str, Any]], metric: str, factor: float) -> float | None:
-    value = figures.get(metric, {}).get("value")
-    return None if value is None else float(value) * factor
-
-
-def _by_segment(report: Mapping[str, Any], roles: Roles | None) -> list[dict[str, Any]]:
-    """Return the RMSE of sideslip by segment, of the answer and the best physics."""
-    if roles is None:
-        return []
-    found: dict[str, dict[str, Any]] = {}
-    for m in report["metrics"]:
-        if (m["signal"], m["metric"]) == ("sideslip_rad", "rmse") and m["estimator"] in (roles.main, roles.rival):
-            found.setdefault(m["segment"], {})[m["estimator"]] = m
-    return [
-        {
-            "segment": segment,
-            "n": next(iter(own.values()))["n"],
-            "main": own.get(roles.main, {}).get("value"),
-            "rival": own.get(roles.rival, {}).get("value"),
-        }
-        for segment, own in sorted(found.items(), key=lambda item: (item[0] != "all", item[0]))
-    ]
-
-
-def _without_truth(report: Mapping[str, Any], roles: Roles | None) -> list[tuple[str, list[tuple[str, str, Any, str]]]]:
-    """Return what can be said without truth, by kind: (who, of what, value, unit)."""
-    kinds = (
-        ("NIS over degrees of freedom (1 as expected)", "nis"),
-        ("Whiteness: autocorrelation of NIS from stamp to stamp (0 when white)", "nis_autocorrelation"),
-        ("d2: lateral velocity against the sensors over 2 s", "d2"),
-        ("Residuals of the sensors, RMS", "residual_rms"),
-        ("Residuals of the sensors, bias", "residual_bias"),
-        ("Disagreement of two estimates' sideslip, RMS", "disagreement_rms"),
-    )
-    whole = [m for m in report["metrics"] if m["segment"] == "all"]
-    dof = {m["estimator"]: m["value"] for m in whole if m["metric"] == "nis_dof"}
-    tables = []
-    for title, metric in kinds:
-        rows = []
-        for m in whole:
-            if m["metric"] != metric or m["value"] is None:
-                continue
-            value, unit = float(m["value"]), m["unit"]
-            if metric == "nis":
-                value, unit = value / (dof.get(m["estimator"]) or float("nan")), ""
-            elif unit == "rad":
-                value, unit = value * 57.29577951308232, "°"
-            rows.append(
-                (
-                    m["estimator"].replace("~", " and "),
-                    _SIGNALS.get(m["signal"], ""),
-                    value,
-                    "" if unit == "1" else unit,
-                )
-            )
-        if rows:
-            tables.append((title, rows))
-    del roles
-    return tables
 
 
 def _estimators(report: Mapping[str, Any]) -> list[dict[str, Any]]:

@@ -53,63 +53,42 @@ def grid_of(stamps_ns: IntArray) -> Grid:
     return Grid(start, cell, duration // cell + 1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Groups:
-    """The known values of a series in time order: which cell each run of them lies in, and where it begins."""
+class Envelope:
+    """The least and the largest value of each cell in the order in which they came: ``values`` [cells, 2].
 
-    values: FloatArray
-    cells: IntArray
-    begins: IntArray
-
-
-def _groups(grid: Grid, stamps_ns: IntArray, values: FloatArray) -> _Groups | None:
-    cell = (stamps_ns - grid.start_ns) // grid.cell_ns
-    known = np.isfinite(values) & (cell >= 0) & (cell < grid.cells)
-    if not known.any():
-        return None
-    cell = cell[known]
-    begins = np.flatnonzero(np.diff(cell, prepend=-1))
-    return _Groups(values[known], cell[begins], begins)
-
-
-def envelope(grid: Grid, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Return the least and the largest value of each cell in the order in which they came, [cells, 2].
-
-    A cell without a known value is NaN; unknown ones beside known ones do not count. ``values`` : [N] at ``stamps_ns``.
+    A cell without a known value is NaN; unknown ones beside known ones do not count. Values come block by block.
     """
-    made = np.full((grid.cells, 2), np.nan)
-    if (found := _groups(grid, stamps_ns, values)) is None:
-        return made
-    low, high = (f.reduceat(found.values, found.begins) for f in (np.minimum, np.maximum))
-    sizes = np.diff(found.begins, append=len(found.values))
-    first = [_first(found.values == np.repeat(extreme, sizes), found.begins) for extreme in (low, high)]
-    falls = first[1] < first[0]
-    made[found.cells, 0], made[found.cells, 1] = np.where(falls, high, low), np.where(falls, low, high)
-    return made
 
+    def __init__(self, grid: Grid) -> None:
+        self._grid = grid
+        self.values: FloatArray = np.full((grid.cells, 2), np.nan)
 
-def largest(grid: Grid, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Return the largest value of each cell, [cells], NaN where none is known."""
-    return _reduced(grid, stamps_ns, values, np.maximum)
+    def add(self, stamps_ns: IntArray, values: FloatArray) -> None:
+        """Take the next values [M] in order of time."""
+        cell = (stamps_ns - self._grid.start_ns) // self._grid.cell_ns
+        known = np.isfinite(values) & (cell >= 0) & (cell < self._grid.cells)
+        if not known.any():
+            return
+        cell, values = cell[known], values[known]
+        before = self.values[cell[0]]
+        if np.isfinite(before[0]):  # what came in the block before of the cell that both share
+            cell, values = np.concatenate([[cell[0]] * 2, cell]), np.concatenate([before, values])
+        begins = np.flatnonzero(np.diff(cell, prepend=-1))
+        sizes = np.diff(begins, append=len(values))
+        low, high = (f.reduceat(values, begins) for f in (np.minimum, np.maximum))
+        first_low, first_high = (_first(values == np.repeat(extreme, sizes), begins) for extreme in (low, high))
+        falls = first_high < first_low
+        self.values[cell[begins]] = np.stack([np.where(falls, high, low), np.where(falls, low, high)], axis=1)
 
+    @property
+    def largest(self) -> FloatArray:
+        """The largest value of each cell [cells]."""
+        return np.asarray(np.max(self.values, axis=1), dtype=np.float64)
 
-def least(grid: Grid, stamps_ns: IntArray, values: FloatArray) -> FloatArray:
-    """Return the least value of each cell, [cells], NaN where none is known."""
-    return _reduced(grid, stamps_ns, values, np.minimum)
-
-
-def first_known(grid: Grid, stamps_ns: IntArray, known: NDArray[np.bool_]) -> IntArray:
-    """Return the row of the first stamp of each cell at which all is known, at most one a cell."""
-    cell = (stamps_ns - grid.start_ns) // grid.cell_ns
-    rows = np.flatnonzero(known & (cell >= 0) & (cell < grid.cells))
-    return rows[np.flatnonzero(np.diff(cell[rows], prepend=-1))]
-
-
-def _reduced(grid: Grid, stamps_ns: IntArray, values: FloatArray, extreme: np.ufunc) -> FloatArray:
-    made = np.full(grid.cells, np.nan)
-    if (found := _groups(grid, stamps_ns, values)) is not None:
-        made[found.cells] = extreme.reduceat(found.values, found.begins)
-    return made
+    @property
+    def least(self) -> FloatArray:
+        """The least value of each cell [cells]."""
+        return np.asarray(np.min(self.values, axis=1), dtype=np.float64)
 
 
 def _first(hit: NDArray[np.bool_], begins: IntArray) -> IntArray:
@@ -117,6 +96,48 @@ def _first(hit: NDArray[np.bool_], begins: IntArray) -> IntArray:
     places = np.flatnonzero(hit)
     result: IntArray = places[np.searchsorted(places, begins)]
     return result
+
+
+class FirstKnown:
+    """Picks the first stamp of each cell at which all is known, block by block."""
+
+    def __init__(self, grid: Grid) -> None:
+        self._grid, self._last = grid, -1
+
+    def rows(self, stamps_ns: IntArray, known: NDArray[np.bool_]) -> IntArray:
+        """Return the rows of the next block [M], at most one a cell."""
+        cell = (stamps_ns - self._grid.start_ns) // self._grid.cell_ns
+        rows = np.flatnonzero(known & (cell > self._last) & (cell < self._grid.cells))
+        if not len(rows):
+            return rows
+        self._last = int(cell[rows[-1]])
+        return rows[np.flatnonzero(np.diff(cell[rows], prepend=-1))]
+
+
+class Means:
+    """Means over spans of equal length from the grid's start, block by block."""
+
+    def __init__(self, grid: Grid, span_s: float) -> None:
+        self._grid, self._span_ns = grid, int(span_s * 1e9)
+        self._sums = np.zeros(grid.cells * grid.cell_ns // self._span_ns + 1)
+        self._counts = np.zeros_like(self._sums)
+
+    def add(self, stamps_ns: IntArray, values: FloatArray) -> None:
+        """Take the next values [M]; unknown ones do not count."""
+        known = np.isfinite(values)
+        span = np.clip((stamps_ns[known] - self._grid.start_ns) // self._span_ns, 0, len(self._sums) - 1)
+        self._sums += np.bincount(span, weights=values[known], minlength=len(self._sums))
+        self._counts += np.bincount(span, minlength=len(self._sums))
+
+    @property
+    def values(self) -> FloatArray:
+        """The mean at each cell [cells]; NaN where less than half of what a span usually has is known."""
+        made = np.full(len(self._sums), np.nan)
+        if self._counts.any():
+            enough = self._counts > 0.5 * np.median(self._counts[self._counts > 0])
+            made[enough] = self._sums[enough] / self._counts[enough]
+        middle = np.arange(self._grid.cells) * self._grid.cell_ns + self._grid.cell_ns // 2
+        return np.asarray(made[middle // self._span_ns], dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

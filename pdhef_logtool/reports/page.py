@@ -27,7 +27,7 @@ _HERE = Path(__file__).parent
 _SCRIPTS = ("before.js", "uplot.min.js", "report.js")
 _STYLES = ("uplot.min.css", "report.css")
 #: A text in a paragraph or a table's cell.
-_MOST_SIGNS = 300
+_MOST_SIGNS = 600
 DASH = "–"
 
 
@@ -71,7 +71,14 @@ def _environment() -> Environment:
         lstrip_blocks=True,
         finalize=_printed,
     )
-    made.filters |= {"number": number, "degrees": degrees, "percent": percent, "stamp": stamp, "seconds": seconds}
+    made.filters |= {
+        "number": number,
+        "degrees": degrees,
+        "percent": percent,
+        "stamp": stamp,
+        "seconds": seconds,
+        "unit": unit,
+    }
     return made
 
 
@@ -120,6 +127,11 @@ def _printed(value: Any) -> Any:
 def number(value: float | None, factor: float = 1.0) -> str:
     """Return a figure with four digits, a dash for none."""
     return DASH if value is None or not math.isfinite(value) else f"{value * factor:.4g}"
+
+
+def unit(text: str) -> str:
+    """Return a unit as it is written: m/s² for m/s^2, nothing for a plain number."""
+    return "" if text == "1" else text.replace("^2", "²")
 
 
 def degrees(value_rad: float | None) -> str:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.reports.drive import FIGURES, drive_page
-from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.reports.drive import FIGURES, DrivePage, drive_page
+from pdhef_logtool.reports.fleet import FIGURES as FLEET_FIGURES
+from pdhef_logtool.reports.fleet import FleetPage, fleet_page
+from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
 
 #: Folder of a log's pictures within its outputs.
 PICTURES = "figures"
@@ -19,7 +22,7 @@ PICTURES = "figures"
 
 @dataclass(frozen=True, slots=True)
 class WrittenPage:
-    """The page of one log: its file, or None and what is wrong; ``pictures``: files of its figures."""
+    """A page: its log (empty: that of the run), file, or None and what is wrong; ``pictures``: files of its figures."""
 
     log: str
     file: Path | None
@@ -29,15 +32,16 @@ class WrittenPage:
 
 @dataclass(frozen=True, slots=True)
 class WrittenPages:
-    """The pages of a run."""
+    """The pages of a run: of its logs, and ``fleet`` of all of them."""
 
     output: Path
     pages: tuple[WrittenPage, ...]
+    fleet: WrittenPage
 
     @property
     def wrong(self) -> tuple[str, ...]:
         """A line for each page that could not be made."""
-        return tuple(f"no page of {p.log}: {p.wrong}" for p in self.pages if p.wrong)
+        return tuple(f"no page of {p.log or 'the run'}: {p.wrong}" for p in (*self.pages, self.fleet) if p.wrong)
 
     @property
     def exit_code(self) -> int:
@@ -49,25 +53,30 @@ class WrittenPages:
         return {
             "output": str(self.output),
             "exit_code": self.exit_code,
-            "logs": [
-                {
-                    "log": p.log,
-                    "page": None if p.file is None else str(p.file),
-                    "pictures": [str(f) for f in p.pictures],
-                    "wrong": p.wrong or None,
-                }
-                for p in self.pages
-            ],
+            **_to_dict(self.fleet),
+            "logs": [{"log": p.log, **_to_dict(p)} for p in self.pages],
         }
 
 
+def _to_dict(page: WrittenPage) -> dict[str, Any]:
+    return {
+        "page": None if page.file is None else str(page.file),
+        "pictures": [str(f) for f in page.pictures],
+        "wrong": page.wrong or None,
+    }
+
+
 def write_pages(
-    run: OpenedRun, progress: Callable[[str, float], None] = lambda _text, _share: None, *, png: bool = False
+    run: OpenedRun,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+    *,
+    png: bool = False,
+    by: Sequence[str] = (),
 ) -> WrittenPages:
-    """Write the page of each log of a run; one that cannot be made never stops the others.
+    """Write the page of each log of a run, then that of the run; one that cannot be made never stops the others.
 
     The caller holds the folder. ``progress`` is told which log, and the share that is done; ``png``: whether each
-    figure is written as a picture too.
+    figure is written as a picture too; ``by``: keys that the run's page breaks the drives down by, none: what it finds.
 
     Raises
     ------
@@ -77,35 +86,39 @@ def write_pages(
     pages = []
     for number, log in enumerate(run.logs):
         progress(f"{log.label}: page", number / len(run.logs))
-        pages.append(_write(log, png=png))
-    return WrittenPages(run.folder, tuple(pages))
+        pages.append(_write(log.folder, log.label, partial(drive_page, log, f"../../{PAGE_FILE}"), FIGURES, png=png))
+    fleet = _write(run.folder, "", partial(fleet_page, run, by), FLEET_FIGURES, png=png)
+    return WrittenPages(run.folder, tuple(pages), fleet)
 
 
 def remove_pages(run: OpenedRun) -> None:
-    """Remove the pages that an earlier run left in the folders of a run's logs: they are of other estimates."""
-    for log in run.logs:
-        for path in (log.folder / PAGE_FILE, *_pictures(log)):
+    """Remove the pages that an earlier run left in its folders: they are of other estimates."""
+    folders = [(run.folder, FLEET_FIGURES), *((log.folder, FIGURES) for log in run.logs)]
+    for folder, keys in folders:
+        for path in (folder / PAGE_FILE, *_pictures(folder, keys)):
             with suppress(OSError):
                 path.unlink(missing_ok=True)
 
 
-def _write(log: OpenedLog, *, png: bool) -> WrittenPage:
+def _write(
+    folder: Path, label: str, make: Callable[[], DrivePage | FleetPage], keys: Iterable[str], *, png: bool
+) -> WrittenPage:
     try:
-        page = drive_page(log)
+        page = make()
     except Exception as error:  # noqa: BLE001 (whatever a report holds, the others get their pages)
         shown = str(error) if isinstance(error, OutputError) else f"internal error, {type(error).__name__}: {error}"
-        return WrittenPage(log.label, None, shown)
-    path = log.folder / PAGE_FILE
+        return WrittenPage(label, None, shown)
+    path = folder / PAGE_FILE
     write_bytes(path, page.html)
-    for old in _pictures(log):
+    for old in _pictures(folder, keys):
         old.unlink(missing_ok=True)
     if not png:
-        return WrittenPage(log.label, path)
+        return WrittenPage(label, path)
     from pdhef_logtool.reports.pictures import write_pictures
 
-    return WrittenPage(log.label, path, pictures=write_pictures(page.charts, log.folder / PICTURES, log.label))
+    return WrittenPage(label, path, pictures=write_pictures(page.charts, folder / PICTURES, label))
 
 
-def _pictures(log: OpenedLog) -> list[Path]:
-    """Return the pictures that this command wrote into a log's folder at some time."""
-    return [p for key in FIGURES if (p := log.folder / PICTURES / f"{key}.png").is_file()]
+def _pictures(folder: Path, keys: Iterable[str]) -> list[Path]:
+    """Return the pictures that this command wrote into a folder at some time."""
+    return [p for key in keys if (p := folder / PICTURES / f"{key}.png").is_file()]

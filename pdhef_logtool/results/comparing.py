@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
+from pdhef_logtool.evaluation.consistency import SENSORS
 from pdhef_logtool.evaluation.segments import SEGMENTS
 from pdhef_logtool.evaluation.thresholds import SIGNALS
 from pdhef_logtool.records.errors import EXIT_GATE, EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
@@ -271,7 +272,7 @@ class _Tables:
     def __init__(self, a: OpenedRun, b: OpenedRun, pairs: Sequence[Pair]) -> None:
         self._runs = (a, b)
         self._pairs = pairs
-        self._main = [_main_of(pair.a) for pair in pairs]
+        self._main = [pair.a.main() for pair in pairs]
 
     def name_of(self, pair: Pair, estimator: str) -> str:
         """Return what ``estimator`` is called for a pair."""
@@ -336,15 +337,19 @@ class _Tables:
         return _of_rows(figure, both.sort("place"), clusters)
 
     def check_estimators(self, figures: Sequence[ComparedFigure]) -> None:
-        """Raise UsageError for an estimator that no drive of either run has."""
-        for name in {f.figure.estimator for f in figures if f.verdict == "no figure"} - {MAIN}:
-            with _reading(METRICS_FILE):
-                frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
-            known = {name for frame in frames for name in frame["estimator"]}
-            if name not in known:
-                raise UsageError(
-                    expected=f"an estimator of these runs: {', '.join(sorted(known))}", got=name, where="estimator"
-                )
+        """Raise UsageError for an estimator that no drive of either run has, and for runs without a main one."""
+        missing = {f.figure.estimator for f in figures if f.verdict == "no figure"}
+        if any(self._main):
+            missing -= {MAIN}
+        if not missing:
+            return
+        with _reading(METRICS_FILE):
+            frames = [run.metrics().select("estimator").unique().collect(engine="streaming") for run in self._runs]
+        known = {name for frame in frames for name in frame["estimator"]}
+        for name in sorted(missing - known):
+            single = sorted(k for k in known if "~" not in k and k != SENSORS)
+            got = "none named, and none that is the answer" if name == MAIN else name
+            raise UsageError(expected=f"an estimator of these runs: {', '.join(single)}", got=got, where="--estimator")
 
     def _rows(self, figures: Sequence[Figure]) -> list[pl.DataFrame]:
         """Return the rows of figures, and of what is said of their truth, of both runs."""
@@ -440,13 +445,6 @@ def _most_changed(pairs: Sequence[Pair], changed: frozenset[str], figure: Compar
     by_drive = {d.drive: abs(float(log_ratios(np.array([d.a]), np.array([d.b]))[0])) for d in figure.drives}
     known = [pair for pair in pairs if pair.a.label in changed]
     return sorted(known, key=lambda pair: -by_drive.get(pair.a.label, -1.0))[:MOST_FOLLOWED]
-
-
-def _main_of(log: OpenedLog) -> str:
-    """Return the estimator that is a drive's answer; empty where there is none."""
-    if "main" in log.entry:
-        return str(log.entry["main"] or "")
-    return str((((log.report() or {}).get("answer")) or {}).get("main", ""))  # a run of an older version
 
 
 def _clusters(pairing: Pairing, key: str) -> list[object]:

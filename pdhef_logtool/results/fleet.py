@@ -38,6 +38,8 @@ WORST = 20
 #: Values of a key that are told one by one; numbers beyond them are told by quarters.
 MOST_VALUES = 12
 _QUARTERS = 4
+#: Folders from the top that drives are told by.
+_MOST_FOLDERS = 3
 #: Labels that a group of failures names, and groups that are told.
 NAMED, _MOST_GROUPS = 10, 50
 _PLACE = re.compile(r"\s*\([^()]*\)\s*$")
@@ -144,7 +146,7 @@ class Breakdown:
 
 @dataclass(frozen=True, slots=True)
 class Failures:
-    """Logs that ended alike: ``labels`` of the first :data:`NAMED` of ``count``."""
+    """Logs that ended alike: the ``reason`` of the first, and ``labels`` of the first :data:`NAMED` of ``count``."""
 
     reason: str
     count: int
@@ -182,8 +184,9 @@ class Fleet:
 
     @property
     def worst(self) -> tuple[FleetDrive, ...]:
-        """The scored drives with the largest errors, the largest first."""
-        return tuple(sorted(self.scored, key=lambda d: (-d.error(), d.label))[:WORST])
+        """The scored drives with the largest errors, the largest first; at most a quarter, but for a few."""
+        scored = sorted(self.scored, key=lambda d: (-d.error(), d.label))
+        return tuple(scored[: min(WORST, max(5, len(scored) // 4))])
 
     @property
     def without_truth(self) -> tuple[FleetDrive, ...]:
@@ -270,8 +273,6 @@ class _Gathered:
         if kind == "failed" or report is None:
             self.failed.append((log.label, reason or "its report is not there any more"))
             return
-        if kind == "lost":
-            self.lost += [(log.label, part) for part in reason.split("; ")]
         try:
             drive = _drive(log, report, figures)
             self._add_space(report.get("operating_space"))
@@ -279,6 +280,7 @@ class _Gathered:
             self.failed.append((log.label, f"its report is none of this tool: {type(error).__name__}"))
             return
         self.drives.append(drive)
+        self.lost += [(log.label, str(x["what"])) for x in report.get("losses", ()) if x.get("severity") == "lost"]
 
     def _add_space(self, space: Mapping[str, Any] | None) -> None:
         if not space:
@@ -343,9 +345,8 @@ def _collected(rows: pl.LazyFrame, run: OpenedRun) -> pl.DataFrame:
 
 def _drive(log: OpenedLog, report: Mapping[str, Any], figures: Mapping[tuple[str, str, str], float]) -> FleetDrive:
     answer = report.get("answer") or {}
-    main = answer.get("main") or ""
-    names = {e for e, _, _ in figures}
-    main = main or (next(iter(sorted(names)), "") if len(names) == 1 else "")
+    ran = [e["name"] for e in report.get("estimators", ()) if e["outcome"] == "ran"]
+    main = answer.get("main") or next(iter(ran), "")  # without an answer the first of recorded estimates
     errors = {
         (e, s): value
         for (e, s, metric), value in figures.items()
@@ -385,20 +386,19 @@ def _keys(log: OpenedLog, report: Mapping[str, Any], main: str) -> dict[str, str
     """Return what a drive can be told by: what its log says of itself, and what the run knows."""
     friction = report.get("friction") or {}
     car = log.entry.get("car") or {}
+    source = str(friction.get("source", ""))
     own = {
         "car": car.get("name") or report["vehicle"]["name"],
         "log format": report["log"]["kind"],
         "answer": main,
-        "friction source": "estimated"
-        if friction.get("estimated")
-        else str(friction.get("source", "")).partition(",")[0],
+        "friction source": "estimated" if friction.get("estimated") else source.partition(",")[0],
         "length": _length(float(report["log"]["duration_s"])),
         "sensor faults": _fault_text(report),
     }
-    return {
-        **{str(k): str(v) for k, v in (report.get("metadata") or {}).items()},
-        **{k: v for k, v in own.items() if v},
-    }
+    parts = str(log.entry.get("folder") or "").split("/")[:_MOST_FOLDERS]
+    own |= {"folder" if i == 0 else f"folder {i + 1}": "/".join(parts[: i + 1]) for i in range(len(parts))}
+    told = {str(k): str(v) for k, v in (report.get("metadata") or {}).items()}
+    return {**told, **{k: v for k, v in own.items() if v}}
 
 
 def _length(seconds: float) -> str:
@@ -476,13 +476,13 @@ def _share(of_logs: Median) -> Median:
 
 
 def _breakdowns(drives: Sequence[FleetDrive], by: Sequence[str]) -> list[Breakdown]:
-    """Return the drives by each key that tells them apart, the one that explains most first; by ``by`` in its order."""
+    """Return the drives by each key that tells them apart, the one that explains most first; ``by`` keeps its order."""
     known = {key: None for d in drives for key in d.keys}
     found = []
     for key in by or known:
         values = _told(key, drives)
         count = len({v for v in values if v is not None})
-        if by or (2 <= count <= MOST_VALUES + 1 and count < len(drives)):
+        if by or 2 <= count <= min(MOST_VALUES, len(drives) - 1):
             found.append(_breakdown(key, drives, values))
     if by:
         return found
@@ -504,7 +504,7 @@ def _told(key: str, drives: Sequence[FleetDrive]) -> list[str | None]:
     if len(finite) == sum(counts.values()):
         edges = np.unique(np.quantile(finite, np.linspace(0.0, 1.0, _QUARTERS + 1)))
         at = np.clip(np.searchsorted(edges, numbers, side="right") - 1, 0, max(len(edges) - 2, 0))
-        names = [f"{a:g} to {b:g}" for a, b in pairwise(edges)] or [f"{edges[0]:g}"]
+        names = [f"{a:.4g} to {b:.4g}" for a, b in pairwise(edges)] or [f"{edges[0]:.4g}"]
         return [names[i] if math.isfinite(x) else None for i, x in zip(at, numbers, strict=True)]
     common = {value for value, _ in counts.most_common(MOST_VALUES)}
     rest = f"{len(counts) - MOST_VALUES} others"
@@ -550,14 +550,14 @@ def _explained(groups: Sequence[FloatArray]) -> float:
 
 def _grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
     """Return reasons with their logs, the most frequent first; numbers and places do not tell reasons apart."""
-    members: dict[str, dict[str, None]] = {}
+    members: dict[str, tuple[str, dict[str, None]]] = {}
     for label, reason in found:
-        members.setdefault(_kind_of(reason), {})[label] = None
-    groups = [Failures(reason, len(labels), tuple(labels)[:NAMED]) for reason, labels in members.items()]
+        text = _without_place(reason)
+        members.setdefault(_NUMBER.sub("", text), (text, {}))[1][label] = None
+    groups = [Failures(text, len(labels), tuple(labels)[:NAMED]) for text, labels in members.values()]
     return tuple(sorted(groups, key=lambda g: (-g.count, g.reason))[:_MOST_GROUPS])
 
 
-def _kind_of(reason: str) -> str:
+def _without_place(reason: str) -> str:
     _, expected, rest = reason.partition(": expected ")
-    text = f"expected {rest}" if expected else _PLACE.sub("", reason)
-    return _NUMBER.sub("N", text)
+    return f"expected {rest}" if expected else _PLACE.sub("", reason)

@@ -42,8 +42,16 @@ class Figure:
 
     @property
     def label(self) -> str:
-        """``sideslip_rad rmse (all) of main``, for tables and test reports."""
-        return f"{self.signal} {self.metric} ({self.segment}) of {self.estimator}"
+        """``sideslip_rad rmse (all)``, with the estimator unless it is the main one, for tables and test reports."""
+        of = "" if self.estimator == MAIN else f" of {self.estimator}"
+        return f"{self.signal} {self.metric} ({self.segment}){of}"
+
+    @property
+    def short(self) -> str:
+        """``sideslip rmse`` or ``sideslip, braking``, for the axis of a figure."""
+        name = re.sub(r"_(rad|rad_s|m|m_s|m_s2)$", "", self.signal)
+        what = name if self.metric == "rmse" and self.segment != "all" else f"{name} {self.metric}"
+        return what if self.segment == "all" else f"{what}, {self.segment}"
 
 
 @dataclass(frozen=True, slots=True)

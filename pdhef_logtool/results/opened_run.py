@@ -49,6 +49,13 @@ class OpenedLog:
             return None
         return read_json(path, "a report.json", OutputError, "run the log again", MAX_DOCUMENT_BYTES)
 
+    def main(self) -> str:
+        """Return the estimator that is the drive's answer; empty where there is none."""
+        if "main" in self.entry:
+            return str(self.entry["main"] or "")
+        answer = (self.report() or {}).get("answer") or {}  # run.json of an older version does not say it
+        return str(answer.get("main") or "")
+
     def estimates(self) -> pl.LazyFrame | None:
         """Return estimates.parquet, of which only what is asked for is read; None where there is none."""
         import polars as pl

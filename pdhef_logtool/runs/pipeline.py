@@ -18,7 +18,7 @@ from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
-from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, find_logs
+from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, find_logs, folders_of
 from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import (
@@ -188,6 +188,7 @@ def run_logs(
     thresholds = read_thresholds(config, junit)
     check_places(inputs, output, config, mapping, junit, cars.paths)
     results: list[LogResult] = []
+    folders = folders_of(inputs)
     had = [_car_of(cars, log_input, alone=len(inputs) == 1) for log_input in inputs]
     pools = _pools(inputs, had, mapping, config) if config.calibrate == "pool" else {}
     with OutputFolder(output, (LOGS,)) as outputs:
@@ -213,6 +214,7 @@ def run_logs(
             except BaseException as stop:
                 stop.add_note(f"{number} of {len(inputs)} logs are done")
                 raise
+            result = replace(result, outcome=replace(result.outcome, folder=folders[number]))
             results.append(judge(result, thresholds))
         write_run(output, config.to_dict(), results, [car for car in had if isinstance(car, Car)])
         write_verdicts(junit, results)
@@ -650,7 +652,7 @@ def check_places(
 ) -> None:
     """Refuse to write over what is read; raises UsageError."""
     can = () if mapping is None or mapping.can is None else mapping.can.dbc
-    files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE)]
+    files = [] if output is None else [output / name for name in (METRICS_FILE, RUN_FILE, PAGE_FILE)]
     folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
     files += [folder / name for folder in folders for name in LOG_FILES]
     check_no_input(

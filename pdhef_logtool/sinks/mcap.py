@@ -79,13 +79,21 @@ class AnnotatedMcapSink(Sink):
     path : where the finished file stands.
     source : the log to copy in full; None for a sidecar that holds our topics alone.
     names : of the tracks that are written; None: all.
+    span_ns : only what of it was recorded in [start, end); None: all of it.
 
     Raises
     ------
     OutputError : When the file cannot be written.
     """
 
-    def __init__(self, path: Path, source: DriveLog | None, names: Container[str] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        source: DriveLog | None,
+        names: Container[str] | None = None,
+        *,
+        span_ns: tuple[int, int] | None = None,
+    ) -> None:
         self._source = source
         self._names = names
         self._topics: dict[str, str] = {}
@@ -101,7 +109,7 @@ class AnnotatedMcapSink(Sink):
             self._writer.abort()
             raise
         self.lost = channels.lost
-        self._raws = iterate_copy(source, channels)
+        self._raws = iterate_copy(source, channels, *(span_ns or (None, None)))
 
     def append(self, track: StateTrack) -> None:
         """Take one track of this window."""

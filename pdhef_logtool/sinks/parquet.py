@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -184,13 +184,35 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
     ------
     OutputError : When the file is no estimates.parquet or holds no such track.
     """
-    wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in set(columns)]
-    unknown = set(columns or ()) - set(TRACK_COLUMNS)
+    tables = list(_tables(path, estimator, None if columns is None else set(columns)))
+    if not tables:
+        raise OutputError(expected=f"one of {', '.join(list_estimators(path))}", got=estimator, where=str(path))
+    return _track_from_table(estimator, pa.concat_tables(tables))
+
+
+def read_blocks(path: Path, estimator: str, columns: Iterable[str]) -> Iterator[StateTrack]:
+    """Yield one track of an estimates.parquet in order of time, a row group at once; none where it is not in the file.
+
+    As :func:`read_track` says; a column that an earlier version did not write stays NaN.
+
+    Raises
+    ------
+    OutputError : When the file is no estimates.parquet or damaged.
+    """
+    with _open(path) as file:
+        later = set(_LATER_COLUMNS) - set(file.schema_arrow.names)
+    for table in _tables(path, estimator, set(columns) - later):
+        yield _track_from_table(estimator, table)
+
+
+def _tables(path: Path, estimator: str, columns: set[str] | None) -> Iterator[pa.Table]:
+    """Yield the row groups of an estimator with the columns asked for, all that there are when None."""
+    wanted = [c for c in TRACK_COLUMNS if c == "stamp_ns" or columns is None or c in columns]
+    unknown = (columns or set()) - set(TRACK_COLUMNS)
     if unknown:
         raise OutputError(
             expected=f"columns of {', '.join(TRACK_COLUMNS)}", got=", ".join(sorted(unknown)), where=str(path)
         )
-    tables: list[pa.Table] = []
     with _open(path) as file:
         absent = set(wanted) - set(file.schema_arrow.names)
         if columns is None:  # a file from before these columns is whole without them
@@ -204,17 +226,18 @@ def read_track(path: Path, estimator: str, columns: Iterable[str] | None = None)
                 remedy="run the log again",
             )
         for group in range(file.num_row_groups):
-            names = _estimators_of(file, group)
-            if estimator not in names:
-                continue
-            if len(names) == 1:
-                tables.append(file.read_row_group(group, columns=wanted))
-            else:
-                table = file.read_row_group(group, columns=[*wanted, "estimator"])
-                tables.append(table.filter(pc.field("estimator") == estimator).select(wanted))
-    if not tables:
-        raise OutputError(expected=f"one of {', '.join(list_estimators(path))}", got=estimator, where=str(path))
-    return _track_from_table(estimator, pa.concat_tables(tables))
+            try:
+                names = _estimators_of(file, group)
+                if estimator not in names:
+                    continue
+                if len(names) == 1:
+                    table = file.read_row_group(group, columns=wanted)
+                else:
+                    table = file.read_row_group(group, columns=[*wanted, "estimator"])
+                    table = table.filter(pc.field("estimator") == estimator).select(wanted)
+            except (OSError, pa.ArrowException) as error:
+                raise _damaged(path, error) from error
+            yield table
 
 
 def _track_from_table(name: str, table: pa.Table) -> StateTrack:
@@ -258,9 +281,11 @@ def _open(path: Path) -> pq.ParquetFile:
     try:
         return pq.ParquetFile(path)
     except (OSError, pa.ArrowException) as error:
-        raise OutputError(
-            expected="a readable Parquet file", got=str(error), where=str(path), remedy="run the log again"
-        ) from error
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> OutputError:
+    return OutputError(expected="a readable Parquet file", got=str(error), where=str(path), remedy="run the log again")
 
 
 def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:

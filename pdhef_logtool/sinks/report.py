@@ -194,7 +194,7 @@ class LogOutcome:
     """How one log of a run ended, with which car; None where it was not read or nothing was estimated.
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
-    ``main``: the estimator that is the answer.
+    ``main``: the estimator that is the answer. ``folder`` of the log, below the one that holds all logs of the run.
     """
 
     log: str
@@ -207,6 +207,7 @@ class LogOutcome:
     truth_sha256: str | None = None
     mapping_sha256: str | None = None
     main: str | None = None
+    folder: str = ""
 
     @property
     def outcome(self) -> str:
@@ -321,6 +322,7 @@ def build_run(
             {
                 "log": o.log,
                 "file": PurePath(o.file).name,
+                "folder": o.folder,
                 "sha256": o.sha256,
                 "signals_sha256": o.signals_sha256,
                 "truth_sha256": o.truth_sha256,

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 Outcome: TypeAlias = Literal["better", "worse", "same", "undecided", "alone", "none"]
 
 _DEG = math.degrees(1.0)
-#: What a signal is called, the factor to the unit that a person reads, and that unit.
+#: By signal the factor to the unit that a person reads, and that unit.
 _SHOWN = {
-    "sideslip_rad": ("sideslip", _DEG, "°"),
-    "vy_m_s": ("v_y", 1.0, " m/s"),
-    "yaw_rate_rad_s": ("yaw rate", _DEG, "°/s"),
-    "vx_m_s": ("v_x", 1.0, " m/s"),
+    "sideslip_rad": (_DEG, "°"),
+    "vy_m_s": (1.0, " m/s"),
+    "yaw_rate_rad_s": (_DEG, "°/s"),
+    "vx_m_s": (1.0, " m/s"),
 }
 
 
@@ -45,11 +45,10 @@ def verdicts_of(
 def _verdict(
     report: Mapping[str, Any], main: str, signal: str, found: Standing | None, limits: Sequence[Verdict]
 ) -> dict[str, Any]:
-    name = _SHOWN[signal][0]
     own = [v for v in limits if v.estimator == main and v.outcome in ("pass", "fail")]
     outcome: Outcome = "none"
     if why := _why_none(report, main, signal, found):
-        text = f"no verdict on {name}: {why}"
+        text = f"no verdict: {why}"
         found = None
     else:
         assert found is not None and found.rmse is not None
@@ -114,7 +113,7 @@ def _outcome(found: Standing) -> Outcome:
 
 
 def _error(found: Standing) -> str:
-    name, factor, unit = _SHOWN[found.signal]
+    factor, unit = _SHOWN[found.signal]
     assert found.rmse is not None
     shown = _number(found.rmse.value * factor)
     if math.isfinite(found.rmse.low):
@@ -122,13 +121,13 @@ def _error(found: Standing) -> str:
         between = f" (95 % between {low} and {high}{unit})"
     else:
         between = f" (too short for an interval: that takes {LEAST_BLOCKS} blocks of {found.block_s:g} s)"
-    return f"{name} by {found.estimator} is {shown}{unit} RMSE off{between}"
+    return f"{found.estimator} is {shown}{unit} RMSE off{between}"
 
 
 def _against(found: Standing, outcome: Outcome) -> str:
     if outcome == "alone":
         return "no other filter on physics alone ran beside it"
-    _, factor, unit = _SHOWN[found.signal]
+    factor, unit = _SHOWN[found.signal]
     assert found.rival_rmse is not None and found.difference is not None and found.rmse is not None
     beside = f"{found.rival} ({_number(found.rival_rmse * factor)}{unit})"
     if outcome == "same":

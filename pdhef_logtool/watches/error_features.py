@@ -12,6 +12,8 @@ term          unit  definition
                     through the same high-pass; its slow mean (3 s: bias, bank) taken off. The accelerometer and the
                     gyro against the estimate's own changes: no vehicle model stands between
 ``yaw_rate``  rad/s rms over 1 s of r_m − r̂, smoothed over 0.15 s so that noise goes and model error stays
+``cure``      rad   abs β̂ times the weight of the filters that cure what the car lacks: it lacks something then
+``bank``      rad   abs of the road's bank as the estimator has it
 ============  ====  ================================================================================================
 
 The sensors' samples of a stamp arrive later than the stamp. So the terms are computed on measurement time and each
@@ -35,7 +37,7 @@ from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: In the order of the columns.
-TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate")
+TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate", "cure", "bank")
 FLOOR_RAD = 1e-4
 GRIP_RAD, GRIP2_RAD = 0.003, 0.01
 GRIP_SMOOTHING_S, GRIP_HOLD_S = 0.05, 0.5
@@ -75,7 +77,7 @@ class FeatureCarry:
 def error_terms(
     track: StateTrack, signals: Signals, roll_gradient_rad_per_m_s2: float, carry: FeatureCarry | None
 ) -> tuple[FloatArray, FeatureCarry]:
-    """Return the terms [N, 7] of :data:`TERMS` at the stamps of a window; joined windows equal the whole.
+    """Return the terms [N, 9] of :data:`TERMS` at the stamps of a window; joined windows equal the whole.
 
     Terms that cannot be known count as 0, for instance before the first sample has arrived.
 
@@ -109,6 +111,8 @@ def error_terms(
             GRIP2_RAD * grip**2,
             known[:, 1],
             known[:, 2],
+            _known(np.abs(track.sideslip_rad)) * _column(track, track.mixture_weight),
+            np.abs(_column(track, track.bank_rad)),
         ],
         axis=1,
     )
@@ -125,6 +129,16 @@ def believed(track: StateTrack, signals: Signals) -> tuple[FloatArray, FloatArra
         return signals.ay_m_s2, signals.yaw_rate_rad_s
     bad = [np.bitwise_and(track.reason, bits) != 0 for bits in (_AY_BITS, _AY_BITS << 1)]
     return np.where(bad[0], np.nan, signals.ay_m_s2), np.where(bad[1], np.nan, signals.yaw_rate_rad_s)
+
+
+def grip_share(terms: FloatArray) -> FloatArray:
+    """Return the share of the grip that is used [N], from terms [N, 9]."""
+    return terms[:, TERMS.index("grip")] / GRIP_RAD
+
+
+def _column(track: StateTrack, values: FloatArray) -> FloatArray:
+    """Return an optional column of a track [N], 0 where it is not known."""
+    return _known(values) if len(values) == len(track) else np.zeros(len(track))
 
 
 def _known(values: FloatArray) -> FloatArray:

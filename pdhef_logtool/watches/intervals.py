@@ -2,10 +2,11 @@
 
 The calibrated variance of sideslip is a sum of non-negative contributions,
 
-    s² = Σ (k_i t_i)²,
+    s² = g² Σ (k_i t_i)²,
 
 with the terms t_i of :mod:`pdhef_logtool.watches.error_features` (the filter's own 1-sigma, grip use, sideslip,
-disagreement with accelerometer and gyro, ...). It grows with every term and needs no truth and no future. ``s`` is the
+disagreement with accelerometer and gyro, ...) and a factor g by grip use: driving near the limit decides what counts
+there, and nothing else. It grows with every term and needs no truth and no future. ``s`` is the
 95 % quantile of the error divided by 1.96, so that ± 1.96 s covers 95 % whatever the errors' distribution. The yaw
 rate's is the same sum over fewer terms; v_y's 1-sigma keeps its ratio to the sideslip's, times a factor. The covariance
 is scaled row and column alike, so that its correlations stay. Estimates themselves never change.
@@ -34,8 +35,10 @@ if TYPE_CHECKING:
     from pdhef_logtool.watches.error_features import FeatureCarry
 
 #: Terms of the sideslip's variance; those of the yaw rate's, where ``filter`` is its own 1-sigma.
-SIDESLIP_TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate")
+SIDESLIP_TERMS = ("floor", "filter", "sideslip", "grip", "grip2", "kinematic", "yaw_rate", "cure", "bank")
 YAW_RATE_TERMS = ("floor", "filter", "yaw_rate")
+#: Share of the grip that is used at which the factors hold; between them it goes over, beyond them it stays.
+GRIP_PLACES = (0.2, 0.45, 0.7)
 #: A sideslip is not known at all beyond this 1-sigma.
 MAX_SIDESLIP_STD_RAD = 1.0
 
@@ -134,9 +137,12 @@ def calibrated(
 
 
 def inflated(track: StateTrack, terms: FloatArray, inflation: Inflation) -> StateTrack:
-    """Scale a track's 1-sigmas and covariance by an inflation; ``terms`` [N, 7]. NaN stays NaN."""
+    """Scale a track's 1-sigmas and covariance by an inflation; ``terms`` [N, 9]. NaN stays NaN."""
+    from pdhef_logtool.watches.error_features import grip_share
+
     own = track.sideslip_std_rad
-    sideslip = np.minimum(combined(terms, _ordered(inflation.sideslip, SIDESLIP_TERMS)), MAX_SIDESLIP_STD_RAD)
+    sideslip = combined(terms, _ordered(inflation.sideslip, SIDESLIP_TERMS))
+    sideslip = np.minimum(sideslip * grip_factor(grip_share(terms), inflation.grip_factors), MAX_SIDESLIP_STD_RAD)
     sideslip = np.where(np.isfinite(own), sideslip, np.nan)
     covariance = track.covariance
     if covariance.shape[0]:
@@ -158,6 +164,11 @@ def combined(terms: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
     return np.sqrt(total)
 
 
+def grip_factor(share: FloatArray, factors: Sequence[float]) -> FloatArray:
+    """Return the factor [N] at shares of the grip [N] of the ``factors`` at :data:`GRIP_PLACES`."""
+    return np.interp(share, GRIP_PLACES, factors)
+
+
 def yaw_rate_terms(terms: FloatArray, rate_std: FloatArray) -> FloatArray:
     """Return the yaw rate's terms [N, 3] from those of the sideslip and the estimator's own 1-sigma [N]."""
     known = np.where(np.isfinite(rate_std), rate_std, 0.0)
@@ -174,10 +185,16 @@ def _ordered(coefficients: YawRateCoefficients, terms: Sequence[str]) -> tuple[f
     return tuple(getattr(coefficients, term) for term in terms)
 
 
-def make_inflation(sideslip: Sequence[float], yaw_rate: Sequence[float], vy_factor: float = 1.0) -> Inflation:
+def make_inflation(
+    sideslip: Sequence[float],
+    yaw_rate: Sequence[float],
+    vy_factor: float = 1.0,
+    grip_factors: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Inflation:
     """Return an inflation of coefficients in the order of :data:`SIDESLIP_TERMS` and :data:`YAW_RATE_TERMS`."""
     return Inflation(
         sideslip=SideslipCoefficients(**dict(zip(SIDESLIP_TERMS, map(float, sideslip), strict=True))),
         yaw_rate=YawRateCoefficients(**dict(zip(YAW_RATE_TERMS, map(float, yaw_rate), strict=True))),
         vy_factor=float(vy_factor),
+        grip_factors=grip_factors,
     )

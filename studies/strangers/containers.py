@@ -30,19 +30,24 @@ class Topic:
     constants: Mapping[str, str | float | Sequence[float]] = field(default_factory=dict)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=2)
 def _store(ros1: bool) -> Any:
-    from rosbags.typesys import Stores, get_typestore
+    """Return the types of a distribution with those of ``shapes.txt``."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
+    for name, text in shapes():
+        store.register(get_types_from_msg(text, name))
+    return store
 
 
-def register(type_name: str, text: str) -> None:
-    """Make a message type known by its definition, the types in it first."""
-    from rosbags.typesys import get_types_from_msg
-
-    for ros1 in (True, False):
-        _store(ros1).register(get_types_from_msg(text, type_name))
+def shapes() -> Iterator[tuple[str, str]]:
+    """Yield name and definition of every type in ``shapes.txt``."""
+    text = (Path(__file__).parent / "shapes.txt").read_text(encoding="utf-8")
+    for paragraph in re.split(r"\n\n+", re.sub(r"(?m)^#.*\n", "", text).strip()):
+        name, *lines = paragraph.splitlines()
+        typed = ((kind, field) for kind, *fields in map(str.split, lines) for field in fields)
+        yield name, "".join(f"{kind} {field}\n" for kind, field in typed)
 
 
 def definition(type_name: str, *, ros1: bool = False) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray
 from studies.strangers.cars import Car, Series, drive
-from studies.strangers.containers import Topic, register
+from studies.strangers.containers import Topic
 from studies.strangers.recordings import (
     DEG,
     DOWN,
@@ -178,13 +178,6 @@ def places_and_delays() -> Iterator[Recording]:
         cause=r"offset|bias|constant",
         at_fault=frozenset({"truth.vy_m_s", "truth.vx_m_s", "truth.sideslip_rad", "truth.yaw_rad"}),
     )
-
-
-register(
-    "can_msgs/msg/Frame",
-    "std_msgs/Header header\nuint32 id\nbool is_rtr\nbool is_extended\nbool is_error\nuint8 dlc\nuint8[8] data\n",
-)
-register("teamx_msgs/msg/DriverInput", "std_msgs/Header header\nfloat32 steering_angle\nfloat32 pedal\nuint8 gear\n")
 
 
 def missing_things() -> Iterator[Recording]:

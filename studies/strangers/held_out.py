@@ -6,10 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pdhef_logtool.records.signals import WHEELS, IntArray
 from studies.strangers.cars import drive
-from studies.strangers.containers import register
-from studies.strangers.layouts import heading_deg, north_east
+from studies.strangers.layouts import course_deg, heading_deg, micros, north_east
 from studies.strangers.recordings import (
     DEG,
     DOWN,
@@ -21,424 +19,299 @@ from studies.strangers.recordings import (
     imu,
     message,
     odometry,
-    scalar,
-    xyz,
 )
 from truthsim.recording import quaternion
 
-_HEADER = "std_msgs/Header header\n"
-#: Radians a second in one revolution a minute.
-RPM = 2.0 * np.pi / 60.0
 
-register(
-    "carla_msgs/msg/CarlaEgoVehicleControl", _HEADER + "float32 throttle\nfloat32 steer\nfloat32 brake\nint32 gear\n"
-)
-register(
-    "carla_msgs/msg/CarlaEgoVehicleStatus",
-    _HEADER
-    + "float32 velocity\ngeometry_msgs/Accel acceleration\ngeometry_msgs/Quaternion orientation\n"
-    + "float32 wheel_angle_fl\nfloat32 wheel_angle_fr\ncarla_msgs/CarlaEgoVehicleControl control\n",
-)
-
-
-def carla() -> Recording:
-    """CARLA's bridge: wheel angles in degrees to the right, the control from -1 to 1, the simulator's odometry."""
+def applanix() -> Recording:
+    """Applanix POS: one solution with velocity north, east, down, rates in deg/s, axes forward, right, down."""
     car = drive("sedan")
-    clock = car.speed
+    clock = car.velocity
+    force, rate = car.force.times(DOWN).along(clock).values, car.rate.times(DOWN).along(clock).values / DEG
+    north, east = north_east(car)
+    lat, lon, alt = car.fix.along(clock).values.T
+    axes = ("long", "trans", "down")
+    solution = {
+        "latitude": lat, "longitude": lon, "altitude": alt, "north_vel": north, "east_vel": east,
+        "heading": heading_deg(car), "track_angle": course_deg(car), "speed": car.ground_speed.values,
+        **{f"ang_rate_{axis}": rate[:, i] for i, axis in enumerate(axes)},
+        **{f"{axis}_accel": force[:, i] for i, axis in enumerate(axes)},
+    }  # fmt: skip
+    return Recording(
+        name="applanix",
+        group="held-out",
+        what="Applanix POS: NavigationSolution (deg/s, forward, right, down; velocity north, east, down)",
+        container="rosbag1",
+        topics=(message("/applanix/nav", "applanix_msgs/msg/NavigationSolution", clock, solution),),
+        right={
+            "truth.enu_velocity_m_s": answers(car, "truth")["truth.enu_velocity_m_s"],
+            **answers(car, "imu", "speed"),
+        },
+        allowed=answers(car, "truth", "truth rate"),
+        page="https://docs.ros.org/en/electric/api/applanix_msgs/html/__NavigationSolution_8py_source.html",
+    )
+
+
+def awapi() -> Recording:
+    """Autoware's web interface: velocity, steering and angular velocity with their targets in one message."""
+    car = drive("suv")
+    clock = car.speed.every(2)
     steer = car.steer.along(clock).values
+    at = car.position.along(clock).values
     roll, pitch, yaw = car.attitude.along(clock).values.T
     status = {
-        "velocity": clock.values,
-        "acceleration.linear.x": np.gradient(clock.values, 0.01),
-        "orientation": quaternion(roll, pitch, yaw),
-        "wheel_angle_fl": -steer / DEG,
-        "wheel_angle_fr": -steer / DEG,
-        "control.steer": np.roll(-steer / 0.7, -10),
-        "control.throttle": 0.3 + 0.0 * steer,
-    }
-    return Recording(
-        name="carla",
-        group="held-out",
-        what="CARLA: CarlaEgoVehicleStatus (wheel angles in degrees, right positive), IMU, speedometer, odometry",
-        container="rosbag2-mcap",
-        topics=(
-            message("/carla/ego_vehicle/vehicle_status", "carla_msgs/msg/CarlaEgoVehicleStatus", clock, status),
-            imu(car.force, car.rate, "/carla/ego_vehicle/imu", "ego_vehicle/imu"),
-            scalar("/carla/ego_vehicle/speedometer", clock),
-            odometry(car, "/carla/ego_vehicle/odometry"),
-            fix(car, "/carla/ego_vehicle/gnss"),
-        ),
-        right=answers(car, "imu", "steer", "speed"),
-        allowed=answers(car, "truth", "truth rate"),
-        page="https://github.com/uulm-mrm/ros-carla-msgs/blob/master/msg/CarlaEgoVehicleStatus.msg",
-    )
-
-
-def nuscenes() -> Recording:
-    """The CAN bus of nuScenes: rad at the steering wheel, right positive; wheels in rpm; a monitor in km/h, deg/s."""
-    car = drive("hatchback")
-    steer, wheels, slow = car.steering_wheel, car.wheels, car.speed.every(50)
-
-    def utime(stamps_ns: IntArray) -> IntArray:
-        return stamps_ns // 1000
-
-    ms_imu = {
-        "utime": utime(car.force.stamps_ns),
-        "linear_accel": car.force.values,
-        "rotation_rate": car.rate.along(car.force).values,
-    }
-    feedback = {"utime": utime(steer.stamps_ns), "value": -steer.values}
-    rates = wheels.values / car.wheel_radius_m / RPM
-    info = {
-        "utime": utime(wheels.stamps_ns),
-        **{f"{w.upper()}_wheel_speed": rates[:, i] for i, w in enumerate(WHEELS)},
-        "odom_speed": car.speed.along(wheels).values / KMH,
-        "longitudinal_accel": car.force[0].along(wheels).values,
-        "transversal_accel": car.force[1].along(wheels).values / G_M_S2,
-        "steer_raw": -car.steering_wheel.along(wheels).values / DEG,
-        "pedal_cc": 100.0 + 0.0 * wheels.values[:, 0],
-    }
-    monitor = {
-        "utime": utime(slow.stamps_ns),
-        "vehicle_speed": slow.values / KMH,
-        "yaw_rate": car.rate[2].along(slow).values / DEG,
-        "steering": -car.steering_wheel.along(slow).values / DEG,
-        "battery_level": 80.0 + 0.0 * slow.values,
-    }
-    return Recording(
-        name="nuscenes",
-        group="held-out",
-        what="nuScenes CAN bus: ms_imu, steeranglefeedback (right positive), zoe_veh_info (rpm, g), vehicle_monitor",
-        container="mcap-json",
-        topics=(
-            message("/ms_imu", "ms_imu", car.force, ms_imu, stamp=None),
-            message("/steeranglefeedback", "steeranglefeedback", steer, feedback, stamp=None),
-            message("/zoe_veh_info", "zoe_veh_info", wheels, info, stamp=None),
-            message("/vehicle_monitor", "vehicle_monitor", slow, monitor, stamp=None),
-        ),
-        right=answers(car, "imu", "steering wheel", "speed", "wheel rates"),
-        page="https://github.com/nutonomy/nuscenes-devkit/blob/master/python-sdk/nuscenes/can_bus/README.md",
-    )
-
-
-def kitti() -> Recording:
-    """KITTI's oxts packets at 10 Hz: two-letter names, forward, left, up; specific force and acceleration beside it."""
-    car = drive("suv")
-    clock = car.body_velocity.every(5)
-    force, rate = car.force.along(clock).values, car.rate.along(clock).values
-    north, east = (v[::5] for v in north_east(car))
-    lat, lon, alt = car.fix.along(clock).values.T
-    roll, pitch, yaw = car.attitude.every(5).values.T
-    packet = {
-        "lat": lat, "lon": lon, "alt": alt, "roll": roll, "pitch": pitch, "yaw": yaw, "vn": north, "ve": east,
-        "vf": clock.values[:, 0], "vl": clock.values[:, 1], "vu": 0.0 * lat,
-        "ax": force[:, 0], "ay": force[:, 1], "az": force[:, 2],
-        "wx": rate[:, 0], "wy": rate[:, 1], "wz": rate[:, 2],
-        "pos_accuracy": 0.05 + 0.0 * lat, "vel_accuracy": 0.02 + 0.0 * lat, "numsats": 9.0 + 0.0 * lat,
+        "pose.position.x": at[:, 0], "pose.position.y": at[:, 1], "pose.orientation": quaternion(roll, pitch, yaw),
+        "eulerangle.roll": roll, "eulerangle.pitch": pitch, "eulerangle.yaw": yaw,
+        "velocity": clock.values, "acceleration": np.gradient(clock.values, 0.02), "steering": steer,
+        "steering_velocity": np.gradient(steer, 0.02), "angular_velocity": car.yaw_rate.along(clock).values,
+        "gear": 2.0 + 0.0 * steer, "energy_level": 0.8 + 0.0 * steer, "target_velocity": np.roll(clock.values, -20),
+        "target_steering": np.roll(steer, -5), "target_steering_velocity": np.gradient(np.roll(steer, -5), 0.02),
     }  # fmt: skip
     return Recording(
-        name="kitti",
+        name="awapi",
         group="held-out",
-        what="KITTI raw oxts at 10 Hz: vf, vl, ax, ay, wz",
-        container="mcap-json",
-        topics=(message("/oxts", "oxts", clock, packet, stamp=None),),
-        right={k: v for k, v in answers(car, "imu", "speed", "truth").items() if k != "truth.enu_velocity_m_s"},
-        allowed=answers(car, "truth", "truth rate"),
-        page="https://www.cvlibs.net/datasets/kitti/raw_data.php",
-    )
-
-
-_VECTORS = ("acc_body_hr", "rate_body_hr", "rate_body", "rate_hor", "acc_body", "acc_hor")
-register(
-    "adma_ros_driver_msgs/msg/AdmaDataScaled",
-    _HEADER
-    + "string genesys_id\nuint32 serial_number\n"
-    + "".join(f"geometry_msgs/Vector3 {name}\n" for name in _VECTORS)
-    + "float64 ext_vel_dig_x\nfloat64 ext_vel_dig_y\nfloat64 inv_path_radius\nfloat64 side_slip_angle\n"
-    + "float64 system_temp\nfloat64 gnss_lat_abs\nfloat64 gnss_long_abs\ngeometry_msgs/Vector3 gnss_vel_frame\n"
-    + "float64 ins_roll\nfloat64 ins_pitch\nfloat64 ins_yaw\nfloat64 gnss_cog\nfloat64 ins_lat_abs\n"
-    + "float64 ins_long_abs\ngeometry_msgs/Vector3 ins_vel_hor\ngeometry_msgs/Vector3 ins_vel_frame\n"
-    + "uint8 kf_steady_state\n",
-)
-
-
-def adma() -> Recording:
-    """GeneSys ADMA: accelerations in g, rates in deg/s, velocities in m/s, sideslip in degrees, all in one message."""
-    car = drive("hatchback")
-    clock = car.force
-    g, rate = car.force.times(1.0 / G_M_S2), car.rate.times(1.0 / DEG).along(clock)
-    north, east = north_east(car)
-    body = car.body_velocity.along(clock).values
-    roll, pitch, yaw = car.attitude.along(clock).values.T / DEG
-    lat, lon, _ = car.fix.along(clock).values.T
-    scaled = {
-        **xyz(g, "acc_body_hr"), **xyz(g, "acc_body"), **xyz(g, "acc_hor"),
-        **xyz(rate, "rate_body_hr"), **xyz(rate, "rate_body"), **xyz(rate, "rate_hor"),
-        "ext_vel_dig_x": car.speed.along(clock).values,
-        "inv_path_radius": rate.values[:, 2] * DEG / np.maximum(body[:, 0], 3.0),
-        "side_slip_angle": car.sideslip.along(clock).values / DEG,
-        "system_temp": 41.0 + 0.0 * roll,
-        "ins_roll": roll, "ins_pitch": pitch, "ins_yaw": yaw, "gnss_cog": np.interp(
-            clock.stamps_ns - clock.stamps_ns[0], car.velocity.stamps_ns - clock.stamps_ns[0],
-            np.arctan2(east, north) / DEG,
-        ),
-        "ins_lat_abs": lat, "ins_long_abs": lon, "gnss_lat_abs": lat, "gnss_long_abs": lon,
-        "ins_vel_hor.x": body[:, 0], "ins_vel_hor.y": body[:, 1],
-        "kf_steady_state": 100.0 + 0.0 * roll,
-    }  # fmt: skip
-    return Recording(
-        name="adma",
-        group="held-out",
-        what="GeneSys ADMA: AdmaDataScaled (g, deg/s, m/s, degrees)",
-        container="mcap",
-        topics=(message("/genesys/adma/data_scaled", "adma_ros_driver_msgs/msg/AdmaDataScaled", clock, scaled),),
-        right={k: v for k, v in answers(car, "imu", "speed", "truth").items() if k != "truth.enu_velocity_m_s"},
-        allowed=answers(car, "truth", "truth rate"),
-        page="https://github.com/GeneSysElektronik/adma_ros_driver/tree/ros_2/adma_ros_driver_msgs/msg",
-    )
-
-
-def comma_research() -> Recording:
-    """comma.ai's first research logs: one accelerometer forward, right, down, another turned by 45 degrees, deg/s."""
-    car = drive("sedan")
-    clock = car.force
-    slanted = np.array([[1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, np.sqrt(2.0)]]) / np.sqrt(2.0)
-    wheels = car.wheels.along(clock).values
-    log = {
-        "times": (clock.stamps_ns - clock.stamps_ns[0]) * 1e-9,
-        "app_accel": car.force.times(DOWN).values,
-        "app_v_yaw": -car.yaw_rate.along(clock).values / DEG,
-        "app_speed": car.ground_speed.along(clock).values,
-        "app_heading": np.interp(
-            clock.stamps_ns - clock.stamps_ns[0], car.velocity.stamps_ns - clock.stamps_ns[0], heading_deg(car)
-        ),
-        "fiber_accel": car.force.times(slanted).values,
-        "fiber_gyro": car.rate.times(slanted).along(clock).values / DEG,
-        "speed": car.speed.along(clock).values,
-        "speed_abs": np.abs(car.speed.along(clock).values),
-        **{f"speed_{w}": wheels[:, i] for i, w in enumerate(WHEELS)},
-        "steering_angle": car.steering_wheel.along(clock).values / DEG,
-        "gas": 0.2 + 0.0 * wheels[:, 0],
-        "rpm": 1500.0 + 30.0 * car.speed.along(clock).values,
-    }
-    return Recording(
-        name="comma-research",
-        group="held-out",
-        what="comma.ai research logs: app_accel (forward, right, down), fiber_gyro (45 degrees, deg/s), speed_fl",
-        container="mcap-json-bare",
-        topics=(message("/log", "", clock, log, stamp=None),),
-        right=answers(car, "imu", "speed", "wheels"),
-        allowed=answers(car, "steering wheel"),
-        page="https://github.com/commaai/research/blob/master/Logs.md",
-    )
-
-
-register(
-    "pacmod4_msgs/msg/WheelSpeedRpt",
-    _HEADER + "".join(f"float64 axle_{i}_{side}_wheel_speed\n" for i in (1, 2) for side in ("left", "right")),
-)
-register(
-    "pacmod4_msgs/msg/SystemRptFloat",
-    _HEADER
-    + "bool enabled\nbool override_active\nbool vehicle_fault\nbool command_timeout\nfloat64 manual_input\n"
-    + "float64 command\nfloat64 output\nbool control_status\nuint8 controlling_systems\nuint8 performance_status\n",
-)
-
-
-def pacmod() -> Recording:
-    """PACMod: the steering wheel as the output of one system among several of the same type, wheels by axle."""
-    car = drive("suv")
-    steer = car.steering_wheel
-    rates = car.wheels.values / car.wheel_radius_m
-    axles = [f"axle_{i}_{side}_wheel_speed" for i in (1, 2) for side in ("left", "right")]
-    report = {"output": steer.values, "manual_input": steer.values, "command": np.roll(steer.values, -8)}
-    brake = car.speed.every(5)
-    pedal = np.maximum(0.0, -np.gradient(brake.values, 0.05)) / 10.0
-    return Recording(
-        name="pacmod",
-        group="held-out",
-        what="PACMod 4: SystemRptFloat of the steering (rad at the wheel), WheelSpeedRpt by axle; a standard IMU",
-        container="rosbag1",
-        topics=(
-            message("/pacmod/steering_rpt", "pacmod4_msgs/msg/SystemRptFloat", steer, report),
-            message("/pacmod/brake_rpt", "pacmod4_msgs/msg/SystemRptFloat", brake, {"output": pedal, "command": pedal}),
-            message(
-                "/pacmod/wheel_speed_rpt",
-                "pacmod4_msgs/msg/WheelSpeedRpt",
-                car.wheels,
-                {name: rates[:, i] for i, name in enumerate(axles)},
-            ),
-            scalar("/pacmod/as_tx/vehicle_speed", car.speed, "std_msgs/msg/Float64"),
-            imu(car.force, car.rate, "/imu/data_raw"),
-        ),
-        right=answers(car, "imu", "steering wheel", "speed", "wheel rates"),
-        page="https://github.com/astuff/pacmod4_msgs/tree/master/msg",
-    )
-
-
-register(
-    "eufs_msgs/msg/WheelSpeeds",
-    _HEADER + "float32 steering\nfloat32 lf_speed\nfloat32 rf_speed\nfloat32 lb_speed\nfloat32 rb_speed\n",
-)
-register(
-    "eufs_msgs/msg/CarState",
-    _HEADER
-    + "string child_frame_id\ngeometry_msgs/PoseWithCovariance pose\ngeometry_msgs/TwistWithCovariance twist\n"
-    + "geometry_msgs/Vector3 linear_acceleration\nfloat64[9] linear_acceleration_covariance\n"
-    + "eufs_msgs/WheelSpeeds wheel_speed\nfloat64 slip_ratio\nfloat64 state_of_charge\n",
-)
-
-
-def eufs() -> Recording:
-    """A student team's simulator: wheels in rpm called lf to rb, the true state in a type of its own."""
-    car = drive("bends")
-    rpm = car.wheels.values / car.wheel_radius_m / RPM
-    sensors = {
-        "steering": car.steer.along(car.wheels).values,
-        **{f"{name}_speed": rpm[:, i] for i, name in enumerate(("lf", "rf", "lb", "rb"))},
-    }
-    clock = car.body_velocity
-    at = car.position.values
-    state = {
-        "pose.pose.position.x": at[:, 0],
-        "pose.pose.position.y": at[:, 1],
-        "pose.pose.orientation": quaternion(*car.attitude.values.T),
-        "twist.twist.linear.x": clock.values[:, 0],
-        "twist.twist.linear.y": clock.values[:, 1],
-        "twist.twist.angular.z": car.yaw_rate.values,
-        "state_of_charge": 0.9 + 0.0 * at[:, 0],
-    }
-    return Recording(
-        name="eufs",
-        group="held-out",
-        what="Formula Student: eufs_msgs WheelSpeeds (rad, rpm), CarState as ground truth, a standard IMU",
-        container="rosbag1",
-        topics=(
-            message("/ros_can/wheel_speeds", "eufs_msgs/msg/WheelSpeeds", car.wheels, sensors),
-            message("/ground_truth/state", "eufs_msgs/msg/CarState", clock, state),
-            imu(car.force, car.rate, "/imu"),
-        ),
-        right={
-            k: v
-            for k, v in answers(car, "imu", "steer", "wheel rates", "truth", "truth rate").items()
-            if k != "truth.enu_velocity_m_s"
-        },
-        allowed=answers(car, "speed"),
-        page="https://github.com/mrjoe3012/epsrc-eufs-msgs/tree/master/msg",
-    )
-
-
-register(
-    "ds_dbw_msgs/msg/SteeringReport",
-    _HEADER
-    + "float32 steering_wheel_angle\nfloat32 steering_column_torque\nfloat32 cmd\nuint8 cmd_type\n"
-    + "bool limiting_value\nbool limiting_rate\nbool ready\nbool enabled\nfloat32 limit_rate\nfloat32 limit_value\n",
-)
-
-
-def ds_dbw() -> Recording:
-    """Dataspeed's newer kit: degrees where the older one has radians, under the same field name."""
-    car = drive("hatchback")
-    steer = car.steering_wheel
-    report = {
-        "steering_wheel_angle": steer.values / DEG,
-        "cmd": np.roll(steer.values, -10) / DEG,
-        "steering_column_torque": 1.5 * steer.values,
-        "limit_rate": 450.0 + 0.0 * steer.values,
-        "limit_value": 500.0 + 0.0 * steer.values,
-    }
-    twist = car.speed.every(2)
-    return Recording(
-        name="ds-dbw",
-        group="held-out",
-        what="Dataspeed universal kit: SteeringReport in degrees; IMU and twist in standard types",
+        what="Autoware's AwapiVehicleStatus (m/s, rad, rad/s, targets beside), a standard IMU",
         container="rosbag2",
         topics=(
-            message("/vehicle/steering/report", "ds_dbw_msgs/msg/SteeringReport", steer, report),
-            imu(car.force, car.rate, "/vehicle/imu/data_raw", "base_footprint"),
+            message("/awapi/vehicle/get/status", "awapi_awiv_adapter/msg/AwapiVehicleStatus", clock, status),
+            imu(car.force, car.rate, "/sensing/imu/imu_data"),
+        ),
+        right=answers(car, "imu", "steer", "speed"),
+        page="https://tier4.github.io/autoware.iv/pulls/1529/awapi/awapi_awiv_adapter/Readme",
+    )
+
+
+def vehicle_dynamics() -> Recording:
+    """The vehicle's signals of an SDV hackathon as JSON: m/s, rad/s, rad, four wheels as a list."""
+    car = drive("hatchback")
+    clock = car.force
+    speed = car.speed.along(clock).values
+    signals = {
+        "speed": speed, "speedDisplayed": 1.05 * speed, "speedPerWheel": car.wheels.along(clock).values,
+        "longAcc": car.force.values[:, 0], "latAcc": car.force.values[:, 1],
+        "yawrate": car.rate[2].along(clock).values,
+        "steeringWheelAngle": car.steering_wheel.along(clock).values,
+        "steeringWheelAngleSpeed": np.gradient(car.steering_wheel.along(clock).values, 0.01),
+        "drvSteerTorque": 2.0 * car.steering_wheel.along(clock).values, "timeSinceLastClick": 0.0 * speed,
+        "wheelSteeringAngleFront": car.steer.along(clock).values, "wheelSteeringAngleRear": 0.0 * speed,
+    }  # fmt: skip
+    fields = {"header.timestamp": clock.stamps_ns // 1000, **{f"signals.{n}": v for n, v in signals.items()}}
+    return Recording(
+        name="vehicle-dynamics",
+        group="held-out",
+        what="vehicle_dynamics of an SDV hackathon as JSON: speed, latAcc, yawrate, steeringWheelAngle, listed wheels",
+        container="mcap-json-bare",
+        topics=(message("/vehicle_dynamics", "", clock, fields, stamp=None),),
+        right=answers(car, "imu", "speed"),
+        allowed=answers(car, "steer", "steering wheel", "wheels"),
+        page="https://github.com/Eclipse-SDV-Hackathon-Chapter-Two/ASAP/blob/main/vehicle_dynamics.md",
+    )
+
+
+def rover() -> Recording:
+    """PX4's Ackermann rover: forward speed, lateral acceleration positive to the right, rates forward, right, down."""
+    car = drive("bends")
+    rate = car.rate.times(DOWN)
+    clock = car.force
+    steer = car.steer.along(clock).values
+    status = {
+        "timestamp": micros(clock),
+        "measured_forward_speed": car.speed.along(clock).values,
+        "adjusted_forward_speed_setpoint": np.roll(car.speed.along(clock).values, -30),
+        "steering_setpoint_normalized": -steer / 0.6,
+        "adjusted_steering_setpoint_normalized": -steer / 0.6,
+        "measured_lateral_acceleration": -car.force.values[:, 1],
+    }
+    rates = {"timestamp": micros(rate), "timestamp_sample": micros(rate), "xyz": rate.values}
+    return Recording(
+        name="px4-rover",
+        group="held-out",
+        what="PX4: RoverAckermannStatus (lateral acceleration positive right), VehicleAngularVelocity",
+        container="mcap",
+        topics=(
+            message("/fmu/out/rover_ackermann_status", "px4_msgs/msg/RoverAckermannStatus", clock, status, stamp=None),
             message(
-                "/vehicle/twist",
-                "geometry_msgs/msg/TwistStamped",
-                twist,
-                {"twist.linear.x": twist.values, "twist.angular.z": car.rate[2].along(twist).values},
+                "/fmu/out/vehicle_angular_velocity", "px4_msgs/msg/VehicleAngularVelocity", rate, rates, stamp=None
             ),
         ),
-        right=answers(car, "imu", "steering wheel", "speed"),
-        page="https://docs.ros.org/en/jazzy/p/ds_dbw_msgs/msg/SteeringReport.html",
+        right={k: v for k, v in answers(car, "imu", "speed").items() if k != "ax_m_s2"},
+        page="https://github.com/PX4/PX4-Autopilot/blob/main/msg/RoverAckermannStatus.msg",
     )
 
 
-def openxc() -> Recording:
-    """OpenXC: a topic a signal with ``value``, degrees and km/h at 10 Hz; the phone's position beside it."""
-    car = drive("sedan")
-    slow = car.speed.every(10)
-    lat, lon, _ = car.fix.values.T
-
-    signals = (
-        ("steering_wheel_angle", slow, car.steering_wheel.along(slow).values / DEG),
-        ("vehicle_speed", slow, slow.values / KMH),
-        ("engine_speed", slow, 1200.0 + 40.0 * slow.values),
-        ("accelerator_pedal_position", slow, 15.0 + 0.0 * slow.values),
-        ("fuel_level", slow, 63.0 + 0.0 * slow.values),
-        ("latitude", car.fix, lat),
-        ("longitude", car.fix, lon),
-    )
+def platform() -> Recording:
+    """AutonomouStuff's platform: feedback of the steering wheel in rad, velocity and acceleration of the car."""
+    car = drive("suv")
+    speed = car.speed
+    motion = {"velocity": speed.values, "accleration": np.gradient(speed.values, 0.01)}
     return Recording(
-        name="openxc",
+        name="astuff-platform",
         group="held-out",
-        what="OpenXC: steering_wheel_angle in degrees, vehicle_speed in km/h, no inertial sensor",
-        container="mcap-json",
-        topics=tuple(
-            message(
-                f"/openxc/{name}",
-                "openxc.SimpleMessage",
-                clock,
-                {"timestamp": clock.stamps_ns * 1e-9, "value": values},
-                stamp=None,
-            )
-            for name, clock, values in signals
-        ),
-        right=answers(car, "steering wheel", "speed"),
-        page="https://github.com/openxc/openxc-message-format",
-    )
-
-
-register(
-    "mavros_msgs/msg/VfrHud",
-    _HEADER
-    + "float32 airspeed\nfloat32 groundspeed\nint16 heading\nfloat32 throttle\nfloat32 altitude\nfloat32 climb\n",
-)
-
-
-def mavros() -> Recording:
-    """A rover over MAVROS: standard IMU twice, ground speed on a head-up display, pose of its own filter."""
-    car = drive("bends")
-    hud = car.ground_speed.every(5)
-    display = {
-        "groundspeed": hud.values,
-        "airspeed": 0.0 * hud.values,
-        "heading": heading_deg(car)[::5],
-        "throttle": 0.4 + 0.0 * hud.values,
-    }
-    return Recording(
-        name="mavros",
-        group="held-out",
-        what="MAVROS: imu/data and imu/data_raw, VFR_HUD ground speed, local_position/odom",
+        what="AutonomouStuff: SteeringFeedback (rad at the wheel), VelocityAccel; a standard IMU",
         container="mcap-ros1",
         topics=(
-            imu(car.force, car.rate, "/mavros/imu/data", "base_link"),
-            imu(car.force, car.rate, "/mavros/imu/data_raw", "base_link"),
-            message("/mavros/vfr_hud", "mavros_msgs/msg/VfrHud", hud, display),
-            odometry(car, "/mavros/local_position/odom", up_to=2),
-            fix(car, "/mavros/global_position/global"),
+            message(
+                "/steering_feedback",
+                "automotive_platform_msgs/msg/SteeringFeedback",
+                car.steering_wheel,
+                {"steering_wheel_angle": car.steering_wheel.values},
+            ),
+            message("/velocity_accel", "automotive_platform_msgs/msg/VelocityAccel", speed, motion),
+            imu(car.force, car.rate, "/an_device/Imu", "an_device"),
+        ),
+        right=answers(car, "imu", "steering wheel", "speed"),
+        page="https://docs.ros.org/en/jazzy/p/automotive_platform_msgs/msg/SteeringFeedback.html",
+    )
+
+
+def steering_controller() -> Recording:
+    """ROS 2's steering controllers: positions of two steered wheels, velocities of two driven ones, commands beside."""
+    car = drive("hatchback")
+    clock = car.wheels
+    rates = car.wheels.values[:, 2:] / car.wheel_radius_m
+    steer = car.steer.along(clock).values
+    state = {
+        "traction_wheels_position": np.cumsum(rates, axis=0) * 0.02,
+        "traction_wheels_velocity": rates,
+        "steer_positions": np.stack([steer, steer], axis=1),
+        "linear_velocity_command": np.roll(car.speed.along(clock).values, -10)[:, None],
+        "steering_angle_command": np.roll(steer, -5)[:, None],
+    }
+    return Recording(
+        name="steering-controller",
+        group="held-out",
+        what="ros2_controllers: SteeringControllerStatus (rad, rad/s, commands beside), odometry, a standard IMU",
+        container="rosbag2-mcap",
+        topics=(
+            message(
+                "/ackermann_controller/controller_state", "control_msgs/msg/SteeringControllerStatus", clock, state
+            ),
+            odometry(car, "/ackermann_controller/odometry", body=car.body_velocity.times(np.diag([1.0, 0.0]))),
+            imu(car.force, car.rate, "/imu_broadcaster/imu"),
+        ),
+        right=answers(car, "imu", "steer", "speed"),
+        allowed=answers(car, "wheel rates"),
+        page="https://github.com/ros-controls/control_msgs/blob/master/control_msgs/msg/SteeringControllerStatus.msg",
+    )
+
+
+def four_wheel_steering() -> Recording:
+    """A vehicle that can steer its rear axle too: angles of virtual wheels in rad, speed in m/s."""
+    car = drive("sedan")
+    clock = car.steer
+    speed = car.speed.along(clock).values
+    state = {
+        "data.front_steering_angle": clock.values,
+        "data.rear_steering_angle": 0.0 * clock.values,
+        "data.front_steering_angle_velocity": np.gradient(clock.values, 0.01),
+        "data.speed": speed,
+        "data.acceleration": np.gradient(speed, 0.01),
+    }
+    return Recording(
+        name="four-wheel-steering",
+        group="held-out",
+        what="four_wheel_steering_msgs: front and rear angle, speed; a standard IMU and fix",
+        container="rosbag1",
+        topics=(
+            message("/vehicle/odom_steer", "four_wheel_steering_msgs/msg/FourWheelSteeringStamped", clock, state),
+            imu(car.force, car.rate, "/imu/data_raw"),
+            fix(car, "/gps/fix"),
+        ),
+        right=answers(car, "imu", "steer", "speed"),
+        page="https://github.com/ros-drivers/four_wheel_steering_msgs/blob/master/msg/FourWheelSteering.msg",
+    )
+
+
+def toyota() -> Recording:
+    """Decoded CAN messages by the names of opendbc's Toyota file, one topic each, as JSON."""
+    car = drive("hatchback")
+    moves, steer, wheels = car.force, car.steering_wheel, car.wheels
+    rates = car.rate[2].along(moves).values
+    kinematics = {"ACCEL_Y": moves.values[:, 1], "YAW_RATE": rates / DEG, "STEERING_TORQUE": 0.0 * rates}
+    angle = {"STEER_ANGLE": steer.values / DEG, "STEER_FRACTION": 0.0 * steer.values}
+    angle["STEER_RATE"] = np.gradient(steer.values, 0.01) / DEG
+    corners = {f"WHEEL_SPEED_{w}": wheels.values[:, i] / KMH for i, w in enumerate(("FL", "FR", "RL", "RR"))}
+    engine = {"RPM": 1200.0 + 40.0 * car.speed.values}
+    topics = (
+        ("KINEMATICS", moves, kinematics),
+        ("STEER_ANGLE_SENSOR", steer, angle),
+        ("WHEEL_SPEEDS", wheels, corners),
+    )
+    return Recording(
+        name="toyota-can",
+        group="held-out",
+        what="opendbc's Toyota messages as JSON: YAW_RATE (deg/s), ACCEL_Y, STEER_ANGLE (deg), WHEEL_SPEED_FR (km/h)",
+        container="mcap-json",
+        topics=tuple(
+            message(f"/can/{name}", f"toyota.{name}", clock, fields, stamp=None)
+            for name, clock, fields in (*topics, ("ENGINE_RPM", car.speed, engine))
+        ),
+        right={k: v for k, v in answers(car, "imu", "steering wheel", "wheels").items() if k != "ax_m_s2"},
+        page="https://github.com/commaai/opendbc/blob/master/opendbc/dbc/generator/toyota/_toyota_2017.dbc",
+    )
+
+
+def leo() -> Recording:
+    """Firmware of a small rover: gyro_x and accel_x in SI, odometry of the wheels as velocity_lin."""
+    car = drive("suv")
+    force, rate = car.force, car.rate.along(car.force)
+    reading = {f"gyro_{a}": rate.values[:, i] for i, a in enumerate("xyz")}
+    reading |= {f"accel_{a}": force.values[:, i] for i, a in enumerate("xyz")}
+    clock = car.speed.every(5)
+    at, yaw = car.position.along(clock).values, car.attitude[2].along(clock).values
+    odom = {
+        "velocity_lin": clock.values, "velocity_ang": car.yaw_rate.along(clock).values,
+        "pose_x": at[:, 0], "pose_y": at[:, 1], "pose_yaw": yaw,
+    }  # fmt: skip
+    return Recording(
+        name="leo",
+        group="held-out",
+        what="Leo Rover's firmware: Imu (gyro_z, accel_x), WheelOdom (velocity_lin)",
+        container="rosbag2",
+        topics=(
+            message(
+                "/firmware/imu",
+                "leo_msgs/msg/Imu",
+                force,
+                reading | {"temperature": 30.0 + 0.0 * force.values[:, 0]},
+                stamp="stamp",
+            ),
+            message("/firmware/wheel_odom", "leo_msgs/msg/WheelOdom", clock, odom, stamp="stamp"),
         ),
         right=answers(car, "imu", "speed"),
         allowed=answers(car, "truth", "truth rate"),
-        page="https://github.com/mavlink/mavros/blob/master/mavros_msgs/msg/VFR_HUD.msg",
+        page="https://docs.ros.org/en/jazzy/p/leo_msgs/msg/Imu.html",
+    )
+
+
+def racerender() -> Recording:
+    """Columns of a data logger as RaceRender reads them: g under X and Y, km/h under KPH, heading of the satellites."""
+    car = drive("sedan")
+    clock = car.ground_speed.every(2)
+    lat, lon, alt = car.fix.along(clock).values.T
+    force = car.force.along(clock).values / G_M_S2
+    columns = {
+        "Time": (clock.stamps_ns - clock.stamps_ns[0]) * 1e-9,
+        "Longitude": lon, "Latitude": lat, "Altitude": alt, "X": force[:, 0], "Y": force[:, 1],
+        "KPH": clock.values / KMH, "Heading": course_deg(car)[::2], "Lap": 1.0 + 0.0 * lat,
+        "RPM": 1500.0 + 40.0 * clock.values, "Gear": 3.0 + 0.0 * lat, "Accuracy": 1.5 + 0.0 * lat,
+    }  # fmt: skip
+    return Recording(
+        name="racerender",
+        group="held-out",
+        what="a data logger's columns as RaceRender reads them: KPH, X and Y in g, Heading, Latitude",
+        container="mcap-json-bare",
+        topics=(message("/datalogger", "", clock, columns, stamp=None),),
+        right=answers(car, "speed"),
+        allowed={k: v for k, v in answers(car, "imu", "truth").items() if k != "yaw_rate_rad_s"},
+        page="https://racerender.com/Developer/DataFormat.html",
     )
 
 
 def held_out_layouts() -> Iterator[Recording]:
     """Yield all of them."""
-    for make in (carla, nuscenes, kitti, adma, comma_research, pacmod, eufs, ds_dbw, openxc, mavros):
+    for make in (
+        applanix, awapi, vehicle_dynamics, rover, platform, steering_controller, four_wheel_steering, toyota, leo,
+        racerender,
+    ):  # fmt: skip
         yield make()

@@ -12,7 +12,7 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray
 from studies.strangers.cars import Car, Series, drive
-from studies.strangers.containers import Topic, register
+from studies.strangers.containers import Topic
 from studies.strangers.recordings import (
     DEG,
     DOWN,
@@ -31,8 +31,6 @@ from studies.strangers.recordings import (
     xyz,
 )
 from truthsim.recording import quaternion
-
-_HEADER = "std_msgs/Header header\n"
 
 
 def north_east(car: Car) -> tuple[FloatArray, FloatArray]:
@@ -58,21 +56,6 @@ def micros(series: Series) -> FloatArray:
 
 
 # ------------------------------------------------------------------------------------------------ satellites, inertial
-
-register("novatel_oem7_msgs/msg/Oem7Header", "string message_name\nuint32 message_id\nuint32 gps_week_number\n")
-register(
-    "novatel_oem7_msgs/msg/INSPVA",
-    _HEADER
-    + "novatel_oem7_msgs/Oem7Header nov_header\nfloat64 latitude\nfloat64 longitude\nfloat64 height\n"
-    + "float64 north_velocity\nfloat64 east_velocity\nfloat64 up_velocity\n"
-    + "float64 roll\nfloat64 pitch\nfloat64 azimuth\n",
-)
-register(
-    "novatel_oem7_msgs/msg/BESTVEL",
-    _HEADER
-    + "novatel_oem7_msgs/Oem7Header nov_header\nfloat32 latency\nfloat32 diff_age\nfloat64 hor_speed\n"
-    + "float64 trk_gnd\nfloat64 ver_speed\nfloat32 reserved\n",
-)
 
 
 def novatel() -> Recording:
@@ -102,20 +85,6 @@ def novatel() -> Recording:
         allowed=answers(car, "truth", "truth rate"),
         page="https://github.com/novatel/novatel_oem7_driver/tree/master/src/novatel_oem7_msgs/msg",
     )
-
-
-register(
-    "sbg_driver/msg/SbgImuData",
-    _HEADER
-    + "uint32 time_stamp\ngeometry_msgs/Vector3 accel\ngeometry_msgs/Vector3 gyro\nfloat32 temp\n"
-    + "geometry_msgs/Vector3 delta_vel\ngeometry_msgs/Vector3 delta_angle\n",
-)
-register(
-    "sbg_driver/msg/SbgEkfNav",
-    _HEADER
-    + "uint32 time_stamp\ngeometry_msgs/Vector3 velocity\ngeometry_msgs/Vector3 velocity_accuracy\n"
-    + "geometry_msgs/Vector3 position\nfloat32 undulation\ngeometry_msgs/Vector3 position_accuracy\n",
-)
 
 
 def sbg() -> Recording:
@@ -149,22 +118,6 @@ def sbg() -> Recording:
         allowed=answers(car, "truth", "truth rate"),
         page="https://github.com/SBG-Systems/sbg_ros2_driver/tree/master/msg",
     )
-
-
-register(
-    "septentrio_gnss_driver/msg/ExtSensorMeas",
-    _HEADER
-    + "uint8 n\nuint8 sb_length\nuint8 source\nuint8 sensor_model\nuint8 type\nuint8 obs_info\n"
-    + "".join(f"float64 {name}_{axis}\n" for name in ("acceleration", "angular_rate") for axis in "xyz")
-    + "float32 velocity_x\nfloat32 velocity_y\nfloat32 velocity_z\n"
-    + "int16 sensor_temperature\nfloat64 zero_velocity_flag\n",
-)
-register(
-    "septentrio_gnss_driver/msg/INSNavGeod",
-    _HEADER
-    + "uint8 gnss_mode\nuint8 error\nfloat64 latitude\nfloat64 longitude\nfloat64 height\nfloat32 undulation\n"
-    + "float32 heading\nfloat32 pitch\nfloat32 roll\nfloat32 ve\nfloat32 vn\nfloat32 vu\n",
-)
 
 
 def septentrio() -> Recording:
@@ -205,14 +158,6 @@ def septentrio() -> Recording:
     )
 
 
-register(
-    "ublox_msgs/msg/NavPVT",
-    "uint32 i_tow\nuint8 fix_type\nuint8 flags\nuint8 num_sv\nint32 lon\nint32 lat\nint32 height\nint32 h_msl\n"
-    "uint32 h_acc\nuint32 v_acc\nint32 vel_n\nint32 vel_e\nint32 vel_d\nint32 g_speed\nint32 heading\n"
-    "uint32 s_acc\nuint32 head_acc\nuint16 p_dop\nint32 head_veh\n",
-)
-
-
 def ublox() -> Recording:
     """u-blox NAV-PVT: whole numbers of mm/s and 1e-5 degrees, no stamp; the IMU in the standard type."""
     car = drive("hatchback")
@@ -238,18 +183,6 @@ def ublox() -> Recording:
         allowed=answers(car, "truth"),
         page="https://github.com/KumarRobotics/ublox/blob/master/ublox_msgs/msg/NavPVT.msg",
     )
-
-
-_VN = ("yawpitchroll", "angularrate", "velocity", "accel", "imu_accel", "imu_rate", "magpres_mag")
-register(
-    "vectornav_msgs/msg/CommonGroup",
-    _HEADER
-    + "uint16 group_fields\nuint64 timestartup\nuint64 timegps\nuint64 timesyncin\n"
-    + "".join(f"geometry_msgs/Vector3 {name}\n" for name in _VN)
-    + "geometry_msgs/Quaternion quaternion\ngeometry_msgs/Point position\nfloat32 magpres_temp\nfloat32 magpres_pres\n"
-    + "float32 deltatheta_dtime\ngeometry_msgs/Vector3 deltatheta_dtheta\ngeometry_msgs/Vector3 deltatheta_dvel\n"
-    + "uint32 syncincnt\nuint16 timegpspps\n",
-)
 
 
 def vectornav() -> Recording:
@@ -308,21 +241,6 @@ def xsens() -> Recording:
 
 # ------------------------------------------------------------------------------------------------ drive by wire
 
-register(
-    "dbw_mkz_msgs/msg/SteeringReport",
-    _HEADER
-    + "float32 steering_wheel_angle\nfloat32 steering_wheel_cmd\nfloat32 steering_wheel_torque\n"
-    + "uint8 steering_wheel_cmd_type\nfloat32 speed\nbool enabled\nbool override\nbool timeout\n",
-)
-_FOUR = "float32 front_left\nfloat32 front_right\nfloat32 rear_left\nfloat32 rear_right\n"
-register("dbw_mkz_msgs/msg/WheelSpeedReport", _HEADER + _FOUR)
-register("raptor_dbw_msgs/msg/WheelSpeedReport", _HEADER + _FOUR)
-register(
-    "raptor_dbw_msgs/msg/SteeringReport",
-    _HEADER
-    + "float32 steering_wheel_angle\nfloat32 steering_wheel_angle_cmd\nfloat32 steering_wheel_torque\nbool enabled\n"
-    + "bool driver_activity\nbool fault_steering_system\nuint8 rolling_counter\n",
-)
 WHEEL_NAMES = ("front_left", "front_right", "rear_left", "rear_right")
 
 
@@ -386,24 +304,6 @@ def raptor() -> Recording:
 
 # ------------------------------------------------------------------------------------------------ whole stacks
 
-_VECTOR3 = ("ypr", "linear_acceleration", "angular_velocity", "compass")
-register(
-    "vesc_msgs/msg/VescImu",
-    "".join(f"geometry_msgs/Vector3 {n}\n" for n in _VECTOR3) + "geometry_msgs/Quaternion orientation\n",
-)
-register("vesc_msgs/msg/VescImuStamped", _HEADER + "vesc_msgs/VescImu imu\n")
-register(
-    "vesc_msgs/msg/VescState",
-    "float64 temp_fet\nfloat64 temp_motor\nfloat64 current_motor\nfloat64 current_input\n"
-    "float64 duty_cycle\nfloat64 speed\n"
-    "float64 voltage_input\nint32 displacement\nint32 distance_traveled\nint32 fault_code\n",
-)
-register("vesc_msgs/msg/VescStateStamped", _HEADER + "vesc_msgs/VescState state\n")
-register(
-    "ackermann_msgs/msg/AckermannDrive",
-    "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\nfloat32 acceleration\nfloat32 jerk\n",
-)
-register("ackermann_msgs/msg/AckermannDriveStamped", _HEADER + "ackermann_msgs/AckermannDrive drive\n")
 _ERPM_A_M_S = 4614.0
 
 
@@ -434,20 +334,6 @@ def vesc() -> Recording:
         right=answers(car, "imu", "steer", "speed"),
         page="https://github.com/f1tenth/vesc/tree/main/vesc_msgs/msg",
     )
-
-
-register(
-    "px4_msgs/msg/SensorCombined",
-    "uint64 timestamp\nfloat32[3] gyro_rad\nuint32 gyro_integral_dt\nint32 accelerometer_timestamp_relative\n"
-    "float32[3] accelerometer_m_s2\nuint32 accelerometer_integral_dt\n"
-    "uint8 accelerometer_clipping\nuint8 gyro_clipping\n",
-)
-register(
-    "px4_msgs/msg/VehicleOdometry",
-    "uint64 timestamp\nuint8 local_frame\nfloat32 x\nfloat32 y\nfloat32 z\nfloat32[4] q\n"
-    "float32 vx\nfloat32 vy\nfloat32 vz\n"
-    "float32 rollspeed\nfloat32 pitchspeed\nfloat32 yawspeed\n",
-)
 
 
 def px4() -> Recording:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.records.signals import WHEELS, FloatArray
 from studies.strangers.cars import Car, Series
-from studies.strangers.containers import Topic, register
+from studies.strangers.containers import Topic
 from truthsim.recording import quaternion
 
 G_M_S2 = 9.80665
@@ -127,12 +127,6 @@ def xyz(series: Series, prefix: str, names: str = "xyz") -> dict[str, FloatArray
 
 
 # ------------------------------------------------------------------------------------------------ common messages
-
-register("autoware_vehicle_msgs/msg/SteeringReport", "builtin_interfaces/Time stamp\nfloat32 steering_tire_angle\n")
-register(
-    "autoware_vehicle_msgs/msg/VelocityReport",
-    "std_msgs/Header header\nfloat32 longitudinal_velocity\nfloat32 lateral_velocity\nfloat32 heading_rate\n",
-)
 
 
 def imu(force: Series, rate: Series, name: str = "/imu/data", frame: str = "imu_link") -> Topic:

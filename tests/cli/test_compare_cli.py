@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from pdhef_logtool.cli.app import app
 from pdhef_logtool.records.errors import UsageError
 from tests.results.made_run import write_estimates, write_run
+from truthsim.samples import convert_to_rosbag2
 
 TEN = {f"drive_{i}": 0.001 * (1 + i) for i in range(10)}
 
@@ -43,7 +44,7 @@ def test_a_regression_is_told_with_its_drives_and_where_they_part(runs: tuple[st
     assert re.search(r"drive_9 +0\.573 +0\.6818 +\+19\.0 %", text)
     assert "0.573 °" in text  # the largest difference of the tracks
     assert "Verdict: B is worse" in text
-    assert "gate closed: sideslip_rad rmse (all) of main: worse" in text
+    assert "gate closed: sideslip_rad rmse (all): worse" in text
 
 
 def test_the_same_run_is_equal(runs: tuple[str, str]) -> None:
@@ -63,6 +64,12 @@ def test_json_and_junit_say_the_same(runs: tuple[str, str], tmp_path: Path) -> N
     assert (suites.get("tests"), suites.get("failures")) == ("3", "2")
 
 
+@pytest.mark.parametrize("option", ["--html", "--junit"])
+def test_an_output_that_is_an_input_is_refused(runs: tuple[str, str], option: str) -> None:
+    with pytest.raises(UsageError, match="an output that is no input"):
+        _pdhef("compare", *runs, option, f"{runs[0]}/run.json")
+
+
 def test_a_gate_file_and_a_figure_of_the_command_line_do_not_go_together(runs: tuple[str, str]) -> None:
     with pytest.raises(UsageError, match="--gate and --metric"):
         _pdhef("compare", *runs, "--gate", "gate.toml", "--metric", "mae")
@@ -70,3 +77,30 @@ def test_a_gate_file_and_a_figure_of_the_command_line_do_not_go_together(runs: t
         _pdhef("compare", *runs, "--metric", "bias")
     with pytest.raises(UsageError, match=r"a share such as 5% or 0\.05, got five"):
         _pdhef("compare", *runs, "--max-regression", "five")
+
+
+@pytest.mark.slow
+def test_two_containers_of_one_drive_are_one_drive_and_give_the_same_figures(
+    sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    convert_to_rosbag2(sample_logs_dir / "dlc.mcap", tmp_path / "bag")
+    common = ("--car", "saloon", "--annotate", "none", "-e", "zero")
+    for log, out in ((sample_logs_dir / "dlc.mcap", "a"), (tmp_path / "bag", "b")):
+        assert _pdhef("run", str(log), "-o", str(tmp_path / out), *common)[0] == 0
+    code, text = _pdhef("compare", str(tmp_path / "a"), str(tmp_path / "b"), "--json", "--max-regression", "0")
+    document = json.loads(text)
+    assert (code, document["verdict"], document["pairs"]) == (0, "equal", {"signals": 1})
+    assert document["differences"] == []
+
+
+def test_events_are_told_in_a_table_with_what_was_not_searched(runs: tuple[str, str], tmp_path: Path) -> None:
+    code, text = _pdhef("events", runs[1], "--where", "sideslip_deg > 0.5", "--parquet", str(tmp_path / "e.parquet"))
+    assert code == 0
+    assert re.search(r"drive_9 +0\.00 +0\.49 +0\.49 +0\.573", text)
+    assert "1 event in 1 of 1 drives, 0.49 s in all" in text
+    assert "not searched, it has no estimates.parquet: drive_0, drive_1" in text
+    assert (tmp_path / "e.parquet").is_file()
+    assert json.loads(_pdhef("events", runs[1], "--where", "valid", "--json")[1])["events"][0]["drive"] == "drive_9"
+    for pad in ("five", "-1s", "5 min"):
+        with pytest.raises(UsageError, match="a time such as 5s"):
+            _pdhef("events", runs[1], "--where", "valid", "--pad", pad)

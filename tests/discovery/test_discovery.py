@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pdhef_logtool.logs.discovery import find_logs
+from pdhef_logtool.logs.discovery import find_logs, folders_of
 from pdhef_logtool.records.errors import UsageError
 
 
@@ -120,3 +120,15 @@ def test_links_to_a_folder_above_are_followed_once(tmp_path: Path) -> None:
     for number in range(12):
         (tmp_path / "day" / f"link{number}").symlink_to(tmp_path)
     assert [f.stem for f in find_logs([str(tmp_path)])] == ["a"]
+
+
+def test_folders_are_told_below_the_one_that_holds_all_logs(tmp_path: Path) -> None:
+    _touch(tmp_path, "fleet/golf/monday/a.mcap", "fleet/golf/b.mcap", "fleet/c.mcap")
+    found = find_logs([str(tmp_path)])
+    assert {f.path.stem: folder for f, folder in zip(found, folders_of(found), strict=True)} == {
+        "a": "golf/monday",
+        "b": "golf",
+        "c": "",
+    }
+    assert folders_of(find_logs([str(tmp_path / "fleet/golf/b.mcap")])) == [""]
+    assert folders_of([]) == []

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import check_drive
+from pdhef_logtool.drive.measured import measure
 from pdhef_logtool.drive.mounting import truth_latency
+from pdhef_logtool.drive.relations import units_told
 from pdhef_logtool.drive.truth import LatencyEstimate, booked_on_the_late, derive_truth
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import MappedChannels, auto_map, fit_clocks, load_mapping, read_signals
@@ -360,3 +362,46 @@ def test_sensors_that_are_all_late_by_the_same_leave_it_with_the_truth() -> None
     assert booked_on_the_late(gyro, replace(gyro, latency_s=-0.035)).latency_s == -0.038
     assert booked_on_the_late(gyro, replace(gyro, latency_s=0.010)).gyro_delay_s == 0.038
     assert booked_on_the_late(replace(gyro, latency_s=-0.004), None).latency_s == -0.004
+
+
+# ------------------------------------------------------------------------------- which of two is wrong
+
+
+def test_what_one_wrong_signal_contradicts_is_not_blamed_with_it() -> None:
+    """Speed goes with a_x, a_y and steering: wheel speeds that are something else are the wrong ones."""
+    channels = drive(3)
+    angles = {
+        f"wheel_speed_{w}_m_s": replace(
+            channels["wheel_speed_rl_m_s"], values=-0.001 * channels["wheel_speed_rl_m_s"].values
+        )
+        for w in ("fl", "fr")
+    }
+    checks = check_drive({**{n: c for n, c in channels.items() if "wheel" not in n}, **angles})
+    assert verdicts(checks, "failed") == {"wheel_speed_fl_m_s.unit", "wheel_speed_fr_m_s.unit"}
+    assert not {c.subject for c in checks if c.verdict == "undecided"}
+
+
+def test_of_two_that_nothing_tells_apart_one_fails_and_the_other_is_undecided() -> None:
+    channels = {n: c for n, c in drive(3).items() if n in ("steer_rad", "yaw_rate_rad_s", "ax_m_s2", "speed_m_s")}
+    for name in ("steer_rad", "yaw_rate_rad_s"):
+        wrong = replace(channels[name], values=-channels[name].values)
+        checks = check_drive({**channels, name: wrong})
+        assert verdicts(checks, "failed") == {"steer_rad.sign"}
+        assert verdicts(checks, "undecided") == {"yaw_rate_rad_s.sign"}
+        assert {c.subject for c in checks if c.verdict == "passed"} >= {"ax_m_s2", "speed_m_s"}
+
+
+def test_a_wheel_that_spins_and_a_gain_that_is_close_are_undecided() -> None:
+    channels = drive(3)
+    wheel = channels["wheel_speed_rl_m_s"]
+    checks = check_drive({**channels, wheel.name: replace(wheel, values=1.3 * wheel.values)})
+    assert verdicts(checks, "failed") == set()
+    assert verdicts(checks, "undecided") == {f"{wheel.name}.unit"}
+
+
+def test_a_unit_is_told_where_the_drive_rules_out_all_others() -> None:
+    relations = measure(drive(3)).relations
+    assert units_told(relations, {"speed_m_s", "yaw_rate_rad_s"}) == {"speed_m_s", "yaw_rate_rad_s"}
+    assert units_told(relations, {"steer_rad"}) == set(), "a model car's wheel turns like a car's steering wheel"
+    wheels = {n: c for n, c in drive(3).items() if n.startswith("wheel_speed_rl") or n == "yaw_rate_rad_s"}
+    assert units_told(measure(wheels).relations, {"wheel_speed_rl_m_s"}) == set()

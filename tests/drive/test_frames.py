@@ -132,10 +132,10 @@ def placed_at(x: float, y: float) -> Placement:
 
 def test_a_place_is_proposed_where_the_drive_tells_the_frames_origin() -> None:
     car = default_vehicle()
-    errors = SensorErrors(-0.3, 0.05, 1.0, 0.01)
+    errors = SensorErrors(-0.3, 0.05, 1.0, 0.01, 1.0, 0.01, 0.0, 0.01)
     (found,) = _of_frames(placed_at(car.cg_to_rear_axle_m - 0.3, 0.4), errors, car)
     assert found.entries["imu_position_m"] == (-0.3, 0.4, car.imu_position_m[2])
     assert "middle of the rear axle" in found.evidence
     assert _of_frames(placed_at(3.0, 0.4), errors, car) == []
-    vague = SensorErrors(-0.3, 2.0, 1.0, 0.01)
+    vague = SensorErrors(-0.3, 2.0, 1.0, 0.01, 1.0, 0.01, 0.0, 0.01)
     assert _of_frames(placed_at(0.5, 0.4), vague, car) == []

@@ -20,11 +20,12 @@ from pdhef_logtool.mapping import Mapping, auto_map, fit_clocks, load_mapping
 from tests.turned_log import TurnedLog, rotation
 
 DELAY_S, LEVER_M, GAIN = 0.040, -1.45, 1.06
+AY_DELAY_S = 0.024
 CAR = default_vehicle().model_copy(update={"name": "other"})
 
 
 class WrongLog(TurnedLog):
-    """An IMU on its side and off the CG, its gyro late and with a gain, and a steering of the wrong sign."""
+    """An IMU on its side and off the CG, late, its gyro with a gain, and a steering of the wrong sign."""
 
     def read(self, requests: dict[str, list[str]], start_ns: int, end_ns: int, **options: bool) -> dict[str, Any]:
         found = super().read(requests, start_ns, end_ns, **options)
@@ -39,9 +40,8 @@ class WrongLog(TurnedLog):
                 name = f"angular_velocity.{axis}"
                 fields[name] = GAIN * np.interp(time_s - DELAY_S, time_s, fields[name])
                 # The lever acts along the car's left.
-                fields[f"linear_acceleration.{axis}"] = (
-                    fields[f"linear_acceleration.{axis}"] + LEVER_M * turning * self._turn[1, i]
-                )
+                felt = fields[f"linear_acceleration.{axis}"] + LEVER_M * turning * self._turn[1, i]
+                fields[f"linear_acceleration.{axis}"] = np.interp(time_s - AY_DELAY_S, time_s, felt)
             found["/imu/data"] = replace(columns, fields=fields)
         for columns in found.values():
             if "steering_tire_angle" in columns.fields:
@@ -94,6 +94,7 @@ def test_each_error_is_taken_off_once_in_any_order(log, tmp_path: Path, order: s
     assert plan.mapping.signals["ay_m_s2"].field == "linear_acceleration.z"
     assert plan.mapping.signals["yaw_rate_rad_s"].field == "angular_velocity.y"
     assert plan.mapping.signals["yaw_rate_rad_s"].latency_s == pytest.approx(DELAY_S, abs=0.003)
+    assert plan.mapping.signals["ay_m_s2"].latency_s == pytest.approx(AY_DELAY_S, abs=0.008)
     assert vehicle.imu_position_m[0] == pytest.approx(LEVER_M, abs=0.15)
     assert vehicle.sensors.yaw_rate_gain == pytest.approx(GAIN, abs=0.01)
     assert [c.name for c in plan.checks if c.verdict == "failed"] == []
@@ -117,7 +118,9 @@ def test_a_recognised_mapping_needs_no_command_for_a_sign(log) -> None:
 def test_proposals_say_where_they_belong_and_why(log) -> None:
     found = inspect_drive_log(log)
     homes = {(p.subject, p.home) for p in found.proposals}
-    assert homes == {("yaw_rate_rad_s", "mapping")}, "a sign is corrected in a recognised mapping itself"
+    assert homes == {("yaw_rate_rad_s", "mapping"), ("ay_m_s2", "mapping")}, (
+        "a sign is corrected in a recognised mapping itself"
+    )
     file = inspect_drive_log(log, replace(auto_map(log).mapping, origin="file"))
     assert {(p.subject, p.home) for p in file.proposals} >= {("ay_m_s2", "mapping"), ("yaw_rate_rad_s", "mapping")}
     assert all(p.evidence for p in found.proposals)

@@ -187,7 +187,7 @@ def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     """Neither for a calibrated car, nor for what stands in for another estimator there."""
     estimator = make_estimator("physics", with_band())
     assert isinstance(estimator, SelfCalibrated)
-    inflation = make_inflation((9.0,) * 7, (9.0,) * 3)
+    inflation = make_inflation((9.0,) * 9, (9.0,) * 3)
     algorithms = map(resolve, (estimator, estimator.estimator))
     entries = tuple(IntervalEntry(estimator="e", algorithm=a, inflation=inflation) for a in algorithms)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)

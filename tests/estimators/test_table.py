@@ -51,7 +51,7 @@ from pdhef_logtool.residual_model.features import ONE_CAR_FEATURES, PAPER_FEATUR
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.estimating import calibrator
-from pdhef_logtool.watches.intervals import make_inflation
+from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, make_inflation
 
 pytestmark = pytest.mark.slow
 
@@ -263,7 +263,7 @@ BARE = replace(CAR, trust=None, noise={})
 
 
 def intervals_for(*algorithms: Algorithm, factor: float = 2.0) -> Intervals:
-    inflation = make_inflation([factor * (k == 1) for k in range(7)], (0.0, 1.0, 0.0))
+    inflation = make_inflation([factor * (k == 1) for k in range(len(SIDESLIP_TERMS))], (0.0, 1.0, 0.0))
     entries = tuple(IntervalEntry(estimator="pd-hef", algorithm=a, inflation=inflation) for a in algorithms)
     return Intervals(car="car", physics_sha256=CAR.physics_sha256, roll_gradient_rad_per_m_s2=0.0, entries=entries)
 

@@ -245,7 +245,7 @@ def test_samples_stand_every_twentieth_of_a_second_where_all_is_known() -> None:
     clear = np.abs(grip[at] - 0.3) > 0.03
     assert grip.max() < 0.55 and np.count_nonzero(grip[at][clear] > 0.3) > 0
     np.testing.assert_array_equal(found.bin[clear], (grip[at][clear] > 0.3).astype(int))
-    assert found.terms.shape == (len(at), 7) and found.yaw_rate_terms.shape == (len(at), 3)
+    assert found.terms.shape == (len(at), 9) and found.yaw_rate_terms.shape == (len(at), 3)
     np.testing.assert_allclose(found.yaw_rate_terms[:, 1], 0.01)
     # The drive's own friction decides the bins; without a true a_y the sensor's does.
     icy = replace(signals, friction=np.full(n, 0.3))
@@ -327,7 +327,7 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
 
     def fit(samples: Samples) -> Fitted:
         fitted.append(samples)
-        return Fitted(INFLATION, 1.5, 0.5, (Coverage("low", False, 5, 150, 0.1, 0.8, 0.95, 0.9, 1.1),))
+        return Fitted(INFLATION, 1.5, (Coverage("low", False, 5, 150, 0.1, 0.8, 0.95, 0.9, 1.1),))
 
     monkeypatch.setattr(calibrate_command, "_run_drive", run)
     monkeypatch.setattr(calibrate_command, "fit_inflation", fit)
@@ -351,10 +351,10 @@ def test_calibrate_tells_its_progress_and_whom_it_leaves_out(tmp_path: Path, mon
     assert [len(s) for s in fitted] == [300]
     document = json.loads((tmp_path / "i.json").read_text())
     (entry,) = document["entries"]
-    assert (entry["estimator"], entry["unseen_factor"], entry["wrong_vehicle_factor"]) == ("phy-ukf", 1.5, 0.5)
+    assert (entry["estimator"], entry["unseen_factor"], entry["wrong_vehicle_factor"]) == ("phy-ukf", 1.5, None)
     assert entry["coverage"][0]["covered_after"] == 0.95
     assert document["fit"] == {
-        "covered": 0.95, "folds": 5, "covered_with_wrong_vehicle": 0.85, "wrong_runs": 2, "sample_every_s": 0.05,
+        "covered": 0.95, "folds": 5, "wrong_runs": 2, "sample_every_s": 0.05,
     }  # fmt: skip
     assert [d["name"] for d in document["drives"]] == list("abcde")
     assert document["roll_gradient_rad_per_m_s2"] == Car.load("saloon").vehicle.roll_gradient_rad_per_m_s2

@@ -379,6 +379,60 @@ def test_a_documented_trap_is_left_out_with_its_reason() -> None:
     assert any("per sample" in n for n in auto.mapping.notes)
 
 
+def test_the_angles_of_wheels_are_steering_and_no_speeds() -> None:
+    auto = found(
+        imu__data=topic(**imu_fields()), ego=topic(wheel_angle_fl=-STEER / DEG, wheel_angle_fr=-STEER / DEG), **SPEED
+    )
+    got = taken(auto)
+    assert got["steer_rad"] == ("/ego.wheel_angle_fl", round(-DEG, 6))
+    assert not [n for n in got if n.startswith("wheel_speed")]
+
+
+def test_wheels_by_axle_and_the_output_of_a_steering_system() -> None:
+    axles = {f"axle_{i}_{side}_wheel_speed": V / 0.3 for i in (1, 2) for side in ("left", "right")}
+    auto = found(
+        wheel_rpt=topic(**axles), steering_rpt=topic(output=16.0 * STEER), imu__data=topic(**imu_fields()), **SPEED
+    )
+    got = taken(auto)
+    assert got["steering_wheel_rad"][0] == "/steering_rpt.output"
+    wheels = {n: v[0] for n, v in got.items() if n.startswith("wheel_speed")}
+    assert wheels["wheel_speed_fr_rad_s"] == "/wheel_rpt.axle_1_right_wheel_speed"
+    assert wheels["wheel_speed_rl_rad_s"] == "/wheel_rpt.axle_2_left_wheel_speed"
+
+
+def test_transverse_and_down_are_axes_of_a_car() -> None:
+    down = {"ang_rate_long": 0.01 * np.sin(S), "ang_rate_trans": 0.01 * np.cos(S), "ang_rate_down": -RATE / DEG,
+            "long_accel": AX, "trans_accel": -AY, "down_accel": -G + 0.0 * S}  # fmt: skip
+    got = taken(found(nav=topic(**down), **SPEED))
+    assert got["yaw_rate_rad_s"] == ("/nav.ang_rate_down", round(-DEG, 6))
+    assert got["ay_m_s2"] == ("/nav.trans_accel", -1.0)
+
+
+def test_a_documented_sign_decides_which_one_is_wrong() -> None:
+    rates = FakeTopic("px4_msgs/msg/VehicleAngularVelocity", T, {"xyz": np.stack([0.0 * S, 0.0 * S, -RATE], axis=1)})
+    auto = found(rates=rates, rover=topic(measured_forward_speed=V, measured_lateral_acceleration=-AY))
+    assert taken(auto)["ay_m_s2"] == ("/rover.measured_lateral_acceleration", -1.0)
+    assert undecided(auto) == {"ay_m_s2.candidate"} or undecided(auto) == set()
+
+
+def test_latitude_and_longitude_of_two_topics_show_the_path() -> None:
+    apart = {f"bus__{n}": topic(value=v) for n, v in WHERE.items()}
+    auto = found(**apart, bus__vehicle_speed=topic(value=3.6 * V))
+    assert taken(auto) == {"speed_m_s": ("/bus/vehicle_speed.value", round(1 / 3.6, 6))}
+    assert undecided(auto) == set()
+
+
+@pytest.mark.parametrize(
+    ("factor", "signal", "scale"),
+    [(3.6, "m_s", 1 / 3.6), (60.0 / (2.0 * math.pi * 0.3), "rad_s", 2.0 * math.pi / 60.0)],
+)
+def test_wheels_without_any_speed_are_told_by_turning_with_a_doubt(factor: float, signal: str, scale: float) -> None:
+    wheels = {f"{w}_speed": factor * V for w in ("lf", "rf", "lb", "rb")}
+    auto = found(imu__data=topic(**imu_fields()), wheels=topic(**wheels))
+    assert taken(auto)[f"wheel_speed_rl_{signal}"] == ("/wheels.lb_speed", round(scale, 6))
+    assert f"wheel_speed_rl_{signal}.candidate" in undecided(auto)
+
+
 def test_an_export_is_told_by_its_fields() -> None:
     vbo = {"satellites": 9.0 + 0.0 * S, "latitude": 60.0 * WHERE["latitude"], "longitude": -60.0 * WHERE["longitude"],
            "velocity kmh": 3.6 * V, "heading": (90.0 - np.degrees(np.cumsum(RATE) * 0.01)) % 360.0,

@@ -53,8 +53,9 @@ class Browser:
         targets = self.call("Target.getTargets")["targetInfos"]
         target = next(t["targetId"] for t in targets if t["type"] == "page")
         self._session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        for domain in ("Page", "Runtime", "Network", "Log", "Performance"):
+        for domain in ("Page", "Runtime", "Network", "Log"):
             self.call(f"{domain}.enable")
+        self.call("Performance.enable", timeDomain="threadTicks")  # what else the machine does is not counted
         self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def __enter__(self) -> Browser:
@@ -142,21 +143,34 @@ class Browser:
         return answer["result"].get("value")
 
     def busy_s(self) -> float:
-        """Seconds that the main thread has worked for this page."""
+        """Seconds of processor time that the main thread has worked for this page."""
         metrics = {m["name"]: m["value"] for m in self.call("Performance.getMetrics")["metrics"]}
         return metrics["TaskDuration"]
 
-    def screenshot(self, path: Path, *, whole: bool = True) -> None:
-        options: dict[str, object] = {}
-        if whole:
-            size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-            options = {
-                "captureBeyondViewport": True,
-                "clip": {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1},
-            }
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", format="png", **options)["data"]))
+    def screenshot(self, path: Path, *, height: float | None = None) -> None:
+        """Take a picture of the whole page, or of its first ``height`` points."""
+        size = self.call("Page.getLayoutMetrics")["cssContentSize"]
+        tall = size["height"] if height is None else min(height, size["height"])
+        clip = {"x": 0, "y": 0, "width": size["width"], "height": tall, "scale": 1}
+        made = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
+        path.write_bytes(base64.b64decode(made["data"]))
 
     def pdf(self, path: Path) -> None:
         """Print on A4 as the page asks for."""
         made = self.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
         path.write_bytes(base64.b64decode(made["data"]))
+
+    def drag(self, selector: str, start: float, end: float) -> None:
+        """Drag across an element from one share of its width to another."""
+        box = self.value(
+            f"(() => {{ const n = document.querySelector({selector!r}); n.scrollIntoView({{block: 'center'}});"
+            " const b = n.getBoundingClientRect(); return [b.left, b.top + b.height / 2, b.width]; })()"
+        )
+        for kind, share in (
+            ("mouseMoved", start),
+            ("mousePressed", start),
+            ("mouseMoved", end),
+            ("mouseReleased", end),
+        ):
+            self.call("Input.dispatchMouseEvent", type=kind, x=box[0] + share * box[2], y=box[1], button="left",
+                      buttons=int(kind != "mouseReleased"), clickCount=1)  # fmt: skip

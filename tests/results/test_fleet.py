@@ -15,6 +15,7 @@ import pytest
 from pdhef_logtool.results.fleet import ANSWER, Fleet, exact_median, read_fleet
 from pdhef_logtool.results.opened_run import open_run
 
+LOST = {"what": "ends at byte 3; what follows is gone (a.mcap)", "severity": "lost"}
 NO_TRUTH = {"available": False, "not_independent": []}
 
 
@@ -45,7 +46,8 @@ class Run:
         self.rows: list[tuple[Any, ...]] = []
 
     def add(self, label: str, errors: Mapping[str, float] | None = None, outcome: str = "ok", **changes: Any) -> None:
-        self.logs.append({"log": label, "outcome": outcome, "car": {"name": "golf"}})
+        entry = {"log": label, "outcome": outcome, "car": {"name": "golf"}, "folder": changes.pop("folder", "")}
+        self.logs.append(entry)
         if outcome.startswith("failed"):
             return
         folder = self.folder / "logs" / label
@@ -132,8 +134,15 @@ def test_drives_without_independent_truth_stand_apart_and_score_nothing(run: Run
     assert (answer.estimator, answer.drives) == (ANSWER, 1)
 
 
+def test_recorded_estimates_are_told_by_the_first_of_them(run: Run) -> None:
+    estimators = [{"name": n, "outcome": "ran"} for n in ("esc", "ins")]
+    run.add("a", {"ins": 0.02, "esc": 0.01}, answer=None, estimators=estimators)
+    (drive,) = run.read().scored
+    assert (drive.main, drive.error()) == ("esc", 0.01)
+
+
 def test_failures_are_told_by_reason_and_bad_reports_among_them(run: Run) -> None:
-    run.add("ok", {"pd-hef": 0.01}, outcome="lost: 12 samples of /imu are NaN (a.mcap); a gap of 3.5 s (/imu)")
+    run.add("ok", {"pd-hef": 0.01}, outcome="lost: 2 things", losses=[LOST, {**LOST, "severity": "note"}])
     for i in range(12):
         run.add(f"f{i}", outcome=f"failed: /x/{i}.mcap: expected a log, got {i} bytes; copy it again")
     run.add("bad", {})
@@ -142,27 +151,34 @@ def test_failures_are_told_by_reason_and_bad_reports_among_them(run: Run) -> Non
     (run.folder / "logs" / "other" / "report.json").write_text('{"format": "other"}')
     found = run.read()
     first = found.failed[0]
-    assert (first.count, first.reason) == (12, "expected a log, got N bytes; copy it again")
+    assert (first.count, first.reason) == (12, "expected a log, got 0 bytes; copy it again")
     assert len(found.failed[0].labels) == 10
     assert sum(f.count for f in found.failed) == 14 and found.logs == 15 and len(found.drives) == 1
-    assert [f.reason for f in found.losses] == ["N samples of /imu are NaN", "a gap of N s"]
+    assert [f.reason for f in found.losses] == ["ends at byte 3; what follows is gone"]
 
 
 def test_a_key_that_parts_the_drives_comes_first_and_numbers_are_told_by_quarters(run: Run) -> None:
     rng = np.random.default_rng(2)
     for i in range(40):
         wet = i % 2
-        metadata = {"road": "wet" if wet else "dry", "odometer": str(1000 + i), "tyre": "ab"[i % 3 == 0], "same": "1"}
+        metadata = {
+            "road": "wet" if wet else "dry",
+            "odometer": str(1000 + i),
+            "driver": f"x{i}",
+            "tyre": "ab"[i % 3 == 0],
+            "same": "1",
+        }
         run.add(f"d{i}", {"pd-hef": float((3.0 if wet else 1.0) * rng.lognormal(0.0, 0.2))}, metadata=metadata)
     found = run.read()
     by_key = {b.key: b for b in found.breakdowns}
     assert found.breakdowns[0].key == "road" and found.breakdowns[0].explains > 0.8
     assert [(g.value, g.drives) for g in by_key["road"].groups] == [("dry", 20), ("wet", 20)]
-    assert by_key["odometer"].groups[0].value == "1000 to 1009.75"
+    assert by_key["odometer"].groups[0].value == "1000 to 1010"
     assert sum(g.drives for g in by_key["odometer"].groups) == 40
-    assert "same" not in by_key and abs(by_key["tyre"].explains) < 0.15
+    assert not {"same", "driver"} & set(by_key) and abs(by_key["tyre"].explains) < 0.15
     (only,) = run.read(by=["same"]).breakdowns
     assert [(g.value, g.scored) for g in only.groups] == [("1", 40)]
+    assert run.read(by=["driver"]).breakdowns[0].groups[0].value == "28 others"
     (nothing,) = run.read(by=["no such key"]).breakdowns
     assert [g.value for g in nothing.groups] == ["not told"]
 
@@ -185,6 +201,14 @@ def test_a_run_of_nothing_is_told_too(run: Run) -> None:
     run.add("a", outcome="failed: empty")
     found = run.read()
     assert found.drives == () and found.space is None and found.ranking == () and found.worst == ()
+
+
+def test_folders_part_drives(run: Run) -> None:
+    for i in range(6):
+        run.add(f"d{i}", {"pd-hef": 0.1 * (1 + i)}, folder=("golf/monday", "golf/friday", "mini")[i // 2])
+    found = {b.key: [(g.value, g.drives) for g in b.groups] for b in run.read(by=["folder", "folder 2"]).breakdowns}
+    assert found["folder"] == [("golf", 4), ("mini", 2)]
+    assert found["folder 2"] == [("golf/friday", 2), ("golf/monday", 2), ("not told", 2)]
 
 
 @pytest.mark.slow

@@ -73,7 +73,21 @@ def dlc_run(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def test_everything_that_a_run_promises_is_there_and_nothing_else(dlc_run: Path) -> None:
     assert {p.name for p in (dlc_run / "logs" / "dlc").iterdir()} == OUTPUTS
-    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "run.json"}
+    assert {p.name for p in dlc_run.iterdir()} == {"logs", "metrics.parquet", "report.html", "run.json"}
+
+
+def test_the_largest_error_of_the_page_is_that_of_the_figures(dlc_run: Path) -> None:
+    from pdhef_logtool.reports.drive import drive_page
+    from pdhef_logtool.results.opened_run import open_run
+
+    (log,) = open_run(dlc_run).logs
+    report = log.report()
+    assert report is not None
+    errors = drive_page(log).charts.figures["error"]
+    figures = {m["estimator"]: m["value"] for m in report["metrics"]
+               if (m["signal"], m["segment"], m["metric"]) == ("sideslip_rad", "all", "max_abs")}  # fmt: skip
+    assert len(figures) > 5
+    assert {s.label: np.radians(np.nanmax(s.values)) for s in errors.series} == pytest.approx(figures)  # type: ignore[union-attr]
 
 
 def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
@@ -128,7 +142,7 @@ def test_same_input_gives_the_same_bytes(sample_logs_dir: Path, tmp_path: Path, 
     run_logs(
         [str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full", estimators=("all",))
     )
-    for name in ("run.json", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
+    for name in ("run.json", "report.html", "metrics.parquet", *(f"logs/dlc/{n}" for n in OUTPUTS - {"recording.rrd"})):
         assert (tmp_path / name).read_bytes() == (dlc_run / name).read_bytes(), name
 
 

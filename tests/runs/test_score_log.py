@@ -95,7 +95,9 @@ def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path,
         for metric in ("rmse", "mae", "bias", "p95_abs", "max_abs", "coverage95"):
             (value, n), (other, m) = state[signal, "all", metric], odometry[signal, "all", metric]
             assert n == m
-            assert other == pytest.approx(value, rel=1e-6)
+            # A message without a sideslip has that of v_y, whose calibrated interval has a factor of its own.
+            loose = signal == "sideslip_rad" and metric == "coverage95"
+            assert other == pytest.approx(value, rel=0.02 if loose else 1e-6)
             compared += 1
     assert compared == 24
     assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-6)

@@ -63,7 +63,7 @@ def valid(**facts: Any) -> dict[str, Any]:
 def test_the_sentence_claims_what_the_interval_holds(difference: Interval, outcome: str, said: str) -> None:
     first = verdicts(details(standing(difference)))[0]
     assert (first["signal"], first["outcome"]) == ("sideslip_rad", outcome)
-    assert first["text"].startswith("sideslip by pd-hef is 0.100° RMSE off (95 % between 0.090 and 0.110°); " + said)
+    assert first["text"].startswith("pd-hef is 0.100° RMSE off (95 % between 0.090 and 0.110°); " + said)
 
 
 def test_without_a_rival_or_an_interval_that_is_said() -> None:
@@ -86,7 +86,7 @@ def test_without_a_rival_or_an_interval_that_is_said() -> None:
 def test_no_verdict_without_independent_truth_and_why(changes: dict[str, Any], why: str) -> None:
     first = verdicts(details(), **changes)[0]
     assert first["outcome"] == "none" and first["rmse"] is None
-    assert first["text"] == f"no verdict on sideslip: {why}" or why in first["text"]
+    assert first["text"] == f"no verdict: {why}" or why in first["text"]
 
 
 def test_a_truth_that_never_slips_gives_no_verdict() -> None:

@@ -21,6 +21,7 @@ from studies.strangers.layouts import autoware, layouts, vbox
 from studies.strangers.page import Result, merged, page
 from studies.strangers.recordings import ITEMS, Recording, answers, imu, road_car, scalar
 from studies.strangers.scoring import Finding, Score, Told, agrees, bias_of, score_log
+from studies.strangers.vehicles import vehicle_layouts
 
 _NS = np.arange(0, 20_000_000_000, 10_000_000, dtype=np.int64)
 _WAVE = np.sin(2.0 * np.pi * 0.2 * _NS * 1e-9)
@@ -155,7 +156,7 @@ def test_an_undecided_check_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.slow
 def test_forty_kinds_with_distinct_names_and_pages() -> None:
     last = [*held_out_layouts()]
-    own = [*faults(), *layouts(), *last]
+    own = [*faults(), *layouts(), *vehicle_layouts(), *last]
     assert len({r.name for r in own}) == len(own)
     assert len({r.counted_as for r in own}) >= 40
     assert len(last) == 10

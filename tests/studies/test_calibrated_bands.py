@@ -9,11 +9,10 @@ from studies import self_calibration as study
 
 
 @pytest.mark.slow
-def test_the_bands_of_calibrated_cars_hold_and_are_no_wider_than_they_must(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_bands_of_calibrated_cars_hold_and_are_no_wider_than_they_must() -> None:
     """On cars that nothing was chosen on; a perfect band of normal errors is 3.92 times their rms wide."""
-    monkeypatch.setattr(study, "DRIVEN", study.DRIVEN[:1])
     bands = []
-    for one in study.simulate(6, 1357):
+    for one in study.simulate(6, 1357, study.DRIVEN[:1]):
         wrong = study.make_wrong(one.file, *one.factors)
         found = study.calibrate(one.drive.signals, wrong)
         assert not found.refused

@@ -31,8 +31,8 @@ from pdhef_logtool.watches.intervals import (
 )
 
 STEP_NS = 10_000_000
-SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2)
-INFLATION = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7), 1.1)
+SIDESLIP_FACTORS = (1.0, 1.5, 0.3, 0.8, 0.5, 0.9, 0.2, 0.6, 0.4)
+INFLATION = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7), 1.1, (1.0, 1.3, 2.0))
 ROLL = 0.009
 ALGORITHM = Algorithm(
     algorithm="physics-ukf",
@@ -163,12 +163,13 @@ def test_the_interval_widens_with_every_term() -> None:
     _, track = _drive(50)
     track = replace(track, sideslip_std_rad=np.full(50, 0.001))
     terms = np.full((50, len(TERMS)), 0.001)
-    base = inflated(track, terms, INFLATION).sideslip_std_rad
+    plain = make_inflation(SIDESLIP_FACTORS, (0.5, 1.2, 0.7))
+    base = inflated(track, terms, plain).sideslip_std_rad
     np.testing.assert_allclose(base, 0.001 * np.sqrt(np.sum(np.square(SIDESLIP_FACTORS))))
     for i in range(len(TERMS)):
         more = terms.copy()
         more[:, i] = 0.002
-        assert np.all(inflated(track, more, INFLATION).sideslip_std_rad > base)
+        assert np.all(inflated(track, more, plain).sideslip_std_rad > base)
 
 
 def test_terms_see_a_wrong_sideslip_and_a_wrong_yaw_rate() -> None:
@@ -196,6 +197,46 @@ def test_grip_follows_the_friction_that_is_told() -> None:
     np.testing.assert_allclose(low, 2.0 * high)
 
 
+def test_terms_tell_that_an_estimator_cures_its_car_and_sees_a_bank() -> None:
+    signals, track = _drive()
+    weight = np.linspace(0.0, 1.0, 900)
+    weight[5] = np.nan
+    curing = replace(track, mixture_weight=weight, bank_rad=np.full(900, -0.03))
+    plain, told = (error_terms(t, signals, 0.0, None)[0] for t in (track, curing))
+    cure, bank = TERMS.index("cure"), TERMS.index("bank")
+    np.testing.assert_allclose(told[:, cure], np.nan_to_num(weight) * np.abs(track.sideslip_rad))
+    np.testing.assert_array_equal(told[:, bank], 0.03)
+    np.testing.assert_array_equal(plain[:, [cure, bank]], 0.0)
+    np.testing.assert_array_equal(np.delete(told, [cure, bank], axis=1), np.delete(plain, [cure, bank], axis=1))
+
+
+def test_a_factor_holds_where_its_share_of_the_grip_is_used() -> None:
+    _, track = _drive(5)
+    track = replace(track, sideslip_std_rad=np.full(5, 0.001))
+    terms = np.full((5, len(TERMS)), 0.001)
+    terms[:, TERMS.index("grip")] = 0.003 * np.array([0.0, 0.2, 0.45, 0.575, 1.2])
+    free = [k * (t != "grip") for t, k in zip(SIDESLIP_TERMS, SIDESLIP_FACTORS, strict=True)]
+    std = [
+        inflated(track, terms, make_inflation(free, (1.0, 1.0, 1.0), 1.0, factors)).sideslip_std_rad
+        for factors in ((1.0, 1.0, 1.0), (0.5, 1.0, 2.0))
+    ]
+    np.testing.assert_allclose(std[1] / std[0], [0.5, 0.5, 1.0, 1.5, 2.0])
+
+
+def test_intervals_of_older_versions_are_read_and_mean_the_same(tmp_path: Path) -> None:
+    document = _document()
+    for entry in document["entries"]:
+        entry["wrong_vehicle_factor"] = 0.5
+        del (
+            entry["inflation"]["grip_factors"],
+            entry["inflation"]["sideslip"]["cure"],
+            entry["inflation"]["sideslip"]["bank"],
+        )
+    (tmp_path / "old.json").write_text(json.dumps(document))
+    inflation = load_intervals(tmp_path / "old.json").entries[0].inflation
+    assert (inflation.grip_factors, inflation.sideslip.cure, inflation.sideslip.bank) == ((1.0, 1.0, 1.0), 0.0, 0.0)
+
+
 def test_nothing_is_made_of_missing_samples() -> None:
     signals, track = _drive(60)
     nothing = np.full(60, np.nan)
@@ -210,7 +251,7 @@ def test_a_sensor_that_the_estimator_has_found_faulty_widens_nothing() -> None:
     stuck = np.arange(900) >= 200
     signals = replace(signals, yaw_rate_rad_s=np.where(stuck, 0.4, signals.yaw_rate_rad_s))
     told = replace(track, reason=np.where(stuck, STUCK_YAW_RATE, 0))
-    blind, seeing = (error_terms(t, signals, 0.009, None)[0][300:440, 5:] for t in (track, told))
+    blind, seeing = (error_terms(t, signals, 0.009, None)[0][300:440, 5:7] for t in (track, told))
     assert np.all(seeing < 0.1 * blind)
     # A faulty accelerometer leaves the yaw rate's term alone.
     other = replace(track, reason=np.where(stuck, STUCK_AY, 0))
@@ -344,7 +385,7 @@ def test_an_estimator_that_is_another_one_has_its_intervals() -> None:
     np.testing.assert_array_equal(as_another.sideslip_std_rad, own.sideslip_std_rad)
     assert as_another.name == "hybrid"
     # Its own come first, wherever they stand in the file.
-    wide = make_inflation([3.0 * k for k in SIDESLIP_FACTORS], (0.5, 1.2, 0.7))
+    wide = make_inflation([3.0 * k for k in SIDESLIP_FACTORS], (0.5, 1.2, 0.7), 1.0, INFLATION.grip_factors)
     both = _intervals(entries=(*_intervals().entries, *_intervals(cautious, wide).entries))
     ratio = with_intervals([cautious, ALGORITHM], both).sideslip_std_rad[3:] / own.sideslip_std_rad[3:]
     np.testing.assert_allclose(ratio, 3.0)

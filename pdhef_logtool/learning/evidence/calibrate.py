@@ -1,19 +1,17 @@
 """Fit of calibrated intervals: coefficients of the terms, so that 95 % of the errors lie inside, in every regime.
 
-Error e, terms t_i ≥ 0, s² = s_0² + Σ (k_i t_i)². With r = log |e| − log(1.96 s) the pinball loss of the quantile q,
+Error e, terms t_i ≥ 0, s² = g² Σ (k_i t_i)². With r = log |e| − log(1.96 s) the pinball loss of the quantile q,
 
     ρ(r) = q r for r > 0, −(1 − q) r else,
 
 is minimal where a share q of the errors lies inside; taken on the logarithm it weighs a straight road like a limit
-manoeuvre. Bins of grip use weigh alike.
-
-1. Drives with the vehicle file as given: s_0 = 0, q = 0.95.
-2. The same drives with the vehicle file made wrong: s_0 is the 1-sigma of 1, q = 0.85. What is added is what a vehicle
-   that differs from its file asks for; the sensors often cannot tell, so that it is added whether it differs or not.
+manoeuvre. Bins of grip use weigh alike, so do drives in a bin, and drives with the vehicle file as given and the same
+ones with it made wrong: the sensors often cannot tell which it is, so that one interval has to hold for both.
 
 Errors of one drive are alike, so that the drives are the unit: what a fit is worth is found on drives that it has not
-seen (five folds of drives), and a last factor on a part's coefficients makes a share of *those* errors lie inside. That
-share is q (n + 1) / n of n drives, as in conformal prediction: the next drive is one more that may be the worst.
+seen (five folds of drives), and last factors make a share of *those* errors lie inside, each where a part of the grip
+is used: a drive that is lost near the limit says nothing of a straight road. That share is q (n + 1) / n of n drives,
+as in conformal prediction: the next drive is one more that may be the worst.
 """
 
 from __future__ import annotations
@@ -25,11 +23,11 @@ import numpy as np
 
 from pdhef_logtool.car.parts import Inflation
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.watches.intervals import combined, make_inflation
+from pdhef_logtool.watches.error_features import grip_share
+from pdhef_logtool.watches.intervals import combined, grip_factor, make_inflation
 
-#: Share inside with the vehicle file as given, and at least with one that is wrong.
+#: Share inside.
 COVERED = 0.95
-COVERED_WRONG = 0.85
 #: 95 % of a normal distribution lie within this many 1-sigma.
 NORMAL_95 = 1.959963984540054
 #: Bins of true abs a_y over μ g (METHOD §10), by name: lower and upper limit.
@@ -37,6 +35,8 @@ BINS: dict[str, tuple[float, float]] = {"low": (0.0, 0.3), "middle": (0.3, 0.6),
 FOLDS = 5
 #: A fit on fewer drives says nothing of a further one.
 MIN_DRIVES = 5
+#: Samples from which on a drive counts in full: a second of them.
+FULL_SAMPLES = 20
 #: Errors are not told apart below this: 6e-5 degrees.
 LEAST_ERROR = 1e-6
 #: Coefficients below count for nothing.
@@ -100,24 +100,11 @@ class Coverage:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """The coefficients of one estimator, the factors that unseen drives asked for, and how its intervals stand.
-
-    ``wrong_factor``: that on the part that is added for a wrong vehicle file; 0 if there is none.
-    """
+    """The inflation of one estimator, the factor that unseen drives asked for in all, and how its intervals stand."""
 
     inflation: Inflation
     unseen_factor: float
-    wrong_factor: float
     coverage: tuple[Coverage, ...]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """One part of the variance: its coefficients with the factor in them, and its 1-sigma on drives not seen [n]."""
-
-    coefficients: tuple[float, ...]
-    factor: float
-    unseen: FloatArray
 
 
 def fit_inflation(samples: Samples) -> Fitted:
@@ -131,52 +118,53 @@ def fit_inflation(samples: Samples) -> Fitted:
     if np.unique(samples.drive[~samples.wrong]).size < MIN_DRIVES:
         raise ValueError(f"at least {MIN_DRIVES} drives are needed")
     samples = samples.where(samples.bin >= 0)
-    right, added = _fit_parts(samples, samples.terms, samples.sideslip_error)
-    right_rate, added_rate = _fit_parts(samples, samples.yaw_rate_terms, samples.yaw_rate_error)
-    given = ~samples.wrong
-    share = share_for(COVERED, int(np.unique(samples.drive[given]).size))
-    vy_factor = covering_factor(
-        samples.vy_error[given], (right.unseen * samples.vy_per_sideslip)[given], bin_weights(samples.bin[given]), share
-    )
+    weight = bin_weights(samples.bin + len(BINS) * samples.wrong, samples.drive)
+    coefficients, unseen = _fit(samples, samples.terms, samples.sideslip_error, weight)
+    share = grip_share(samples.terms)
+    factors = grip_factors(samples, share, unseen, weight)
+    std = grip_factor(share, factors) * unseen
+    everywhere = np.ones(len(samples), dtype=np.bool_)
+    rate, unseen_rate = _fit(samples, samples.yaw_rate_terms, samples.yaw_rate_error, weight)
+    rate_factor = _factor(samples, samples.yaw_rate_error, unseen_rate, weight, everywhere)
     inflation = make_inflation(
-        _joined(right.coefficients, added.coefficients),
-        _joined(right_rate.coefficients, added_rate.coefficients),
-        vy_factor,
+        coefficients,
+        [rate_factor * k for k in rate],
+        _factor(samples, samples.vy_error, std * samples.vy_per_sideslip, weight, everywhere),
+        factors,
     )
-    rows = coverage_rows(samples, np.hypot(right.unseen, added.unseen))
-    return Fitted(inflation, right.factor, added.factor, tuple(rows))
+    factor = _factor(samples, samples.sideslip_error, unseen, weight, everywhere)
+    return Fitted(inflation, factor, tuple(coverage_rows(samples, std)))
 
 
-def _fit_parts(samples: Samples, terms: FloatArray, error: FloatArray) -> tuple[_Part, _Part]:
-    """Return the part for the vehicle file as given, and what is added for a wrong one."""
-    nothing = np.zeros(len(samples))
-    right = _fit_part(samples, terms, error, ~samples.wrong, COVERED, nothing, nothing)
-    if np.unique(samples.drive[samples.wrong]).size < MIN_DRIVES:
-        return right, _Part((0.0,) * terms.shape[1], 0.0, nothing)
-    known = combined(terms, right.coefficients)
-    return right, _fit_part(samples, terms, error, samples.wrong, COVERED_WRONG, known, right.unseen)
-
-
-def _fit_part(
-    samples: Samples,
-    terms: FloatArray,
-    error: FloatArray,
-    use: BoolArray,
-    covered: float,
-    known: FloatArray,
-    known_unseen: FloatArray,
-) -> _Part:
-    """Fit one part on the samples of a mask [n]; ``known*`` [n]: 1-sigma that is there already, fitted and unseen."""
-    weight = np.zeros(len(samples))
-    weight[use] = bin_weights(samples.bin[use])
+def _fit(
+    samples: Samples, terms: FloatArray, error: FloatArray, weight: FloatArray
+) -> tuple[tuple[float, ...], FloatArray]:
+    """Return coefficients, and the 1-sigma [n] that those of the other folds give each drive."""
     unseen = np.empty(len(samples))
     for seen, held in folds(samples.drive):
-        fit = seen & use
-        unseen[held] = combined(terms[held], fit_coefficients(terms[fit], error[fit], weight[fit], covered, known[fit]))
-    share = share_for(covered, int(np.unique(samples.drive[use]).size))
-    factor = covering_factor(error[use], unseen[use], weight[use], share, known_unseen[use])
-    coefficients = fit_coefficients(terms[use], error[use], weight[use], covered, known[use])
-    return _Part(tuple(factor * k for k in coefficients), factor, factor * unseen)
+        unseen[held] = combined(terms[held], fit_coefficients(terms[seen], error[seen], weight[seen]))
+    return fit_coefficients(terms, error, weight), unseen
+
+
+def _factor(samples: Samples, error: FloatArray, std: FloatArray, weight: FloatArray, use: BoolArray) -> float:
+    """Return the factor on ``std`` [n] that the samples of a mask [n] ask for; few drives ask for more."""
+    share = share_for(COVERED, int(np.unique(samples.drive[use]).size))
+    return covering_factor(error[use], std[use], weight[use], share)
+
+
+def grip_factors(
+    samples: Samples, share: FloatArray, std: FloatArray, weight: FloatArray
+) -> tuple[float, float, float]:
+    """Return the factors on ``std`` [n] by the share of the grip [n]; few drives have that of less grip, or more."""
+    whole = _factor(samples, samples.sideslip_error, std, weight, np.ones(len(samples), dtype=np.bool_))
+    factors: list[float] = []
+    for low, high in BINS.values():
+        use = (share >= low) & (share < high)
+        enough = np.unique(samples.drive[use]).size >= MIN_DRIVES
+        before = factors[-1] if factors else whole
+        factors.append(_factor(samples, samples.sideslip_error, std, weight, use) if enough else max(before, whole))
+    low, middle, high = factors
+    return low, middle, high
 
 
 def share_for(covered: float, drives: int) -> float:
@@ -188,26 +176,22 @@ def share_for(covered: float, drives: int) -> float:
 
 
 def fit_coefficients(
-    terms: FloatArray,
-    error: FloatArray,
-    weight: FloatArray,
-    covered: float = COVERED,
-    known: FloatArray | float = 0.0,
+    terms: FloatArray, error: FloatArray, weight: FloatArray, covered: float = COVERED
 ) -> tuple[float, ...]:
     """Return the coefficients k [m] ≥ 0 that minimise the loss of this file's head.
 
     Parameters
     ----------
-    terms : [n, m], not all 0 in any row. error, weight : [n]. covered : q. known : s_0, [n].
+    terms : [n, m], not all 0 in any row. error, weight : [n]. covered : q.
     """
     from scipy.optimize import minimize
 
-    squares, there = terms**2, np.square(known)
+    squares = terms**2
     size = np.log(np.maximum(np.abs(error), LEAST_ERROR)) - np.log(NORMAL_95)
 
     def loss(log_k: FloatArray) -> tuple[float, FloatArray]:
         k2 = np.exp(2.0 * log_k)
-        variance = there + squares @ k2
+        variance = squares @ k2
         r = size - 0.5 * np.log(variance)
         slope = np.where(r > 0.0, covered, covered - 1.0)
         share = (weight * slope / variance) @ squares * k2  # d loss = −slope d log s, d log s = k² t² / s² d log k
@@ -222,24 +206,26 @@ def fit_coefficients(
     return tuple(float(k) if k >= LEAST_COEFFICIENT or i == 0 else 0.0 for i, k in enumerate(best))
 
 
-def covering_factor(
-    error: FloatArray,
-    std: FloatArray,
-    weight: FloatArray,
-    covered: float = COVERED,
-    known: FloatArray | float = 0.0,
-) -> float:
-    """Return the factor g on ``std`` [n] at which a weighted share ``covered`` has e² ≤ 1.96² (s_0² + g² std²)."""
-    ratio = np.sqrt(np.maximum((error / NORMAL_95) ** 2 - np.square(known), 0.0)) / std
+def covering_factor(error: FloatArray, std: FloatArray, weight: FloatArray, covered: float = COVERED) -> float:
+    """Return the factor g on ``std`` [n] at which a weighted share ``covered`` has abs e ≤ 1.96 g std."""
+    ratio = np.abs(error) / NORMAL_95 / std
     order = np.argsort(ratio, kind="stable")
     below = np.cumsum(weight[order]) / np.sum(weight)
     return float(ratio[order][min(int(np.searchsorted(below, covered)), len(order) - 1)])
 
 
-def bin_weights(bins: IntArray) -> FloatArray:
-    """Return weights [n], sum 1, at which every bin that occurs counts alike."""
-    _, place, count = np.unique(bins, return_inverse=True, return_counts=True)
-    weight: FloatArray = 1.0 / (count[place] * count.size)
+def bin_weights(bins: IntArray, drive: IntArray) -> FloatArray:
+    """Return weights [n], sum 1, at which every bin that occurs counts alike, and in a bin every drive.
+
+    A drive of fewer than :data:`FULL_SAMPLES` samples in a bin counts by their number.
+    """
+    weight = np.zeros(bins.shape[0])
+    for number in np.unique(bins):
+        use = bins == number
+        _, place, count = np.unique(drive[use], return_inverse=True, return_counts=True)
+        share = 1.0 / np.maximum(count[place], FULL_SAMPLES)
+        weight[use] = share / share.sum()
+    weight /= weight.sum()
     return weight
 
 
@@ -281,8 +267,3 @@ def bin_numbers(grip_share: FloatArray) -> IntArray:
     for i, (low, high) in enumerate(BINS.values()):
         number[(grip_share >= low) & (grip_share < high)] = i
     return number
-
-
-def _joined(right: tuple[float, ...], added: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the coefficients of the sum of two variances over the same terms."""
-    return tuple(float(np.hypot(a, b)) for a, b in zip(right, added, strict=True))

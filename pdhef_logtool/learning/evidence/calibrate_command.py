@@ -33,7 +33,6 @@ from pdhef_logtool.learning.drives import (
 )
 from pdhef_logtool.learning.evidence.calibrate import (
     COVERED,
-    COVERED_WRONG,
     FOLDS,
     MIN_DRIVES,
     Fitted,
@@ -268,7 +267,6 @@ def _entry(name: str, algorithm: Algorithm, fitted: Fitted) -> IntervalEntry:
         algorithm=algorithm,
         inflation=fitted.inflation,
         unseen_factor=fitted.unseen_factor,
-        wrong_vehicle_factor=fitted.wrong_factor,
         coverage=tuple(asdict(c) for c in fitted.coverage),
     )
 
@@ -287,7 +285,6 @@ def _intervals(
         fit={
             "covered": COVERED,
             "folds": FOLDS,
-            "covered_with_wrong_vehicle": COVERED_WRONG,
             "wrong_runs": WRONG_RUNS,
             "sample_every_s": SAMPLE_EVERY_S,
         },

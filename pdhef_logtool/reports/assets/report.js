@@ -154,7 +154,7 @@
 
   const moves = (type) => type === "mousemove" || type === "mouseleave";
   const sync = { key: "time", setSeries: false, scales: ["x", null], filters: { pub: moves, sub: moves } };
-  const PADDING = [8, 12, 0, 0];
+  const PADDING = [8, 24, 0, 0];
 
   // ---- figures over time ------------------------------------------------------------------------------------------
 
@@ -277,6 +277,7 @@
   // ---- the strip --------------------------------------------------------------------------------------------------
 
   const ROW = 17;
+  const WHOLE = [1, 2, 5].flatMap((k) => [1, 1e1, 1e2, 1e3, 1e4, 1e5].map((d) => k * d)).sort((a, b) => a - b);
 
   function drawStrip(figure) {
     const rows = figure.data.rows;
@@ -366,17 +367,18 @@
     }
     figure.follows = clouds.some((c) => c.at);
     const [left, right] = extent(clouds.map((c) => c.x), spec.log), [low, high] = extent(clouds.map((c) => c.y), spec.log);
-    const height = 330;
+    const height = () => (printing ? 270 : 330);
+    figure.height = height;
     const ranges = () => {
       if (!spec.equal) return [[left, right], [low, high]];
-      const wide = widthOf(figure) - 66, tall = height - 52;
+      const wide = widthOf(figure) - 66, tall = height() - 52;
       const scale = Math.max((right - left) / wide, (high - low) / tall) || 1;
       const cx = (left + right) / 2, cy = (low + high) / 2;
       return [[cx - (scale * wide) / 2, cx + (scale * wide) / 2], [cy - (scale * tall) / 2, cy + (scale * tall) / 2]];
     };
     const scale = (k) => (spec.log ? { time: false, distr: 3, range: () => ranges()[k] } : { time: false, range: () => ranges()[k] });
     figure.chart = new uPlot({
-      width: widthOf(figure), height, legend: { show: false },
+      width: widthOf(figure), height: height(), legend: { show: false },
       scales: { x: scale(0), y: scale(1) },
       axes: [axis(spec.xLabel, { size: 26 }), axis(spec.yLabel, { size: 46 })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
@@ -421,7 +423,7 @@
       }
       pen.stroke();
     } else {
-      const size = (x.length > 3000 ? 1.4 : x.length > 300 ? 2 : 4) * r;
+      const size = (x.length > 3000 ? 1.4 : x.length > 300 ? 2 : 5) * r;
       pen.globalAlpha = x.length > 3000 ? 0.5 : 0.75;
       for (let i = 0; i < x.length; i++) {
         if (x[i] === null || y[i] === null || (at && !(at[i] >= first && at[i] <= last))) continue;
@@ -489,7 +491,7 @@
     figure.chart = new uPlot({
       width: widthOf(figure), height: 220, legend: { show: false },
       scales: { x: { time: false, range: [edges[0], edges[edges.length - 1]] }, y: { range: [0, 1.06 * most] } },
-      axes: [axis(unit, { size: 26 }), axis("number", { size: 46 })],
+      axes: [axis(unit, { size: 26 }), axis("number", { size: 46, incrs: WHOLE })],
       series: [{}, { scale: "y", stroke: "transparent", points: { show: false } }],
       cursor: { show: false },
       hooks: { draw: [(u) => {
@@ -541,7 +543,9 @@
   }
 
   function resizeAll() {
-    for (const figure of figures) if (figure.chart) figure.chart.setSize({ width: widthOf(figure), height: figure.chart.height });
+    for (const figure of figures) {
+      if (figure.chart) figure.chart.setSize({ width: widthOf(figure), height: figure.height ? figure.height() : figure.chart.height });
+    }
   }
 
   async function start() {
@@ -572,5 +576,11 @@
     document.documentElement.dataset.drawn = String(figures.length);
   }
 
-  start();
+  start().catch((error) => {
+    const said = typeof DecompressionStream === "undefined"
+      ? "This browser is too old to draw the figures: it has no DecompressionStream."
+      : "The figures cannot be drawn: " + error;
+    document.querySelector("h1").after(element("p", null, said, "note"));
+    throw error;
+  });
 })();

@@ -1,0 +1,40 @@
+"""What ``pdhef events`` prints."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pdhef_logtool.cli.console import table
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pdhef_logtool.results.events import FoundEvents
+
+#: Events, and drives that were left out for one reason, that are named.
+_MOST_EVENTS, _MOST_NAMED = 50, 5
+
+
+def render_events(found: FoundEvents, console: Console) -> None:
+    """Print the events, and what was not searched."""
+    if found.events:
+        made = table("drive", ">from, s", ">to, s", ">for, s", ">peak", fold=1)
+        for event in found.events[:_MOST_EVENTS]:
+            peak = "-" if event.peak is None else f"{event.peak:.4g}"
+            seconds = f"{event.end_s - event.start_s:.2f}"
+            made.add_row(event.drive, f"{event.start_s:.2f}", f"{event.end_s:.2f}", seconds, peak)
+        console.print(made)
+        if (more := len(found.events) - _MOST_EVENTS) > 0:
+            console.print(f"  and {more} more: --json, --parquet")
+    seconds_in_all = sum(e.end_s - e.start_s for e in found.events)
+    drives = len({e.drive for e in found.events})
+    told = f"{len(found.events)} event{'s' * (len(found.events) != 1)} in {drives} of {found.searched} drives"
+    console.print(f"{told}, {seconds_in_all:.2f} s in all")
+    reasons: dict[str, list[str]] = {}
+    for drive, reason in found.left_out.items():
+        reasons.setdefault(reason, []).append(drive)
+    for reason, names in reasons.items():
+        more_names = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        console.print(f"not searched, {reason}: {', '.join(names[:_MOST_NAMED])}{more_names}")
+    for clip in found.clips:
+        console.print(f"clip: {clip}", soft_wrap=True)

@@ -1,0 +1,244 @@
+"""The page of a whole run: how its drives are spread, who ranks where, where nobody drove, what failed."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.reports.charts import Charts, Cloud, Interval
+from pdhef_logtool.reports.colours import INK, PLAIN, colour
+from pdhef_logtool.reports.page import render
+from pdhef_logtool.results.fleet import ANSWER, JUDGED, LEAST_DRIVES, Distribution, Fleet, Space, read_fleet
+from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
+
+#: Keys of the figures of the page.
+FIGURES = ("medians", "spread", "against")
+#: What signals are called, the factor to the unit that a person reads, and that unit.
+_SHOWN = {
+    "sideslip_rad": ("sideslip", math.degrees(1.0), "°"),
+    "vy_m_s": ("v_y", 1.0, "m/s"),
+    "yaw_rate_rad_s": ("yaw rate", math.degrees(1.0), "°/s"),
+    "vx_m_s": ("v_x", 1.0, "m/s"),
+}
+#: Rows of tables that a run can make as long as it likes, keys that are told, and bars of a histogram at most.
+MOST_ROWS, _MOST_KEYS, _MOST_BARS = 1000, 12, 40
+#: Errors beyond this quantile of the drives are counted in the last bar.
+_MOST_SHARE = 0.98
+_LEVELS = 8
+#: Estimators with a median error beyond this many times the answer's are left to the table.
+_DRAWN = 5.0
+#: The table of the operating space shows at least this far, so that what a car can do and nobody did is seen.
+_SPEED_M_S, _AY_M_S2 = 40.0, 8.0
+
+
+@dataclass(frozen=True, slots=True)
+class SpaceCell:
+    """A cell of the table: its classes and what stands in it, empty for one where nobody drove."""
+
+    kind: str
+    minutes: str
+    rmse_rad: float | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FleetPage:
+    """The page of a run: the HTML, and the figures in it."""
+
+    html: bytes
+    charts: Charts
+
+
+def fleet_page(run: OpenedRun, by: Sequence[str] = ()) -> FleetPage:
+    """Return the page of a run.
+
+    Parameters
+    ----------
+    by : keys to break the drives down by; none: all that tell drives apart.
+
+    Raises
+    ------
+    OutputError
+        metrics.parquet is damaged.
+    """
+    fleet = read_fleet(run, by)
+    pages = {log.label for log in run.logs if log.file(PAGE_FILE) is not None}
+    mains = {d.main for d in fleet.scored}
+    told = [b for b in fleet.breakdowns if by or b.explains > 0.0][: None if by else _MOST_KEYS]
+    charts = Charts()
+    _add_figures(charts, fleet)
+    html = render(
+        "fleet.html",
+        charts,
+        fleet=fleet,
+        pages=pages,
+        hours=sum(d.seconds for d in fleet.drives) / 3600.0,
+        answers=Counter(d.main for d in fleet.drives if d.main).most_common(),
+        verdicts=Counter(d.verdict for d in fleet.scored if d.verdict),
+        paired=_paired(fleet),
+        answer=next((d for d in fleet.distributions if (d.estimator, d.signal) == (ANSWER, JUDGED)), None),
+        rows=_rows(_told(fleet)),
+        mains={ANSWER} if len(mains) > 1 else mains,
+        breakdowns=told,
+        idle_keys=[b.key for b in fleet.breakdowns if b not in told],
+        space=None if fleet.space is None else _space_rows(fleet.space),
+        held=sorted(fleet.drives, key=lambda d: d.label)[:MOST_ROWS],
+        most_rows=MOST_ROWS,
+        least=LEAST_DRIVES,
+        run=run.document,
+    )
+    return FleetPage(html, charts)
+
+
+def _add_figures(charts: Charts, fleet: Fleet) -> None:
+    judged = [d for d in _told(fleet) if d.signal == JUDGED]
+    if not judged or len(fleet.drives) == 1:
+        return
+    first = judged[0]
+    near = [d for d in judged if d.median.value <= _DRAWN * first.median.value]
+    degree = math.degrees(1.0)
+    charts.intervals(
+        "medians",
+        f"Median RMSE of sideslip over {first.drives} drives, 95 % interval"
+        + ("" if len(near) == len(judged) else f" (beyond {_DRAWN:g} times the answer's: table)"),
+        "°",
+        [
+            Interval(d.estimator, d.median.low * degree, d.median.value * degree, d.median.high * degree, _colour(d))
+            for d in near
+        ],
+    )
+    if first.drives > 2:
+        values = first.values * degree
+        edges, counts = _histogram(values)
+        beyond = ", the last bar and beyond" if values[-1] > edges[-1] else ""
+        charts.bars("spread", f"Drives by RMSE of the answer's sideslip{beyond}", "°", edges, counts)
+    rival, drives = _rival(fleet), fleet.scored
+    if rival is not None:
+        own, other = (np.array([d.error(name) * degree for d in drives]) for name in (ANSWER, rival))
+        known = np.isfinite(own) & np.isfinite(other) & (own > 0.0) & (other > 0.0)
+        if np.count_nonzero(known) > 2:
+            ends = np.array([min(own[known].min(), other[known].min()), max(own[known].max(), other[known].max())])
+            charts.points(
+                "against",
+                f"A point a drive: the answer is nearer than {rival} below the line",
+                f"RMSE of {rival}, °",
+                "RMSE of the answer, °",
+                [
+                    Cloud("equal", PLAIN, ends, ends, line=True),
+                    Cloud("drives", INK, other[known], own[known]),
+                ],
+                log=True,
+            )
+
+
+def _rival(fleet: Fleet) -> str | None:
+    """Return the estimator that the answer is drawn against: physics where it ran, else the best of the others."""
+    mains = {d.main for d in fleet.scored}
+    names = [r.estimator for r in fleet.ranking if {r.estimator} != mains]
+    return "physics" if "physics" in names else next(iter(names), None)
+
+
+def _told(fleet: Fleet) -> list[Distribution]:
+    """Return the distributions, the answer's first; an estimator that always is the answer stands once."""
+    mains = {d.main for d in fleet.scored}
+    if len(mains) > 1:
+        return list(fleet.distributions)
+    told = [d for d in fleet.distributions if d.estimator != ANSWER]
+    return sorted(told, key=lambda d: d.estimator not in mains)
+
+
+def _colour(distribution: Distribution) -> str:
+    return INK if distribution.estimator == ANSWER else colour(distribution.estimator)
+
+
+def _histogram(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return edges [B + 1] and counts [B]; what lies beyond almost all drives is in the last bar."""
+    most = max(float(np.quantile(values, _MOST_SHARE)), 1e-6)
+    bars = int(np.clip(2.0 * math.sqrt(len(values)), 5, _MOST_BARS))
+    edges = np.linspace(0.0, most, bars + 1)
+    counts, _ = np.histogram(np.minimum(values, most), edges)
+    return edges, counts.astype(np.float64)
+
+
+def _paired(fleet: Fleet) -> str:
+    """Return how the answer stands against the rival over drives, in words; empty without one."""
+    rival = _rival(fleet)
+    rank = next((r for r in fleet.ranking if r.estimator == rival), None)
+    if rank is None or rank.against_answer is None or len(fleet.scored) < 2:
+        return ""
+    found = rank.against_answer
+    side = "above" if found.value >= 0.0 else "below"
+    how = f"In the median of drives the error of {rival} is {abs(found.value):.1%} {side} the answer's"
+    if not math.isfinite(found.low):
+        return f"{how}; too few drives to tell."
+    bounds = f"{how} (95 % between {found.low:+.1%} and {found.high:+.1%})"
+    if found.low > 0.0:
+        return f"{bounds}: the answer is better."
+    return f"{bounds}: {'the answer is worse.' if found.high < 0.0 else 'not told apart.'}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Row:
+    """Errors of an estimator in a signal over drives, in the unit that is shown."""
+
+    signal: str
+    unit: str
+    estimator: str
+    drives: int
+    figures: tuple[float, ...]
+
+
+def _rows(distributions: Sequence[Distribution]) -> list[_Row]:
+    """Return rows with median, its bounds, the tenths at both ends, and the largest."""
+    rows = []
+    for d in distributions:
+        name, factor, unit = _SHOWN[d.signal]
+        told = d.median.value, d.median.low, d.median.high, d.quantile(0.1), d.quantile(0.9), float(d.values[-1])
+        rows.append(_Row(name, unit, d.estimator, d.drives, tuple(x * factor for x in told)))
+    return sorted(rows, key=lambda r: [name for name, _, _ in _SHOWN.values()].index(r.signal))
+
+
+def _space_rows(space: Space) -> tuple[list[str], list[tuple[str, list[SpaceCell]]], int, int]:
+    """Return heads, rows from the fastest down, and how many cells are empty of how many."""
+    rows = _reach(space.speed_edges_m_s, space.seconds.any(axis=1), _SPEED_M_S)
+    columns = _reach(space.ay_edges_m_s2, space.seconds.any(axis=0), _AY_M_S2)
+    seconds = space.seconds[:rows, :columns]
+    most = float(seconds.max()) or 1.0
+    made = []
+    for i in reversed(range(rows)):
+        cells = []
+        for j in range(columns):
+            spent, rmse = float(seconds[i, j]), float(space.rmse_rad[i, j])
+            # Time differs by powers of ten: a level is a factor of three.
+            level = max(0, _LEVELS + math.floor(math.log(spent / most, 3.0))) if spent else 0
+            kind = f"h{min(level, _LEVELS)}" if spent else "empty"
+            cells.append(SpaceCell(kind, _time(spent), rmse if math.isfinite(rmse) else None))
+        made.append((_bin(space.speed_edges_m_s, i), cells))
+    return (
+        [_bin(space.ay_edges_m_s2, j) for j in range(columns)],
+        made,
+        int(np.count_nonzero(seconds == 0.0)),
+        seconds.size,
+    )
+
+
+def _reach(edges: FloatArray, used: Any, least: float) -> int:
+    last = int(np.flatnonzero(used)[-1]) + 1 if used.any() else 0
+    return max(last, int(np.searchsorted(edges, least)))
+
+
+def _bin(edges: FloatArray, i: int) -> str:
+    return f"{edges[i]:g}–{edges[i + 1]:g}" if i + 1 < len(edges) else f"above {edges[i]:g}"
+
+
+def _time(seconds: float) -> str:
+    if not seconds:
+        return ""
+    if seconds < 60.0:
+        return f"{seconds:.0f} s" if seconds >= 1.0 else "< 1 s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"

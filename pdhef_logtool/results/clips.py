@@ -1,0 +1,118 @@
+"""Events as clips: an MCAP each, with what the source recorded around it and our tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from itertools import groupby
+from pathlib import Path
+
+from pdhef_logtool.logs.discovery import hash_log
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.records.errors import OutputError, PdhefError
+from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder
+from pdhef_logtool.results.events import TRUTH, FoundEvent, FoundEvents
+from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
+from pdhef_logtool.sinks.parquet import list_estimators, read_track
+
+#: Folder of the clips within those of a run; it holds those of the last search alone.
+CLIPS = "clips"
+_ANNOTATED = "annotated.mcap"
+
+
+def write_clips(
+    run: OpenedRun,
+    found: FoundEvents,
+    *,
+    pad_s: float,
+    named: Collection[str] = (),
+    source: Path | None = None,
+    tell: Callable[[str], None] = lambda _text: None,
+) -> FoundEvents:
+    """Write a clip an event into ``OUT/clips``, which they replace; return the events with their files.
+
+    Parameters
+    ----------
+    pad_s : what a clip has before and behind its event.
+    named : tracks that clips have beside the truth and those that the report shows.
+    source : folder (or file) with the logs; None takes the full copies that the run wrote.
+    tell : called with what a drive's clips lack.
+
+    Raises
+    ------
+    OutputError : The clips cannot be written.
+    """
+    logs = {log.label: log for log in run.logs}
+    names: list[str] = []
+    failed = found.failed
+    with OutputFolder(run.folder), FolderTransaction(run.folder / CLIPS, keep=False) as change:
+        for label, events in groupby(found.events, key=lambda event: event.drive):
+            try:
+                opened = open_log(_source_of(run, logs[label], source))
+            except PdhefError as error:
+                failed = True
+                tell(f"{label}: no clip: {error}")
+                continue
+            try:
+                names += [
+                    str(run.folder / CLIPS / name)
+                    for name in _clips_of(logs[label], list(events), change, opened, pad_s, named)
+                ]
+                failed |= any(loss.severity == "lost" for loss in opened.lost)
+            finally:
+                opened.close()
+    return replace(found, clips=tuple(names), failed=failed)
+
+
+def _clips_of(
+    log: OpenedLog,
+    events: list[FoundEvent],
+    change: FolderTransaction,
+    source: DriveLog,
+    pad_s: float,
+    named: Collection[str],
+) -> Iterator[str]:
+    """Write the clips of one drive; yield their names."""
+    report, estimates = log.report() or {}, log.file(ESTIMATES_FILE)
+    assert estimates is not None
+    wanted = {TRUTH, log.main(), *((report.get("answer") or {}).get("shown") or ()), *named}
+    tracks = [read_track(estimates, name) for name in list_estimators(estimates) if name in wanted]
+    for event in events:
+        span_ns = _span(source, event, pad_s)
+        name = f"{log.label}_{event.start_s:.2f}s.mcap"
+        sink = AnnotatedMcapSink(change.file(name), source, span_ns=span_ns)
+        try:
+            for track in tracks:
+                sink.append(track.between(*span_ns))
+            sink.finish(report)
+        finally:
+            sink.abort()
+        yield name
+
+
+def _span(log: DriveLog, event: FoundEvent, pad_s: float) -> tuple[int, int]:
+    pad_ns = round(pad_s * 1e9)
+    return max(event.start_ns - pad_ns, log.start_ns), min(event.end_ns + pad_ns, log.end_ns)
+
+
+def _source_of(run: OpenedRun, log: OpenedLog, folder: Path | None) -> Path:
+    """Return a file with all that the source of a drive holds; raises OutputError where there is none."""
+    sha256, name = log.entry.get("sha256"), str(log.entry.get("file", ""))
+    if folder is not None:
+        candidates = [folder] if folder.name == name else sorted(p for p in folder.rglob("*") if p.name == name)
+        for path in candidates:
+            if sha256 is not None and hash_log(path) == sha256:
+                return path
+        got = f"{len(candidates)} of that name with other content" if candidates else "none of that name"
+        raise OutputError(expected=f"the log {name}", got=got, where=str(folder), remedy="name its folder by --source")
+    copy = log.file(_ANNOTATED)
+    if copy is not None and (run.document.get("config") or {}).get("annotate") == "full":
+        return copy
+    raise OutputError(
+        expected=f"a full copy of {name}, {_ANNOTATED}",
+        got="a run without one",
+        where=str(log.folder),
+        remedy="say where the logs are: --source DIR",
+    )

@@ -1,0 +1,103 @@
+"""A comparison in words, the same in the terminal, on the page and in JUnit."""
+
+from __future__ import annotations
+
+import math
+
+from pdhef_logtool.results.changed_signals import TRUTH, ChangedSignal
+from pdhef_logtool.results.comparing import ComparedFigure, Comparison
+from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
+
+_DEG = math.degrees(1.0)
+_SHOWN_UNITS = {"rad": ("°", _DEG), "rad/s": ("°/s", _DEG), "m/s^2": ("m/s²", 1.0), "1": ("", 1.0)}
+_COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
+_BY = {"signals": "what their signals held", "content": "their files", "name": "their names alone"}
+
+
+def paired_text(found: Comparison) -> str:
+    """Return how many drives are in both runs, and by what they were known."""
+    pairs = sum(found.pairs.values())
+    by = ", ".join(f"{count} by {_BY[key]}" for key, count in found.pairs.items())
+    if len(found.pairs) == 1:
+        by = by.partition(" ")[2]
+    return f"{pairs} drive{'s' * (pairs != 1)} in both, paired {by}"
+
+
+def verdict_text(found: Comparison) -> str:
+    """Return the verdict in a sentence."""
+    if found.verdict == "equal":
+        return "equal: all figures of all pairs are the same bit for bit"
+    told = {
+        "worse": "B is worse",
+        "better": "B is better",
+        "not worse": "B is not worse",
+        "equal": "no figure that was asked for changed",
+        "cannot tell": "these drives cannot tell",
+        "no figure": "no drive has the figure on both sides (is there truth?)",
+    }[found.verdict]
+    detectable = [f.detectable for f in found.figures if f.verdict == "cannot tell"]
+    if any(math.isfinite(d) for d in detectable):
+        told += f"; a worsening of {percent(max(d for d in detectable if math.isfinite(d)))} would have shown"
+    elif detectable:
+        told += f", as they are too few: at least {LEAST_CLUSTERS} drives (clusters) are needed"
+    return told
+
+
+def notes_of(found: Comparison) -> list[str]:
+    """Return what must be known of the figures that were asked for, a line each."""
+    notes = []
+    if found.cluster:
+        notes.append(f"in brackets: clusters by {found.cluster}, which are drawn whole")
+    for one in found.figures:
+        notes += [f"{one.figure.label}: {note}" for note in one.notes]
+        if one.neither and one.drives:
+            notes.append(f"{one.figure.label}: {one.neither} drives have it on neither side")
+        if math.isfinite(one.detectable):
+            least = percent(one.detectable)
+            notes.append(
+                f"{one.figure.label}: the smallest worsening that so many drives show in 4 of 5 cases: {least}"
+            )
+    return notes
+
+
+def interval_text(one: ComparedFigure) -> str:
+    """Return the 95 % interval of the median change, a dash without."""
+    low, high = (math.expm1(x) for x in (one.change.low, one.change.high))
+    return f"{percent(low)} to {percent(high)}" if math.isfinite(one.change.low) else "-"
+
+
+def shown_unit(unit: str) -> tuple[str, float]:
+    """Return the unit that people read for one of metrics.parquet, and the factor to it."""
+    return _SHOWN_UNITS.get(unit, (unit, 1.0))
+
+
+def unit_of_column(column: str) -> str:
+    """Return the unit of a column of estimates.parquet by its name."""
+    plain = column.replace("_std", "")
+    return next((unit for end, unit in sorted(_COLUMN_UNITS.items(), reverse=True) if plain.endswith(f"_{end}")), "1")
+
+
+def one_signal_a_drive(found: Comparison) -> list[ChangedSignal]:
+    """Return the signal that was asked about of each drive, else its first, and of a truth that changed its first."""
+    asked = found.figures[0].figure.signal
+    shown: dict[tuple[str, bool], ChangedSignal] = {}
+    for one in found.signals:
+        key = (one.drive, one.track == TRUTH)
+        if key not in shown or (one.signal == asked and one.track != TRUTH):
+            shown[key] = one
+    return list(shown.values())
+
+
+def largest_text(one: ChangedSignal) -> str:
+    """Return the largest difference with its unit."""
+    unit, factor = shown_unit(unit_of_column(one.signal))
+    return "-" if one.largest is None else f"{one.largest * factor:.3g} {unit}".strip()
+
+
+def percent(share: float) -> str:
+    """Return a share with its sign; one too small for a digit keeps its sign, so that it does not pass for none."""
+    if not math.isfinite(share):
+        return "-" if math.isnan(share) else "+∞"
+    if share and abs(share) < 5e-4:
+        return f"{'+' if share > 0 else '-'}<0.1 %"
+    return f"{share * 100:+.1f} %" if share else "0 %"

@@ -1,0 +1,331 @@
+"""Where in the drives of a run a condition holds: rows of drive, start, end and peak."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pdhef_logtool.evaluation.segments import RUN_GAP_S
+from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
+from pdhef_logtool.records.files import PendingFile, open_new, writing
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.results.expression import ERRORS, FLAGS, SPEED, Applied, Column, Condition, Node, Number
+from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
+
+if TYPE_CHECKING:
+    import polars as pl
+
+TRUTH = "truth"
+
+
+@dataclass(frozen=True, slots=True)
+class FoundEvent:
+    """A condition that held in [start_ns, end_ns); ``*_s``: seconds from the log's start.
+
+    ``peak``: the largest value in between of the left side of the first comparison, the smallest where it asks for
+    what is below; None without. ``peak_ns``: when.
+    """
+
+    drive: str
+    start_ns: int
+    end_ns: int
+    start_s: float
+    end_s: float
+    peak: float | None
+    peak_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class FoundEvents:
+    """What was found in a run.
+
+    Attributes
+    ----------
+    where : the condition. searched : drives that were looked at. events : in the order of the run's drives.
+    left_out : drives that could not be looked at, with the reason; ``failed``: whether one of them is damaged.
+    clips : files that were written.
+    """
+
+    where: str
+    searched: int
+    events: tuple[FoundEvent, ...]
+    left_out: Mapping[str, str]
+    failed: bool = False
+    clips: tuple[str, ...] = ()
+
+    @property
+    def exit_code(self) -> int:
+        """3 where a drive could not be read, else 0."""
+        return EXIT_PARTIAL if self.failed else EXIT_OK
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON-able values."""
+        return {
+            "format": "pdhef.events",
+            "version": 1,
+            "where": self.where,
+            "searched": self.searched,
+            "events": [asdict(e) for e in self.events],
+            "left_out": dict(self.left_out),
+            "clips": self.clips,
+        }
+
+
+def find_events(
+    run: OpenedRun, condition: Condition, *, estimator: str | None = None, pad_s: float = 0.0
+) -> FoundEvents:
+    """Search all drives of a run, one at a time, reading only the columns that the condition has.
+
+    Parameters
+    ----------
+    estimator : what columns without a prefix are of; None: each drive's main one.
+    pad_s : events that are nearer than twice this become one.
+
+    Raises
+    ------
+    UsageError : No drive has an estimator of that name.
+    """
+    events: list[FoundEvent] = []
+    left_out: dict[str, str] = {}
+    failed, searched = False, 0
+    for log in run.logs:
+        try:
+            reason = _unfit(log, condition, estimator)
+            if reason is None:
+                searched += 1
+                events += _events_of(log, condition, estimator or log.main(), pad_s)
+        except OutputError as error:
+            reason, failed = error.got, True
+        if reason is not None:
+            left_out[log.label] = reason
+            failed |= log.outcome.startswith("failed")
+    if not searched and left_out:
+        _check_tracks(run, condition, estimator)
+    return FoundEvents(condition.text, searched, tuple(events), left_out, failed)
+
+
+def write_events(path: Path, found: FoundEvents) -> None:
+    """Write the events as Parquet; raises OutputError."""
+    import polars as pl
+
+    schema = {
+        "drive": pl.String,
+        "start_ns": pl.Int64,
+        "end_ns": pl.Int64,
+        "start_s": pl.Float64,
+        "end_s": pl.Float64,
+        "peak": pl.Float64,
+        "peak_ns": pl.Int64,
+    }
+    with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
+        pl.DataFrame([asdict(e) for e in found.events], schema=schema).write_parquet(file)
+
+
+def _unfit(log: OpenedLog, condition: Condition, estimator: str | None) -> str | None:
+    """Return why a drive cannot be searched, None where it can."""
+    frame = log.estimates()
+    if frame is None:
+        return log.outcome if log.outcome.startswith("failed") else f"it has no {ESTIMATES_FILE}"
+    there = _tracks(log)
+    for name in _needed(condition, estimator or log.main()):
+        if name not in there:
+            return "it has no truth" if name == TRUTH else f"it has no estimator {name}".strip()
+    return None
+
+
+def _check_tracks(run: OpenedRun, condition: Condition, estimator: str | None) -> None:
+    """Raise UsageError for an estimator that no drive has."""
+    known = {name for log in run.logs if log.file(ESTIMATES_FILE) is not None for name in _tracks(log)}
+    if known and estimator is None and not any(log.main() for log in run.logs):
+        raise UsageError(
+            expected=f"an estimator of this run: {', '.join(sorted(known))}",
+            got="none named, and none that is the answer",
+            where="--estimator",
+        )
+    asked = {c.track for c in condition.columns() if c.track is not None} | ({estimator} if estimator else set())
+    for name in sorted(asked - known - {TRUTH, None}, key=str):
+        raise UsageError(
+            expected=f"an estimator of this run: {', '.join(sorted(known))}",
+            got=str(name),
+            where="--where" if name != estimator else "--estimator",
+            remedy="a minus between columns needs spaces" if "-" in str(name) else "",
+        )
+
+
+def _tracks(log: OpenedLog) -> frozenset[str]:
+    import polars as pl
+
+    frame = log.estimates()
+    assert frame is not None
+    with _reading(log):
+        names = frame.select(pl.col("estimator").cast(pl.String).unique()).collect()["estimator"]
+    return frozenset(names)
+
+
+@contextmanager
+def _reading(log: OpenedLog) -> Iterator[None]:
+    """Turn what polars says of a damaged file into an OutputError."""
+    import polars as pl
+
+    try:
+        yield
+    except (pl.exceptions.PolarsError, OSError) as error:
+        raise OutputError(
+            expected=f"the {ESTIMATES_FILE} of a run",
+            got=f"one that cannot be read: {str(error).splitlines()[0]}",
+            where=log.label,
+            remedy="run the log again",
+        ) from error
+
+
+def _needed(condition: Condition, main: str) -> set[str]:
+    """Return the tracks that a condition reads."""
+    errors = {TRUTH for c in condition.columns() if c.name in ERRORS}
+    return {main} | {c.track or main for c in condition.columns()} | errors
+
+
+def _events_of(log: OpenedLog, condition: Condition, main: str, pad_s: float) -> list[FoundEvent]:
+    """Return the events of one drive."""
+    import polars as pl
+
+    frame = log.estimates()
+    assert frame is not None
+    report = log.report() or {}
+    low_speed = (report.get("vehicle") or {}).get("low_speed_blend_m_s")
+    builder = _Builder(main, 0.0 if low_speed is None else float(low_speed))
+    holds = builder.expression(condition.node).fill_null(value=False)
+    peak = pl.lit(None, pl.Float64) if condition.peak is None else builder.expression(condition.peak)
+    with _reading(log):
+        rows = (
+            _joined(frame, builder.columns, main).select("stamp_ns", holds=holds, peak=peak.cast(pl.Float64)).collect()
+        )
+    stamps, mask = rows["stamp_ns"].to_numpy(), rows["holds"].to_numpy()
+    values = rows["peak"].fill_null(math.nan).to_numpy()
+    log_start_ns = int((report.get("log") or {}).get("start_ns", stamps[0] if len(stamps) else 0))
+    found = []
+    for first, last in _spans(stamps, mask, condition.least_s, pad_s):
+        at = _peak_at(values[first:last], condition.falls)
+        start_ns, end_ns = int(stamps[first]), int(stamps[last - 1]) + 1
+        found.append(
+            FoundEvent(
+                log.label,
+                start_ns,
+                end_ns,
+                (start_ns - log_start_ns) * 1e-9,
+                (end_ns - log_start_ns) * 1e-9,
+                None if at is None else float(values[first + at]),
+                None if at is None else int(stamps[first + at]),
+            )
+        )
+    return found
+
+
+def _spans(stamps_ns: IntArray, mask: BoolArray, least_s: float, pad_s: float) -> list[tuple[int, int]]:
+    """Return the rows [first, last) of the runs in a mask [N] that last long enough, joined where their pads touch."""
+    where = np.flatnonzero(mask)
+    if not where.size:
+        return []
+    apart = np.flatnonzero((np.diff(where) > 1) | (np.diff(stamps_ns[where]) > RUN_GAP_S * 1e9)) + 1
+    joined: list[tuple[int, int]] = []
+    for run in np.split(where, apart):
+        first, last = int(run[0]), int(run[-1]) + 1
+        if (stamps_ns[last - 1] - stamps_ns[first]) * 1e-9 < least_s - 1e-9:
+            continue
+        if joined and (stamps_ns[first] - stamps_ns[joined[-1][1] - 1]) * 1e-9 <= 2.0 * pad_s:
+            first = joined.pop()[0]
+        joined.append((first, last))
+    return joined
+
+
+def _peak_at(values: FloatArray, falls: bool) -> int | None:
+    if np.isnan(values).all():
+        return None
+    return int(np.nanargmin(values) if falls else np.nanargmax(values))
+
+
+def _joined(frame: pl.LazyFrame, columns: Mapping[str, set[str]], main: str) -> pl.LazyFrame:
+    """Return the columns by track at the stamps of the main one, named ``track.column``; what is no number is null."""
+    import polars as pl
+
+    def of(track: str) -> pl.LazyFrame:
+        known = [pl.col(c) if c in FLAGS else pl.col(c).cast(pl.Float64).fill_nan(None) for c in sorted(columns[track])]
+        named = [c.alias(f"{track}.{c.meta.output_name()}") for c in known]
+        return frame.filter(pl.col("estimator").cast(pl.String) == track).select("stamp_ns", *named)
+
+    rows = of(main)
+    for track in sorted(columns.keys() - {main}):
+        rows = rows.join(of(track), on="stamp_ns", how="left")
+    return rows.sort("stamp_ns")
+
+
+class _Builder:
+    """Turns a condition into an expression of polars; ``columns`` collects what it reads, by track."""
+
+    def __init__(self, main: str, low_speed_m_s: float) -> None:
+        self._main = main
+        self._low_speed_m_s = low_speed_m_s
+        self.columns: dict[str, set[str]] = {main: set()}
+
+    def expression(self, node: Node) -> pl.Expr:
+        import polars as pl
+
+        if isinstance(node, Number):
+            return pl.lit(node.value)
+        if isinstance(node, Column):
+            found = self._column(node)
+            return found if node.factor == 1.0 else found * node.factor
+        return _applied(node, [self.expression(operand) for operand in node.operands])
+
+    def _column(self, column: Column) -> pl.Expr:
+        track = column.track or self._main
+        if column.name in ERRORS:
+            return self._error(track, ERRORS[column.name])
+        return self._speed(track) if column.name == SPEED else self._read(track, column.name)
+
+    def _read(self, track: str, name: str) -> pl.Expr:
+        import polars as pl
+
+        self.columns.setdefault(track, set()).add(name)
+        return pl.col(f"{track}.{name}")
+
+    def _speed(self, track: str) -> pl.Expr:
+        vx, vy = self._read(track, "vx_m_s"), self._read(track, "vy_m_s")
+        return (vx * vx + vy.fill_null(0.0) * vy.fill_null(0.0)).sqrt()
+
+    def _error(self, track: str, signal: str) -> pl.Expr:
+        """Return estimate − truth where it is scored: both valid, and for sideslip above the lowest speed."""
+        import polars as pl
+
+        error = self._read(track, signal) - self._read(TRUTH, signal)
+        scored = self._read(track, "valid") & self._read(TRUTH, "valid")
+        if signal == "sideslip_rad":
+            error = pl.arctan2(error.sin(), error.cos())
+            scored &= self._speed(TRUTH) > self._low_speed_m_s
+        return pl.when(scored).then(error)
+
+
+def _applied(node: Applied, operands: Sequence[pl.Expr]) -> pl.Expr:
+    one = operands[0]
+    if len(operands) == 1:
+        return {"not": lambda: ~one, "minus": lambda: -one, "abs": one.abs}[node.of]()
+    other = operands[1]
+    return {
+        "and": lambda: one & other,
+        "or": lambda: one | other,
+        "+": lambda: one + other,
+        "-": lambda: one - other,
+        "*": lambda: one * other,
+        "/": lambda: one / other,
+        "<": lambda: one < other,
+        "<=": lambda: one <= other,
+        ">": lambda: one > other,
+        ">=": lambda: one >= other,
+        "==": lambda: one == other,
+        "!=": lambda: one != other,
+    }[node.of]()

@@ -1,0 +1,127 @@
+"""Finished runs as files, made without estimating: what a page is drawn from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.records.tracks import StateTrack, make_track
+from pdhef_logtool.sinks.parquet import EstimatesSink, write_metrics
+from pdhef_logtool.sinks.report import write_json
+
+START_NS = 1_700_000_000_000_000_000
+#: Those of `pdhef run --estimators all` with a network that has its baselines.
+NAMES = (
+    "pd-hef", "physics", "zero", "gyro", "kinematic", "open-loop", "phy-ukf", "phy-ukf-tuned", "linear-regression",
+    "pure-lstm", "pd-hef-fixed-r", "pd-hef-smoothed", "pd-hef-paper", "pd-hef-trust1",
+)  # fmt: skip
+
+
+def drive_tracks(
+    duration_s: float = 30.0, names: tuple[str, ...] = ("pd-hef", "physics", "zero"), *, truth: bool = True,
+    speed_m_s: float = 20.0, rate_hz: float = 100.0,
+) -> list[StateTrack]:  # fmt: skip
+    """Return a drive with a little sideslip, noise that differs by estimator, and a stop in its middle fifth."""
+    n = int(duration_s * rate_hz) + 1
+    stamps = START_NS + (np.arange(n) * (1e9 / rate_hz)).astype(np.int64)
+    t = np.arange(n) / rate_hz
+    rng = np.random.default_rng(0)
+    vx = np.full(n, speed_m_s)
+    vx[int(0.4 * n) : int(0.6 * n)] = 0.3 * min(speed_m_s, 1.0)
+    beta = np.radians(2.0) * np.sin(0.7 * t) * np.cos(0.03 * t)
+    heading = np.cumsum(0.1 * np.sin(0.2 * t)) / rate_hz
+    pose = {
+        "x_m": np.cumsum(vx * np.cos(heading)) / rate_hz,
+        "y_m": np.cumsum(vx * np.sin(heading)) / rate_hz,
+        "yaw_rad": heading,
+    }
+    ay = vx * 0.1 * np.sin(0.2 * t)
+    tracks = []
+    if truth:
+        tracks.append(
+            make_track("truth", stamps, vx_m_s=vx, vy_m_s=vx * np.tan(beta), sideslip_rad=beta, ay_m_s2=ay,
+                       yaw_rate_rad_s=ay / np.maximum(vx, 1.0), **pose)
+        )  # fmt: skip
+    for i, name in enumerate(names):
+        drift = np.radians(0.1 * (i + 1)) * np.sin(0.05 * t + i)
+        own = beta + drift + np.radians(0.01) * rng.normal(size=n)
+        filtered = {} if name in ("zero", "gyro") else {
+            "network_trust": 0.6 + 0.2 * np.sin(0.1 * t + i) + 0.01 * rng.normal(size=n),
+            "r_scale": 1.0 + np.where(rng.random(n) < 0.01, 50.0 * rng.random(n), 0.0),
+            "nis": rng.chisquare(3, size=n),
+            "sideslip_std_rad": np.full(n, np.radians(0.1)) * (1.5 + np.sin(0.02 * t)),
+            "reason": np.where((t > 0.1 * duration_s) & (t < 0.12 * duration_s), 16, 0).astype(np.int64),
+        }  # fmt: skip
+        tracks.append(
+            make_track(name, stamps, vx_m_s=vx, vy_m_s=vx * np.tan(own), sideslip_rad=own,
+                       ay_m_s2=ay + 0.1 * rng.normal(size=n), yaw_rate_rad_s=ay / np.maximum(vx, 1.0),
+                       **pose, **filtered)
+        )  # fmt: skip
+    return tracks
+
+
+def report_of(tracks: list[StateTrack], label: str = "drive", **changes: Any) -> dict[str, Any]:
+    """Return a report.json with what a page reads of it."""
+    names = [t.name for t in tracks if t.name != "truth"]
+    stamps = tracks[0].stamps_ns
+    truth = any(t.name == "truth" for t in tracks)
+    end = int(stamps[-1]) + 1
+
+    def figure(name: str, signal: str, metric: str, value: float, unit: str) -> dict[str, Any]:
+        return {"log": label, "estimator": name, "signal": signal, "segment": "all", "metric": metric, "value": value,
+                "unit": unit, "n": len(stamps)}  # fmt: skip
+
+    metrics = [figure(n, "sideslip_rad", "rmse", 0.001 * (i + 1), "rad") for i, n in enumerate(names) if truth]
+    metrics += [
+        figure(n, "state", m, v, "1") for n in names if n != "zero" for m, v in (("nis", 3.1), ("nis_dof", 3.0))
+    ]
+    return {
+        "format": "pdhef.report",
+        "version": 1,
+        "log": {"name": label, "file": f"{label}.mcap", "kind": "mcap", "sha256": "0" * 64, "start_ns": int(stamps[0]),
+                "end_ns": end, "duration_s": (end - int(stamps[0])) * 1e-9, "topics": []},
+        "mapping": {"signals": [], "missing": []},
+        "vehicle": {"name": "sedan", "sha256": "1" * 64, "file": None, "proven": False, "low_speed_blend_m_s": 3.0},
+        "estimators": [
+            {"name": n, "causal": n != "pd-hef-smoothed", "outcome": "ran", "reason": None, "notes": [],
+             "intervals": [], "reasons": [],
+             "algorithm": {"sha256": "2" * 64, "physics_sha256": None if n == "zero" else "3" * 64,
+                           "network_sha256": "4" * 64 if "hef" in n else None}}
+            for n in names
+        ],
+        "truth": {"available": truth, "quantities": [], "latency_s": None, "notes": [], "not_independent": []},
+        "friction": None,
+        "self_calibration": None,
+        "metrics": metrics,
+        "segments": [
+            {"name": "straight", "start_ns": int(stamps[0]), "end_ns": int(stamps[len(stamps) // 3]), "text": ""}
+        ],
+        "losses": [],
+        "ledger": {"bytes": [], "samples": []},
+        "warnings": [],
+        "remarks": [],
+        "checks": [],
+        "versions": {"python": "3.11"},
+        "answer": {"main": names[0], "why": "for a test", "texts": {"result": "a result"}},
+        **changes,
+    }  # fmt: skip
+
+
+def write_run(
+    folder: Path, tracks: list[StateTrack], label: str = "drive", outcome: str = "ok", **changes: Any
+) -> Path:
+    """Write a finished run of one log and return its folder."""
+    place = folder / "logs" / label
+    place.mkdir(parents=True)
+    if tracks:
+        sink = EstimatesSink(place / "estimates.parquet")
+        for track in tracks:
+            sink.append(track)
+        sink.finish({})
+        write_json(place / "report.json", report_of(tracks, label, **changes))
+    write_metrics(folder / "metrics.parquet", [])
+    entry = {"log": label, "file": f"{label}.mcap", "sha256": None, "outcome": outcome, "car": None}
+    write_json(folder / "run.json", {"format": "pdhef.run", "version": 1, "logs": [entry]})
+    return folder

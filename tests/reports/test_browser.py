@@ -1,0 +1,174 @@
+"""The pages in a browser: what it says, asks for, draws, and how long that takes."""
+
+from __future__ import annotations
+
+import base64
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from browser import CHROMIUM, WHY_NOT, Browser
+from made_runs import NAMES, drive_tracks, write_run
+from test_drive import hostile_run
+
+from pdhef_logtool.reports.pages import write_pages
+from pdhef_logtool.results.opened_run import open_run
+
+pytestmark = [pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT), pytest.mark.slow]
+#: Processor time of the main thread.
+FIRST_PICTURE_S, ZOOM_S = 2.0, 0.1
+#: A picture of one point.
+_DOT = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNk+M9QDwADhgGAWjR9awAAAABJRU5ErkJggg=="
+)
+_DRAWN = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with Browser() as made:
+        yield made
+
+
+def page_of(folder: Path) -> Path:
+    file = write_pages(open_run(folder)).pages[0].file
+    assert file is not None
+    return file
+
+
+def opened(browser: Browser, file: Path) -> None:
+    """Open a page and see that nothing but it was asked for, and nothing said."""
+    browser.messages.clear()
+    browser.requests.clear()
+    browser.open(file)
+    assert browser.messages == []
+    assert browser.requests == [file.resolve().as_uri()]
+
+
+def test_a_page_draws_all_figures_zooms_all_of_them_and_says_nothing(browser, tmp_path):
+    file = page_of(write_run(tmp_path, drive_tracks(60.0, NAMES)))
+    opened(browser, file)
+    places = browser.value("document.querySelectorAll('[data-figure]').length")
+    assert browser.value("document.querySelectorAll('.canvas canvas').length") == places == 11
+    browser.drag(".u-over", 0.1, 0.2)
+    browser.value(_DRAWN)
+    low, high = (float(s) for s in browser.value("document.querySelector('.range').textContent").split()[0:3:2])
+    assert (low, high) == pytest.approx((6.0, 12.0), abs=0.3)
+    browser.value("document.querySelector('button.jump').click()")
+    at = float(browser.value("document.querySelector('button.jump').textContent").split()[0])
+    low, high = (float(s) for s in browser.value("document.querySelector('.range').textContent").split()[0:3:2])
+    assert low <= at <= high
+    assert high - low == pytest.approx(5.0, abs=0.1)
+    shown = "[...document.querySelectorAll('.legend .item')].filter(n => !n.hidden).length"
+    before = browser.value(shown)
+    browser.value("document.querySelector('.toggles input').click()")
+    browser.wait_for(f"{shown} > {before}")
+    browser.value("document.querySelector('button.whole').click()")
+    assert browser.value("document.querySelector('.range').textContent") == "0.0 to 60.0 s (whole drive)"
+    assert browser.messages == []
+
+
+@pytest.mark.parametrize("kind", ["short", "standstill", "truthless", "failed", "one stamp"])
+def test_odd_drives_say_nothing_in_the_console(browser, tmp_path, kind):
+    tracks = {
+        "short": lambda: drive_tracks(3.0),
+        "standstill": lambda: drive_tracks(speed_m_s=0.0),
+        "truthless": lambda: drive_tracks(truth=False),
+        "failed": list,
+        "one stamp": lambda: drive_tracks(0.0),
+    }[kind]()
+    opened(browser, page_of(write_run(tmp_path, tracks, outcome="failed: for a test" if kind == "failed" else "ok")))
+
+
+def test_hostile_names_run_nothing(browser, tmp_path):
+    opened(browser, page_of(hostile_run(tmp_path / "out")))
+    assert "ran" not in browser.value("document.title").split()
+    assert browser.value("document.images.length") == 0
+    assert browser.value("document.scripts.length") == browser.value(
+        "document.querySelectorAll('script[type]').length + 3"
+    )
+    browser.value("document.querySelectorAll('.toggles input').forEach(n => n.click())")
+    browser.drag(".u-over", 0.1, 0.2)
+    time.sleep(0.2)
+    assert browser.messages == []
+    assert len(browser.requests) == 1
+
+
+def test_a_script_that_came_into_the_page_would_not_run(browser, tmp_path):
+    file = page_of(write_run(tmp_path, drive_tracks(3.0)))
+    text = file.read_text().replace("</main>", "<script>document.title='ran'</script><img src='x.png'></main>")
+    (file.parent / "x.png").write_bytes(_DOT)
+    file.write_text(text.replace("<h1>", "<h1 onclick=\"document.title='ran'\">"))
+    browser.open(file)
+    browser.value("document.querySelector('h1').click()")
+    assert browser.value("document.title") != "ran"
+    assert len([m for m in browser.messages if "Content Security Policy" in m]) >= 2
+    assert browser.value("document.images[0].naturalWidth") == 0
+
+
+def test_an_error_of_one_sample_is_seen_unzoomed_and_named(browser, tmp_path):
+    tracks = drive_tracks(3600.0, ("pd-hef", "physics"))
+    tracks[1].sideslip_rad[100_000] += np.radians(5.0)
+    opened(browser, page_of(write_run(tmp_path, tracks)))
+    # The column of the figure at 1000 s has a line in the estimator's colour nearly up to the top.
+    reach = browser.value(
+        """(() => {
+          const canvas = document.querySelector('[data-figure="error"] canvas:not(.legend canvas)');
+          const box = document.querySelector('[data-figure="error"] .u-over');
+          const k = canvas.width / canvas.clientWidth;
+          const x = Math.round((box.offsetLeft + box.offsetWidth * 1000 / 3600.1) * k);
+          const tall = Math.round(box.offsetHeight * k), top = Math.round(box.offsetTop * k);
+          const seen = canvas.getContext('2d').getImageData(x - 3, top, 7, tall).data;
+          let rows = 0;
+          for (let y = 0; y < tall; y++) for (let i = 0; i < 7; i++) {
+            const at = 4 * (7 * y + i);
+            if (seen[at] > 180 && seen[at + 1] > 60 && seen[at + 1] < 150 && seen[at + 2] < 90) { rows++; break; }
+          }
+          return rows / tall;
+        })()"""
+    )
+    assert reach > 0.7
+    assert "1000.000 s" in browser.value("document.querySelector('button.jump').textContent")
+
+
+def test_an_hour_of_fourteen_tracks_is_small_and_quick(browser, tmp_path):
+    file = page_of(write_run(tmp_path, drive_tracks(3600.0, NAMES)))
+    assert file.stat().st_size < 8_000_000
+    before = browser.busy_s()
+    opened(browser, file)
+    after = browser.busy_s()
+    # The clock of a page begins anew where the browser gives it another process.
+    assert (after - before if after > before else after) < FIRST_PICTURE_S
+    browser.value(_DRAWN)
+    times = []
+    for start, end in ((0.3, 0.6), (0.4, 0.5), (0.45, 0.55)):
+        before = browser.busy_s()
+        browser.drag(".u-over", start, end)
+        browser.value(_DRAWN)
+        times.append(browser.busy_s() - before)
+    assert np.median(times) < ZOOM_S
+
+
+def test_print_is_a4_with_figures(browser, tmp_path):
+    opened(browser, page_of(write_run(tmp_path, drive_tracks())))
+    browser.pdf(tmp_path / "page.pdf")
+    made = (tmp_path / "page.pdf").read_bytes()
+    assert made.startswith(b"%PDF")
+    assert len(made) > 50_000
+    browser.value(_DRAWN)
+    widths = browser.value("[...document.querySelectorAll('.canvas .uplot')].map(n => n.clientWidth)")
+    assert max(widths) > 1000  # back on the screen
+
+
+def test_a_browser_that_cannot_draw_says_so(browser, tmp_path):
+    file = page_of(write_run(tmp_path, drive_tracks(3.0)))
+    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source="delete window.DecompressionStream")
+    browser.call("Page.navigate", url=file.resolve().as_uri())
+    browser.wait_for("document.querySelector('.note') !== null")
+    assert "too old" in browser.value("document.querySelector('.note').textContent")
+    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])

@@ -1,0 +1,69 @@
+"""The page of a comparison."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pdhef_logtool.reports.comparison import comparison_page
+from pdhef_logtool.results.comparing import compare_runs
+from pdhef_logtool.results.gate import Figure, Gate
+from pdhef_logtool.results.opened_run import open_run
+from tests.reports.browser import CHROMIUM, WHY_NOT, Browser
+from tests.results.made_run import entry, write_run
+
+TEN = {f"d{i}": 0.001 * (1 + i) for i in range(10)}
+HOSTILE = "<img src=x onerror=alert(1)>"
+
+
+def _page(a: Path, b: Path, limit: float | None = 0.05) -> str:
+    return comparison_page(compare_runs(open_run(a), open_run(b), Gate((Figure(limit=limit),)))).decode()
+
+
+def _text(page: str) -> str:
+    body = page[page.index("<main>") : page.index("<footer>")]
+    return " ".join(re.sub(r"<[^>]*>", " ", body).split())
+
+
+def test_a_page_says_what_the_terminal_says(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    worse = {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())}
+    page = _page(a, write_run(tmp_path / "b", {**worse, "new": 0.1}, config={"friction": 0.3}))
+    text = _text(page)
+    assert "Verdict B is worse" in text
+    assert "Gate closed drives in B only: new" in text
+    assert "configuration: friction auto → 0.3" in text
+    assert "d9 0.573 0.6818 +19.0 %" in text
+    assert page.count('data-figure="') == 2
+
+
+def test_an_equal_run_has_a_page_that_says_so(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    assert "equal: all figures of all pairs are the same bit for bit" in _text(_page(a, a))
+    assert "Nothing changed, so that there is nothing to draw." in _text(_page(a, a))
+
+
+def test_names_that_are_markup_stay_texts_and_a_run_without_truth_has_a_page(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", {HOSTILE: float("nan"), "d": 0.1}, config={HOSTILE: 1})
+    entries = [entry(HOSTILE), entry("d", main=HOSTILE)]
+    b = write_run(tmp_path / "b", {HOSTILE: 0.1, "d": float("nan")}, entries=entries)
+    page = _page(a, b)
+    assert "<img" not in page
+    assert "no drive has the figure on both sides" in _text(page)
+    assert "No drive has the figure on both sides." in _text(page)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
+def test_a_browser_draws_both_figures_asks_for_nothing_and_says_nothing(tmp_path: Path) -> None:
+    a = write_run(tmp_path / "a", TEN)
+    b = write_run(tmp_path / "b", {label: value * (1.1 + 0.01 * i) for i, (label, value) in enumerate(TEN.items())})
+    file = tmp_path / "page.html"
+    file.write_text(_page(a, b), encoding="utf-8")
+    with Browser() as browser:
+        browser.open(file)
+        assert browser.messages == []
+        assert browser.requests == [file.resolve().as_uri()]
+        assert browser.value("document.querySelectorAll('.canvas canvas').length") == 2

@@ -1,0 +1,279 @@
+"""The page of a drive, without a browser: what it says of drives of every kind."""
+
+from __future__ import annotations
+
+import html
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from made_runs import START_NS, drive_tracks, write_run
+
+from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.reports.colours import colour, contrast
+from pdhef_logtool.reports.drive import drive_page, roles_of
+from pdhef_logtool.reports.pages import remove_pages, write_pages
+from pdhef_logtool.results.opened_run import open_run
+
+
+def page_of(folder: Path) -> str:
+    result = write_pages(open_run(folder))
+    assert result.wrong == ()
+    return result.pages[0].file.read_text(encoding="utf-8")
+
+
+def words(page: str) -> str:
+    body = page[page.index("<main>") : page.index("</main>")]
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", body)).split())
+
+
+def figures(page: str) -> dict:
+    return json.loads(re.search(r'id="document">(.*?)</script>', page, re.DOTALL)[1])["figures"]
+
+
+def test_a_page_has_its_figures_and_needs_nothing_else(tmp_path):
+    page = page_of(write_run(tmp_path, drive_tracks()))
+    assert {"sideslip", "error", "trust", "r_scale", "nis", "speed", "ay", "strip", "path", "phase"} <= set(
+        figures(page)
+    )
+    assert page.count("<script") == page.count("</script>")
+    assert re.findall(r'(?:src|href)="(?!data:|#)[^"]*"', page) == ['href="../../report.html"']
+    assert " style=" not in page
+    assert "Leon Sorokin" in page
+
+
+def test_the_same_run_gives_the_same_bytes(tmp_path):
+    folder = write_run(tmp_path, drive_tracks())
+    assert page_of(folder) == page_of(folder)
+
+
+def test_a_one_sample_error_is_in_the_table_with_its_exact_stamp_and_in_the_figure(tmp_path):
+    tracks = drive_tracks(duration_s=600.0)
+    tracks[1].sideslip_rad[12_345] += np.radians(5.0)
+    run = open_run(write_run(tmp_path, tracks))
+    page = drive_page(run.logs[0])
+    text = words(page.html.decode())
+    stamp = START_NS + 123_450_000_000
+    assert re.search(rf"1 (4\.9|5\.0)\d° \S+ \S+ 123\.450 s 2023-11-14T22:15:23\.450000000Z {stamp}", text)
+    errors = next(s for s in page.charts.figures["error"].series if s.label == "pd-hef")
+    assert np.nanmax(errors.values) == pytest.approx(5.0, abs=0.2)
+    assert page.charts.figures["error"].marks[0].at_s == pytest.approx(123.45)
+
+
+def test_sideslip_below_the_low_speed_blend_is_a_gap(tmp_path):
+    page = drive_page(open_run(write_run(tmp_path, drive_tracks())).logs[0])
+    for line in page.charts.figures["sideslip"].series:
+        cells = len(line.values)
+        assert np.isnan(line.values[int(0.42 * cells) : int(0.58 * cells)]).all()
+        assert np.isfinite(line.values[: int(0.38 * cells)]).all()
+
+
+def test_a_drive_of_three_seconds_says_that_it_is_short(tmp_path):
+    assert "only 3.0 s long" in words(page_of(write_run(tmp_path, drive_tracks(3.0))))
+
+
+def test_standstill_says_that_there_is_no_sideslip(tmp_path):
+    tracks = drive_tracks(speed_m_s=0.0)
+    page = page_of(write_run(tmp_path, tracks))
+    assert "never fast enough for a sideslip" in words(page)
+    assert "sideslip" not in figures(page)
+    assert "strip" in figures(page)
+
+
+def test_without_truth_the_page_says_why_there_is_no_score_and_shows_disagreement(tmp_path):
+    page = page_of(write_run(tmp_path, drive_tracks(truth=False)))
+    text = words(page)
+    assert "The log has no truth" in text
+    assert "Largest disagreements of pd-hef" in text
+    assert "pd-hef 1.033 –" in text  # NIS of 3.1 at 3 degrees of freedom
+    assert figures(page)["error"]["title"].startswith("Disagreement")
+    assert [s["label"] for s in figures(page)["error"]["series"]] == ["physics", "zero"]
+
+
+def test_one_estimator_without_truth_has_a_page(tmp_path):
+    page = page_of(write_run(tmp_path, drive_tracks(names=("zero",), truth=False)))
+    assert "error" not in figures(page)
+
+
+def test_a_log_that_failed_has_a_page_with_its_reason(tmp_path):
+    page = page_of(write_run(tmp_path, [], outcome="failed: no IMU <b>"))
+    assert "failed: no IMU &lt;b&gt;" in page
+
+
+@pytest.mark.parametrize("damage", ["absent", "cut", "empty"])
+def test_without_usable_estimates_the_page_says_so_and_shows_the_rest(tmp_path, damage):
+    folder = write_run(tmp_path, drive_tracks())
+    file = folder / "logs" / "drive" / "estimates.parquet"
+    if damage == "absent":
+        file.unlink()
+    else:
+        file.write_bytes(b"" if damage == "empty" else file.read_bytes()[:1000])
+    text = words(page_of(folder))
+    assert "estimates.parquet is not in the folder" in text if damage == "absent" else "cannot be drawn" in text
+    assert "Errors over the whole drive" in text
+
+
+def test_a_damaged_report_stops_no_other_page(tmp_path):
+    folder = write_run(tmp_path, drive_tracks())
+    other = folder / "logs" / "other"
+    other.mkdir()
+    (other / "report.json").write_text("{}")
+    document = json.loads((folder / "run.json").read_text())
+    document["logs"].insert(0, {**document["logs"][0], "log": "other"})
+    (folder / "run.json").write_text(json.dumps(document))
+    result = write_pages(open_run(folder))
+    assert result.exit_code in (0, 3)
+    assert result.pages[1].file.is_file()
+
+
+def test_tracks_of_one_row_and_of_unknown_values_have_a_page(tmp_path):
+    at = np.array([START_NS], dtype=np.int64)
+    nothing = make_track("pd-hef", at)
+    assert words(page_of(write_run(tmp_path, [nothing])))
+
+
+@pytest.mark.parametrize("outcome", ["better", "worse", "same", "undecided", "none"])
+def test_verdicts_stand_on_top(tmp_path, outcome):
+    verdict = {"signal": "sideslip_rad", "outcome": outcome, "text": "a sentence", "rival": "zero"}
+    folder = write_run(tmp_path, drive_tracks(), verdicts=[verdict])
+    page = page_of(folder)
+    assert "a sentence" in words(page)[:300]
+    assert roles_of(open_run(folder).logs[0].report()).rival == "zero"
+
+
+def test_budget_faults_and_innovations_are_shown_where_a_report_has_them(tmp_path):
+    moved = [{"name": "friction", "unit": "1", "value": -0.12}]
+    budget = {"reason": "", "seconds": 60.0, "rmse_rad": 0.01, "causes": [
+        {"name": "tyres", "rmse_left_rad": 0.004, "moved": moved, "reason": ""},
+        {"name": "delay", "rmse_left_rad": None, "moved": [], "reason": "not excited"}]}  # fmt: skip
+    faults = [{"sensor": "ay_m_s2", "kind": "stuck", "count": 1, "seconds": 2.0,
+               "intervals": [{"start_ns": START_NS + 10**9, "end_ns": START_NS + 3 * 10**9}]}]  # fmt: skip
+    innovations = [{"estimator": "physics", "channel": "ay_m_s2", "unit": "m/s^2", "n": 9, "mean": 0.1, "rms": 0.2,
+                    "autocorrelation": None}]  # fmt: skip
+    changes = {"error_budget": budget, "faults": faults, "innovations": innovations}
+    text = words(page_of(write_run(tmp_path, drive_tracks(), **changes)))
+    for said in ("tyres 0.229° 60.0%", "not excited", "ay_m_s2 stuck 1 2.00", "physics ay_m_s2 0.1 0.2"):
+        assert said in text
+
+
+HOSTILE = (
+    "</script><script>document.title='ran'</script>",
+    '"><img src=x onerror="document.title=\'ran\'">',
+    "../../../outside",
+    "long " + "x" * 10_000,
+    "\u202egnp.exe\u2066",
+    "{{ 7*7 }}{% raw %}",
+    "\x1b[31m\x00",
+    "\ud800",
+)
+
+
+def hostile_run(folder: Path) -> Path:
+    tracks = [*drive_tracks(), *drive_tracks(names=tuple(HOSTILE[:-1]), truth=False)]
+    tracks = [t for t in tracks if t.name != "truth"] + [t for t in tracks if t.name == "truth"]
+    name = HOSTILE[0].replace("/", "_")
+    all_of_it = " ".join(HOSTILE[:-1])
+    when = {"start_ns": START_NS, "end_ns": START_NS + 10**9}
+    return write_run(
+        folder,
+        tracks,
+        name,
+        outcome=f"lost: {all_of_it}",
+        warnings=list(HOSTILE),
+        remarks=list(HOSTILE),
+        losses=[{"kind": "gap", "what": h, "where": h, "count": 1, "severity": "lost", **when} for h in HOSTILE],
+        segments=[{"name": h, "text": h, **when} for h in HOSTILE],
+        checks=[
+            {"name": h, "subject": h, "verdict": "failed", "evidence": h, "remedy": h, "waived": False} for h in HOSTILE
+        ],
+        versions=dict.fromkeys(HOSTILE, all_of_it),
+        verdicts=[{"signal": h, "outcome": h, "text": h, "rival": h} for h in HOSTILE],
+        metadata=dict(zip(HOSTILE, HOSTILE, strict=True)),
+        vehicle={"name": all_of_it, "file": all_of_it, "sha256": "0", "proven": False},
+    )
+
+
+def test_hostile_names_are_text_and_nothing_is_written_outside(tmp_path):
+    inside = tmp_path / "a" / "b" / "out"
+    page = page_of(hostile_run(inside))
+    assert not re.search(r"<img|<script>document", page)
+    assert page.count("<script") == page.count("</script>") == page.count("<script type=") + 3
+    assert not re.search("[\u202e\u2066\x1b\x00]", page)
+    assert "x" * 2000 not in page
+    assert {p.name for p in (tmp_path / "a").iterdir()} == {"b"}
+    assert {p.name for p in (tmp_path / "a" / "b").iterdir()} == {"out"}
+    assert len(list(inside.rglob("report.html"))) == 2  # the drive's and the run's
+
+
+@pytest.mark.slow
+def test_a_page_that_another_run_left_goes(tmp_path):
+    folder = write_run(tmp_path, drive_tracks())
+    (folder / "logs" / "drive" / "figures").mkdir()
+    mine = folder / "logs" / "drive" / "figures" / "mine.png"
+    mine.write_bytes(b"")
+    write_pages(open_run(folder), png=True)
+    assert len(list(mine.parent.iterdir())) > 8
+    remove_pages(open_run(folder))
+    assert list(mine.parent.iterdir()) == [mine]
+    assert not (folder / "logs" / "drive" / "report.html").exists()
+
+
+def test_lines_stand_out_of_white_paper():
+    for name in ("truth", "zero", "physics", "pd-hef", "my own estimator"):
+        packed = int(colour(name)[1:], 16)
+        assert contrast((packed >> 16, packed >> 8 & 255, packed & 255)) >= 3.0
+
+
+@pytest.mark.parametrize("kind", ["protan", "deutan", "tritan"])
+def test_the_three_lines_that_are_always_drawn_differ_for_the_colour_blind(kind):
+    # Machado, Oliveira and Fernandes (2009), severity 1, on linear RGB; differences in CIELAB.
+    matrix = {
+        "protan": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+        "deutan": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+        "tritan": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+    }[kind]
+    seen = [_lab(np.clip(np.array(matrix) @ _linear(colour(n)), 0, 1)) for n in ("truth", "physics", "pd-hef")]
+    for i in range(3):
+        assert np.linalg.norm(seen[i] - seen[i - 1]) > 20.0
+
+
+def _linear(text: str) -> np.ndarray:
+    v = np.array([int(text[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return np.where(v <= 0.04045, v / 12.92, ((v + 0.055) / 1.055) ** 2.4)
+
+
+def _lab(rgb: np.ndarray) -> np.ndarray:
+    xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]) @ rgb
+    f = np.cbrt(np.maximum(xyz / np.array([0.9505, 1.0, 1.089]), 1e-6))
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def _report(*arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    command = [sys.executable, "-m", "pdhef_logtool", "report", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+
+
+def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path):
+    folder = write_run(tmp_path, drive_tracks())
+    result = _report(str(folder), "--open", "--json")
+    assert result.returncode == 0
+    document = json.loads(result.stdout)
+    assert document["logs"] == [
+        {"log": "drive", "page": str(folder / "logs" / "drive" / "report.html"), "pictures": [], "wrong": None}
+    ]
+    assert "there is no browser" in result.stderr
+
+
+def test_a_folder_that_is_no_run_is_one_line_and_is_not_made(tmp_path):
+    result = _report(str(tmp_path / "nothing"))
+    assert result.returncode == 1
+    assert "pdhef run LOG -o OUT writes one" in result.stderr
+    assert not (tmp_path / "nothing").exists()

@@ -1,0 +1,139 @@
+"""The page of a run: it says what is there, links to what it names, and runs nothing that a log says."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+from browser import CHROMIUM, WHY_NOT, Browser
+
+from pdhef_logtool.reports.fleet import fleet_page
+from pdhef_logtool.reports.pages import remove_pages, write_pages
+from pdhef_logtool.results.opened_run import open_run
+
+HOSTILE = "</script><script>alert(1)</script>\"'><img src=x onerror=alert(1)>\u202egnp"
+
+
+def run_of(folder: Path, drives: Mapping[str, Mapping[str, Any]], failed: Mapping[str, str] | None = None) -> Path:
+    """Write a run: ``drives`` with RMSE in rad of pd-hef and physics, and changes of the report; ``failed`` reasons."""
+    logs, rows = [], []
+    for label, drive in drives.items():
+        given = dict(drive)
+        for name, value in zip(("pd-hef", "physics"), given.pop("errors", ()), strict=False):
+            rows.append((label, name, "sideslip_rad", "all", "rmse", value))
+        cells = [{"speed": 1, "ay": 0, "seconds": 90.0, "scored": 9, "sideslip_mse_rad2": 1e-4}]
+        report = {
+            "format": "pdhef.report",
+            "log": {"name": label, "duration_s": 100.0, "kind": "mcap"},
+            "vehicle": {"name": "golf"},
+            "truth": {"available": True, "not_independent": []},
+            "answer": {"main": "pd-hef", "naive": "zero"},
+            "verdicts": [{"signal": "sideslip_rad", "outcome": "better", "text": "x"}],
+            "operating_space": {"speed_edges_m_s": [0, 5, 10], "ay_edges_m_s2": [0, 1], "cells": cells},
+            **given,
+        }
+        place = folder / "logs" / label
+        place.mkdir(parents=True)
+        (place / "report.json").write_text(json.dumps(report))
+        (place / "report.html").write_text("x")
+        logs.append({"log": label, "outcome": "ok", "car": None})
+    logs += [{"log": label, "outcome": f"failed: {reason}", "car": None} for label, reason in (failed or {}).items()]
+    columns = ["log", "estimator", "signal", "segment", "metric", "value"]
+    schema = {c: pl.Float64 if c == "value" else pl.String for c in columns}
+    pl.DataFrame(rows, schema=schema, orient="row").write_parquet(folder / "metrics.parquet")
+    (folder / "run.json").write_text(json.dumps({"format": "pdhef.run", "logs": logs, "versions": {"a": "1"}}))
+    return folder
+
+
+def words(folder: Path, **options: Any) -> str:
+    return fleet_page(open_run(folder), **options).html.decode()
+
+
+def test_a_run_with_everything_says_everything(tmp_path: Path) -> None:
+    drives: dict[str, dict[str, Any]] = {
+        f"d{i}": {"errors": (0.001 * (1 + i), 0.0015 * (1 + i)), "metadata": {"road": "ab"[i // 4]}} for i in range(8)
+    }
+    drives["blind"] = {"truth": {"available": False, "not_independent": []}}
+    page = words(run_of(tmp_path, drives, {"bad": "/x/bad.mcap: expected a log, got 3 bytes"}))
+    assert "9 with a report" in page and "8 scored" in page and "1 of 10 logs failed" in page
+    assert "50.0% above the answer" in page and "the answer is better" in page
+    assert '<a href="logs/d7/report.html">d7</a>' in page
+    assert "the log has no truth" in page and "expected a log, got 3 bytes" in page
+    assert "<h3>road" in page
+    assert 'class="empty"' in page and "14 min" in page
+    for key in ("medians", "spread", "against"):
+        assert f'data-figure="{key}"' in page
+
+
+def test_one_log_has_a_short_page(tmp_path: Path) -> None:
+    page = words(run_of(tmp_path, {"only": {"errors": (0.001, 0.0015)}}))
+    assert "The answer is 0.057° RMSE off." in page
+    assert "Ranking" not in page and "Breakdown" not in page and "data-figure" not in page.split("<script")[0]
+    assert 'href="logs/only/report.html"' in page
+
+
+@pytest.mark.parametrize("drives", [{}, {"a": {"truth": {"available": False, "not_independent": []}}}])
+def test_without_a_score_there_is_no_verdict_and_no_empty_figure(tmp_path: Path, drives: dict[str, Any]) -> None:
+    page = words(run_of(tmp_path, drives, {"bad": "empty"}))
+    assert "No verdict" in page and "<figure" not in page.split("<script type")[0]
+
+
+def test_what_logs_say_is_text(tmp_path: Path) -> None:
+    drives = {f"d{i}": {"errors": (0.001, 0.002), "metadata": {HOSTILE: HOSTILE[: 20 + i % 2]}} for i in range(4)}
+    page = words(run_of(tmp_path, drives, {"bad": HOSTILE}))
+    assert "<script>alert" not in page and "<img" not in page and "\u202e" not in page
+    assert "&lt;/script&gt;" in page
+
+
+def test_a_key_can_be_asked_for(tmp_path: Path) -> None:
+    drives = {f"d{i}": {"errors": (0.001, 0.002), "metadata": {"who": f"x{i}"}} for i in range(3)}
+    folder = run_of(tmp_path, drives)
+    assert "<h3>who" not in words(folder)
+    assert re.search(r"<h3>who.*<td>x2</td>", words(folder, by=["who"]), re.DOTALL)
+
+
+def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
+    drives: dict[str, dict[str, Any]] = {f"d{i}": {"errors": (0.001, 0.002)} for i in range(4)}
+    folder = run_of(tmp_path, drives, {"bad": "empty"})
+    written = write_pages(open_run(folder), png=True)
+    assert written.fleet.file == folder / "report.html"
+    assert {p.name for p in written.fleet.pictures} == {"medians.png", "spread.png", "against.png"}
+    assert 'href="logs/bad/report.html"' in (folder / "report.html").read_text()
+    assert 'href="../../report.html"' in (folder / "logs" / "bad" / "report.html").read_text()
+    assert written.to_dict()["page"] == str(folder / "report.html")
+    remove_pages(open_run(folder))
+    assert not [*folder.rglob("*.html"), *folder.rglob("*.png")]
+
+
+def test_a_damaged_table_is_told_and_stops_no_other_page(tmp_path: Path) -> None:
+    folder = run_of(tmp_path, {"a": {"errors": (0.001, 0.002)}}, {"bad": "empty"})
+    (folder / "metrics.parquet").write_bytes(b"PAR1 no")
+    written = write_pages(open_run(folder))
+    assert written.fleet.file is None and written.exit_code == 3
+    assert any("no page of the run" in line for line in written.wrong)
+    assert written.pages[1].file is not None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason=WHY_NOT)
+def test_in_a_browser_the_page_draws_its_figures_asks_for_nothing_and_runs_nothing(tmp_path: Path) -> None:
+    drives = {
+        f"d{i}": {"errors": (0.001 * (1 + i), 0.002), "metadata": {HOSTILE: HOSTILE[: 20 + i % 2]}} for i in range(9)
+    }
+    folder = run_of(tmp_path, drives, {"bad": HOSTILE})
+    write_pages(open_run(folder))
+    page = folder / "report.html"
+    with Browser() as browser:
+        browser.open(page)
+        assert browser.value("document.querySelectorAll('[data-figure] canvas').length") >= 3
+        assert browser.messages == [] and browser.requests == [page.resolve().as_uri()]
+        overflow = browser.value("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+        assert overflow <= 0

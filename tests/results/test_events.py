@@ -1,0 +1,180 @@
+"""Where something holds in the drives of a run, and clips of it."""
+
+from __future__ import annotations
+
+import json
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.results.clips import write_clips
+from pdhef_logtool.results.events import FoundEvents, find_events, write_events
+from pdhef_logtool.results.expression import parse_condition
+from pdhef_logtool.results.opened_run import open_run
+from tests.results.made_run import START_NS, entry, write_estimates, write_run
+from tests.run_report import report
+from tests.sinks import source_log
+
+N = 600
+
+
+def _find(folder: Path, where: str, **options: Any) -> FoundEvents:
+    return find_events(open_run(folder), parse_condition(where), **options)
+
+
+def _report(folder: Path, label: str, **vehicle: Any) -> None:
+    document = report()
+    document["log"] |= {"name": label, "start_ns": START_NS - 1_000_000_000, "end_ns": START_NS + 10_000_000_000}
+    document["vehicle"] |= vehicle
+    place = folder / "logs" / label / "report.json"
+    place.parent.mkdir(parents=True, exist_ok=True)
+    place.write_text(json.dumps(document))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = write_run(
+        tmp_path / "out",
+        {},
+        entries=[entry("a"), entry("b"), entry("no_truth"), entry("bad", outcome="failed: empty", main=None)],
+    )
+    slip = np.zeros(N)
+    slip[100:111] = np.deg2rad(np.linspace(1.0, 3.0, 11))
+    slip[130:141] = -np.deg2rad(4.0)
+    speed = np.full(N, 20.0)
+    speed[:50] = 2.0
+    still = {"vx_m_s": speed, "vy_m_s": np.zeros(N), "sideslip_rad": np.zeros(N)}
+    wild = {
+        "vx_m_s": speed,
+        "vy_m_s": np.zeros(N),
+        "sideslip_rad": np.full(N, np.pi) * np.where(np.arange(N) < 50, 1, 0),
+    }
+    valid = np.ones(N, dtype=np.bool_)
+    valid[105:] = False
+    write_estimates(folder, "a", truth=still, pd_hef={**still, "sideslip_rad": slip}, physics=still)
+    write_estimates(folder, "b", truth=still, pd_hef={**wild, "valid": valid})
+    write_estimates(folder, "no_truth", pd_hef=still)
+    for label in ("a", "b", "no_truth"):
+        _report(folder, label)
+    return folder
+
+
+def test_rows_have_drive_start_end_and_peak(run: Path) -> None:
+    found = _find(run, "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10")
+    first, second = found.events
+    assert (first.drive, second.drive, found.searched) == ("a", "a", 2)
+    assert (first.start_ns, first.end_ns) == (START_NS + 1_030_000_000, START_NS + 1_100_000_001)
+    assert first.start_s == pytest.approx(2.03)
+    assert (first.peak, first.peak_ns) == (pytest.approx(3.0), START_NS + 1_100_000_000)
+    assert second.peak == pytest.approx(4.0)
+    assert found.left_out == {"no_truth": "it has no truth", "bad": "failed: empty"}
+    assert found.exit_code == 3
+
+
+def test_room_around_events_joins_them(run: Path) -> None:
+    where = "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10"
+    assert len(_find(run, where, pad_s=0.09).events) == 2
+    (one,) = _find(run, where, pad_s=0.1).events
+    assert (one.start_ns, one.end_ns) == (START_NS + 1_030_000_000, START_NS + 1_400_000_001)
+    assert one.peak == pytest.approx(4.0)
+
+
+def test_what_holds_too_short_is_none(run: Path) -> None:
+    assert len(_find(run, "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10 for 0.1s").events) == 1
+    assert not _find(run, "abs(sideslip_error_deg) > 1.5 and speed_m_s > 10 for 0.2s").events
+
+
+def test_an_error_is_known_only_where_it_is_scored(run: Path) -> None:
+    assert [e.drive for e in _find(run, "abs(sideslip_error_deg) > 170").events] == ["b"]
+    _report(run, "b", low_speed_blend_m_s=3.0)
+    assert not _find(run, "abs(sideslip_error_deg) > 170").events
+    unknown = _find(run, "not abs(vx_error_m_s) > 1").events  # an error of what is not valid is not below 1 either
+    assert {e.drive: round(e.end_s, 2) for e in unknown} == {"a": 6.99, "b": 2.04}
+
+
+def test_other_tracks_are_read_at_the_same_stamps(run: Path, tmp_path: Path) -> None:
+    found = _find(run, "abs(sideslip_deg - physics.sideslip_deg) > 2.5")
+    assert [e.drive for e in found.events] == ["a", "a"]
+    assert found.left_out["b"] == "it has no estimator physics"
+    assert len(_find(run, "speed_km_h < 8", estimator="physics").events) == 1
+    with pytest.raises(UsageError, match="an estimator of this run: pd-hef, physics, truth, got ukf"):
+        _find(run, "ukf.sideslip_deg > 1")
+    with pytest.raises(UsageError, match="--estimator: expected an estimator of this run"):
+        _find(run, "sideslip_deg > 1", estimator="ukf")
+    scored = write_run(tmp_path / "scored", {}, entries=[entry("a", main=None)])
+    write_estimates(scored, "a", esc={"vx_m_s": np.ones(9)})
+    with pytest.raises(UsageError, match="an estimator of this run: esc, got none named"):
+        _find(scored, "vx_m_s > 0")
+    assert len(_find(scored, "vx_m_s > 0", estimator="esc").events) == 1
+    with pytest.raises(UsageError, match="a minus between columns needs spaces"):
+        _find(run, "vx_m_s-truth.vx_m_s > 1")
+
+
+def test_a_peak_of_what_falls_is_its_smallest(run: Path) -> None:
+    assert {e.peak for e in _find(run, "speed_m_s < 3").events} == {2.0}
+    assert _find(run, "not valid").events[0].peak is None
+
+
+def test_a_damaged_file_leaves_a_drive_out(run: Path) -> None:
+    (run / "logs" / "a" / "estimates.parquet").write_bytes(b"PAR1 no")
+    found = _find(run, "speed_m_s > 1")
+    assert found.left_out["a"].startswith("one that cannot be read")
+    assert (found.exit_code, {e.drive for e in found.events}) == (3, {"b", "no_truth"})
+
+
+def test_rows_are_written_as_parquet_even_none(run: Path, tmp_path: Path) -> None:
+    write_events(tmp_path / "e.parquet", _find(run, "speed_m_s < 3"))
+    table = pl.read_parquet(tmp_path / "e.parquet")
+    assert table["drive"].to_list() == ["a", "b", "no_truth"]
+    write_events(tmp_path / "e.parquet", _find(run, "speed_m_s > 300"))
+    assert pl.read_parquet(tmp_path / "e.parquet").schema == table.schema
+
+
+@pytest.fixture
+def clipped(tmp_path: Path) -> tuple[Path, Path]:
+    """Return a run without full copies, and the folder with its log."""
+    logs = tmp_path / "logs" / "deep"
+    logs.mkdir(parents=True)
+    source_log.write_source(logs / "drive.mcap")
+    from pdhef_logtool.logs.discovery import hash_log
+
+    sha256 = hash_log(logs / "drive.mcap")
+    folder = write_run(tmp_path / "out", {}, entries=[entry("drive", file="drive.mcap", sha256=sha256)])
+    slip = np.zeros(N)
+    slip[300:310] = 1.0
+    stamps = source_log.START_NS + 10_000_000 * np.arange(N, dtype=np.int64)
+    write_estimates(folder, "drive", pd_hef={"sideslip_rad": slip, "stamps_ns": stamps})
+    _report(folder, "drive")
+    return folder, tmp_path / "logs"
+
+
+def test_a_clip_has_the_topics_of_the_source_and_ours_around_the_event(clipped: tuple[Path, Path]) -> None:
+    folder, logs = clipped
+    found = _find(folder, "sideslip_rad > 0.5", pad_s=1.0)
+    (name,) = write_clips(open_run(folder), found, pad_s=1.0, source=logs).clips
+    with closing(open_log(folder / name)) as clip:
+        assert {"/imu", "/can/speed", "/pdhef/pd_hef/state"} <= {t.name for t in clip.topics}
+        assert clip.start_ns >= source_log.START_NS + 2_000_000_000
+        assert clip.end_ns <= source_log.START_NS + 4_100_000_000
+        messages = {t.name: t.messages for t in clip.topics}
+        assert (messages["/imu"], messages["/pdhef/pd_hef/state"]) == (209, 210)
+    write_clips(open_run(folder), _find(folder, "sideslip_rad > 2"), pad_s=1.0, source=logs)
+    assert list((folder / "clips").iterdir()) == []  # those of the last search alone
+
+
+def test_a_source_that_is_not_found_or_is_another_file_is_told(clipped: tuple[Path, Path], tmp_path: Path) -> None:
+    folder, logs = clipped
+    found = _find(folder, "sideslip_rad > 0.5")
+    told: list[str] = []
+    without = write_clips(open_run(folder), found, pad_s=1.0, tell=told.append)
+    assert (without.clips, without.exit_code) == ((), 3)
+    assert "--source DIR" in told[0]
+    (logs / "deep" / "drive.mcap").write_bytes(b"another")
+    write_clips(open_run(folder), found, pad_s=1.0, source=logs, tell=told.append)
+    assert "1 of that name with other content" in told[1]
