@@ -71,7 +71,7 @@ class AnnotatedMcapSink(Sink):
 
     Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp) and ``odometry`` (``nav_msgs/msg/Odometry``, the
     stamps that are valid and have a pose, as the message can say neither). Log and publish time are the scored stamp.
-    Numbers are rounded to single precision, 6e-8 of their size, and positions to 0.12 mm: the file is a third smaller.
+    Numbers are rounded to single precision, 6e-8 of their size, positions to 0.12 mm: a quarter less of ours.
     Everything that an earlier annotation left in the source is replaced.
 
     Parameters

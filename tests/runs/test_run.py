@@ -329,3 +329,29 @@ def test_a_part_that_is_not_used_is_told(sample_logs_dir: Path, tmp_path: Path) 
         estimates = pl.read_parquet(tmp_path / name / "logs/dlc/estimates.parquet")
         offset[name] = float(estimates.filter(pl.col("estimator") == "open-loop")["sideslip_rad"].abs().mean())
     assert offset["same"] > 1.5 * offset["other"]
+
+
+@pytest.mark.slow
+def test_an_annotated_log_holds_the_answer_and_the_recordings_of_a_run_are_one_dataset(
+    sample_logs_dir: Path, tmp_path: Path
+) -> None:
+    from mcap.reader import make_reader
+    from rerun.chunk import RrdReader
+
+    run_logs(
+        [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")],
+        tmp_path,
+        _config(sample_logs_dir, annotate="sidecar"),
+    )
+    entries = []
+    for name in ("dlc", "step"):
+        folder = tmp_path / "logs" / name
+        main = json.loads((folder / "report.json").read_text())["answer"]["main"].replace("-", "_")
+        with (folder / "annotated.mcap").open("rb") as stream:
+            topics = {c.topic for c in make_reader(stream).get_summary().channels.values()}
+        assert topics == {f"/pdhef/{who}/{what}" for who in (main, "truth") for what in ("state", "odometry")}
+        plotted = json.loads((folder / "foxglove.json").read_text())["configById"]["3D!way"]["topics"]
+        assert set(plotted) == {topic for topic in topics if topic.endswith("odometry")}
+        entries += RrdReader(folder / "recording.rrd").recordings()
+    assert len({entry.application_id for entry in entries}) == 1
+    assert len({entry.recording_id for entry in entries}) == 2

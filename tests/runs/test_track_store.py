@@ -44,3 +44,26 @@ def test_rows_of_a_stored_record_are_those_of_the_record(tmp_path):
             assert [call.args[2] for call in read.call_args_list] == [2]
         with pytest.raises(AttributeError):
             _ = part.no_such_column
+
+
+def test_windows_come_back_as_they_were_added_with_what_is_drawn(tmp_path):
+    parts = (slice(0, 4), slice(4, 4), slice(4, 10))
+    columns = [STAMPS * float(i) for i in range(6)]
+    signals = Signals(STAMPS, STAMPS, *columns, wheel_speed_m_s=np.ones((10, 4)), available=frozenset({"ay_m_s2"}))
+    truth = make_track("truth", STAMPS, vx_m_s=STAMPS * 1.0)
+    drawn = make_track("truth", STAMPS, vx_m_s=STAMPS * 2.0)
+    with TrackStore(tmp_path / "tracks") as store:
+        for part in parts:
+            rows = part.start, part.stop
+            store.append_signals(signals.rows(*rows))
+            store.append(truth.rows(*rows))
+            store.append_drawn(drawn.rows(*rows))
+            store.append(make_track("ukf", STAMPS[part], vx_m_s=STAMPS[part] * 3.0), drawn=True)
+        windows = list(store.windows())
+        np.testing.assert_array_equal(store.read("truth").vx_m_s, truth.vx_m_s)
+    for part, (of_window, tracks) in zip(parts, windows, strict=True):
+        np.testing.assert_array_equal(of_window.stamps_ns, STAMPS[part])
+        assert of_window.available == {"ay_m_s2"}
+        assert [t.name for t in tracks] == ["truth", "ukf"]
+        for track, factor in zip(tracks, (2.0, 3.0), strict=True):
+            np.testing.assert_array_equal(track.vx_m_s, STAMPS[part] * factor)
