@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table
+from pdhef_logtool.results.opened_run import PAGE_FILE
 from pdhef_logtool.sinks.answer import NEARLY_HOLDS, degrees
 from pdhef_logtool.sinks.report import diverged_line, reasons_line
 
@@ -86,7 +87,9 @@ def render_run(result: RunResult, console: Console) -> None:
         done = f"{len(result.results) - len(failed)} done, {len(failed)} failed, {len(lost)} with input lost"
         console.print(f"{len(result.results)} logs: {done}")
     if result.output is not None:
-        console.print(f"outputs in {result.output}", soft_wrap=True)
+        page = result.output / PAGE_FILE
+        shown = f"; open {page} in a browser" if page.is_file() else ""
+        console.print(f"outputs in {result.output}{shown}", soft_wrap=True)
 
 
 def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:
