@@ -14,7 +14,7 @@ import re
 import shutil
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from pathlib import Path
 from typing import Self
 
@@ -84,6 +84,7 @@ class FolderTransaction(Transaction):
     Parameters
     ----------
     target : the folder, which the process must hold. keep : whether what the new one has not is kept.
+    stale : names of files that are not, as they tell of what is replaced.
 
     Raises
     ------
@@ -91,8 +92,9 @@ class FolderTransaction(Transaction):
         The folder cannot be made.
     """
 
-    def __init__(self, target: Path, *, keep: bool = True) -> None:
+    def __init__(self, target: Path, *, keep: bool = True, stale: Container[str] = ()) -> None:
         self.target = target
+        self._stale = stale
         self._place = Path(os.path.realpath(target))
         self._keep = keep
         self._work = self._place.parent / WORK / self._place.name
@@ -134,7 +136,7 @@ class FolderTransaction(Transaction):
                 if self._place.is_dir():
                     shutil.copymode(self._place, self._new)
                     if self._keep:
-                        _take_over(self._place, self._new)
+                        _take_over(self._place, self._new, self._stale)
                 _sync_all(self._new)
                 _take_place(self._new, self._place, self._old)
                 sync(self._place.parent)
@@ -167,9 +169,9 @@ class OutputFolder:
         self._parts = tuple(parts)
         self._lock = FolderLock(path)
 
-    def begin(self, name: str) -> Transaction:
-        """Begin to replace the folder of a name, such as ``logs/drive``; raises OutputError."""
-        return FolderTransaction(self.path / name)
+    def begin(self, name: str, stale: Container[str] = ()) -> Transaction:
+        """Begin to replace a folder, such as ``logs/drive``, without its stale files; raises OutputError."""
+        return FolderTransaction(self.path / name, stale=stale)
 
     def sweep(self) -> None:
         """Remove what killed commands left here, and finish an exchange that one was killed in."""
@@ -389,11 +391,11 @@ def _sync_all(folder: Path) -> None:
         sync(path)
 
 
-def _take_over(old: Path, new: Path) -> None:
-    """Give everything of the old folder that the new one has not a second name there."""
+def _take_over(old: Path, new: Path, stale: Container[str]) -> None:
+    """Give everything of the old folder that the new one has not, but for stale files, a second name there."""
     for path in old.iterdir():
         to = new / path.name
-        if os.path.lexists(to):
+        if path.name in stale or os.path.lexists(to):
             continue
         if path.is_symlink():
             to.symlink_to(path.readlink())

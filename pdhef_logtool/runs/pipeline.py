@@ -369,7 +369,7 @@ def _run_estimators(
     drive, car, ready = job.drive, job.car, job.ready
     algorithms = {e.name: resolve(e) for e in ready}
     intervals = calibrator(car, ready)
-    with outputs.begin(log_place(drive.name)) as change, ExitStack() as opened:
+    with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         signals = _estimate(drive, ready, intervals, store, progress)
         sensors = log_sensors(drive.car.vehicle, job.calibration)

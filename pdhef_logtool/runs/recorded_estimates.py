@@ -49,7 +49,7 @@ from pdhef_logtool.records.signals import (
 )
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 from pdhef_logtool.residual_model.bundle import NO_MODEL
-from pdhef_logtool.results.opened_run import LOGS
+from pdhef_logtool.results.opened_run import LOGS, PAGE_FILE
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimate_channels import RecordedEstimate, gap_ns, read_estimate
 from pdhef_logtool.runs.estimating import DeadReckoning, first_pose
@@ -215,7 +215,7 @@ class _Scoring:
         folder = None
         if outputs is not None:
             written = valid_as_a_whole(truth_track, plan.derivation, self.car.vehicle.standstill_m_s)
-            with outputs.begin(log_place(drive.name)) as change:
+            with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change:
                 _write(change, report, rows, [written, *(r.track for r in recorded)], plan)
             folder = change.target
         progress(drive.name, 1.0)
