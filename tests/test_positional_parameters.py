@@ -29,6 +29,7 @@ def overlong(source: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", ["pdhef_logtool", "truthsim", "studies", "benchmarks"])
 def test_no_function_takes_many_positional_parameters(package: str) -> None:
     found = {str(p.relative_to(_ROOT)): overlong(p.read_text()) for p in sorted((_ROOT / package).rglob("*.py"))}

@@ -677,6 +677,7 @@ def test_a_place_that_cannot_be_written_is_one_line(folder: Path, tmp_path: Path
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("new", [False, True])
 def test_changes_by_several_commands_at_once_are_all_there(folder: Path, new: bool) -> None:
     car = load(folder)

@@ -249,6 +249,7 @@ def test_the_files_of_the_project_are_taken(path):
     load_vehicle(path)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, deadline=None, max_examples=200)
 @given(
     size=st.floats(0.1, 2.6),

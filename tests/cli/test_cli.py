@@ -40,7 +40,7 @@ def test_help_names_every_command_with_a_whole_sentence() -> None:
     assert all(line.endswith(".") and not line.endswith("...") for line in listed)
 
 
-@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("width", [80, pytest.param(120, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_says_what_the_command_does(command: str, width: int) -> None:
     result = _pdhef(*command.split(), "--help", env={"COLUMNS": str(width)})
@@ -53,7 +53,9 @@ def test_help_says_what_the_command_does(command: str, width: int) -> None:
         assert examples[0].startswith(f"    pdhef {command} ")
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS])
+@pytest.mark.parametrize(
+    "command", ["", "run", *(pytest.param(c, marks=pytest.mark.slow) for c in COMMANDS if c != "run")]
+)
 def test_help_imports_nothing_heavy(command: str) -> None:
     heavy = {"numpy", "numba", "torch", "polars", "pyarrow", "rerun", "rich", "scipy", "rosbags", "mcap", "truthsim"}
     # Typer itself reads the options of a single command by pydantic.
@@ -110,6 +112,7 @@ def test_what_is_no_log_is_one_line_and_exit_code_1(tmp_path: Path, content: byt
         assert result.stdout == ""
 
 
+@pytest.mark.slow
 def test_missing_log_is_one_line_and_exit_code_1(tmp_path: Path) -> None:
     result = _pdhef("run", str(tmp_path / "none.mcap"), "-o", str(tmp_path / "out"))
     assert result.returncode == 1
@@ -137,6 +140,7 @@ def test_usage_errors_are_one_line_and_exit_code_2(
     _one_line_error(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -286,6 +290,7 @@ def test_simulate_writes_a_log_that_inspect_reads(tmp_path: Path) -> None:
     assert {"steer_rad", "ay_m_s2", "yaw_rate_rad_s"} <= json.loads(seen.stdout)["signals"].keys()
 
 
+@pytest.mark.slow
 def test_list_of_manoeuvres_names_the_demo_ones() -> None:
     result = _pdhef("simulate", "--list", "--json")
     assert {"dlc", "sine-sweep", "road"} <= {m["name"] for m in json.loads(result.stdout)["manoeuvres"]}
@@ -303,6 +308,7 @@ def _run_of(folder: Path, *names: str) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_view_says_what_is_missing(tmp_path: Path) -> None:
     result = _pdhef("view", str(tmp_path))
     assert result.returncode == 1
@@ -363,6 +369,7 @@ def test_log_without_truth_shows_what_there_is_instead(sample_logs_dir: Path, tm
     assert "RMSE" not in result.stdout
 
 
+@pytest.mark.slow
 def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp_path: Path) -> None:
     result = _pdhef("map", str(sample_logs_dir / "dlc.mcap"), "-o", "m.toml", cwd=tmp_path)
     assert result.returncode == 0
@@ -371,6 +378,7 @@ def test_map_without_a_terminal_writes_what_was_found(sample_logs_dir: Path, tmp
     assert "one that exists" in _one_line_error(again)
 
 
+@pytest.mark.slow
 def test_a_topic_goes_with_fields(sample_logs_dir: Path) -> None:
     log = str(sample_logs_dir / "dlc.mcap")
     assert "angular_velocity.z" in _pdhef("inspect", log, "--fields", "/imu/data").stdout

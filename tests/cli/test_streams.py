@@ -27,6 +27,7 @@ def test_a_reader_that_has_had_enough_hears_nothing(sample_logs_dir: Path, argum
     assert (done.returncode, done.stderr) == (141, "")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("arguments", [["simulate", "--list"], ["estimators", "--json"], ["--help"], ["--version"]])
 def test_an_output_that_takes_nothing_is_one_line(arguments: list[str]) -> None:

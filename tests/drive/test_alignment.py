@@ -235,6 +235,7 @@ def test_a_measurement_at_half_the_rate_is_given_at_half_the_stamps():
     np.testing.assert_allclose(signals.speed_m_s[good], seconds(signals.stamps_ns[good]), atol=1e-6)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=50, deadline=None)
 @given(seed=st.integers(0, 10**6), count=st.integers(5, 900))
 def test_never_more_measurements_than_samples(seed, count):
@@ -347,6 +348,7 @@ def test_slowly_drifting_clocks_are_not_lateness():
     assert np.isfinite(whole(channels, plan).speed_m_s).all()
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=40, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_lateness_matches_a_plain_loop(seed):
@@ -380,6 +382,7 @@ def ragged(rng, name, topic, rate, share_late):
     return channel(name, stamps, rng.normal(size=stamps.size), delay_ns=delay, topic=topic)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=40, deadline=None)
 @given(
     seed=st.integers(0, 10**6), cuts=st.lists(st.integers(0, 40_000), min_size=1, max_size=5), late=st.floats(0, 0.2)

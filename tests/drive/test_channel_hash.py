@@ -119,6 +119,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[str | No
     return path, _hashes(path)
 
 
+@pytest.mark.slow
 def test_a_slim_copy_other_containers_and_other_windows_have_one_hash(
     tmp_path: Path, full: tuple[Path, tuple[str, str]]
 ) -> None:

@@ -96,6 +96,7 @@ def test_right_drives_fail_nothing(seed: int, calm: bool) -> None:
     assert failed(drive(seed, calm=calm)) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "factor"), CASES)
 def test_every_mistake_is_found_and_its_signal_named(name: str, factor: float) -> None:
     channels = drive(3)
@@ -169,6 +170,7 @@ def test_standing_or_missing_data_decide_nothing() -> None:
     assert verdicts(check_drive({"speed_m_s": channels["speed_m_s"]}), "undecided") == {"speed_m_s.sign"}
 
 
+@pytest.mark.slow
 def test_a_gap_and_an_absurd_stamp_do_no_harm() -> None:
     channels = drive(7, duration_s=120.0)
     for name, c in list(channels.items()):
@@ -212,6 +214,7 @@ def saloon(sample_logs_dir: Path) -> VehicleParameters:
     return Car.load(sample_logs_dir / "vehicle.toml").vehicle.model_copy(update={"name": "saloon"})
 
 
+@pytest.mark.slow
 def test_a_sound_road_passes_everything(road: MappedChannels, saloon: VehicleParameters) -> None:
     checks = checked(road, saloon)
     assert {c.verdict for c in checks} == {"passed"}
@@ -220,6 +223,7 @@ def test_a_sound_road_passes_everything(road: MappedChannels, saloon: VehiclePar
     assert subjects == set(road.signals) | truth | {"vehicle"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("factors", "subjects"),
     [
@@ -250,6 +254,7 @@ def test_a_truth_that_is_turned_by_half_a_degree(road: MappedChannels) -> None:
     assert verdicts(checks, "failed") == {"truth.sideslip_rad.offset"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "name"),
     [
@@ -283,6 +288,7 @@ DRIVES = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("file", "mapping_name"), DRIVES)
 def test_recorded_drives_fail_nothing(shared_dir: Path, file: str, mapping_name: str) -> None:
     checks = checked(survey(shared_dir / "data" / "drives" / file, mapping_name))
@@ -291,6 +297,7 @@ def test_recorded_drives_fail_nothing(shared_dir: Path, file: str, mapping_name:
     assert verdicts(checks, "failed") == known
 
 
+@pytest.mark.slow
 def test_every_mistake_is_found_on_a_recorded_drive(shared_dir: Path) -> None:
     found = survey(shared_dir / "data" / "drives" / "revs_250lm_a.mcap", "revs_250lm")
     for name, factor in CASES:

@@ -58,6 +58,7 @@ def components(log):
     return read_signals(log, sources, clocks, log.start_ns, log.end_ns), triads, mapping
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angles", ANGLES)
 def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles: tuple[float, float, float]) -> None:
     channels, triads, mapping = components
@@ -73,6 +74,7 @@ def test_every_mounting_in_steps_of_90_degrees_is_found(components, angles: tupl
     assert found.is_as_named == (angles == (0, 0, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angles", [(0, 0, 0), (0, 90, 0), (180, 0, 270)])
 def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles: tuple[float, float, float]) -> None:
     turned = TurnedLog(log, rotation(*angles))
@@ -86,6 +88,7 @@ def test_a_recognised_imu_is_read_as_it_is_mounted(log, angles: tuple[float, flo
         assert all(isinstance(plan.mapping.signals[n].field, str) for n in IMU), "one field is enough"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angles", [(7, 0, 0), (180, 0, 30)])
 def test_a_mounting_askew_is_found_to_two_degrees(log, angles: tuple[float, float, float]) -> None:
     turned = TurnedLog(log, rotation(*angles))

@@ -60,6 +60,7 @@ def test_a_sound_log_uses_every_sample(sample_logs_dir: Path, car: Car) -> None:
     assert {reason for s in drive.sample_ledger for reason in s.dropped} == {"outside-slice"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_ns", [0, 2**64 - 1])
 def test_one_message_at_the_end_of_time(at_ns: int, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
     def shift(number: int, at_s: float, topic: str) -> int:
@@ -86,6 +87,7 @@ def test_a_clock_that_is_set(until_s: float, kept: float, sample_logs_dir: Path,
     assert (whole.signals.stamps_ns[0] < START) == (until_s > 5.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [30_000, 1 << 26])
 def test_a_clock_that_steps_back(chunk: int, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
     """Log time and header stamps fall back by 3 s: the times that come twice are left out, and a gap shows the step."""
@@ -113,6 +115,7 @@ def shifts() -> dict[str, Shift]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", shifts())
 def test_header_stamps_that_are_no_time(name: str, sample_logs_dir: Path, tmp_path: Path, car: Car) -> None:
     log = tmp_path / "headers.mcap"

@@ -331,6 +331,7 @@ def test_headings_are_interpolated_the_shorter_way():
     np.testing.assert_allclose(np.exp(1j * out.yaw_rad), np.exp(1j * (3.05 + 0.1 * np.arange(9))), atol=1e-12)
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=25, deadline=None)
 @given(
     kind=st.sampled_from(KINDS),

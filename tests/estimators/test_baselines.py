@@ -37,6 +37,7 @@ def drive(car: Car, request: pytest.FixtureRequest) -> tuple[WholeDrive, dict[st
         return d.whole(), STRENGTH[request.param]
 
 
+@pytest.mark.slow
 def test_no_baseline_is_weaker_than_it_was(car: Car, drive: tuple[WholeDrive, dict[str, float]]) -> None:
     whole, strength = drive
     assert whole.truth is not None

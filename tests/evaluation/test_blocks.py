@@ -205,6 +205,7 @@ def test_masks_take_a_bit_each_and_refuse_another_shape():
         bits["m10"]
 
 
+@pytest.mark.slow
 def test_scoring_a_stored_track_holds_no_column(tmp_path):
     signals, truth, estimate, _ = drive(3, seconds=600.0)
     with TrackStore(tmp_path / "tracks") as store, patch.object(metrics, "LAG_SPAN_NS", 10**10):

@@ -70,6 +70,7 @@ def test_what_a_log_is_good_for(signals: tuple[str, ...], truth: tuple[str, ...]
     assert uses["sideslip_needs"] == needs
 
 
+@pytest.mark.slow
 def test_inspect_ends_with_what_can_be_done(sample_logs_dir: Path, shared_dir: Path) -> None:
     assert "What you can do with this log: estimate sideslip" in text_of(
         render_inspection, inspect_log(sample_logs_dir / "dlc.mcap"), 200
@@ -80,6 +81,7 @@ def test_inspect_ends_with_what_can_be_done(sample_logs_dir: Path, shared_dir: P
     assert "pdhef map LOG" in text
 
 
+@pytest.mark.slow
 def test_doubtful_candidates_stand_in_the_file_as_comments(shared_dir: Path, tmp_path: Path) -> None:
     found = inspect_log(shared_dir / "reader_corpus" / "dart_ros1" / "4_sept_random_driving_fast.bag")
     write_mapping(found, tmp_path / "m.toml")

@@ -191,6 +191,7 @@ def test_recorded_drives(shared_dir: Path, file: str, mapping_name: str | None) 
     assert max(len(line) for line in text.splitlines()[1:]) <= 80  # The path stands on a line of its own.
 
 
+@pytest.mark.slow
 def test_a_log_with_a_dropout_and_losses(shared_dir: Path) -> None:
     found = inspect_log(shared_dir / "data" / "drives" / "faulty" / "revs_250lm_a_disorder.mcap")
     imu = next(t for t in found.topics if t.name == "/imu/data")
@@ -210,6 +211,7 @@ def test_fields_of_vendor_messages_are_candidates(shared_dir: Path, tmp_path: Pa
     assert "steer_ang_deg" in (tmp_path / "m.toml").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dlc", "sweep", "road"])
 def test_simulated_drives_need_no_mapping(sample_logs_dir: Path, name: str) -> None:
     found = inspect_log(sample_logs_dir / f"{name}.mcap")
@@ -223,6 +225,7 @@ def test_simulated_drives_need_no_mapping(sample_logs_dir: Path, name: str) -> N
     assert "pose.pose.orientation.{w,x,y,z}" in text_of(found, 110)
 
 
+@pytest.mark.slow
 def test_signal_and_truth_of_one_name_keep_their_own_comments(shared_dir: Path, tmp_path: Path) -> None:
     write_mapping(inspect_log(shared_dir / "data" / "drives" / "f1tenth_hoons_run2.bag"), tmp_path / "m.toml")
     lines = (tmp_path / "m.toml").read_text().splitlines()

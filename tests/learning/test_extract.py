@@ -131,6 +131,7 @@ def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarr
     return error, index[use]
 
 
+@pytest.mark.slow
 def test_clean_truth_is_differenced_as_it_is(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = _extract(tmp_path, monkeypatch, _log(motion))
     error, index = _errors(result, motion)
@@ -162,6 +163,7 @@ def test_late_truth_is_put_back(motion: Motion, tmp_path: Path, monkeypatch: pyt
     assert np.sqrt(np.mean(error**2, axis=0)).max() < 0.02
 
 
+@pytest.mark.slow
 def test_noisy_truth_is_smoothed_and_unbiased(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = _log(motion, sigma=0.01)
     result = _extract(tmp_path, monkeypatch, log)
@@ -188,6 +190,7 @@ def test_a_drive_below_the_low_speed_limit_gives_rows_and_is_told(
     assert one.record.seconds == pytest.approx(3.99) and result.exit_code == 0
 
 
+@pytest.mark.slow
 def test_windows_of_reading_change_no_byte(motion: Motion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hashes = set()
     for window_s in (3.0, 7.3, 600.0):
@@ -331,6 +334,7 @@ def test_hash_split_is_stable_and_about_70_15_15() -> None:
     assert " ".join(choose_split(n, 0)[0] for n in names[:8]) == "train train train validation train train train train"
 
 
+@pytest.mark.slow
 def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: Path, tmp_path: Path) -> None:
     shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
     shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "b.mcap")

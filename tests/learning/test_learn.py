@@ -182,6 +182,7 @@ def test_a_gain_is_not_worth_intervals_that_mean_nothing(was: int, now: int, sur
     assert learn_command._still_sure(old, new) is sure
 
 
+@pytest.mark.slow
 def test_the_page_holds_any_name_and_what_was_not_known() -> None:
     line = {"name": "pd-hef-smoothed, learnt", "causal": False, "share": 1.0, "covered": None}
     parameter = {

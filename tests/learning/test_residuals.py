@@ -119,6 +119,7 @@ def test_smoothed_targets_of_a_noisy_truth_are_unbiased(motion: Motion) -> None:
     assert mean[0] < 0.01 and mean[1] < 0.004
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(cuts=st.lists(st.integers(1, 1900), max_size=8), half_window=st.sampled_from([0, 1, 15]))
 def test_windows_change_no_bit(noisy: DriveWindow, cuts: list[int], half_window: int) -> None:
@@ -248,6 +249,7 @@ def oracle_window(oracle: Oracle, made: Drive, **signals: np.ndarray) -> DriveWi
     return DriveWindow(whole, truth_of(whole.stamps_ns, state), 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("names", [("lag",), ("lag", "roll", "load_transfer")], ids="+".join)
 def test_physics_of_the_car_lacks_nothing_and_a_force_that_it_does_not_know_comes_out(names: tuple[str, ...]) -> None:
     """The oracle's car, driven by its own equations; told 10 % less grip the model lacks force in proportion to a_y."""
@@ -278,6 +280,7 @@ def test_windows_change_no_bit_of_what_physics_lacks() -> None:
         np.testing.assert_array_equal(getattr(joined, f.name), getattr(once, f.name), err_msg=f.name)
 
 
+@pytest.mark.slow
 def test_an_offset_of_the_steering_angle_is_no_residual() -> None:
     """What is taken off before training is what the offset makes, and nothing of a residual that comes and goes."""
     oracle = Oracle(parts("lag"))

@@ -136,6 +136,7 @@ def test_no_damage_escapes_as_another_error(
         assert "\n" not in str(error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", sorted(_SOURCES))
 @settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
@@ -194,6 +195,7 @@ def test_what_was_not_asked_for_is_unwanted(tmp_path: Path) -> None:
     log.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["mcap", "mcap-lz4", "bag"])
 def test_a_cut_file_never_gives_more_nor_passes_as_whole(good: dict[str, bytes], tmp_path: Path, kind: str) -> None:
     content, counts = good[kind], []

@@ -101,6 +101,7 @@ def test_a_json_message_that_is_no_json_is_counted(tmp_path: Path) -> None:
     log.close()
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(
     rows=st.lists(

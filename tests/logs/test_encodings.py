@@ -149,6 +149,7 @@ _ROWS = st.lists(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", _ENCODINGS)
 @settings(
     max_examples=40, derandomize=True, deadline=None,

@@ -69,6 +69,7 @@ def _signals(draw: st.DrawFn) -> tuple[Signal, int]:
     return Signal("S", start, length, order, signed, conversion=conversion), size
 
 
+@pytest.mark.slow
 @settings(max_examples=300, derandomize=True, deadline=None)
 @given(layout=_signals(), frames=st.lists(st.binary(min_size=64, max_size=64), min_size=1, max_size=5))
 def test_any_layout_decodes_as_cantools_decodes_it(layout: tuple[Signal, int], frames: list[bytes]) -> None:
@@ -211,6 +212,7 @@ _FRAMES = st.lists(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["ros", "json", "hex", "base64", "protobuf"])
 @settings(max_examples=15, derandomize=True, deadline=None)
 @given(frames=_FRAMES)

@@ -230,6 +230,7 @@ def test_cleaning_agrees_with_a_dictionary(samples: tuple[np.ndarray, ...]) -> N
     assert len(got.out_of_range_at) == int((values > 5.0).sum())
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10_000), length=st.integers(30 * MS, 900 * MS), device=st.booleans())
 def test_windows_joined_are_the_whole(seed: int, length: int, device: bool) -> None:

@@ -46,6 +46,7 @@ _TEXTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", _LOADERS)
 @pytest.mark.parametrize("case", _TEXTS)
 def test_a_broken_document_is_one_line_and_exit_code_2(tmp_path: Path, name: str, case: str) -> None:

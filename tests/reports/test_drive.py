@@ -54,6 +54,7 @@ def test_the_same_run_gives_the_same_bytes(tmp_path):
     assert page_of(folder) == page_of(folder)
 
 
+@pytest.mark.slow
 def test_a_one_sample_error_is_in_the_table_with_its_exact_stamp_and_in_the_figure(tmp_path):
     tracks = drive_tracks(duration_s=600.0)
     tracks[1].sideslip_rad[12_345] += np.radians(5.0)
@@ -267,6 +268,7 @@ def _report(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
 
 
+@pytest.mark.slow
 def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path):
     folder = write_run(tmp_path, drive_tracks())
     result = _report(str(folder), "--open", "--json")
@@ -278,6 +280,7 @@ def test_the_command_says_what_it_wrote_and_where_no_browser_is(tmp_path):
     assert "there is no browser" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_folder_that_is_no_run_is_one_line_and_is_not_made(tmp_path):
     result = _report(str(tmp_path / "nothing"))
     assert result.returncode == 1

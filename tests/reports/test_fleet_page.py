@@ -100,6 +100,7 @@ def test_a_key_can_be_asked_for(tmp_path: Path) -> None:
     assert re.search(r"<h3>who.*<td>x2</td>", words(folder, by=["who"]), re.DOTALL)
 
 
+@pytest.mark.slow
 def test_every_page_of_a_run_is_written_and_removed(tmp_path: Path) -> None:
     drives: dict[str, dict[str, Any]] = {f"d{i}": {"errors": (0.001, 0.002)} for i in range(4)}
     folder = run_of(tmp_path, drives, {"bad": "empty"})

@@ -67,6 +67,7 @@ def _value(report: dict[str, Any], signal: str, metric: str, estimator: str | No
     return float(found[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window_s", [600.0, 1.3])
 def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(
     annotated: Path, sample_logs_dir: Path, window_s: float

@@ -63,6 +63,7 @@ def stiffness_errors(calibration: SelfCalibration) -> list[tuple[float, float]]:
     return pairs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("front", "rear"), [(1.0, 1.0), (2.0, 0.5), (0.5, 0.7)])
 def test_a_sweep_finds_the_stiffness_within_its_own_posterior_whatever_the_file_says(front: float, rear: float) -> None:
     calibration = found(with_noise(wide().signals, 3), wrong(front, rear))

@@ -282,6 +282,7 @@ def test_rosbags_reads_every_state(ros_only, circle, token):
         np.testing.assert_allclose(covariance, track.covariance.reshape(600, 9), rtol=SINGLE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("token", NAMES)
 def test_rosbags_reads_every_odometry(ros_only, circle, token):
     track = circle(NAMES[token], 0, 600)
@@ -357,6 +358,7 @@ def test_in_place(source, circle):
     assert {topic for topic, *_ in messages(source)} == set(TOPICS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("windows", [1, 3, 10])
 def test_content_does_not_depend_on_windows(tmp_path, source, circle, windows):
     annotate(tmp_path / "a.mcap", source, circle, windows)

@@ -148,6 +148,7 @@ def test_report_without_truth_follows_its_schema_too():
     assert "no truth" in report_markdown(report)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "part",
     [

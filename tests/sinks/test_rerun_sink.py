@@ -251,6 +251,7 @@ def test_weights_and_reasons_are_drawn_over_windows(tmp_path, circle):
     assert texts == ["pd-hef: a_y spike, 0.00 s", "pd-hef: gyro stuck, 0.49 s", "pd-hef: a_y spike, 0.00 s"]
 
 
+@pytest.mark.slow
 def test_same_input_gives_the_same_content(tmp_path, circle, circle_signals):
     contents = []
     for name in ("a.rrd", "b.rrd"):
@@ -377,6 +378,7 @@ def run_script(tmp_path: Path, **env: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_writing_starts_no_analytics_and_a_switched_off_rerun_is_said(tmp_path):
     assert "unset RERUN" in run_script(tmp_path, RERUN="off")
 
@@ -454,6 +456,7 @@ def test_a_disk_that_hangs_is_given_up_and_the_process_ends(tmp_path, writes):
     assert "recording.rrd: expected a place to write to, got nothing could be written for 1 s" in done.stdout
 
 
+@pytest.mark.slow
 @settings(max_examples=200, derandomize=True, deadline=None)
 @given(
     st.lists(st.booleans(), min_size=1, max_size=40),

@@ -49,6 +49,7 @@ def valid(**facts: Any) -> dict[str, Any]:
     return document
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("difference", "outcome", "said"),
     [
@@ -74,6 +75,7 @@ def test_without_a_rival_or_an_interval_that_is_said() -> None:
     assert first["rmse"]["low"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("changes", "why"),
     [

@@ -117,6 +117,7 @@ def test_a_sound_log_is_right_and_a_wrong_one_is_not(tmp_path: Path) -> None:
     assert absent.items["yaw rate"].startswith("wrong")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recording", [r for r in units_and_signs() if r.name in ("yaw-rate-deg", "steering-sign")])
 def test_wrong_units_and_signs_are_corrected_or_told(recording: Recording, tmp_path: Path) -> None:
     result = score_recording(recording, tmp_path)

@@ -221,6 +221,7 @@ def test_friction_limits_the_lateral_acceleration() -> None:
         assert 0.75 * friction < peak < 1.02 * friction
 
 
+@pytest.mark.slow
 def test_a_road_is_ordinary_and_has_a_standstill(road: Drive) -> None:
     truth = road.truth
     standing = np.hypot(truth["vx_m_s"], truth["vy_m_s"]) < 0.02
@@ -259,6 +260,7 @@ def test_roads_are_those_of_town_country_and_motorway() -> None:
     assert course.stops.shape[0] > 10 and course.stops[:, 1].min() >= 3.0
 
 
+@pytest.mark.slow
 def test_the_driver_keeps_to_the_road() -> None:
     plan = MANOEUVRES["road"].plan(Request(25.0, 0.85, 3, 120.0, 1.0))
     motion = simulate_motion(plan, 0.85)
@@ -312,6 +314,7 @@ def test_a_wheel_that_leaves_the_road_is_no_drive_to_learn_from() -> None:
     assert judge(motion).lifted and judge(motion).lost and "wheel" in judge(motion).describe()
 
 
+@pytest.mark.slow
 def test_an_amplitude_that_cannot_be_had_is_said() -> None:
     drive = simulate_drive("sine-sweep", speed_km_h=20.0, friction=1.0)
     assert any("only" in note for note in drive.notes)
@@ -341,6 +344,7 @@ def test_an_unknown_manoeuvre_is_a_usage_error() -> None:
         simulate_drive("loop-the-loop")
 
 
+@pytest.mark.slow
 def test_command_makes_the_drive_again(lane_change: Drive) -> None:
     assert lane_change.command == "pdhef simulate dlc --speed 100 --mu 0.85 --seed 1"
     assert simulate_drive("road", duration_s=20.0).command.endswith("--seed 0 --duration 20")
@@ -358,6 +362,7 @@ def test_command_makes_the_drive_again(lane_change: Drive) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["dlc", "step-steer", "fishhook", "banked-road"])
 def test_amplitude_multiplies_what_the_manoeuvre_is_scaled_to(name: str) -> None:
     half, whole = simulate_drive(name, amplitude=0.3), simulate_drive(name, amplitude=0.6)

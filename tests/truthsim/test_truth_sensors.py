@@ -185,6 +185,7 @@ def test_fix_is_the_position_in_geodetic_coordinates(lane_change: Motion) -> Non
     )
 
 
+@pytest.mark.slow
 def test_changing_one_error_leaves_the_others_alone(straight: Motion) -> None:
     a = sense(straight, Vehicle(), SensorNoise(), 7, 100)
     b = sense(straight, Vehicle(), SensorNoise(steer_rad=0.01), 7, 100)

@@ -75,6 +75,7 @@ def test_braking_loads_the_front_axle() -> None:
     assert (front - M * G * LR / L).mean() == pytest.approx(moment.mean() / L, rel=0.002)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "scale", "friction"), [("dlc", 0.76, 0.85), ("sine-sweep", 1.8, 0.3)])
 def test_one_millisecond_is_fine_enough(name: str, scale: float, friction: float) -> None:
     coarse = simulate_motion(plan_of(name, scale), friction)

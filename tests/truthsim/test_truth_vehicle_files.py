@@ -99,6 +99,7 @@ def test_randomised_cars_spread_as_documented_and_repeat() -> None:
         assert {getattr(c, name) for c in cars} == {getattr(car, name)}, name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VEHICLES)
 def test_randomised_cars_drive(name: str) -> None:
     steer = 0.03 * np.sin(2.0 * np.pi * 0.7 * np.arange(0.0, 4.0, 1e-3))

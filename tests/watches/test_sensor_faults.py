@@ -123,6 +123,7 @@ def road(seed: int, *, degrees: float = 4.0, factor: float = 1.0) -> Signals:
     )
 
 
+@pytest.mark.slow
 def test_an_hour_of_healthy_driving_reports_one_fault_at_most():
     """With the very noise of which the filters weight down hundreds of samples."""
     told, raised = 0, 0
