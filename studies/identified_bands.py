@@ -24,8 +24,9 @@ from pdhef_logtool.estimators.posterior_band import OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive
-from pdhef_logtool.learning.car.physics_fit import VARIED, fit_physics, varied_vehicles
+from pdhef_logtool.learning.car.physics_fit import fit_physics, varied_vehicles
 from pdhef_logtool.runs.estimating import calibrator
+from pdhef_logtool.self_calibration.calibration import VARIED
 from studies.condition_drives import SIDESLIP
 from studies.many_cars import FIT_ITERATIONS, PARTS
 from studies.pages import DOCS, number, options, table, write

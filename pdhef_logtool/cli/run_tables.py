@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -13,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table
+from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.results.opened_run import PAGE_FILE
 from pdhef_logtool.sinks.answer import NEARLY_HOLDS, degrees
 from pdhef_logtool.sinks.report import diverged_line, reasons_line
@@ -27,25 +27,24 @@ _Report: TypeAlias = Mapping[str, Any]
 #: Head, signal, segment, metric, factor to the shown unit, digits.
 _Column: TypeAlias = tuple[str, str, str, str, float, int]
 
-_DEG = math.degrees(1.0)
 _COLUMNS: tuple[_Column, ...] = (
-    ("sideslip\nRMSE °", "sideslip_rad", "all", "rmse", _DEG, 3),
-    ("\np95 °", "sideslip_rad", "all", "p95_abs", _DEG, 3),
-    ("\nmax °", "sideslip_rad", "all", "max_abs", _DEG, 2),
+    ("sideslip\nRMSE °", "sideslip_rad", "all", "rmse", DEGREES, 3),
+    ("\np95 °", "sideslip_rad", "all", "p95_abs", DEGREES, 3),
+    ("\nmax °", "sideslip_rad", "all", "max_abs", DEGREES, 2),
     ("\nlag ms", "sideslip_rad", "all", "lag_s", 1e3, 0),
     ("in 95 %\nband", "sideslip_rad", "all", "coverage95", 1.0, 2),
     ("v_y\nRMSE m/s", "vy_m_s", "all", "rmse", 1.0, 3),
     ("v_x\nRMSE m/s", "vx_m_s", "all", "rmse", 1.0, 3),
-    ("yaw rate\nRMSE °/s", "yaw_rate_rad_s", "all", "rmse", _DEG, 3),
+    ("yaw rate\nRMSE °/s", "yaw_rate_rad_s", "all", "rmse", DEGREES, 3),
     ("a_y\nRMSE m/s²", "ay_m_s2", "all", "rmse", 1.0, 3),
     ("1 s lateral\nRMSE m", "lateral_1s_m", "all", "rmse", 1.0, 3),
-    ("linear\nRMSE °", "sideslip_rad", "linear", "rmse", _DEG, 3),
-    ("nonlinear\nRMSE °", "sideslip_rad", "nonlinear", "rmse", _DEG, 3),
+    ("linear\nRMSE °", "sideslip_rad", "linear", "rmse", DEGREES, 3),
+    ("nonlinear\nRMSE °", "sideslip_rad", "nonlinear", "rmse", DEGREES, 3),
     ("\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2),
 )
 #: Where there is no truth: no column of errors.
 _WITHOUT_TRUTH: tuple[_Column, ...] = (
-    ("sideslip: RMS\nfrom {main} °", "sideslip_rad", "all", "from_main", _DEG, 3),
+    ("sideslip: RMS\nfrom {main} °", "sideslip_rad", "all", "from_main", DEGREES, 3),
     ("v_y against sensors\nd2 m/s", "vy_m_s", "all", "d2", 1.0, 3),
     ("surprise\nNIS/dof", "state", "all", "nis_ratio", 1.0, 2),
 )
@@ -310,7 +309,7 @@ def _joint_table(reports: Sequence[_Report]) -> Table:
     joint.columns[-1].overflow = "fold"
     for report in reports:
         values, main = _figures(report), report["answer"]["main"]
-        errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), _DEG, 3) for n in (main, *rivals)]
+        errors = [cell(values.get((n, "sideslip_rad", "all", "rmse")), DEGREES, 3) for n in (main, *rivals)]
         inside = values.get((main, "sideslip_rad", "all", "coverage95"))
         seconds = f"{report['log']['duration_s']:.0f}"
         notes = _look_at(report, inside, main if len(mains) > 1 else "")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, Sensors, VehicleParameters, default_vehicle
-from pdhef_logtool.drive.columns import derivative, earlier, independent_samples, moving_at
+from pdhef_logtool.drive.columns import derivative, earlier, independent_samples, median_known, moving_at
 from pdhef_logtool.drive.delays import LateSensor, delay_checks
 from pdhef_logtool.drive.faulty_samples import without_faulty_samples
 from pdhef_logtool.drive.measured import WHEEL_SPEEDS, Measured, measure
@@ -304,7 +304,7 @@ def _levels(
         driven, at_ease = np.zeros_like(columns[name]), np.ones(columns[name].shape[0], np.bool_)
         if speed is not None and yaw is not None:
             # Where the car slides, speed and yaw rate no longer say what accelerates it.
-            at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - _median(columns[name]), at_ease)
+            at_ease = gentle_at(yaw * speed, at_ease) & gentle_at(columns[name] - median_known(columns[name]), at_ease)
         if speed is not None and name == "ax_m_s2":
             driven = derivative(speed)
         elif speed is not None and yaw is not None:
@@ -322,11 +322,6 @@ def _levels(
         if (driving_is_known and told) or check.name == f"{name}.axis":
             checks.append(check)
     return checks
-
-
-def _median(column: FloatArray) -> float:
-    known = column[np.isfinite(column)]
-    return float(np.median(known)) if known.size else 0.0
 
 
 def _level(name: str, rest: float, mean: float) -> Check:

@@ -102,3 +102,9 @@ def _low_pass(values: FloatArray, good: BoolArray) -> FloatArray:
     enough = weight > 0.8
     out[enough] = total[enough] / weight[enough]
     return out
+
+
+def median_known(column: FloatArray) -> float:
+    """Return the median of what is known of a column [N], 0 where nothing is."""
+    known = column[np.isfinite(column)]
+    return float(np.median(known)) if known.size else 0.0

@@ -20,7 +20,8 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from pdhef_logtool.drive.correlation import find_shift, on_common_grid
+from pdhef_logtool.drive.columns import median_known
+from pdhef_logtool.drive.correlation import GAP_PERIODS, find_shift, on_common_grid
 from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.mapping.records import VECTOR_COLUMNS
 from pdhef_logtool.records.geometry import (
@@ -36,8 +37,6 @@ from pdhef_logtool.records.tracks import StateTrack, make_track
 
 #: Half window of the smoothing derivative. A cubic over ±0.2 s passes 1 Hz with 1 % loss.
 DIFFERENTIATION_HALF_S = 0.2
-#: A truth gap is a step of more than this many median periods.
-GAP_PERIODS = 3.0
 #: Latency is searched for within this range.
 MAX_LATENCY_S = 0.5
 #: And known to this, 1-sigma.
@@ -484,7 +483,7 @@ def _find_attitude(source: _Source) -> Attitude:
     best, best_score = Attitude(frames[0], "FLU"), -np.inf
     for frame, body in [(f, b) for f in frames for b in bodies]:
         rotation = source.rotation(Attitude(frame, body))
-        up = _median(rotation[:, 2, 2]) if source.reference == "ENU" else 1.0
+        up = median_known(rotation[:, 2, 2]) if source.reference == "ENU" else 1.0
         score = (1.0 if up > 0.5 else -1.0) + _forward_share(rotation, velocity)
         if score > best_score + 0.05:
             best, best_score = Attitude(frame, body), score
@@ -495,12 +494,7 @@ def _forward_share(rotation: FloatArray, velocity: FloatArray) -> float:
     """Median of v_x / |v| in body axes while the car moves; 0 if it is not known to."""
     speed = np.linalg.norm(velocity, axis=1)
     moving = speed > 1.0  # NaN compares False
-    return _median((rotation[moving, :, 0] * velocity[moving]).sum(axis=1) / speed[moving])
-
-
-def _median(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else 0.0
+    return median_known((rotation[moving, :, 0] * velocity[moving]).sum(axis=1) / speed[moving])
 
 
 # ---- columns on the truth's clock ----

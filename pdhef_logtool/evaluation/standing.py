@@ -14,13 +14,13 @@ import numpy as np
 
 from pdhef_logtool.evaluation.blocks import row_blocks
 from pdhef_logtool.evaluation.bootstrap import Interval, block_sums, rmse_difference_interval, rmse_interval
+from pdhef_logtool.evaluation.comparison import BLOCK_S
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.records.tracks import StateTrack
 
 #: What a drive is judged by, in the order in which it is told.
 JUDGED_SIGNALS = ("sideslip_rad", "vy_m_s", "yaw_rate_rad_s", "vx_m_s")
-BLOCK_S = 10.0
 #: Of fewer blocks no interval is given: with five, all of one sign come by chance in more than one of twenty drives.
 LEAST_BLOCKS = 6
 #: Of a longer drive blocks are longer.

@@ -17,6 +17,7 @@ from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo
 from pdhef_logtool.mapping.checking import stamp_path_of
 from pdhef_logtool.mapping.evidence import FEWEST_CELLS, Pieces, Seen
 from pdhef_logtool.mapping.naming import meaning_of, unit_of, words_of
+from pdhef_logtool.mapping.path import DEGREE_M
 from pdhef_logtool.mapping.records import SignalSource
 from pdhef_logtool.records.signals import FloatArray
 
@@ -26,8 +27,6 @@ MOVING_M_S = 3.0
 NEAR_RAD, FAR_RAD = math.radians(12.0), math.radians(25.0)
 #: Nobody drives farther in a log.
 WIDEST_DEG = 10.0
-#: Metres of a degree of latitude.
-_DEGREE_M = 111_200.0
 _SIDES = {
     "north": "n", "n": "n", "vn": "n", "veln": "n", "east": "e", "e": "e", "ve": "e", "vele": "e",
     "up": "u", "u": "u", "vu": "u", "velu": "u", "down": "d", "d": "d", "vd": "d", "veld": "d",
@@ -150,7 +149,7 @@ def _course(
     elif {"lat_deg", "lon_deg"} <= set(truth):
         latitude, longitude = (read[topic, truth[n].paths[0]].cells for n in ("lat_deg", "lon_deg"))
         narrowed = math.cos(math.radians(float(np.nanmean(latitude))))
-        north, east = (pieces.rate_of(c) * _DEGREE_M for c in (latitude, longitude))
+        north, east = (pieces.rate_of(c) * DEGREE_M for c in (latitude, longitude))
         east = east * narrowed
     else:
         return None

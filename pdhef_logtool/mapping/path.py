@@ -14,7 +14,7 @@ from pdhef_logtool.records.signals import FloatArray
 #: Half of the time over which a course is taken from positions, in cells.
 _HALF = 5
 #: Metres of a degree of latitude.
-_DEGREE_M = 111_200.0
+DEGREE_M = 111_200.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ def _path(fields: Fields) -> _Steps | None:
             continue
         up, right = _step(fields, north.si), _step(fields, east.si)
         if north.meaning.quantity == "latitude":
-            up, right = up * _DEGREE_M, right * _DEGREE_M * math.cos(math.radians(float(np.nanmean(north.si))))
+            up, right = up * DEGREE_M, right * DEGREE_M * math.cos(math.radians(float(np.nanmean(north.si))))
         if np.isfinite(up).any():
             return _Steps(up, right)
     return None

@@ -6,6 +6,9 @@ import numpy as np
 
 from pdhef_logtool.records.signals import FloatArray, IntArray
 
+#: Degrees of a radian.
+DEGREES = 180.0 / np.pi
+
 WGS84_A_M = 6378137.0
 WGS84_E2 = 6.69437999014e-3
 

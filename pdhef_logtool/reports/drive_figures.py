@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.reports.charts import Band, Charts, Cloud, Mark, Row, Series, Span
@@ -17,7 +18,6 @@ from pdhef_logtool.reports.drive_series import DriveSeries, Points, Reference, S
 from pdhef_logtool.reports.encoding import grid_of
 from pdhef_logtool.sinks.base import TRUTH
 
-_DEG = float(np.degrees(1.0))
 #: What nobody sees on a page, in degrees, as a share, and in m/s or m/s².
 _DEGREES_SEEN, _SHARE_SEEN, _SEEN = 0.001, 0.001, 0.002
 #: Rows of the table of the largest errors; two of them are further apart than this, and than this share of the drive.
@@ -206,7 +206,7 @@ def _add_error(
     title = f"Disagreement: sideslip of the others less that of {roles.main}, absolute"
     if scored:
         title = "Absolute error of sideslip, largest of each cell"
-    marks = [Mark(str(i + 1), p.at_s, abs(p.error_rad) * _DEG) for i, p in enumerate(peaks)]
+    marks = [Mark(str(i + 1), p.at_s, abs(p.error_rad) * DEGREES) for i, p in enumerate(peaks)]
     charts.time("error", title, "°", lines, marks=marks, level=0.0, resolution=_DEGREES_SEEN)
 
 

@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
-from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.reports.encoding import Envelope, FirstKnown, Grid, Means
 from pdhef_logtool.sinks.base import TRUTH
 from pdhef_logtool.sinks.parquet import list_estimators, read_blocks
 
-_DEG = float(np.degrees(1.0))
 #: NIS is shown as its mean over so long.
 _NIS_S = 1.0
 _COLUMNS = (
@@ -155,12 +154,12 @@ def gather(
     made = DriveSeries(name, grid)
     for track in tracks.blocks(name):
         drawn, stamps = tracks.drawn(track), track.stamps_ns
-        beta, half = drawn.sideslip_rad * _DEG, NORMAL_95 * drawn.sideslip_std_rad * _DEG
+        beta, half = drawn.sideslip_rad * DEGREES, NORMAL_95 * drawn.sideslip_std_rad * DEGREES
         made.sideslip.add(stamps, beta)
         made.band_low.add(stamps, beta - half)
         made.band_high.add(stamps, beta + half)
         if reference is not None:
-            made.error.add(stamps, np.abs(reference.error(track)) * _DEG)
+            made.error.add(stamps, np.abs(reference.error(track)) * DEGREES)
         made.trust.add(stamps, track.network_trust)
         made.r_scale.add(stamps, track.r_scale)
         made.nis.add(stamps, track.nis / nis_dof.get(name, np.nan))
@@ -168,7 +167,7 @@ def gather(
         made.ay.add(stamps, track.ay_m_s2)
         made.path.add(stamps, track.x_m, track.y_m)
         made.ay_sideslip.add(stamps, np.abs(track.ay_m_s2), beta)
-        made.phase.add(stamps, beta, np.where(np.isfinite(beta), sideslip_rate(track), np.nan) * _DEG)
+        made.phase.add(stamps, beta, np.where(np.isfinite(beta), sideslip_rate(track), np.nan) * DEGREES)
         made.invalid.append(~track.valid)
         if len(track.reason) == len(track):
             made.reason.append(track.reason)

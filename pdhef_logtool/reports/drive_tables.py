@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.reports.drive_figures import Roles
 
 SIGNALS = {"sideslip_rad": "sideslip", "vy_m_s": "v_y", "yaw_rate_rad_s": "yaw rate", "vx_m_s": "v_x", "ay_m_s2": "a_y"}
 #: Figures of a signal as columns: metric and head.
 _SCORES = (("rmse", "RMSE"), ("mae", "mean"), ("p95_abs", "95 %"), ("max_abs", "largest"), ("bias", "bias"))
 HEADS = tuple(head for _, head in _SCORES)
-_DEG = math.degrees(1.0)
-_SHOWN = {"rad": (_DEG, "°"), "rad/s": (_DEG, "°/s")}
+_SHOWN = {"rad": (DEGREES, "°"), "rad/s": (DEGREES, "°/s")}
 
 _Row = Mapping[str, Any]
 

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.results.pairing import Pair
+from pdhef_logtool.sinks.base import TRUTH
 
 if TYPE_CHECKING:
     import polars as pl
 
 #: What is looked at of a track.
 _SIGNALS = ("sideslip_rad", "vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2", "sideslip_std_rad", "valid")
-TRUTH = "truth"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,9 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder
-from pdhef_logtool.results.events import TRUTH, FoundEvent, FoundEvents
+from pdhef_logtool.results.events import FoundEvent, FoundEvents
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.sinks.base import TRUTH
 from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
 from pdhef_logtool.sinks.parquet import list_estimators, read_track
 

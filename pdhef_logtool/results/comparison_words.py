@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
-from pdhef_logtool.results.changed_signals import TRUTH, ChangedSignal
+from pdhef_logtool.records.geometry import DEGREES
+from pdhef_logtool.results.changed_signals import ChangedSignal
 from pdhef_logtool.results.comparing import ComparedFigure, Comparison
 from pdhef_logtool.results.paired_change import LEAST_CLUSTERS
+from pdhef_logtool.sinks.base import TRUTH
 
-_DEG = math.degrees(1.0)
-_SHOWN_UNITS = {"rad": ("°", _DEG), "rad/s": ("°/s", _DEG), "m/s^2": ("m/s²", 1.0), "1": ("", 1.0)}
+_SHOWN_UNITS = {"rad": ("°", DEGREES), "rad/s": ("°/s", DEGREES), "m/s^2": ("m/s²", 1.0), "1": ("", 1.0)}
 _COLUMN_UNITS = {"rad": "rad", "rad_s": "rad/s", "m_s": "m/s", "m_s2": "m/s^2"}
 _BY = {"signals": "what their signals held", "content": "their files", "name": "their names alone"}
 

@@ -17,11 +17,10 @@ from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.results.expression import ERRORS, FLAGS, SPEED, Applied, Column, Condition, Node, Number
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
+from pdhef_logtool.sinks.base import TRUTH
 
 if TYPE_CHECKING:
     import polars as pl
-
-TRUTH = "truth"
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator
@@ -22,7 +23,6 @@ from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.drive_sample import sample_drive
 from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget, no_budget
-from pdhef_logtool.runs.guard import PHYSICS
 from pdhef_logtool.runs.innovations import channel_innovations
 from pdhef_logtool.sinks.base import TRUTH
 from pdhef_logtool.sinks.report import DriveDetails

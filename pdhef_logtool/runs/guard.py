@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import all_names, spec_of
@@ -21,7 +22,6 @@ SIMPLE = ("zero", "open-loop", "open-loop-calibrated", "phy-ukf", "physics")
 #: On simulated drives with right and wrong files every estimate beyond 1.05 times the least d2 had at least 1.7 times
 #: its sideslip error (docs/self_calibration.md).
 FACTOR = 1.2
-PHYSICS = "physics"
 #: What an estimate must beat to be worth anything: no estimator at all. It needs the least and cannot drift; the
 #: other naive one, ``kinematic``, follows the accelerometer's bias and is worse on half of the recorded drives.
 NAIVE = "zero"

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
-from pdhef_logtool.car.parts import Algorithm
+from pdhef_logtool.car.parts import PHYSICS, Algorithm
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.algorithm import resolve
@@ -45,7 +45,7 @@ from pdhef_logtool.results.opened_run import (
 from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
-from pdhef_logtool.runs.guard import GUARDED, PHYSICS, Distrust, choose_main, default_names, distrust
+from pdhef_logtool.runs.guard import GUARDED, Distrust, choose_main, default_names, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore

@@ -342,6 +342,21 @@ def _inside(drive: Driving, settle: int) -> BoolArray:
     return inside
 
 
+def varied_parameters(
+    theta: FloatArray, root: FloatArray, sideslip: Callable[[FloatArray], FloatArray]
+) -> list[FloatArray]:
+    """Return parameters 1-sigma away from θ [n] along the directions of their posterior that move the sideslip most.
+
+    ``root`` [n, m]: its product with its transpose is the posterior's covariance. ``sideslip`` of parameters, or errors
+    of it, [K]. The directions, at most :data:`VARIED` and the largest first, are uncorrelated in the posterior and in
+    what they do to the sideslip.
+    """
+    at = sideslip(theta)
+    moved = np.stack([sideslip(theta + step) - at for step in root.T])
+    _, axes = np.linalg.eigh(moved @ moved.T)
+    return [theta + step for step in (root @ axes[:, ::-1][:, :VARIED]).T]
+
+
 class _Problem:
     """The fit of one pool: its priors, its model, its cost."""
 
@@ -372,12 +387,9 @@ class _Problem:
 
         They are uncorrelated in the posterior and in what they do to the sideslip.
         """
-        root = np.linalg.cholesky(covariance)
-        at = self._sideslip(theta)
-        moved = np.stack([self._sideslip(theta + root[:, i]) - at for i in range(theta.size)])
-        _, axes = np.linalg.eigh(moved @ moved.T)
-        steps = root @ axes[:, ::-1][:, :VARIED]  # largest first
-        return tuple(self.vehicle(theta + step, digits=6) for step in steps.T)
+        root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+        varied = varied_parameters(theta, root, self._sideslip)
+        return tuple(self.vehicle(at, digits=6) for at in varied)
 
     def _sideslip(self, theta: FloatArray) -> FloatArray:
         """Return the open-loop v_y / v_x of all logs, of what a vehicle holds: without delays and superelevation."""

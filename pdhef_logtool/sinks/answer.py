@@ -5,16 +5,16 @@ Everything is said from the report's document, so that terminal, report.json, Ma
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
+
+from pdhef_logtool.records.geometry import DEGREES
 
 Report: TypeAlias = Mapping[str, Any]
 #: Figures of the whole drive by estimator, signal and metric; None where there is none.
 _Figures: TypeAlias = Mapping[tuple[str, str, str], float | None]
 
-_DEG = math.degrees(1.0)
 #: Share of the truth inside the 95 % band from which on it is said to hold, and nearly, and to be too wide.
 HOLDS, NEARLY_HOLDS = 0.94, 0.90
 _WIDE = 0.995
@@ -85,7 +85,7 @@ def answer_of(report: Report, main: MainFacts) -> dict[str, Any]:
 
 def degrees(value_rad: float) -> str:
     """Return an angle with as many digits as a person reads."""
-    shown = value_rad * _DEG
+    shown = value_rad * DEGREES
     return f"{shown:.3f}°" if shown < 1.0 else f"{shown:.2f}°"
 
 
@@ -153,7 +153,7 @@ def _why_not_scored(report: Report, main: MainFacts) -> str:
 
 
 def _scored_instead(main: MainFacts, figures: _Figures) -> str:
-    shown = (("yaw_rate_rad_s", "yaw rate", _DEG, "°/s"), ("vx_m_s", "v_x", 1.0, " m/s"))
+    shown = (("yaw_rate_rad_s", "yaw rate", DEGREES, "°/s"), ("vx_m_s", "v_x", 1.0, " m/s"))
     found = [
         f"{text} {value * factor:.2f}{unit}"
         for signal, text, factor, unit in shown

@@ -20,7 +20,7 @@ from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMa
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.files import PendingFile, cannot_write, open_new, writing
-from pdhef_logtool.records.geometry import wrap_angle
+from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -49,8 +49,6 @@ LONGEST_WAIT_S = 60.0
 #: Stands near the end of a recording that was finished.
 _FOOTER = b"RRF2FOOT"
 
-_DEG = float(np.rad2deg(1.0))
-
 
 @dataclass(frozen=True, slots=True)
 class _Plot:
@@ -67,8 +65,8 @@ class _Plot:
 
 
 _STATES = (
-    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", _DEG, "sideslip_std_rad", True, from_low_speed=False),
-    _Plot("yaw_rate_deg_s", "yaw rate [deg/s]", "yaw_rate_rad_s", _DEG, "yaw_rate_std_rad_s"),
+    _Plot("sideslip_deg", "sideslip [deg]", "sideslip_rad", DEGREES, "sideslip_std_rad", True, from_low_speed=False),
+    _Plot("yaw_rate_deg_s", "yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES, "yaw_rate_std_rad_s"),
     _Plot("vx_m_s", "longitudinal velocity [m/s]", "vx_m_s", std="vx_std_m_s"),
     _Plot("vy_m_s", "lateral velocity [m/s]", "vy_m_s", std="vy_std_m_s"),
     _Plot("ay_m_s2", "lateral acceleration [m/s²]", "ay_m_s2"),
@@ -84,10 +82,10 @@ _HEALTH = (
 )
 _INPUTS = (
     _Plot("speed_m_s", "speed [m/s]", "speed_m_s"),
-    _Plot("steer_deg", "road-wheel angle [deg]", "steer_rad", _DEG),
+    _Plot("steer_deg", "road-wheel angle [deg]", "steer_rad", DEGREES),
     _Plot("ax_m_s2", "measured a_x [m/s²]", "ax_m_s2"),
     _Plot("ay_m_s2", "measured a_y [m/s²]", "ay_m_s2"),
-    _Plot("yaw_rate_deg_s", "measured yaw rate [deg/s]", "yaw_rate_rad_s", _DEG),
+    _Plot("yaw_rate_deg_s", "measured yaw rate [deg/s]", "yaw_rate_rad_s", DEGREES),
 )
 _INPUT_RGB = (0x56, 0xB4, 0xE9)
 _TRACK, _SIGNALS = "track", "signals"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pdhef_logtool.evaluation.bootstrap import Interval
 from pdhef_logtool.evaluation.standing import JUDGED_SIGNALS, LEAST_BLOCKS, Standing
+from pdhef_logtool.records.geometry import DEGREES
 from pdhef_logtool.sinks.answer import NO_SIDESLIP_RAD, SAME
 
 if TYPE_CHECKING:
@@ -21,12 +22,11 @@ if TYPE_CHECKING:
 #: ``undecided``: it holds 0, or there is none. ``alone``: no other physics ran.
 Outcome: TypeAlias = Literal["better", "worse", "same", "undecided", "alone", "none"]
 
-_DEG = math.degrees(1.0)
 #: By signal the factor to the unit that a person reads, and that unit.
 _SHOWN = {
-    "sideslip_rad": (_DEG, "°"),
+    "sideslip_rad": (DEGREES, "°"),
     "vy_m_s": (1.0, " m/s"),
-    "yaw_rate_rad_s": (_DEG, "°/s"),
+    "yaw_rate_rad_s": (DEGREES, "°/s"),
     "vx_m_s": (1.0, " m/s"),
 }
 

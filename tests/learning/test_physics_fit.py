@@ -33,6 +33,7 @@ from pdhef_logtool.learning.car.physics_fit import (
 )
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.self_calibration.calibration import VARIED
 
 STATIC = PhysicsParts()
 #: Slope of the true tyres at no slip, N/rad at friction 0.85.
@@ -118,7 +119,7 @@ def test_what_is_kept_of_the_posterior_is_what_moves_the_sideslip_most(static: F
         (there,) = drive_errors([short], guess(), vehicle, found.noise)
         (here,) = drive_errors([short], guess(), found.vehicle, found.noise)
         moved.append(float(np.sqrt(np.mean((there.error - here.error) ** 2))))
-    assert len(kept) == physics_fit.VARIED
+    assert len(kept) == VARIED
     assert moved[0] == max(moved)
     assert moved[0] > 1e-5
 

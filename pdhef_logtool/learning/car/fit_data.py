@@ -9,10 +9,10 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
+from pdhef_logtool.drive.correlation import GAP_PERIODS
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.proposals import Proposal, car_proposals, surest
 from pdhef_logtool.drive.truth import (
-    GAP_PERIODS,
     TruthTrack,
     booked_on_the_late,
     estimate_truth_latency,

@@ -42,6 +42,7 @@ from pdhef_logtool.learning.car.axle_forces import (
 from pdhef_logtool.learning.car.fit_data import FitDrive, part_of, period_s, signals_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.self_calibration.calibration import varied_parameters
 
 #: Errors stay alike for this long, s; what the filter needs before its error counts, s.
 CORRELATION_S, SETTLE_S = 1.0, 2.0
@@ -57,8 +58,6 @@ MAX_ITERATIONS, MAX_STEP, MIN_GAIN = 40, 1.5, 2e-4
 AXLE_FIT_SHARE = 0.5
 NOISE_LOG_STD = 1.2
 Theta = dict[str, float]
-#: Directions of the posterior that are kept: those that move the sideslip most.
-VARIED = 5
 #: Where θ starts: the noise has two valleys, that of clean sensors and that of a filter that hardly hears a_y.
 STARTS: tuple[Theta, ...] = ({}, {"r a_y": 1.5, "q v_y": 1.4, "q yaw rate": 2.3})
 
@@ -285,11 +284,7 @@ def varied_vehicles(
     def errors(theta: FloatArray) -> FloatArray:
         return np.concatenate([d.error for d in drive_errors(drives, start, vehicle(theta), found.noise)])
 
-    at = errors(found.theta)
-    moved = np.stack([errors(found.theta + step) - at for step in root.T])
-    _, axes = np.linalg.eigh(moved @ moved.T)
-    steps = root @ axes[:, ::-1][:, :VARIED]  # largest first
-    return tuple(vehicle(found.theta + step, digits=6) for step in steps.T)
+    return tuple(vehicle(theta, digits=6) for theta in varied_parameters(found.theta, root, errors))
 
 
 def _scale(drive: DriveError) -> float:

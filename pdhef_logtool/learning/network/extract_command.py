@@ -20,8 +20,8 @@ import numpy as np
 from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.reading import Tell, friction_of, no_samples, read_drive
-from pdhef_logtool.drive.truth import GAP_PERIODS as TRUTH_GAP_PERIODS
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.estimators.parallel_physics import filter_of
