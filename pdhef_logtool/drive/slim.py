@@ -1,0 +1,79 @@
+"""Slim logs: what a run reads of a log, written so that a run of it gives the same figures bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.logs.open_log import metadata_of
+from pdhef_logtool.logs.slim_copy import copy_topics, write_record
+from pdhef_logtool.logs.slim_log import FORMAT, SlimRecord
+from pdhef_logtool.logs.writer import McapLogWriter
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.mapping.frames import holds_fixed_frames
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.version import __version__
+
+
+def slim_log(
+    log: LogInput,
+    target: Path,
+    mapping: Mapping | None,
+    options: ReadOptions,
+    tell: Callable[[str], None] = lambda _text: None,
+) -> tuple[Loss, ...]:
+    """Write the slim log of a whole log, and return what of the log could not be read.
+
+    Parameters
+    ----------
+    mapping : None recognises types. options : of them count those that say how a log is opened and which truth counts.
+    tell : as for :func:`~pdhef_logtool.drive.reading.read_drive`.
+
+    Raises
+    ------
+    PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the file cannot be written.
+    """
+    whole = replace(options, start=None, end=None)
+    with read_drive(replace(log, span_s=None), Car.load(None), mapping, whole, tell=tell) as drive:
+        for _ in drive.windows(fill_friction=False):
+            pass
+        return write_slim(drive, target)
+
+
+def write_slim(drive: Drive, target: Path) -> tuple[Loss, ...]:
+    """Write the slim log of a drive that was read from start to end, and return the log's losses."""
+    log = drive.log
+    assert isinstance(log, ColumnarLog)
+    lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
+    record = SlimRecord(
+        format=FORMAT,
+        tool=__version__,
+        file=drive.file,
+        kind=log.kind,
+        identity=drive.sha256,
+        distro=log.distro,
+        intervals=log.occupied.intervals,
+        left_out={topic: dict(by_reason) for topic, by_reason in log.occupied.left_out.items()},
+        topics=log.topics,
+        losses=tuple(replace(x, where=drive.without_folder(x.where)) for x in lost),
+        byte_ledgers=ledgers,
+        metadata=metadata_of(log, drive.options.limits),
+        mapped=drive.chosen.to_dict(),
+        signals_sha256=drive.signals_sha256,
+        truth_sha256=drive.truth_sha256,
+    )
+    mapping = drive.chosen.mapping
+    topics = {*mapping.topics, *(s.topic for named in mapping.estimates.values() for s in named.values())}
+    topics |= {t.name for t in log.topics if holds_fixed_frames(t)}
+    with McapLogWriter(target, profile="ros1" if log.kind == "rosbag1" else "ros2") as writer:
+        copy_topics(writer, log, topics)
+        for name, path in zip(drive.chosen.dbc_names, () if mapping.can is None else mapping.can.dbc, strict=True):
+            writer.attachment(name, "text/plain", path.read_bytes(), 0, 0)
+        write_record(writer, record)
+    return lost
