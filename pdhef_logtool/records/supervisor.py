@@ -96,8 +96,8 @@ def supervise(
     work : a function of a module; takes an item and what tells its progress, and returns something small.
     jobs : processes at once.
     preload : modules that the fork server imports: ``package.module``, ``package.*`` for all of a package, or
-        ``package.module:function`` to call that too. ``pdhef_logtool.records.compiled:load_kept`` behind others loads
-        their compiled code. They must leave no thread behind, and no library that a fork breaks at work (polars, torch).
+        ``package.module:function`` to call that too. ``pdhef_logtool.records.compiled:load_kept`` behind others
+        loads their compiled code. They must leave no thread behind that is needed, and run no query (polars) or tensor.
 
     Raises
     ------

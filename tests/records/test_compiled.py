@@ -177,6 +177,7 @@ def test_a_run_works_as_nobody_with_a_read_only_installation_and_no_home(tmp_pat
         assert again.returncode == 0, again.stderr
         assert "compiling" not in again.stderr
 
+
 def test_kept_code_is_loaded_before_it_is_called(
     module_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
