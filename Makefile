@@ -92,7 +92,7 @@ format: $(VENV)/installed-dev
 check: lint test
 
 bench: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/python -m benchmarks
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.performance
 
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default

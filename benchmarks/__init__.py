@@ -1,1 +1,1 @@
-"""Speed against peers in the same run: ``python -m benchmarks``."""
+"""Speed against peers in the same run: ``python -m benchmarks.performance``."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measuring import CACHE, Figure, best_seconds
+from benchmarks.measuring import CACHE, Row, best_seconds
 from benchmarks.one_hour_log import HOUR_S, START_NS, hour_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.source_copy import iterate_copy, iterate_raw, register_channels
@@ -21,7 +21,7 @@ from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
 _SLICE = 10
 _SLICE_END_NS = START_NS + HOUR_S // _SLICE * 10**9
 _WINDOW_S = 60
-_REPORT = {"log": {"name": "hour", "end_ns": START_NS}, "truth": {"available": False}, "metrics": []}
+_REPORT = {"log": {"name": "hour", "end_ns": START_NS}, "truth": {"available": False}, "metrics": [], "estimators": []}
 
 
 def _track(name: str, begin_s: int) -> StateTrack:
@@ -72,7 +72,7 @@ def copy_with_mcap(path: Path, end_ns: int) -> None:
         writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves it without types
 
 
-def run() -> list[Figure]:
+def rows() -> list[Row]:
     """Measure."""
     path = hour_log()
     ways = {
@@ -83,11 +83,8 @@ def run() -> list[Figure]:
     }
     seconds = best_seconds(ways)
     chunks, messages, mcap = seconds["chunks"], _SLICE * seconds["messages"], _SLICE * seconds["mcap"]
+    peers = {"message by message": messages / chunks, "mcap": mcap / chunks}
     return [
-        Figure("copying", "ours: full annotated copy (1.26 M + 1.44 M messages)", seconds["annotate"], "s"),
-        Figure("copying", "ours: source alone, chunks as they are", chunks, "s"),
-        Figure("copying", "ours: source alone, message by message", messages, "s"),
-        Figure("copying", "mcap reader to Writer, source alone", mcap, "s"),
-        Figure("copying", "message by message / chunks", messages / chunks, "x"),
-        Figure("copying", "mcap / chunks", mcap / chunks, "x"),
+        Row("full annotated copy (1.26 M + 1.44 M messages)", seconds["annotate"], "s"),
+        Row("the source alone, chunks as they are", chunks, "s", peers=peers),
     ]

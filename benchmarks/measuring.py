@@ -10,11 +10,11 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
+from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Generated logs and outputs; ignored by git.
@@ -23,29 +23,32 @@ ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
-    """One line of the table.
+class Row:
+    """One line of a table.
 
     Attributes
     ----------
-    benchmark, name : file of the benchmark, and what was measured.
+    work : what was measured, in words.
     value, unit : the figure.
-    limit : what it must not exceed (``at most``) or fall below (``at least``); None without a target.
+    target : what it must not exceed (``at most``) or fall below (``at least``); None without a target.
+    peers : how many times as much as ours each peer takes, measured in the same run.
+    command : what a user types for this work, where there is such a command.
     """
 
-    benchmark: str
-    name: str
+    work: str
     value: float
     unit: str
-    limit: float | None = None
-    sense: str = ""
+    target: float | None = None
+    sense: str = "at most"
+    peers: Mapping[str, float] = field(default_factory=dict)
+    command: str = ""
 
     @property
     def passed(self) -> bool | None:
         """Whether the target is met; None without one."""
-        if self.limit is None:
+        if self.target is None:
             return None
-        return self.value <= self.limit if self.sense == "at most" else self.value >= self.limit
+        return self.value <= self.target if self.sense == "at most" else self.value >= self.target
 
 
 def best_seconds(ways: Mapping[str, Callable[[], object]], rounds: int = ROUNDS) -> dict[str, float]:
@@ -53,10 +56,15 @@ def best_seconds(ways: Mapping[str, Callable[[], object]], rounds: int = ROUNDS)
     best = dict.fromkeys(ways, float("inf"))
     for _ in range(rounds):
         for name, way in ways.items():
-            start = time.process_time()
+            start = _processor_seconds()
             way()
-            best[name] = min(best[name], time.process_time() - start)
+            best[name] = min(best[name], _processor_seconds() - start)
     return best
+
+
+def _processor_seconds() -> float:
+    """Return the processor seconds of this process and of its children that have ended."""
+    return sum(sum(getrusage(who)[:2]) for who in (RUSAGE_SELF, RUSAGE_CHILDREN))
 
 
 def peak_bytes(module: str, *arguments: str) -> int:

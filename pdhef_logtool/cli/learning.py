@@ -58,8 +58,11 @@ def identify(
     "pdhef extract drive.mcap -o residuals --car mycar --prefer-truth rtk \\",
     "  --truth-smoothing 0.15",
     "pdhef extract 'held_out/*.mcap' -o residuals_test --split test --resume",
+    'pdhef extract logs/ -o residuals --where "vx_km_h > 30" --per-cell 600',
     notes="Drives are split 70/15/15 by a hash of their content and --seed, unless the manifest of a simulated set "
-    "beside them has a split, or --split puts all of them into one.",
+    "beside them has a split, or --split puts all of them into one. Of drives with the same signals one is taken. "
+    "Columns of --where: the features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h in place of _rad and _m_s "
+    "(docs/retrain.md).",
     shared="sensors friction",
     car="The nominal car (default: what a set's manifest names)",
 )
@@ -75,6 +78,11 @@ def extract(
     model: Annotated[
         str, Option("--filter", help="Whose residuals: physics, or phy-ukf for --paper and --baselines.")
     ] = "physics",
+    where: Annotated[str | None, Option(metavar="EXPR", help="Learn only from rows on which this holds.")] = None,
+    per_cell: Annotated[
+        float | None,
+        Option(metavar="SECONDS", help="Of each cell of speed, |a_y| and friction at most so much, drawn by --seed."),
+    ] = None,
     jobs: options.Jobs = 1,
     resume: Annotated[bool, Option("--resume", help="Keep drives whose log and settings are as they were.")] = False,
     as_json: options.JsonFlag = False,
@@ -83,7 +91,16 @@ def extract(
     from pdhef_logtool.learning.network.extract_command import ExtractSettings
     from pdhef_logtool.learning.network.extract_command import extract as write_residuals
 
-    settings = ExtractSettings(config, truth_smoothing=truth_smoothing, split=split, seed=seed, vary=vary, model=model)
+    settings = ExtractSettings(
+        config,
+        truth_smoothing=truth_smoothing,
+        split=split,
+        seed=seed,
+        vary=vary,
+        model=model,
+        where=where,
+        per_cell_s=per_cell,
+    )
     with console.progress() as bar:
         result = write_residuals(logs, output, settings, jobs=jobs, resume=resume, progress=bar, warn=console.warn)
     console.finish(result, learning_tables.render_extraction, as_json)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.cli.console import cell, table
 
@@ -59,7 +60,8 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
     drives = table("drive", ">seconds", ">usable", *residuals, "split", "truth", fold=1)
     for drive in result.results:
         if drive.entry is None:
-            drives.add_row(drive.record.name, "-", "-", "-", "-", "-", "failed")
+            said = f"as {drive.copy_of}" if drive.copy_of else "failed"
+            drives.add_row(drive.record.name, "-", "-", "-", "-", "-", said)
             continue
         e, truth, rms = drive.entry, drive.entry["truth"], drive.entry["residual_rms"]
         half_s = truth["smoothing_half_s"]
@@ -76,7 +78,35 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
     splits = result.manifest["splits"].items()
     told = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
     console.print(", ".join(told))
+    _print_cells(result.manifest, console)
     console.print(f"dataset in {result.output}", soft_wrap=True)
+
+
+def _print_cells(manifest: Mapping[str, Any], console: Console) -> None:
+    """Print how much of each cell of driving split train holds, and how many hold nothing."""
+    from pdhef_logtool.learning.network.cells import AY_M_S2, FRICTION, SPEED_M_S, cells
+    from pdhef_logtool.learning.network.dataset import CHOSEN_SPLIT
+
+    seconds, empty = (manifest["cells"][key][CHOSEN_SPLIT] for key in ("usable_s", "empty"))
+    most = math.inf if manifest["choice"] is None else manifest["choice"]["per_cell_s"]
+    shown = table("friction", "|a_y|\nm/s²", *(f">{_span(SPEED_M_S, i)}\nm/s" for i in range(len(SPEED_M_S))))
+    for first in range(0, len(seconds), len(SPEED_M_S)):
+        row, bins = first // len(SPEED_M_S), cells()[first : first + len(SPEED_M_S)]
+        held = zip(bins, seconds[first : first + len(bins)], strict=True)
+        shown.add_row(
+            _span(FRICTION, row // len(AY_M_S2)),
+            _span(AY_M_S2, row % len(AY_M_S2)),
+            *(f"{min(s, most):.0f}" if s >= 0.5 else "<1" if s else "-" if c.in_reach else "" for c, s in held),
+        )
+    console.print(f"seconds to learn from in split {CHOSEN_SPLIT}" + ("" if most == math.inf else ", as chosen"))
+    console.print(shown)
+    within = sum(c.in_reach for c in cells())
+    console.print(f"{len(empty)} of the {within} cells that grip allows hold nothing")
+
+
+def _span(edges: Sequence[float], number: int) -> str:
+    low = f"{edges[number]:g}"
+    return f"{low} to {edges[number + 1]:g}" if number + 1 < len(edges) else f"{low} up"
 
 
 def render_training(result: TrainResult, console: Console) -> None:

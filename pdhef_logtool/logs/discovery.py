@@ -78,6 +78,16 @@ def folders_of(inputs: Sequence[LogInput]) -> list[str]:
     return [Path(os.path.relpath(f, common)).as_posix().removeprefix(".") for f in folders]
 
 
+def identity_of(log: LogInput) -> str:
+    """Return what a log is known by wherever it lies and whatever it is called: its content's sha256.
+
+    Raises
+    ------
+    LogError : It is neither a folder nor a regular file.
+    """
+    return hash_log(log.path)
+
+
 def hash_log(path: Path) -> str:
     """Return the sha256 of a log file, or of the names and contents of a log folder's files in order.
 

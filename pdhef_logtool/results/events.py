@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,7 +15,7 @@ from pdhef_logtool.evaluation.segments import RUN_GAP_S
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError, UsageError
 from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
-from pdhef_logtool.results.expression import ERRORS, FLAGS, SPEED, Applied, Column, Condition, Node, Number
+from pdhef_logtool.results.expression import ERRORS, FLAGS, OPERATIONS, SPEED, Column, Condition, Node, Number
 from pdhef_logtool.results.opened_run import ESTIMATES_FILE, OpenedLog, OpenedRun
 from pdhef_logtool.sinks.base import TRUTH
 
@@ -279,7 +279,8 @@ class _Builder:
         if isinstance(node, Column):
             found = self._column(node)
             return found if node.factor == 1.0 else found * node.factor
-        return _applied(node, [self.expression(operand) for operand in node.operands])
+        applied: pl.Expr = OPERATIONS[node.of](*(self.expression(operand) for operand in node.operands))
+        return applied
 
     def _column(self, column: Column) -> pl.Expr:
         track = column.track or self._main
@@ -307,24 +308,3 @@ class _Builder:
             error = pl.arctan2(error.sin(), error.cos())
             scored &= self._speed(TRUTH) > self._low_speed_m_s
         return pl.when(scored).then(error)
-
-
-def _applied(node: Applied, operands: Sequence[pl.Expr]) -> pl.Expr:
-    one = operands[0]
-    if len(operands) == 1:
-        return {"not": lambda: ~one, "minus": lambda: -one, "abs": one.abs}[node.of]()
-    other = operands[1]
-    return {
-        "and": lambda: one & other,
-        "or": lambda: one | other,
-        "+": lambda: one + other,
-        "-": lambda: one - other,
-        "*": lambda: one * other,
-        "/": lambda: one / other,
-        "<": lambda: one < other,
-        "<=": lambda: one <= other,
-        ">": lambda: one > other,
-        ">=": lambda: one >= other,
-        "==": lambda: one == other,
-        "!=": lambda: one != other,
-    }[node.of]()

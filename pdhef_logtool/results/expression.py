@@ -18,14 +18,18 @@ km_h. What is not known, as an error without truth, is neither true nor false.
 from __future__ import annotations
 
 import math
+import operator
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import NoReturn, TypeAlias
+from typing import Any, NoReturn, TypeAlias
+
+import numpy as np
 
 from pdhef_logtool.evaluation.metrics import SCORED_SIGNALS
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import TRACK_COLUMNS
 
 SPEED = "speed_m_s"
@@ -43,6 +47,12 @@ _TOKEN = re.compile(
     re.ASCII,
 )
 _COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
+#: What an :class:`Applied` does, on arrays as on expressions of polars.
+OPERATIONS: dict[str, Callable[..., Any]] = {
+    "not": operator.invert, "minus": operator.neg, "abs": abs, "and": operator.and_, "or": operator.or_,
+    "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv,
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +101,17 @@ class Condition:
         return _columns(self.node)
 
 
-def parse_condition(text: str) -> Condition:
-    """Read a condition.
+def parse_condition(text: str, columns: tuple[str, ...] = COLUMNS, guide: str = "docs/compare.md") -> Condition:
+    """Read a condition on the columns of tracks, or on others, which are all numbers and of no track.
+
+    ``guide``: the page that tells of the columns.
 
     Raises
     ------
     UsageError
         It does not parse, names no column, or mixes numbers with what is true or false; the place is told.
     """
-    parser = _Parser(text)
+    parser = _Parser(text, columns, guide)
     node = parser.condition()
     compared = next((n for n in _all(node) if isinstance(n, Applied) and n.of in _COMPARISONS), None)
     return Condition(
@@ -109,6 +121,21 @@ def parse_condition(text: str) -> Condition:
         peak=None if compared is None else compared.operands[0],
         falls=compared is not None and compared.of in ("<", "<="),
     )
+
+
+def where_holds(condition: Condition, columns: Mapping[str, FloatArray]) -> BoolArray:
+    """Return where a condition on columns [N] holds, its time aside; of a NaN no comparison holds but !=."""
+    count = len(next(iter(columns.values())))
+    with np.errstate(all="ignore"):
+        return np.broadcast_to(np.asarray(_value(condition.node, columns), dtype=np.bool_), count)
+
+
+def _value(node: Node, columns: Mapping[str, FloatArray]) -> Any:
+    if isinstance(node, Number):
+        return np.float64(node.value)
+    if isinstance(node, Column):
+        return columns[node.name] * node.factor
+    return OPERATIONS[node.of](*(_value(operand, columns) for operand in node.operands))
 
 
 def _all(node: Node) -> Iterator[Node]:
@@ -133,8 +160,8 @@ _Rule: TypeAlias = Callable[[], Node]
 
 
 class _Parser:
-    def __init__(self, text: str) -> None:
-        self._text = text
+    def __init__(self, text: str, columns: tuple[str, ...], guide: str) -> None:
+        self._text, self._columns, self._guide = text, columns, guide
         self.least_s = 0.0
         self._depth = 0
         if len(text) > _MOST_SIGNS:
@@ -236,11 +263,13 @@ class _Parser:
         track, _, name = self._word.rpartition(".")
         ours, factor = name, 1.0
         for end, (ending, times) in _UNITS.items():
-            if name.endswith(end) and name.removesuffix(end) + ending in COLUMNS:
+            if name.endswith(end) and name.removesuffix(end) + ending in self._columns:
                 ours, factor = name.removesuffix(end) + ending, times
-        if ours not in COLUMNS:
-            near = get_close_matches(name, [*COLUMNS, *_in_other_units()], n=1, cutoff=0.5)
-            self._fail(f"a column such as {near[0]}" if near else f"a column: {', '.join(COLUMNS)}")
+        if ours not in self._columns:
+            near = get_close_matches(name, [*self._columns, *_in_other_units(self._columns)], n=1, cutoff=0.5)
+            self._fail(f"a column such as {near[0]}" if near else f"a column: {', '.join(self._columns)}")
+        if track and self._columns is not COLUMNS:
+            self._fail(f"{name} alone")
         if track == "truth" and ours in ERRORS:
             self._fail("an estimator before an error")
         self._at += 1
@@ -318,10 +347,10 @@ class _Parser:
             expected=expected,
             got=got,
             where=f"--where, sign {at + 1} (here: {before[-30:]}»{after[:30]})",
-            remedy="docs/compare.md has the columns and what joins them",
+            remedy=f"{self._guide} has the columns and what joins them",
         )
 
 
-def _in_other_units() -> Iterator[str]:
+def _in_other_units(columns: tuple[str, ...]) -> Iterator[str]:
     for end, (ours, _) in _UNITS.items():
-        yield from (c.removesuffix(ours) + end for c in COLUMNS if c.endswith(ours))
+        yield from (c.removesuffix(ours) + end for c in columns if c.endswith(ours))

@@ -28,6 +28,7 @@ def arrow_schema(name: str) -> pa.Schema:
     types = {
         "int64": pa.int64(),
         "int32": pa.int32(),
+        "int16": pa.int16(),
         "float": pa.float32(),
         "double": pa.float64(),
         "bool": pa.bool_(),

@@ -124,7 +124,7 @@ def _extract(
 
 def _errors(result: ExtractResult, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
     """Usable rows: errors of the residual rates, and indices."""
-    (found,) = (d.arrays for d in read_dataset(result.output).drives)
+    (found,) = (d.load() for d in read_dataset(result.output).drives)
     index = np.round((found.stamps_ns - motion.stamps_ns[0]) / 1e7).astype(int)
     use = found.weight > 0
     error = found.targets[use] / found.step_s[use, None] - motion.residual[index[use]] / 0.01
@@ -223,7 +223,8 @@ def test_manifest_follows_its_schema(dataset: ExtractResult, sample_logs_dir: Pa
 
 
 def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
-    frame = pl.read_parquet(dataset.output / "drives/dlc.parquet")
+    (file,) = dataset.output.glob("split=*/car=truthsim-saloon-*/part-dlc.parquet")
+    frame = pl.read_parquet(file, hive_partitioning=False)
     assert frame.columns == [
         "stamp_ns",
         *FEATURES,
@@ -233,14 +234,22 @@ def test_rows_are_whole_and_in_order(dataset: ExtractResult) -> None:
         "truth_vy_m_s",
         "weight",
         "segment",
-        "split",
+        "chosen",
+        "cell",
+        "draw",
     ]
     assert frame["stamp_ns"].diff().drop_nulls().min() > 0  # type: ignore[operator]
     entry = next(d for d in dataset.manifest["drives"] if d["log"] == "dlc")
     assert (len(frame), int(frame["weight"].sum())) == (entry["rows"], entry["usable_rows"])
     usable = frame.filter(pl.col("weight") > 0)
     assert usable.null_count().sum_horizontal().item() == 0
-    assert set(frame["split"].unique()) == {entry["split"]}
+    assert frame["chosen"].all() and set(frame["cell"].unique()) <= {-1, *(int(n) for n in entry["cells"])}
+    assert sum(entry["cells"].values()) == entry["usable_rows"]
+    whole = pl.scan_parquet(dataset.output / "**/*.parquet", hive_partitioning=True)
+    sums = whole.group_by("split").agg(pl.len()).collect()
+    assert dict(sums.iter_rows()) == {
+        name: s["rows"] for name, s in dataset.manifest["splits"].items() if s["drives"]
+    }  # fmt: skip
 
 
 def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
@@ -248,8 +257,8 @@ def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
     assert data.features == FEATURES
     assert data.period_s == pytest.approx(0.01)
     for one in data.drives:
-        found = one.arrays
-        frame = pl.read_parquet(one.path).filter(pl.col(FEATURES[0]).is_not_null())
+        found = one.load()
+        frame = pl.read_parquet(one.path, hive_partitioning=False).filter(pl.col(FEATURES[0]).is_not_null())
         np.testing.assert_array_equal(found.features, frame.select(FEATURES).to_numpy())
         assert found.features.dtype == found.targets.dtype == found.weight.dtype == np.float32
         assert np.isfinite(found.features).all() and np.isfinite(found.targets).all()
@@ -263,7 +272,8 @@ def test_reading_back_gives_arrays_for_training(dataset: ExtractResult) -> None:
 def test_damaged_dataset_is_told(dataset: ExtractResult, tmp_path: Path) -> None:
     copy = tmp_path / "copy"
     shutil.copytree(dataset.output, copy)
-    (copy / "drives/dlc.parquet").write_bytes((copy / "drives/sweep.parquet").read_bytes())
+    files = {d.name: d.path for d in read_dataset(copy).drives}
+    files["dlc"].write_bytes(files["sweep"].read_bytes())
     broken = next(d for d in read_dataset(copy).drives if d.name == "dlc")
     with pytest.raises(OutputError, match="another content"):
         broken.load()
@@ -281,10 +291,9 @@ def test_processes_and_order_change_no_byte(dataset: ExtractResult, sample_logs_
     logs = [str(sample_logs_dir / name) for name in ("sweep.mcap", "dlc.mcap")]
     again = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), seed=4), jobs=2)
     assert again.manifest == dataset.manifest
-    for name in ("dlc", "sweep"):
-        assert (tmp_path / f"out/drives/{name}.parquet").read_bytes() == (
-            dataset.output / f"drives/{name}.parquet"
-        ).read_bytes()
+    for one in read_dataset(dataset.output).drives:
+        again_there = tmp_path / "out" / one.path.relative_to(dataset.output)
+        assert again_there.read_bytes() == one.path.read_bytes()
 
 
 @pytest.mark.slow
@@ -292,7 +301,8 @@ def test_resume_keeps_what_is_as_it_was(dataset: ExtractResult, sample_logs_dir:
     out = tmp_path / "out"
     shutil.copytree(dataset.output, out)
     (out / MANIFEST).unlink()  # a killed command leaves none
-    (out / "drives/sweep.parquet").write_bytes(b"PAR1 torn")
+    (torn,) = out.glob("split=*/car=*/part-sweep.parquet")
+    torn.write_bytes(b"PAR1 torn")
     logs = [str(sample_logs_dir / name) for name in ("dlc.mcap", "sweep.mcap")]
     settings = ExtractSettings(RunConfig(), seed=4)
     resumed = extract(logs, out, settings, resume=True)
@@ -337,7 +347,7 @@ def test_hash_split_is_stable_and_about_70_15_15() -> None:
 @pytest.mark.slow
 def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: Path, tmp_path: Path) -> None:
     shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "a.mcap")
-    shutil.copy(sample_logs_dir / "dlc.mcap", tmp_path / "b.mcap")
+    shutil.copy(sample_logs_dir / "sweep.mcap", tmp_path / "b.mcap")
     suite = {"format": 1, "drives": [{"file": "a.mcap", "split": "extrapolation"}, {"file": "c.mcap", "split": "test"}]}
     (tmp_path / "manifest.json").write_text(json.dumps(suite))
     logs = [str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")]
@@ -348,6 +358,8 @@ def test_manifest_beside_the_logs_decides_and_the_option_wins(sample_logs_dir: P
     jsonschema.validate(result.manifest, SCHEMA)
     chosen = extract(logs, tmp_path / "out", ExtractSettings(RunConfig(), split="validation"))
     assert {(d["split"], d["split_from"]) for d in chosen.manifest["drives"]} == {("validation", "option")}
+    # What stood in another split's folder is gone: it would be read with the rest.
+    assert {p.parent.parent.name for p in (tmp_path / "out").rglob("*.parquet")} == {"split=validation"}
 
 
 @pytest.mark.parametrize(
@@ -371,7 +383,7 @@ def test_calls_add_up_by_log_and_slice(sample_logs_dir: Path, tmp_path: Path) ->
         ("road.0-8.0", "train"),
         ("road.10.0-14.0", "validation"),
     ]
-    assert [d.name for d in read_dataset(out).drives if len(d.arrays.stamps_ns)] == ["road.0-8.0", "road.10.0-14.0"]
+    assert [d.name for d in read_dataset(out).drives if len(d.load().stamps_ns)] == ["road.0-8.0", "road.10.0-14.0"]
     again = extract([log], out, second).manifest
     assert again["sha256"] == both["sha256"], "what is extracted again takes its own place"
     other = extract([str(sample_logs_dir / "dlc.mcap")], out, ExtractSettings(RunConfig(), split="train")).manifest
@@ -428,8 +440,8 @@ def test_command_line_end_to_end(sample_logs_dir: Path, tmp_path: Path) -> None:
     (entry,) = document["manifest"]["drives"]
     assert entry["truth"]["kind"] == "recorded" and entry["truth"]["smoothing_half_s"] > 0
     # The two truths of one drive tell of the same residual.
-    found = drive.arrays
-    (other,) = (d.arrays for d in read_dataset(tmp_path / "rtk").drives)
+    found = drive.load()
+    (other,) = (d.load() for d in read_dataset(tmp_path / "rtk").drives)
     both = (found.weight > 0) & (other.weight > 0)
     for i in range(2):
         assert np.corrcoef(found.targets[both, i], other.targets[both, i])[0, 1] > 0.95
@@ -446,13 +458,11 @@ def test_errors_are_one_line(tmp_path: Path) -> None:
 def test_a_dataset_never_replaces_what_it_is_made_from(sample_logs_dir: Path, tmp_path: Path) -> None:
     log = tmp_path / "dlc.mcap"
     shutil.copy(sample_logs_dir / "dlc.mcap", log)
-    for name in ("drives/dlc.parquet", "manifest.json"):
-        file = tmp_path / "out" / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.symlink_to(log)
-        with pytest.raises(UsageError, match=r"replace the input|another manifest"):
-            extract([str(log)], tmp_path / "out", ExtractSettings(RunConfig()))
-        file.unlink()
+    file = tmp_path / "out" / "manifest.json"
+    file.parent.mkdir()
+    file.symlink_to(log)
+    with pytest.raises(UsageError, match=r"replace the input|another manifest"):
+        extract([str(log)], tmp_path / "out", ExtractSettings(RunConfig()))
     assert log.read_bytes() == (sample_logs_dir / "dlc.mcap").read_bytes()
 
 
@@ -473,7 +483,7 @@ def test_a_command_that_is_ended_takes_its_processes_with_it(
     command = [sys.executable, "-m", "pdhef_logtool", "extract", *logs, "-o", str(out), "--seed", "4", "--jobs", "2"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         children: list[int] = []
-        while len(children) < 2 or not list((out / "drives").glob(".*.partial")):
+        while len(children) < 2 or not list(out.glob("split=*/car=*/.*.partial")):
             assert process.poll() is None
             time.sleep(0.01)
             children = [int(c) for c in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
@@ -486,6 +496,5 @@ def test_a_command_that_is_ended_takes_its_processes_with_it(
         time.sleep(0.05)
     assert not any(Path(f"/proc/{child}/stat").exists() for child in children)
     assert extract(logs, out, ExtractSettings(RunConfig(), seed=4)).manifest == dataset.manifest
-    assert {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()} == {
-        "manifest.json", "drives/dlc.parquet", "drives/sweep.parquet",
-    }  # fmt: skip
+    files = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert files == {"manifest.json", *(d["file"] for d in dataset.manifest["drives"])}

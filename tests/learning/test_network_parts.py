@@ -22,6 +22,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.learning.network import baselines, extract_command, fit, train_command
 from pdhef_logtool.learning.network.baselines import SideslipSequence, fit_dataset, run_baselines
+from pdhef_logtool.learning.network.cells import Picked
 from pdhef_logtool.learning.network.dataset import (
     DriveArrays,
     DriveWriter,
@@ -116,7 +117,7 @@ def residual_rows(count: int = 120, **changes: Any) -> ResidualRows:
 def entry_of(log: str, split: str, rows: ResidualRows, period_s: float = 0.01) -> dict[str, Any]:
     return {
         "name": log, "log": log, "split": split, "rows": len(rows), "usable_rows": int(rows.weight.sum()),
-        "period_s": period_s,
+        "period_s": period_s, "signals_sha256": None, "cells": {"3": 10}, "car": "test car",
         "vehicle_sha256": "f" * 64, "source": {"file": log, "sha256": log}, "start_s": 0.0, "end_s": 1.0,
     }  # fmt: skip
 
@@ -127,10 +128,10 @@ SETTINGS = {"a": 1, "model": "physics"}
 def write_dataset(folder: Path, **drives: tuple[str, ResidualRows]) -> None:
     entries = []
     for log, (split, rows) in drives.items():
-        writer = DriveWriter(drive_file(folder, log), split, rows_a_group=50)
+        entries.append(entry_of(log, split, rows, 0.02 if log == "z" else 0.01))
+        writer = DriveWriter(drive_file(folder, entries[-1]), rows_a_group=50)
         for a in range(0, len(rows), 35):
             writer.append(replace(rows, **{k: getattr(rows, k)[a : a + 35] for k in rows.__slots__}))
-        entries.append(entry_of(log, split, rows, 0.02 if log == "z" else 0.01))
         writer.finish(entries[-1])
     write_manifest(
         folder,
@@ -161,12 +162,14 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
         "extra": {"drives": 1, "rows": 40, "usable_rows": 39},
     }
     assert (document["period_s"], document["seed"], document["settings"]) == (0.01, 3, SETTINGS)
-    assert document["drives"][2]["file"] == "drives/z.parquet"
-    assert read_entry(drive_file(tmp_path, "z")) == entry_of("z", "train", rows, 0.02)
+    file = "split=train/car=test-car-ffffffff/part-z.parquet"
+    assert document["drives"][2]["file"] == file
+    assert read_entry(tmp_path / file) == entry_of("z", "train", rows, 0.02)
+    assert document["cells"]["usable_s"]["train"][3] == pytest.approx(0.3) and document["choice"] is None
     data = read_dataset(tmp_path)
     assert data.vehicle_name == "test car" and data.vehicle(data.drives[0]) == CAR
     assert data.identified_share == 1.0
-    found = data.drives[2].arrays
+    found = data.drives[2].load()
     kept = np.delete(np.arange(120), 5)
     np.testing.assert_array_equal(found.stamps_ns, rows.stamps_ns[kept])
     np.testing.assert_array_equal(found.features, rows.features[kept].astype(np.float32))
@@ -181,9 +184,9 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path) -> None:
         (tmp_path / "manifest.json").write_text(json.dumps({**document, **wrong}))
         with pytest.raises(OutputError, match="extract"):
             read_dataset(tmp_path)
-    frame = pl.read_parquet(tmp_path / "drives/z.parquet")
+    frame = pl.read_parquet(tmp_path / file, hive_partitioning=False)
     assert frame["target_dvy_m_s"].null_count() == 1 and frame[FEATURES[0]].null_count() == 1
-    groups = pl.read_parquet_metadata(tmp_path / "drives/z.parquet")
+    groups = pl.read_parquet_metadata(tmp_path / file)
     assert groups["pdhef.drive"] == json.dumps(entry_of("z", "train", rows, 0.02), sort_keys=True)
 
 
@@ -192,7 +195,7 @@ def test_parts_of_rows_change_no_byte_and_a_dropped_file_is_gone(tmp_path: Path)
     files = []
     for size in (7, 50, 170):
         path = tmp_path / f"{size}.parquet"
-        writer = DriveWriter(path, "train", rows_a_group=50)
+        writer = DriveWriter(path, rows_a_group=50)
         for a in range(0, 170, size):
             writer.append(replace(rows, **{k: getattr(rows, k)[a : a + size] for k in rows.__slots__}))
         writer.finish({})
@@ -202,7 +205,7 @@ def test_parts_of_rows_change_no_byte_and_a_dropped_file_is_gone(tmp_path: Path)
 
     metadata = pq.read_metadata(tmp_path / "7.parquet")
     assert [metadata.row_group(g).num_rows for g in range(metadata.num_row_groups)] == [50, 50, 50, 20]
-    writer = DriveWriter(tmp_path / "gone.parquet", "train")
+    writer = DriveWriter(tmp_path / "gone.parquet")
     writer.append(rows)
     writer.abort()
     assert not (tmp_path / "gone.parquet").exists()
@@ -220,7 +223,7 @@ def test_settings_say_what_decides_a_dataset() -> None:
     plain = ExtractSettings(RunConfig(car=Path("a/b.toml"), end="5"))
     assert plain.to_dict() == {
         "car": "b.toml", "mapping": None, "start": None, "end": "5", "sensors": "full", "prefer_truth": "perfect",
-        "truth_smoothing": "auto", "split": None, "model": "physics",
+        "truth_smoothing": "auto", "split": None, "model": "physics", "where": None, "per_cell_s": None,
     }  # fmt: skip
     varied = ExtractSettings(RunConfig(friction=0.5), vary=0.1, seed=7).to_dict()
     assert (varied["friction"], varied["vary"], varied["vary_seed"]) == (0.5, 0.1, 7)
@@ -297,8 +300,9 @@ def test_counts_are_sums_over_the_usable_rows() -> None:
     counts = extract_command._Counts()
     assert counts.to_dict() == {
         "duration_s": 0.0, "rows": 0, "usable_rows": 0, "segments": 0,
-        "residual_rms": {"vy_dot_m_s2": None, "yaw_acceleration_rad_s2": None},
+        "residual_rms": {"vy_dot_m_s2": None, "yaw_acceleration_rad_s2": None}, "cells": {},
     }  # fmt: skip
+    picked = Picked(np.array([True, True, False, True]), np.array([2, 2, 2, 2], dtype=np.int16), np.zeros(4, "f4"))
     for first, value in ((0, 0.03), (4, 0.04)):
         counts.add(
             residual_rows(
@@ -308,11 +312,13 @@ def test_counts_are_sums_over_the_usable_rows() -> None:
                 step_s=np.full(4, 0.01),
                 weight=np.array([1.0, 1.0, 1.0, 0.0]),
                 segment=np.array([first, first, first, 8]),
-            )
+            ),
+            picked,
         )
     found = counts.to_dict()
     rms = found.pop("residual_rms")
-    assert found == {"duration_s": pytest.approx(0.07), "rows": 8, "usable_rows": 6, "segments": 2}
+    cells = {"2": 4}  # of those that the condition chooses
+    assert found == {"duration_s": pytest.approx(0.07), "rows": 8, "usable_rows": 6, "segments": 2, "cells": cells}
     assert rms == {"vy_dot_m_s2": pytest.approx(math.sqrt(12.5)), "yaw_acceleration_rad_s2": pytest.approx(1.0)}
 
 
@@ -336,10 +342,14 @@ def test_a_fingerprint_follows_all_that_decides_a_file_and_nothing_else(tmp_path
         (replace(job, car=Car.of(CAR.model_copy(update={"mass_kg": 1501.0}))), "train"),
         (replace(job, settings=ExtractSettings(RunConfig(mapping=mapping), truth_smoothing="none")), "train"),
         (replace(job, settings=ExtractSettings(RunConfig())), "train"),
+        (replace(job, settings=replace(job.settings, where="vx_m_s > 1")), "train"),
+        (replace(job, settings=replace(job.settings, seed=1)), "train"),
     ]
+    # What is chosen of the cells is said by the manifest alone.
+    assert extract_command._fingerprint(replace(job, settings=replace(job.settings, per_cell_s=9.0)), "train") == same
     copy.write_text("a = 2")
     others.append((renamed, "train"))
-    assert len({same, *(extract_command._fingerprint(*o) for o in others)}) == 6
+    assert len({same, *(extract_command._fingerprint(*o) for o in others)}) == 8
 
 
 class DyingPool:
@@ -407,9 +417,9 @@ def test_an_empty_split_is_told_and_a_default_car_is(tmp_path: Path, monkeypatch
     def one(job: Any, _progress: Any) -> Any:
         assert not (job.output / "manifest.json").exists()  # while drives are written, the old one is not true
         rows, split = residual_rows(60), "train" if job.log_input.stem == "a" else "test"
-        writer = DriveWriter(drive_file(job.output, job.log_input.stem), split)
-        writer.append(rows)
         entry = {**entry_of(job.log_input.stem, split, rows), "vehicle_sha256": job.physics[0]}
+        writer = DriveWriter(drive_file(job.output, entry))
+        writer.append(rows)
         writer.finish(entry)
         return replace(extract_command._failure(job, ""), entry=entry)
 
@@ -651,7 +661,7 @@ def arrays(count: int = 200, **changes: Any) -> DriveArrays:
 
 
 def dataset(**drives: tuple[str, DriveArrays]) -> Any:
-    held = tuple(SimpleNamespace(name=n, split=s, arrays=a) for n, (s, a) in drives.items())
+    held = tuple(SimpleNamespace(name=n, split=s, load=lambda a=a: a) for n, (s, a) in drives.items())
     slow = SimpleNamespace(low_speed_blend_m_s=3.0)
     about: dict[str, Any] = {"model": "physics", "physics_sha256": "e" * 64, "vehicle_name": "a car"}
     about["identified_share"] = 0.5

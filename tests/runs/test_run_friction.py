@@ -152,7 +152,7 @@ def test_the_network_is_trained_with_what_a_run_tells(
     (entry,) = result.manifest["drives"]
     assert entry["friction_from"].startswith("estimate, observable")
     assert result.manifest["settings"]["friction"] == "estimate"
-    (found,) = (d.arrays for d in read_dataset(tmp_path).drives)
+    (found,) = (d.load() for d in read_dataset(tmp_path).drives)
     track = slippery[2].drop_nulls("friction")
     of_run = dict(zip(track["stamp_ns"].to_list(), track["friction"].to_list(), strict=True))
     told = found.features[:, FEATURES.index("friction")].tolist()

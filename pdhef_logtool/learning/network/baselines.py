@@ -21,6 +21,7 @@ from pdhef_logtool.learning.network.train_command import (
     gap_free_runs,
     make_recipe,
     train_on,
+    weights_of,
 )
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.files import write_bytes
@@ -182,10 +183,10 @@ def _sequences(data: Dataset, split: str) -> Iterable[SideslipSequence]:
         if drive.split != split:
             continue
         slowest = data.vehicle(drive).low_speed_blend_m_s
-        rows = drive.arrays
+        rows = drive.load()
         for part in gap_free_runs(rows):
             vx, vy = np.asarray(rows.truth_velocity[part], dtype=np.float64).T
-            used = (rows.weight[part] > 0.0) & (vx >= slowest) & np.isfinite(vy)
+            used = (weights_of(rows, part) > 0.0) & (vx >= slowest) & np.isfinite(vy)
             yield SideslipSequence(
                 features=np.asarray(rows.features[part], dtype=np.float64),
                 dt_s=np.concatenate([[np.nan], np.diff(rows.stamps_ns[part]) * 1e-9]),

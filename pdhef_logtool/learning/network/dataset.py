@@ -1,5 +1,6 @@
 """A residual dataset on disk: one Parquet file a drive, and manifest.json that makes them one dataset (DESIGN §8).
 
+Files stand in ``split=SPLIT/car=CAR/part-DRIVE.parquet``: ``polars.scan_parquet`` and others read them as one table.
 Features, targets and weights are stored as float32: a relative error of 6e-8, which no network sees. Each file carries
 its own entry of the manifest in its footer, so that what an interrupted command had finished can be kept. Files in the
 folder that the manifest does not name are no part of the dataset. Calls add up: the manifest keeps what earlier ones
@@ -10,11 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeAlias
+from urllib.parse import quote
 
 import numpy as np
 import pyarrow as pa
@@ -23,23 +26,31 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.car.parts import digest
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.learning.network.cells import COUNT, EVERYTHING, Picked, Picking, draw_limits, is_chosen, table_of
 from pdhef_logtool.learning.network.residuals import ResidualRows
 from pdhef_logtool.records.errors import OutputError
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.sinks.parquet import RowGroups
 from pdhef_logtool.sinks.report import tool_versions, write_json
 from pdhef_logtool.sinks.schema import arrow_schema
 
 FORMAT = "pdhef.residual-dataset"
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
+#: Versions that can be opened; what is written is of the last.
+READABLE = (3, FORMAT_VERSION)
 MANIFEST = "manifest.json"
 #: Of more vehicles a bundle names the number.
 NAMED_VEHICLES = 4
-DRIVES = "drives"
+#: All files of a dataset that may be drives, by a pattern of its folder.
+FILES = "split=*/car=*/part-*.parquet"
+#: Signs of a car's name in the name of its folder, and of the digest behind them.
+_CAR_NAME, _CAR_DIGEST = 24, 8
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
 TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
 SPLITS = ("train", "validation", "test")
+#: The split of which --per-cell chooses: the others stay as the fleet drives.
+CHOSEN_SPLIT = "train"
 #: Rows of a row group: what waits stays below 2 MB.
 ROWS_A_GROUP = 32768
 
@@ -52,19 +63,23 @@ FloatArray32: TypeAlias = NDArray[np.float32]
 class DriveWriter:
     """Writes the Parquet file of one drive; the same rows give the same bytes, however they are handed over.
 
+    ``picking`` says which rows are learnt from.
+
     Raises
     ------
     OutputError
         When the file cannot be written.
     """
 
-    def __init__(self, path: Path, split: str, rows_a_group: int = ROWS_A_GROUP) -> None:
-        self._schema, self._split = arrow_schema(_SCHEMA), split
-        self._file = RowGroups(path, self._schema, rows_a_group, ["split", "segment"], joined=True)
+    def __init__(self, path: Path, picking: Picking = EVERYTHING, rows_a_group: int = ROWS_A_GROUP) -> None:
+        self._schema, self._picking = arrow_schema(_SCHEMA), picking
+        self._file = RowGroups(path, self._schema, rows_a_group, ["segment", "cell", "draw"], joined=True)
 
-    def append(self, rows: ResidualRows) -> None:
-        """Take the next rows of the drive."""
-        self._file.append(self._split, _table(rows, self._split, self._schema))
+    def append(self, rows: ResidualRows) -> Picked:
+        """Take the next rows of the drive; return which of them are learnt from."""
+        picked = self._picking.of(rows)
+        self._file.append("", _table(rows, picked, self._schema))
+        return picked
 
     def finish(self, entry: Mapping[str, Any]) -> None:
         """Write what waits and the drive's entry, and give the file its name."""
@@ -75,19 +90,17 @@ class DriveWriter:
         self._file.abort()
 
 
-def _table(rows: ResidualRows, split: str, schema: pa.Schema) -> pa.Table:
+def _table(rows: ResidualRows, picked: Picked, schema: pa.Schema) -> pa.Table:
     columns: dict[str, Any] = {name: rows.features[:, i] for i, name in enumerate(FEATURES)}
     columns |= {name: rows.targets[:, i] for i, (name, _) in enumerate(TARGETS)}
     columns |= {name: rows.truth_velocity[:, i] for i, name in enumerate(TRUTH)}
     columns |= {"stamp_ns": rows.stamps_ns, "weight": rows.weight, "segment": rows.segment.astype(np.int32)}
+    columns |= {"chosen": picked.chosen, "cell": picked.cell, "draw": picked.draw}
     arrays = []
     for f in schema:
-        if f.name == "split":
-            arrays.append(pa.DictionaryArray.from_arrays(np.zeros(len(rows), dtype=np.int32), [split]))
-        else:
-            values = np.asarray(columns[f.name])
-            values = values.astype(np.float32) if f.type == pa.float32() else values
-            arrays.append(pa.array(values, type=f.type, from_pandas=True))
+        values = np.asarray(columns[f.name])
+        values = values.astype(np.float32) if f.type == pa.float32() else values
+        arrays.append(pa.array(values, type=f.type, from_pandas=True))
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
@@ -101,9 +114,16 @@ def read_entry(path: Path) -> dict[str, Any] | None:
     return entry if isinstance(entry, dict) else None
 
 
-def drive_file(folder: Path, name: str) -> Path:
-    """Return where a drive stands in a dataset, by the name of its log and slice."""
-    return folder / DRIVES / f"{name}.parquet"
+def drive_file(folder: Path, entry: Mapping[str, Any]) -> Path:
+    """Return where a drive stands in a dataset, by its entry: split, car and the name of its log and slice."""
+    name = re.sub(r"[^A-Za-z0-9._]+", "-", entry["car"])[:_CAR_NAME]
+    car = f"car={name}-{entry['vehicle_sha256'][:_CAR_DIGEST]}"
+    return folder / split_folder(entry["split"]) / car / f"part-{entry['name']}.parquet"
+
+
+def split_folder(split: str) -> str:
+    """Return the name of the folder of a split; readers of such folders take back the quoting."""
+    return f"split={quote(split, safe='')}"
 
 
 def write_manifest(
@@ -114,18 +134,20 @@ def write_manifest(
     settings: Mapping[str, Any],
     seed: int,
     vehicles: Mapping[str, Mapping[str, Any]],
+    duplicates: Sequence[Mapping[str, str]] = (),
 ) -> dict[str, Any]:
     """Write manifest.json over the drives' files that are there, and return it; raises OutputError.
 
     Parameters
     ----------
     entries : one a drive, as in its file. failed : log, file and reason of the logs that gave none.
-    settings, seed : of the call that wrote last. vehicles : by the digest of their physics; those that no drive names
-        are left out.
+    duplicates : log, file and the name of the drive that holds the same, of the logs that were left out for it.
+    settings, seed : of the call that wrote last; with ``per_cell_s`` so much of each cell is chosen of split train.
+    vehicles : by the digest of their physics; those that no drive names are left out.
     """
     drives = []
     for entry in sorted(entries, key=lambda e: str(e["name"])):
-        path = drive_file(folder, entry["name"])
+        path = drive_file(folder, entry)
         drives.append({**entry, "file": path.relative_to(folder).as_posix(), "file_sha256": _sha256(path)})
     splits: dict[str, dict[str, int]] = {name: {"drives": 0, "rows": 0, "usable_rows": 0} for name in SPLITS}
     for d in drives:
@@ -133,7 +155,10 @@ def write_manifest(
         total["drives"] += 1
         total["rows"] += d["rows"]
         total["usable_rows"] += d["usable_rows"]
-    content = json.dumps([[d["name"], d["file_sha256"]] for d in drives]).encode()
+    cells = {name: _seconds_by_cell([d for d in drives if d["split"] == name]) for name in splits}
+    per_cell_s = settings.get("per_cell_s")
+    limits = None if per_cell_s is None else _limits(folder, drives, per_cell_s)
+    content = json.dumps([[[d["name"], d["file_sha256"]] for d in drives], limits]).encode()
     document = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
@@ -146,12 +171,46 @@ def write_manifest(
         "seed": seed,
         "vehicles": [vehicles[sha256] for sha256 in sorted({d["vehicle_sha256"] for d in drives})],
         "splits": splits,
+        "cells": table_of(cells),
+        "choice": None if limits is None else {"per_cell_s": per_cell_s, "limits": limits},
         "drives": drives,
         "failed": list(failed),
+        "duplicates": list(duplicates),
         "versions": tool_versions(),
     }
     write_json(folder / MANIFEST, document)
     return document
+
+
+def _seconds_by_cell(drives: Sequence[Mapping[str, Any]]) -> list[float]:
+    seconds = [0.0] * COUNT
+    for d in drives:
+        for number, rows in d.get("cells", {}).items():
+            seconds[int(number)] += rows * d["period_s"]
+    return seconds
+
+
+def _limits(folder: Path, drives: Sequence[Mapping[str, Any]], per_cell_s: float) -> list[float]:
+    def usable() -> Iterator[tuple[NDArray[np.int16], FloatArray32, float]]:
+        for d in drives:
+            if d["split"] == CHOSEN_SPLIT:
+                names = ["cell", "draw", "weight", "chosen"]
+                table = pq.read_table(folder / d["file"], columns=names, partitioning=None)
+                use = (table["weight"].to_numpy() > 0.0) & table["chosen"].to_numpy()
+                yield table["cell"].to_numpy()[use], table["draw"].to_numpy()[use], float(d["period_s"])
+
+    return draw_limits(usable(), per_cell_s)
+
+
+def remove_unnamed(folder: Path, manifest: Mapping[str, Any]) -> None:
+    """Remove the files of drives that the manifest does not name: they would be read with the others."""
+    named = {d["file"] for d in manifest["drives"]}
+    for path in sorted(folder.glob(FILES)):
+        if path.relative_to(folder).as_posix() not in named:
+            path.unlink()
+            for parent in (path.parent, path.parent.parent):
+                with suppress(OSError):  # it holds others
+                    parent.rmdir()
 
 
 def vehicle_entry(sha256: str, vehicle: VehicleParameters, *, identified: bool) -> dict[str, Any]:
@@ -184,6 +243,7 @@ class DriveArrays:
     step_s : float64 [N], time that a target covers: target / step is the residual rate; the period at the last row.
     weight : float32 [N]. segment : int64 [N]; recurrent state starts anew where it changes.
     truth_velocity : float32 [N, 2], true v_x and v_y; NaN where unknown.
+    chosen : bool [N], which rows are learnt from where the weight allows it; None: all.
     """
 
     stamps_ns: IntArray
@@ -193,13 +253,14 @@ class DriveArrays:
     weight: FloatArray32
     segment: IntArray
     truth_velocity: FloatArray32
+    chosen: BoolArray | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class DatasetDrive:
-    """One drive of a dataset; its arrays are read when one of them is first asked for, and kept.
+    """One drive of a dataset, whose arrays are read each time that they are asked for: a set may not fit the memory.
 
-    ``entry`` is what the manifest says of it.
+    ``entry`` is what the manifest says of it; ``limits`` are those of the cells, None: all is chosen.
     """
 
     name: str
@@ -209,14 +270,10 @@ class DatasetDrive:
     usable_rows: int
     period_s: float
     entry: Mapping[str, Any]
-
-    @cached_property
-    def arrays(self) -> DriveArrays:
-        """All arrays; see :meth:`load`."""
-        return self.load()
+    limits: Sequence[float] | None = None
 
     def load(self) -> DriveArrays:
-        """Read the drive's file, without keeping anything.
+        """Read the drive's file.
 
         Raises
         ------
@@ -230,7 +287,7 @@ class DatasetDrive:
                 where=str(self.path),
                 remedy="extract it again",
             )
-        table = pq.read_table(self.path)
+        table = pq.read_table(self.path, partitioning=None)
         column = {name: table[name].to_numpy() for name in table.column_names if name != "split"}
         stamps = column["stamp_ns"].astype(np.int64)
         step_s = np.full(stamps.shape[0], self.period_s)
@@ -240,6 +297,9 @@ class DatasetDrive:
         weight = column["weight"].astype(np.float32)
         targets[weight == 0.0] = 0.0
         known = np.isfinite(features).all(axis=1)
+        chosen: BoolArray = column.get("chosen", np.ones_like(known))
+        if self.limits is not None:
+            chosen = chosen & is_chosen(column["cell"], column["draw"], self.limits)
         return DriveArrays(
             stamps_ns=stamps[known],
             features=features[known],
@@ -248,6 +308,7 @@ class DatasetDrive:
             weight=weight[known],
             segment=column["segment"].astype(np.int64)[known],
             truth_velocity=np.stack([column[name] for name in TRUTH], axis=1).astype(np.float32)[known],
+            chosen=None if chosen[known].all() else chosen[known],
         )
 
 
@@ -304,13 +365,14 @@ def read_dataset(folder: Path) -> Dataset:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         kind = (document["format"], document["version"])
-        if kind != (FORMAT, FORMAT_VERSION) or document["features"] != list(FEATURES):
+        if kind[0] != FORMAT or kind[1] not in READABLE or document["features"] != list(FEATURES):
             raise OutputError(
                 expected=f"{FORMAT} {FORMAT_VERSION} with the features {', '.join(FEATURES)}",
                 got=f"{kind[0]} {kind[1]} with {', '.join(document['features'])}",
                 where=str(path),
                 remedy="pdhef extract LOG... -o DATASET makes it anew, in another folder",
             )
+        limits = (document.get("choice") or {}).get("limits")
         return Dataset(
             folder=folder,
             model=str(document["model"]),
@@ -326,6 +388,7 @@ def read_dataset(folder: Path) -> Dataset:
                     usable_rows=int(d["usable_rows"]),
                     period_s=float(d["period_s"]),
                     entry=d,
+                    limits=limits if d["split"] == CHOSEN_SPLIT else None,
                 )
                 for d in document["drives"]
             ),

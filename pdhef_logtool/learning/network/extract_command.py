@@ -35,8 +35,8 @@ from pdhef_logtool.learning.drives import (
     set_manifest,
     tell_drive,
 )
+from pdhef_logtool.learning.network.cells import COUNT, Picked, Picking, condition_of, rows_by_cell
 from pdhef_logtool.learning.network.dataset import (
-    DRIVES,
     FORMAT,
     FORMAT_VERSION,
     MANIFEST,
@@ -44,6 +44,8 @@ from pdhef_logtool.learning.network.dataset import (
     DriveWriter,
     drive_file,
     read_entry,
+    remove_unnamed,
+    split_folder,
     vehicle_entry,
     write_manifest,
 )
@@ -88,6 +90,8 @@ class ExtractSettings:
     seed : of that hash, and of the variation.
     vary : spread by which friction and vehicle are made wrong for a part of the drives (``variation.vary``).
     model : whose residuals, one of :data:`~.bundle.MODELS`.
+    where : condition on the columns of a row (``cells.COLUMNS``); rows on which it does not hold are not learnt from.
+    per_cell_s : at most so many seconds of each cell of driving are chosen of split train; None = all.
     """
 
     config: RunConfig
@@ -96,6 +100,8 @@ class ExtractSettings:
     seed: int = 0
     vary: float = 0.0
     model: str = PHYSICS_MODEL
+    where: str | None = None
+    per_cell_s: float | None = None
 
     def name_of(self, log: str) -> str:
         """Return what the slice of a log is called in the dataset."""
@@ -133,17 +139,23 @@ class ExtractSettings:
             "truth_smoothing": self.truth_smoothing,
             "split": self.split,
             "model": self.model,
+            "where": self.where,
+            "per_cell_s": self.per_cell_s,
             **({"vary": self.vary, "vary_seed": self.seed} if self.vary else {}),
         }
 
 
 @dataclass(frozen=True, slots=True)
 class DriveResult:
-    """What came of one log: its entry in the manifest, None if it is left out. ``kept``: from an earlier command."""
+    """What came of one log: its entry in the manifest, None if it is left out. ``kept``: from an earlier command.
+
+    ``copy_of``: the drive in the dataset whose signals it holds too, empty without.
+    """
 
     record: DriveRecord
     entry: dict[str, Any] | None
     kept: bool = False
+    copy_of: str = ""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -192,6 +204,11 @@ class _Job:
         """What the drive is called in the dataset."""
         return self.settings.name_of(self.log_input.stem)
 
+    def target(self, split: str) -> Path:
+        """Where the drive stands in the dataset."""
+        sha, vehicle = self.physics
+        return drive_file(self.output, {"name": self.name, "split": split, "car": vehicle.name, "vehicle_sha256": sha})
+
     @property
     def physics(self) -> tuple[str, VehicleParameters]:
         """The vehicle whose model residuals are of, and its digest."""
@@ -233,32 +250,44 @@ def extract(
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
-    files = [output / MANIFEST, *(drive_file(output, name) for name in sorted(names))]
-    check_no_input([*(i.path for i in inputs), *settings.config.files, *(j.car.source for j in work)], files)
+    read = [*(i.path for i in inputs), *settings.config.files, *(j.car.source for j in work)]
+    check_no_input(read, [output / MANIFEST])
     kept = [_as_in_file(d) for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
 
     def write(results: Sequence[DriveResult]) -> dict[str, Any]:
         entries = [r.entry for r in results if r.entry is not None]
-        _check_apart([*kept, *entries])
+        held = {e["signals_sha256"] for e in entries} - {None}
+        entries += [d for d in kept if d["signals_sha256"] not in held]
+        _check_apart(entries)
         left_out = [r.record for r in results if r.record.left_out]
         failed = [{"log": r.name, "file": r.file, "reason": r.left_out} for r in left_out]
+        copies = [{"log": r.record.name, "file": r.record.file, "of": r.copy_of} for r in results if r.copy_of]
         return write_manifest(
-            output, [*kept, *entries], failed, settings=settings.to_dict(), seed=settings.seed, vehicles=vehicles
+            output,
+            entries,
+            failed,
+            settings=settings.to_dict(),
+            seed=settings.seed,
+            vehicles=vehicles,
+            duplicates=copies,
         )
 
-    with OutputFolder(output, (DRIVES,)):
+    splits = {*SPLITS, settings.split, *(job.listed_split for job in work)} - {None}
+    with OutputFolder(output, sorted(split_folder(str(s)) for s in splits)):
         # Until the new manifest stands, what the old one says of the files that change is no longer true.
         if kept:
             write([])
         else:
             with writing(output):
                 (output / MANIFEST).unlink(missing_ok=True)
-        results = _extract_all(work, jobs, progress, warn)
+        results = _without_copies(_extract_all(work, jobs, progress, warn), warn)
         for job in work:
             sha, vehicle = job.physics
             vehicles[sha] = vehicle_entry(sha, vehicle, identified=job.car.fitted_physics is not None)
         manifest = write(results)
+        with writing(output):
+            remove_unnamed(output, manifest)
     if settings.split is None and manifest["drives"] and not all(manifest["splits"][s]["drives"] for s in SPLITS):
         empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
         warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
@@ -267,6 +296,25 @@ def extract(
 
 def _as_in_file(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in entry.items() if k not in ("file", "file_sha256")}
+
+
+def _without_copies(results: Sequence[DriveResult], warn: Tell) -> tuple[DriveResult, ...]:
+    """Leave out drives whose signals another one holds too, by name the first: it would count twice, or test itself."""
+    first: dict[str, str] = {}
+    for entry in sorted((r.entry for r in results if r.entry is not None), key=lambda e: str(e["name"])):
+        first.setdefault(str(entry["signals_sha256"]), entry["name"])
+
+    def told(result: DriveResult) -> DriveResult:
+        entry = result.entry
+        if entry is None or entry["signals_sha256"] is None:
+            return result
+        other = first[entry["signals_sha256"]]
+        if other == entry["name"]:
+            return result
+        warn(f"{result.record.name} is left out: it holds the same signals as {other}")
+        return replace(result, entry=None, copy_of=other)
+
+    return tuple(told(r) for r in results)
 
 
 def _check_apart(entries: Sequence[Mapping[str, Any]]) -> None:
@@ -340,6 +388,10 @@ def _check_counts(jobs: int, settings: ExtractSettings) -> None:
         raise UsageError(expected=f"a spread of 0 to {MAX_VARIATION:g}", got=str(settings.vary), where="--vary")
     if settings.split is not None and settings.split not in SPLITS:
         raise UsageError(expected=f"one of {', '.join(SPLITS)}", got=repr(settings.split), where="--split")
+    if settings.where is not None:
+        condition_of(settings.where)
+    if settings.per_cell_s is not None and not 0.0 < settings.per_cell_s < math.inf:
+        raise UsageError(expected="seconds above 0", got=str(settings.per_cell_s), where="--per-cell")
     if settings.model not in MODELS:
         raise UsageError(expected=f"one of {', '.join(MODELS)}", got=repr(settings.model), where="--filter")
 
@@ -414,7 +466,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     source = hash_log(job.log_input.path)
     split, split_from = choose_split(source, settings.seed, chosen=settings.split, listed=job.listed_split)
     fingerprint = _fingerprint(job, split)
-    target = drive_file(job.output, job.name)
+    target = job.target(split)
     if job.resume:
         entry = read_entry(target)
         if (
@@ -439,7 +491,8 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 yield window
                 progress(window.share_done)
 
-        writer = DriveWriter(target, split)
+        condition = None if settings.where is None else condition_of(settings.where)
+        writer = DriveWriter(target, Picking(condition, f"{settings.seed}:{source}"))
         try:
             counts = _Counts()
             for rows in residual_windows(
@@ -448,8 +501,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 period_s=plan.alignment.grid_period_s,
                 half_window=round(smoothing.half_s / plan.alignment.grid_period_s),
             ):
-                counts.add(rows)
-                writer.append(rows)
+                counts.add(rows, writer.append(rows))
             if not counts.rows:
                 raise no_samples(job.log_input.path)
             friction = drive.friction
@@ -458,8 +510,10 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
                 "log": stem,
                 **counts.span(drive.log.start_ns),
                 "source": {"file": name, "sha256": source},
+                "signals_sha256": drive.signals_sha256,
                 "split": split,
                 "split_from": split_from,
+                "car": job.physics[1].name,
                 "vehicle_sha256": job.physics[0],
                 "settings_sha256": fingerprint,
                 "period_s": plan.alignment.grid_period_s,
@@ -589,11 +643,13 @@ class _Counts:
     def __init__(self) -> None:
         self.rows = self.usable = 0
         self._squares = np.zeros(2)
+        self._cells = np.zeros(COUNT, dtype=np.int64)
         self._segments: set[int] = set()
         self._span: tuple[int, int] | None = None
 
-    def add(self, rows: ResidualRows) -> None:
+    def add(self, rows: ResidualRows, picked: Picked) -> None:
         use = rows.weight > 0.0
+        self._cells += rows_by_cell(picked.cell, use & picked.chosen)
         self.rows += len(rows)
         self.usable += int(np.count_nonzero(use))
         squares = np.square(rows.targets[use] / rows.step_s[use, None])
@@ -617,6 +673,7 @@ class _Counts:
             "usable_rows": self.usable,
             "segments": len(self._segments),
             "residual_rms": _pair(rms.tolist()),
+            "cells": {str(n): int(rows) for n, rows in enumerate(self._cells) if rows},
         }
 
 
@@ -625,8 +682,11 @@ def _fingerprint(job: _Job, split: str) -> str:
     mapping = job.settings.config.mapping
     document = {
         "format": FORMAT_VERSION,
-        "settings": {k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping")},
+        "settings": {
+            k: v for k, v in job.settings.to_dict().items() if k not in ("split", "car", "mapping", "per_cell_s")
+        },
         "split": split,
+        "seed": job.settings.seed,
         "vehicle": [job.physics[0], job.car.noise_sha256],
         **({} if job.log_input.span_s is None else {"span_s": job.log_input.span_s}),
         "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),

@@ -17,7 +17,7 @@ from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
-from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import (
     DOCUMENT_FILE,
     NOMINAL_MODEL,
@@ -34,6 +34,8 @@ HISTORY_FILE = "history.parquet"
 PLOT_FILE = "history.png"
 #: Shorter runs between two restarts teach nothing.
 MIN_SEQUENCE_STEPS = 50
+#: What recurrent state is built up from before a stretch that is chosen.
+LEAD_STEPS = 200
 #: Utilisation up to which tyres answer to the steering angle in proportion, and driving by which an offset is shrunk.
 CALM_UTILISATION, OFFSET_SHRINK_S = 0.4, 1.0
 
@@ -189,12 +191,32 @@ def mean_square(bundle: ModelBundle, sequences: Iterable[FeatureSequence]) -> fl
 
 
 def gap_free_runs(drive: DriveArrays) -> Iterable[slice]:
-    """Yield the runs of a drive that no restart of the parallel filter cuts and that are long enough to learn from."""
-    edges = [0, *(np.flatnonzero(np.diff(drive.segment)) + 1).tolist(), drive.stamps_ns.shape[0]]
+    """Yield the runs of a drive that no restart of the parallel filter cuts and that are long enough to learn from.
+
+    Where not all of it is chosen they end with a chosen stretch, and begin :data:`LEAD_STEPS` before it.
+    """
+    piece = drive.segment
+    if drive.chosen is not None:
+        near = _near(drive.chosen & (drive.weight > 0.0))
+        piece = np.cumsum(np.diff(near, prepend=near[:1]) | (np.diff(piece, prepend=piece[:1]) != 0))
+    edges = [0, *(np.flatnonzero(np.diff(piece)) + 1).tolist(), drive.stamps_ns.shape[0]]
     for a, b in pairwise(edges):
         known = np.isfinite(drive.features[a:b]).all()
-        if b - a >= MIN_SEQUENCE_STEPS and known and drive.weight[a:b].sum() > 0.0:
+        if b - a >= MIN_SEQUENCE_STEPS and known and weights_of(drive, slice(a, b)).sum() > 0.0:
             yield slice(a, b)
+
+
+def weights_of(drive: DriveArrays, part: slice) -> FloatArray:
+    """Return the weights of a part of a drive, 0 where it is not chosen."""
+    weight = drive.weight[part].astype(np.float64)
+    return weight if drive.chosen is None else weight * drive.chosen[part]
+
+
+def _near(chosen: BoolArray) -> BoolArray:
+    """Return which rows are chosen, or come at most :data:`LEAD_STEPS` before one that is."""
+    at = np.arange(len(chosen))
+    following = np.minimum.accumulate(np.where(chosen, at, len(chosen) + LEAD_STEPS)[::-1])[::-1]
+    return np.asarray(following - at <= LEAD_STEPS, dtype=np.bool_)
 
 
 def steering_offset(rows: DriveArrays) -> FloatArray:
@@ -221,10 +243,10 @@ def _sequences(
 ) -> Iterable[FeatureSequence]:
     """Yield the gap-free runs of the drives: residual increments as rates by the true step, or the true v_y."""
     for drive in drives:
-        rows = drive.arrays
+        rows = drive.load()
         offset = steering_offset(rows) if odd else np.zeros(2)
         for part in gap_free_runs(rows):
-            weight = np.asarray(rows.weight[part], dtype=np.float64)
+            weight = weights_of(rows, part)
             features = np.asarray(rows.features[part], dtype=np.float64)
             if target == RESIDUAL:
                 values = np.asarray(rows.targets[part], dtype=np.float64) / rows.step_s[part, None] - offset

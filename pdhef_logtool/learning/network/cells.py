@@ -1,0 +1,162 @@
+"""Which driving a dataset holds, in cells of speed x |a_y| x friction, and a choice of at most so much of each.
+
+A row lies in the cell of its own features. What is chosen of a cell is drawn by seconds: each second of a drive draws a
+number by the hash of its log, the seed and itself, and the smallest ones are taken. So the choice depends on no order,
+and a set that grows gives up what it had chosen only for what draws less.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pdhef_logtool.car.vehicle import GRAVITY_M_S2
+from pdhef_logtool.learning.network.residuals import ResidualRows
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
+from pdhef_logtool.residual_model.features import FEATURES
+from pdhef_logtool.results.expression import Condition, parse_condition, where_holds
+
+#: Lower ends of the bins; the last of each has no upper end.
+SPEED_M_S, AY_M_S2, FRICTION = (0.0, 10.0, 20.0, 30.0), (0.0, 2.0, 4.0, 6.0), (0.0, 0.35, 0.65)
+EDGES = {"speed_m_s": SPEED_M_S, "abs_ay_m_s2": AY_M_S2, "friction": FRICTION}
+COUNT = len(SPEED_M_S) * len(AY_M_S2) * len(FRICTION)
+#: Of rows without features.
+NO_CELL = -1
+#: Draws are multiples of this, which float32 holds exactly.
+_STEP = 2.0**-24
+
+
+#: What a condition of ``--where`` may ask of a row; truth is never an input, but may say what is learnt from.
+COLUMNS = (*FEATURES, "truth_vx_m_s", "truth_vy_m_s")
+
+
+def condition_of(text: str) -> Condition:
+    """Read the condition of ``--where``; raises UsageError."""
+    condition = parse_condition(text, COLUMNS, "docs/retrain.md")
+    if condition.least_s:
+        raise UsageError(expected="a condition on single rows", got=f"for {condition.least_s:g} s", where="--where")
+    return condition
+
+
+@dataclass(frozen=True, slots=True)
+class Picking:
+    """What says which rows of a drive are learnt from: a condition (None: all), and the key of its draws."""
+
+    condition: Condition | None = None
+    key: str = ""
+
+    def of(self, rows: ResidualRows) -> Picked:
+        """Return what is kept of rows beside them."""
+        chosen = np.ones(len(rows), dtype=np.bool_)
+        if self.condition is not None:
+            columns = dict(zip(COLUMNS, [*rows.features.T, *rows.truth_velocity.T], strict=True))
+            chosen = where_holds(self.condition, columns)
+        return Picked(chosen, cell_of(rows.features), draw_of(rows.stamps_ns, self.key))
+
+
+EVERYTHING = Picking()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picked:
+    """Of each row whether the condition holds, its cell, and what its second drew; all [N]."""
+
+    chosen: BoolArray
+    cell: NDArray[np.int16]
+    draw: NDArray[np.float32]
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """One cell: lower ends of its speed, |a_y| and friction; their upper ends, infinite for the last."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    @property
+    def in_reach(self) -> bool:
+        """Whether its grip allows its lateral acceleration at all."""
+        return self.low[1] < self.high[2] * GRAVITY_M_S2
+
+
+def cells() -> list[Cell]:
+    """Return all cells in the order of their numbers: speed changes first, friction last."""
+    bins = [list(zip(edges, (*edges[1:], math.inf), strict=True)) for edges in EDGES.values()]
+    speed, ay, friction = bins
+    return [
+        Cell((s[0], a[0], f[0]), (s[1], a[1], f[1])) for f in friction for a in ay for s in speed
+    ]  # fmt: skip
+
+
+def cell_of(features: FloatArray) -> NDArray[np.int16]:
+    """Return the cell of each row of features [N, 28]; :data:`NO_CELL` where they are not known."""
+    speed, ay, friction = (features[:, FEATURES.index(n)] for n in ("vx_m_s", "ay_m_s2", "friction"))
+    known = np.isfinite(speed) & np.isfinite(ay) & np.isfinite(friction)
+    number = np.zeros(len(features), dtype=np.int16)
+    for edges, values in ((FRICTION, friction), (AY_M_S2, np.abs(ay)), (SPEED_M_S, speed)):
+        number = number * np.int16(len(edges)) + np.searchsorted(edges[1:], values, side="right").astype(np.int16)
+    return np.where(known, number, np.int16(NO_CELL))
+
+
+def draw_of(stamps_ns: IntArray, key: str) -> NDArray[np.float32]:
+    """Return what the second of each stamp draws, in [0, 1)."""
+    seconds, inverse = np.unique(stamps_ns // 1_000_000_000, return_inverse=True)
+    drawn = [int.from_bytes(hashlib.sha256(f"{key}:{s}".encode()).digest()[:3], "big") * _STEP for s in seconds]
+    return np.array(drawn, dtype=np.float32)[inverse]
+
+
+def rows_by_cell(cell: NDArray[np.int16], used: BoolArray) -> IntArray:
+    """Return how many rows that are used lie in each cell."""
+    return np.bincount(cell[used & (cell >= 0)], minlength=COUNT).astype(np.int64)
+
+
+def draw_limits(
+    drives: Iterable[tuple[NDArray[np.int16], NDArray[np.float32], float]], per_cell_s: float
+) -> list[float]:
+    """Return for each cell the draw below which its seconds are chosen, so that they last ``per_cell_s`` at most.
+
+    Parameters
+    ----------
+    drives : cell and draw of the usable rows of each drive, and its period in seconds; in any order.
+    """
+    draws = [np.empty(0, dtype=np.float32) for _ in range(COUNT)]
+    lasts = [np.empty(0) for _ in range(COUNT)]
+    limits = [1.0] * COUNT
+    for cell, draw, period_s in drives:
+        for number in np.unique(cell[cell >= 0]).tolist():
+            drawn, rows = np.unique(draw[(cell == number) & (draw < limits[number])], return_counts=True)
+            joined = np.concatenate([draws[number], drawn])
+            order = np.argsort(joined, kind="stable")
+            joined, seconds = joined[order], np.concatenate([lasts[number], rows * period_s])[order]
+            beyond = np.cumsum(seconds) > per_cell_s * (1.0 + 1e-9)
+            if beyond.any():
+                limits[number] = float(joined[int(np.argmax(beyond))])
+            kept = joined < limits[number]
+            draws[number], lasts[number] = joined[kept], seconds[kept]
+    return limits
+
+
+def is_chosen(cell: NDArray[np.int16], draw: NDArray[np.float32], limits: Sequence[float]) -> BoolArray:
+    """Return which rows are chosen by the limits of their cells."""
+    chosen: BoolArray = (cell >= 0) & (draw < np.asarray(limits, dtype=np.float32)[cell])
+    return chosen
+
+
+def table_of(seconds: Mapping[str, Sequence[float]]) -> dict[str, Any]:
+    """Return the part of the manifest that tells of cells: edges, and the seconds of each cell by split."""
+    return {
+        "edges": {name: list(edges) for name, edges in EDGES.items()},
+        "order": "speed changes first, friction last",
+        "usable_s": {split: [round(s, 3) for s in values] for split, values in seconds.items()},
+        "empty": {
+            split: [n for n, (cell, s) in enumerate(zip(cells(), values, strict=True)) if cell.in_reach and s == 0.0]
+            for split, values in seconds.items()
+        },
+    }

@@ -1,0 +1,406 @@
+"""Work on many items in processes of their own, under watch.
+
+A worker lives as long as the run and has one thread. What dies, falls silent or takes too much memory costs the item
+in flight only: that is tried once more when nothing else runs, in a new process, and then given up and told. Workers
+come from a fork server (``fork_server.py``), a pipe each; they end when their parent does, however that ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Generic, Self, TypeVar
+
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.fork_server import FORK, ONE_THREAD, STATUS, ask, receive, send, split, told_error
+from pdhef_logtool.records.shown import shown
+
+T = TypeVar("T")
+R = TypeVar("R")
+#: Tells what an item is at, and its share from 0 to 1.
+Tell = Callable[[str, float], None]
+#: Hears the same, with the number of the item.
+Progress = Callable[[int, str, float], None]
+
+_TICK_S = 0.05
+#: The most that one look at the workers counts as silence: more means that the parent itself was stopped or busy.
+_LONGEST_TICK_S = 5.0
+#: No allocation brings a worker further beyond its bound than this, however fast; allocators reserve more than needed.
+_RESERVED_BYTES = 2 << 30
+_TRIES = 2
+#: A worker that does not take an item within this time does not listen.
+_SEND_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What an item may take; None: as much as it likes.
+
+    Parameters
+    ----------
+    silence_s : between two words of progress.
+    memory_bytes : of a worker's resident set.
+    """
+
+    silence_s: float | None = None
+    memory_bytes: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Why there is no result: a line for people, the last progress that was told, and how often it was tried."""
+
+    reason: str
+    last: str = ""
+    tries: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Ended(Generic[T, R]):
+    """How an item ended, with its number in the order of the items; with no ``failure`` it has a result."""
+
+    number: int
+    item: T
+    result: R | None = None
+    failure: Failure | None = None
+
+
+def supervise(
+    work: Callable[[T, Tell], R],
+    items: Iterable[T],
+    *,
+    jobs: int,
+    limits: Limits = Limits(),
+    preload: Sequence[str] = (),
+    progress: Progress = lambda _number, _text, _share: None,
+) -> Iterator[Ended[T, R]]:
+    """Do the work on every item and yield how each ended, in the order of ending.
+
+    Items are pulled as workers become free, and nothing of an item is kept once it has ended. With one job and no
+    limits all is done in this process.
+
+    Parameters
+    ----------
+    work : a function of a module; takes an item and what tells its progress, and returns something small.
+    jobs : processes at once.
+    preload : modules that the fork server imports, ``package.module`` or ``package.module:function`` to call that too.
+        They must leave no thread behind, and no library that a fork breaks at work (polars, torch).
+
+    Raises
+    ------
+    UsageError : fewer jobs than one, or more on a system that cannot fork.
+    """
+    if jobs < 1:
+        raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
+    if jobs == 1 and limits == Limits():
+        return _in_this_process(work, items, progress)
+    if not hasattr(os, "fork"):
+        raise UsageError(
+            expected="a system with fork", got=sys.platform, where="--jobs", remedy="--jobs 1, and no limits"
+        )
+    return _in_processes(work, items, jobs, limits, preload, progress)
+
+
+def _in_this_process(
+    work: Callable[[T, Tell], R], items: Iterable[T], progress: Progress
+) -> Generator[Ended[T, R], None, None]:
+    for number, item in enumerate(items):
+        last = ""
+
+        def tell(text: str, share: float, number: int = number) -> None:
+            nonlocal last
+            last = text
+            progress(number, text, share)
+
+        try:
+            result = work(item, tell)
+        except Exception as error:  # noqa: BLE001 (one item never stops the others)
+            yield Ended(number, item, failure=Failure(f"raised {told_error(error)}", last))
+        else:
+            yield Ended(number, item, result)
+            del result
+        del item
+
+
+def _in_processes(  # positional: the arguments of `supervise`, which checked them
+    work: Callable[[T, Tell], R],
+    items: Iterable[T],
+    jobs: int,
+    limits: Limits,
+    preload: Sequence[str],
+    progress: Progress,
+) -> Generator[Ended[T, R], None, None]:
+    with _Crew[T, R](work, limits, preload, progress) as crew:
+        lost: list[_Attempt[T]] = []
+        for attempt, ended in crew.run((_Attempt(n, item) for n, item in enumerate(items)), jobs):
+            if ended is None:
+                lost.append(attempt)
+            else:
+                yield ended
+            del attempt, ended
+        while lost:
+            crew.dismiss()
+            for _, ended in crew.run(iter([lost.pop(0)]), 1):
+                assert ended is not None
+                yield ended
+                del ended
+
+
+@dataclass(slots=True)
+class _Attempt(Generic[T]):
+    number: int
+    item: T
+    tries: int = 0
+    last: str = ""
+
+
+@dataclass(slots=True)
+class _Worker(Generic[T]):
+    """A process as the parent knows it; ``pid`` is None until it has said that it is ready."""
+
+    channel: socket.socket
+    server: _Server
+    attempt: _Attempt[T] | None
+    pid: int | None = None
+    silent_s: float = 0.0
+    buffer: bytearray = field(default_factory=bytearray)
+
+    def resident_bytes(self) -> int:
+        try:
+            return int(Path(f"/proc/{self.pid}/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        except (OSError, IndexError, ValueError):
+            return 0
+
+    def end(self) -> str:
+        """End the process if it lives, and return how it ended."""
+        self.channel.close()
+        if self.pid is None:
+            return "no process could be started for it"
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.pid, signal.SIGKILL)
+        code = self.server.status(self.pid)
+        if code is None:
+            return "the worker died"
+        return f"the worker was killed (signal {-code})" if code < 0 else f"the worker ended with exit code {code}"
+
+
+class _Server:
+    """A fork server of our own."""
+
+    def __init__(self, preload: Sequence[str]) -> None:
+        self._control, theirs = socket.socketpair()
+        start = (
+            "import json, sys; sys.path[:] = json.loads(sys.argv[1]); "
+            "from pdhef_logtool.records.fork_server import serve; serve(int(sys.argv[2]))"
+        )
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 (ourselves)
+                [sys.executable, "-c", start, json.dumps(sys.path), str(theirs.fileno())],
+                stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                env={**os.environ, **ONE_THREAD},
+            )
+        self._hears = True
+        self._preload = list(preload)
+
+    def start(self) -> None:
+        """Wait until it has loaded what it is to load.
+
+        Raises
+        ------
+        RuntimeError : it could not.
+        """
+        try:
+            send(self._control, self._preload)
+            problem = receive(self._control)
+        except (EOFError, OSError):
+            problem = f"the fork server ended with exit code {self._process.wait()}"
+        if problem:
+            raise RuntimeError(problem)
+
+    def fork(self, channel: socket.socket) -> bool:
+        """Begin a worker on its channel; False if the server is dead."""
+        try:
+            ask(self._control, FORK, descriptors=[channel.fileno()])
+        except OSError:
+            self._hears = False
+        return self._hears
+
+    def status(self, pid: int) -> int | None:
+        """Wait for a worker that ended and return its exit code, below zero a signal; None if nobody knows."""
+        if self._hears:
+            try:
+                ask(self._control, STATUS, pid)
+                return int(receive(self._control))
+            except (EOFError, OSError):
+                self._hears = False
+        return None
+
+    def end(self) -> None:
+        self._control.close()
+        self._process.wait()
+
+
+class _Crew(Generic[T, R]):
+    """The workers of a run."""
+
+    def __init__(
+        self, work: Callable[[T, Tell], R], limits: Limits, preload: Sequence[str], progress: Progress
+    ) -> None:
+        most = limits.memory_bytes
+        self._orders = (pickle.dumps(work), None if most is None else most + _RESERVED_BYTES)
+        self._limits, self._preload, self._progress = limits, preload, progress
+        self._server: _Server | None = None
+        self._workers: list[_Worker[T]] = []
+        self._selector = selectors.DefaultSelector()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        self._selector.close()
+        for worker in self._workers:
+            worker.channel.close()
+        if self._server is not None:
+            self._server.end()
+
+    def dismiss(self) -> None:
+        """End all workers, so that what they hold is free."""
+        for worker in list(self._workers):
+            self._end(worker)
+
+    def run(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """Try items, so many at once; yield how each ended, None if it was lost and may be tried again."""
+        since = time.monotonic()
+        while True:
+            while self._busy() < jobs and (attempt := next(attempts, None)) is not None:
+                yield from self._give(attempt)
+                del attempt
+            if not self._busy():
+                return
+            heard = [key.data for key, _ in self._selector.select(_TICK_S)]
+            now = time.monotonic()
+            for worker in self._workers:
+                worker.silent_s += min(now - since, _LONGEST_TICK_S)
+            since = now
+            for worker in heard:
+                yield from self._hear(worker)
+            yield from self._watch()
+
+    def _busy(self) -> int:
+        return sum(w.attempt is not None for w in self._workers)
+
+    def _give(self, attempt: _Attempt[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """Hand an item to a worker that is free, or to a new one; an item that cannot be sent ends here."""
+        attempt.tries, attempt.last = attempt.tries + 1, ""
+        free = next((w for w in self._workers if w.attempt is None), None)
+        if free is None:
+            self._start(attempt)
+        else:
+            free.attempt = attempt
+            yield from self._send(free)
+
+    def _start(self, attempt: _Attempt[T]) -> None:
+        ours, theirs = socket.socketpair()
+        with theirs:
+            if self._server is None or not self._server.fork(theirs):
+                if self._server is not None:
+                    self._server.end()
+                self._server = _Server(self._preload)
+                self._server.start()
+                self._server.fork(theirs)
+        ours.settimeout(_SEND_S)
+        worker = _Worker(ours, self._server, attempt)
+        self._workers.append(worker)
+        self._selector.register(ours, selectors.EVENT_READ, worker)
+
+    def _send(self, worker: _Worker[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        attempt = worker.attempt
+        assert attempt is not None
+        try:
+            packed = pickle.dumps(attempt.item)
+        except Exception as error:  # noqa: BLE001 (whatever a pickler may raise)
+            worker.attempt = None
+            yield attempt, _failed(attempt, f"it cannot be sent to a worker: {told_error(error)}")
+            return
+        worker.silent_s = 0.0
+        with contextlib.suppress(OSError):  # a worker that is dead or does not listen is found by the watch
+            send(worker.channel, packed)
+
+    def _hear(self, worker: _Worker[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """Take what a worker says."""
+        try:
+            data = worker.channel.recv(1 << 16)
+        except OSError:
+            data = b""
+        if not data:
+            yield from self._lose(worker)
+            return
+        worker.silent_s = 0.0
+        worker.buffer += data
+        for kind, *said in split(worker.buffer):
+            attempt = worker.attempt
+            if kind == "ready":
+                worker.pid = said[0]
+                with contextlib.suppress(OSError):
+                    send(worker.channel, self._orders)
+                yield from self._send(worker)
+            elif attempt is None:
+                continue
+            elif kind == "tell":
+                attempt.last = said[0]
+                self._progress(attempt.number, said[0], said[1])
+            elif kind == "memory":
+                yield from self._lose(worker, self._too_big())
+                return
+            else:
+                worker.attempt = None
+                yield attempt, _opened(attempt, said[0]) if kind == "done" else _failed(attempt, said[0])
+
+    def _watch(self) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """End the workers that have been silent for too long or have grown too big."""
+        for worker in [w for w in self._workers if w.attempt is not None and w.pid is not None]:
+            silence_s, memory_bytes = self._limits.silence_s, self._limits.memory_bytes
+            if memory_bytes is not None and worker.resident_bytes() > memory_bytes:
+                yield from self._lose(worker, self._too_big())
+            elif silence_s is not None and worker.silent_s > silence_s:
+                yield from self._lose(worker, f"nothing heard for {silence_s:g} s")
+
+    def _too_big(self) -> str:
+        most = self._limits.memory_bytes
+        return "there was no more memory" if most is None else f"took more than {most / 1e6:.0f} MB"
+
+    def _lose(self, worker: _Worker[T], reason: str = "") -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+        """End a worker; its item, if it has one, is lost for a reason, or for how the process ended."""
+        attempt = worker.attempt
+        how = self._end(worker)
+        if attempt is not None:
+            yield attempt, _failed(attempt, reason or how) if attempt.tries >= _TRIES else None
+
+    def _end(self, worker: _Worker[T]) -> str:
+        self._workers.remove(worker)
+        self._selector.unregister(worker.channel)
+        return worker.end()
+
+
+def _failed(attempt: _Attempt[T], reason: str) -> Ended[T, R]:
+    return Ended(attempt.number, attempt.item, failure=Failure(shown(reason), shown(attempt.last), attempt.tries))
+
+
+def _opened(attempt: _Attempt[T], answer: bytes) -> Ended[T, R]:
+    try:
+        return Ended(attempt.number, attempt.item, pickle.loads(answer))  # noqa: S301 (from our own process)
+    except Exception as error:  # noqa: BLE001 (whatever a pickle may raise)
+        return _failed(attempt, f"its result cannot be read: {told_error(error)}")

@@ -1,0 +1,130 @@
+"""What goes wrong in a worker, on purpose: a work for the supervisor, whose items say what is to happen."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+from pdhef_logtool.records.supervisor import Tell
+
+#: What to do, and the value to return or a path.
+Item = tuple[str, str]
+called: list[int] = []
+
+
+def note_call() -> None:
+    """Be called by the fork server."""
+    called.append(os.getpid())
+
+
+class Odd:
+    """A result that does not travel."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        raise TypeError("not me")
+
+
+class Unreadable:
+    """A result, or an item, that travels and cannot be opened."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return (_burst, ())
+
+
+def _burst() -> None:
+    raise ValueError("burst")
+
+
+def planted(item: Item, tell: Tell) -> object:
+    """Do what the item says."""
+    what, value = item
+    tell(f"at {what}", 0.5)
+    if what in _FAULTS:
+        return _FAULTS[what](value, tell)
+    if what == "where":
+        return os.getpid(), called, threading.active_count(), os.environ["OMP_NUM_THREADS"]
+    return value
+
+
+def _kill(_value: str, _tell: Tell) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _kill_once(value: str, tell: Tell) -> str:
+    if not Path(value).exists():
+        Path(value).touch()
+        _kill(value, tell)
+    return value
+
+
+def _kill_server(_value: str, _tell: Tell) -> None:
+    os.kill(os.getppid(), signal.SIGKILL)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _hang(_value: str, _tell: Tell) -> None:
+    time.sleep(600)
+
+
+def _stop(_value: str, _tell: Tell) -> None:
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def _slowly(value: str, tell: Tell) -> str:
+    for k in range(10):
+        time.sleep(0.1)
+        tell("slowly", k / 10)
+    return value
+
+
+def _grow(_value: str, _tell: Tell) -> None:
+    held = []
+    while True:
+        held.append(bytearray(os.urandom(1 << 16)) * 160)
+        time.sleep(0.005)
+
+
+def _8_gb(_value: str, _tell: Tell) -> int:
+    return len(bytearray(8 << 30))
+
+
+def _raise(_value: str, _tell: Tell) -> None:
+    raise ValueError("two\nlines")
+
+
+def _cut(_value: str, _tell: Tell) -> None:
+    """Write half a message and then nothing, as when it is stopped while it writes."""
+    files = [f for f in Path("/proc/self/fd").iterdir() if int(f.name) > 2 and f.is_socket()]
+    for file in files:
+        os.write(int(file.name), (1000).to_bytes(8, "little") + b"half")
+    time.sleep(600)
+
+
+def _alone(value: str, tell: Tell) -> int:
+    """Be lost the first time; the second time return how many workers there are."""
+    _kill_once(value, tell)
+    parent = os.getppid()
+    return len(Path(f"/proc/{parent}/task/{parent}/children").read_text().split())
+
+
+_FAULTS = {
+    "kill": _kill,
+    "kill once": _kill_once,
+    "kill server": _kill_server,
+    "exit": lambda _value, _tell: os._exit(5),
+    "hang": _hang,
+    "stop": _stop,
+    "cut": _cut,
+    "slowly": _slowly,
+    "grow": _grow,
+    "8 GB": _8_gb,
+    "raise": _raise,
+    "quit": lambda _value, _tell: sys.exit(3),
+    "odd": lambda _value, _tell: Odd(),
+    "unreadable": lambda _value, _tell: Unreadable(),
+    "alone": _alone,
+}

@@ -1,0 +1,207 @@
+"""Workers under watch: what dies, hangs or grows costs its own item only, and is told."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.supervisor import Ended, Failure, Limits, supervise
+from tests.records.planted_work import Item, Unreadable, called, planted
+
+LIMITS = Limits(silence_s=0.5, memory_bytes=400_000_000)
+PRELOAD = ["tests.records.planted_work:note_call"]
+REASONS = {
+    "kill": "the worker was killed (signal 9)",
+    "exit": "the worker ended with exit code 5",
+    "hang": "nothing heard for 0.5 s",
+    "stop": "nothing heard for 0.5 s",
+    "cut": "nothing heard for 0.5 s",
+    "grow": "took more than 400 MB",
+    "8 GB": "took more than 400 MB",
+    "raise": "raised ValueError: two lines",
+    "quit": "raised SystemExit: 3",
+    "odd": "its result cannot be sent: TypeError: not me",
+    "unreadable": "its result cannot be read: ValueError: burst",
+}
+#: What another try would not change.
+FINAL = {"raise", "quit", "odd", "unreadable"}
+
+
+def outcomes(items: list[Item], jobs: int, limits: Limits = LIMITS) -> list[Ended[Item, object]]:
+    """Return how the items ended, in their order."""
+    ended = sorted(supervise(planted, items, jobs=jobs, limits=limits, preload=PRELOAD), key=lambda e: e.number)
+    assert [e.number for e in ended] == list(range(len(items)))
+    assert [e.item for e in ended] == items
+    return ended
+
+
+def assert_as_planted(ended: list[Ended[Item, object]]) -> None:
+    for e in ended:
+        what, value = e.item
+        if what in REASONS:
+            assert e.failure == Failure(REASONS[what], f"at {what}", 1 if what in FINAL else 2)
+            assert e.result is None
+        else:
+            assert e.failure is None
+            assert e.result == value
+
+
+@pytest.mark.slow
+def test_each_fault_costs_its_own_item_only(tmp_path: Path) -> None:
+    items = [(what, "") for what in REASONS] + [("kill once", str(tmp_path / "once")), ("slowly", "x")]
+    items = [x for i, fault in enumerate(items) for x in (fault, ("well", str(i)))]
+    assert_as_planted(outcomes(items, 2))
+
+
+@settings(max_examples=6, deadline=None)
+@given(
+    items=st.lists(st.tuples(st.sampled_from(["well", "well", "kill", "exit", "raise", "odd"]), st.text(max_size=5))),
+    jobs=st.integers(1, 4),
+)
+def test_every_item_ends_once_whatever_happens_in_any_order(items: list[Item], jobs: int) -> None:
+    assert_as_planted(outcomes(items, jobs, Limits(silence_s=60.0)))
+
+
+def test_a_lost_item_is_tried_again_when_nothing_else_runs(tmp_path: Path) -> None:
+    items = [("alone", str(tmp_path / "mark")), *[("well", "")] * 4]
+    ended = list(supervise(planted, items, jobs=3, preload=PRELOAD))
+    assert [e.number for e in ended[-1:]] == [0]
+    assert ended[-1].result == 1
+
+
+def test_workers_have_one_thread_and_live_as_long_as_the_run() -> None:
+    ended = outcomes([("where", "")] * 20, 2, Limits())
+    pids, calls, threads, omp = zip(*(e.result for e in ended), strict=True)  # type: ignore[misc]
+    assert len(set(pids)) <= 2
+    assert os.getpid() not in pids
+    assert set(threads) == {1}
+    assert set(omp) == {"1"}
+    assert {len(c) for c in calls} == {1}, "the fork server called it, once for all"
+    assert not called
+
+
+def test_one_job_without_limits_runs_here() -> None:
+    told: list[tuple[int, str, float]] = []
+    items = [("where", ""), ("raise", ""), ("well", "x")]
+    ended = list(supervise(planted, items, jobs=1, progress=lambda *what: told.append(what)))
+    assert ended[0].result[0] == os.getpid()  # type: ignore[index]
+    assert ended[1].failure == Failure(REASONS["raise"], "at raise", 1)
+    assert ended[2].result == "x"
+    assert told == [(0, "at where", 0.5), (1, "at raise", 0.5), (2, "at well", 0.5)]
+
+
+def test_progress_of_workers_is_heard() -> None:
+    told: list[tuple[int, str, float]] = []
+    list(supervise(planted, [("well", ""), ("raise", "")], jobs=2, progress=lambda *what: told.append(what)))
+    assert sorted(told) == [(0, "at well", 0.5), (1, "at raise", 0.5)]
+
+
+def test_items_that_do_not_travel_are_told() -> None:
+    items: list[object] = [lambda: 0, ("well", "x"), Unreadable()]
+    lost, well, burst = sorted(supervise(planted, items, jobs=2), key=lambda e: e.number)  # type: ignore[arg-type]
+    assert lost.failure is not None
+    assert lost.failure.reason.startswith("it cannot be sent to a worker: ")
+    assert well.result == "x"
+    assert burst.failure == Failure("raised ValueError: burst", "", 1)
+
+
+def test_the_fork_server_may_die_too() -> None:
+    ended = outcomes([("kill server", ""), *[("well", "x")] * 3], 2, Limits())
+    assert ended[0].failure == Failure("the worker died", "at kill server", 2)
+    assert [e.result for e in ended[1:]] == ["x"] * 3
+
+
+def test_what_cannot_be_loaded_is_told_at_once() -> None:
+    with pytest.raises(RuntimeError, match="no_such_module: ModuleNotFoundError"):
+        list(supervise(planted, [("well", "")], jobs=2, preload=["no_such_module"]))
+
+
+def test_no_jobs_are_refused_before_anything_is_pulled() -> None:
+    with pytest.raises(UsageError, match="at least one process"):
+        supervise(planted, [], jobs=0)
+
+
+def test_items_are_pulled_as_workers_become_free() -> None:
+    pulled = 0
+
+    def items() -> Iterator[Item]:
+        nonlocal pulled
+        while True:
+            pulled += 1
+            yield "well", ""
+
+    with closing(supervise(planted, items(), jobs=2, preload=PRELOAD)) as ended:  # type: ignore[type-var]
+        for count, _ in zip(range(10), ended, strict=False):
+            assert pulled <= count + 1 + 2
+
+
+def test_a_busy_caller_is_no_silence_of_the_workers() -> None:
+    items = [("well", ""), ("slowly", "")]
+    for ended in supervise(planted, items, jobs=2, limits=Limits(silence_s=0.6), preload=PRELOAD):
+        time.sleep(0.8 if ended.item[0] == "well" else 0.0)
+        assert ended.failure is None
+
+
+@pytest.mark.slow
+def test_3000_items_leave_nothing_in_the_parent() -> None:
+    sizes = []
+    tracemalloc.start()
+    items = (("well", "x" * 10_000 + str(i)) for i in range(3000))
+    for count, ended in enumerate(supervise(planted, items, jobs=2, preload=PRELOAD)):
+        assert ended.failure is None
+        if count in (300, 2900):
+            sizes.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    assert sizes[1] - sizes[0] < 100_000
+
+
+SCRIPT = """
+import sys
+from pathlib import Path
+from pdhef_logtool.records.supervisor import Limits, supervise
+from tests.records.planted_work import planted
+
+def heard(number, text, share):
+    print("heard", flush=True)
+
+for ended in supervise(planted, [("hang", "")] * 2, jobs=2, limits=Limits(silence_s=60.0), progress=heard):
+    pass
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_all_ends_with_the_parent_without_a_word(number: int) -> None:
+    root = Path(__file__).parents[2]
+    with subprocess.Popen(
+        [sys.executable, "-c", textwrap.dedent(SCRIPT)],
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": str(root)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "heard\n"
+        assert process.stdout.readline() == "heard\n"
+        if number == signal.SIGKILL:
+            process.kill()
+        else:
+            os.killpg(process.pid, number)
+        # Its pipes close when the last process that holds them is gone.
+        _, err = process.communicate(timeout=10)
+    told = [line for line in err.splitlines() if line and not line.startswith((" ", "Traceback"))]
+    assert told == ([] if number == signal.SIGKILL else ["KeyboardInterrupt"]), "the workers and the server say nothing"
