@@ -56,7 +56,7 @@ from pdhef_logtool.learning.network.residuals import (
     residual_windows,
 )
 from pdhef_logtool.learning.variation import vary
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
@@ -248,7 +248,7 @@ def extract(
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
-    read = [*(i.path for i in inputs), *settings.config.files, *(j.car.source for j in work)]
+    read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
     check_no_input(read, [output / MANIFEST])
     kept = [_as_in_file(d) for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
@@ -403,7 +403,7 @@ def _plan_jobs(
     warn: Tell,
 ) -> Iterator[_Job]:
     cars, manifests = cache(_car), cache(set_manifest)
-    listed = [_listed(i.path, manifests(i.path.parent)) for i in inputs]
+    listed = [_listed(i, manifests(i.folder)) for i in inputs]
     for log_input, entry in zip(inputs, listed, strict=True):
         car = cars(settings.config.car or entry.vehicle)
         yield _Job(log_input, output, settings, car, mapping, entry.split, resume)
@@ -450,7 +450,7 @@ def _failure(job: _Job, reason: str) -> DriveResult:
 
 def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     stem, name, settings = job.log_input.stem, job.log_input.path.name, job.settings
-    source = hash_log(job.log_input.path)
+    source = identity_of(job.log_input)
     split, split_from = choose_split(source, settings.seed, chosen=settings.split, listed=job.listed_split)
     fingerprint = _fingerprint(job, split)
     target = job.target(split)
@@ -542,11 +542,12 @@ class _Listed:
     vehicle: Path | None = None
 
 
-def _listed(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
+def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
     """Return what the manifest of a simulated set beside a log says of it: its split and its vehicle file."""
-    entry = manifest.get(path.name, {})
+    entry = manifest.get(log.path.name, {})
     split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
-    file = path.parent / vehicle if isinstance(vehicle, str) and vehicle.endswith(".toml") else None
+    named = log.folder is not None and isinstance(vehicle, str) and vehicle.endswith(".toml")
+    file = log.folder / str(vehicle) if log.folder is not None and named else None
     return _Listed(
         split=split if isinstance(split, str) and split else None,
         vehicle=file if file is not None and file.is_file() else None,
