@@ -119,7 +119,7 @@ def slim(
     jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Keep of logs what a run reads: mapped signals and truth. A run of a slim log has the same figures."""
+    """Keep only what a run reads of logs. A run of a slim log has the same figures, bit for bit."""
     from pdhef_logtool.cli.run_tables import render_slim
     from pdhef_logtool.drive.slim import slim_logs
 

@@ -21,7 +21,6 @@ from pdhef_logtool.mapping.frames import holds_fixed_frames
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, PdhefError
 from pdhef_logtool.records.outputs import check_no_input
-from pdhef_logtool.records.signals import Loss
 from pdhef_logtool.records.supervisor import Tell, supervise
 from pdhef_logtool.records.version import __version__
 
@@ -79,7 +78,7 @@ def slim_logs(
     inputs = find_logs(arguments)
     sources = None if mapping is None else load_mapping(mapping)
     targets = [output / f"{log.stem}.mcap" for log in inputs]
-    check_no_input([*(log.path for log in inputs), mapping], targets)
+    check_no_input([*(log.local for log in inputs), mapping], targets)
     items = [(log, target, sources, options) for log, target in zip(inputs, targets, strict=True)]
     results: list[SlimmedLog] = [SlimmedLog(log.stem, "", failed="not reached") for log in inputs]
     ended = supervise(_slim_one, items, jobs=jobs, preload=(__name__,))
@@ -94,12 +93,11 @@ def _slim_one(item: tuple[LogInput, Path, Mapping | None, ReadOptions], tell: Te
     log, target, mapping, options = item
     tell(log.stem, 0.0)
     try:
-        lost = slim_log(log, target, mapping, options)
+        record = slim_log(log, target, mapping, options)
     except PdhefError as error:
         return SlimmedLog(log.stem, "", failed=str(error))
-    paths = log.path.rglob("*") if log.path.is_dir() else (log.path,)
-    size = sum(path.stat().st_size for path in paths if path.is_file())
-    return SlimmedLog(log.stem, str(target), size, target.stat().st_size, lost_texts(lost))
+    size = sum(file.size for file in record.byte_ledgers)
+    return SlimmedLog(log.stem, str(target), size, target.stat().st_size, lost_texts(record.losses))
 
 
 def slim_log(
@@ -108,8 +106,8 @@ def slim_log(
     mapping: Mapping | None,
     options: ReadOptions,
     tell: Callable[[str], None] = lambda _text: None,
-) -> tuple[Loss, ...]:
-    """Write the slim log of a whole log, and return what of the log could not be read.
+) -> SlimRecord:
+    """Write the slim log of a whole log, and return what is known of the log beside its messages.
 
     Parameters
     ----------
@@ -127,8 +125,8 @@ def slim_log(
         return write_slim(drive, target)
 
 
-def write_slim(drive: Drive, target: Path) -> tuple[Loss, ...]:
-    """Write the slim log of a drive that was read from start to end, and return the log's losses."""
+def write_slim(drive: Drive, target: Path) -> SlimRecord:
+    """Write the slim log of a drive that was read from start to end, and return its record."""
     log = drive.log
     assert isinstance(log, ColumnarLog)
     lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
@@ -157,4 +155,4 @@ def write_slim(drive: Drive, target: Path) -> tuple[Loss, ...]:
         for name, path in zip(drive.chosen.dbc_names, () if mapping.can is None else mapping.can.dbc, strict=True):
             writer.attachment(name, "text/plain", path.read_bytes(), 0, 0)
         write_record(writer, record)
-    return lost
+    return record

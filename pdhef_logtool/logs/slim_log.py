@@ -18,6 +18,7 @@ from pdhef_logtool.logs.container import MAX_TIME_NS, Container
 from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
 from pdhef_logtool.records.files import scratch_folder, write_bytes
 from pdhef_logtool.records.signals import Loss
@@ -73,7 +74,7 @@ class SlimLog(ColumnarLog):
     record : what is known of the source.
     """
 
-    def __init__(self, path: Path, container: Container, record: SlimRecord) -> None:
+    def __init__(self, path: LogPlace, container: Container, record: SlimRecord) -> None:
         super().__init__(path, record.kind, [container], distro=record.distro)
         self.record = record
         self._occupied = OccupiedTime(record.intervals, left_out=record.left_out)
