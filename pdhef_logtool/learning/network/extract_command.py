@@ -6,12 +6,10 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ from pdhef_logtool.drive.reading import Tell, friction_of, no_samples, read_driv
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.estimators.parallel_physics import filter_of
-from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.estimators.table import FILTERS, spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     drives_document,
@@ -64,8 +62,8 @@ from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
-from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.supervisor import supervise
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
@@ -419,40 +417,29 @@ def _car(path: Path | None) -> Car:
 
 def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[DriveResult]:
     """Yield one result a job, in any order; a process that dies costs its own drive only."""
-    if jobs == 1 or len(work) == 1:
-        for number, job in enumerate(work):
-
-            def of_all(share: float, number: int = number, job: _Job = job) -> None:
-                progress(job.log_input.stem, (number + share) / len(work))
-
-            yield _extract_guarded(job, of_all) if len(work) > 1 else _extract(job, of_all)
+    if len(work) == 1:
+        yield _extract(work[0], partial(progress, work[0].log_input.stem))
         return
-    broken: list[_Job] = []
-    with ProcessPoolExecutor(min(jobs, len(work)), mp_context=get_context("spawn"), initializer=follow_parent) as pool:
-        futures = {pool.submit(_extract_guarded, job): job for job in work}
-        try:
-            for future in as_completed(futures):
-                try:
-                    yield future.result()
-                except BrokenProcessPool:
-                    broken.append(futures[future])
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    # A dead process takes the whole pool with it: who it was is found out one by one.
-    for job in broken:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=follow_parent) as pool:
-            try:
-                yield pool.submit(_extract_guarded, job).result()
-            except BrokenProcessPool:
-                yield _failure(job, "the process that read it died (out of memory?)")
+    shares: dict[int, float] = {}
+
+    def told(number: int, name: str, share: float) -> None:
+        shares[number] = share
+        progress(name, sum(shares.values()) / len(work))
+
+    preload = (__name__, *FILTERS)
+    with closing(supervise(_extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told)) as ends:
+        for ended in ends:
+            shares[ended.number] = 1.0
+            yield ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
 
 
-def _extract_guarded(job: _Job, progress: Callable[[float], None] = lambda _share: None) -> DriveResult:
+def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
     try:
-        return _extract(job, progress)
+        return _extract(job, partial(progress, job.log_input.stem))
     except PdhefError as error:
         return _failure(job, str(error))
+    except MemoryError:
+        raise  # it may have been another's: tried again, alone
     except Exception as error:  # noqa: BLE001 (one bad log never stops the others, whatever is wrong with it)
         return _failure(job, f"internal error, {type(error).__name__}: {error}")
 
