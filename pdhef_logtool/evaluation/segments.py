@@ -227,8 +227,9 @@ def _gaussian(values: FloatArray, sigma_rows: float) -> FloatArray:
     n = len(values)
     padded = np.concatenate([np.zeros(reach), values, np.zeros(reach)])
     out: FloatArray = values * weights[reach]
-    for away in range(reach, 0, -1):
-        out += (padded[reach - away : reach - away + n] + padded[reach + away : reach + away + n]) * weights[reach - away]
+    for first in range(reach):
+        before, behind = padded[first : first + n], padded[2 * reach - first : 2 * reach - first + n]
+        out += (before + behind) * weights[first]
     return out
 
 
