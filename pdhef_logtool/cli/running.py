@@ -47,7 +47,7 @@ def run(
     as_json: options.JsonFlag = False,
 ) -> None:
     """Run estimators on logs, score and annotate them. Recordings and metrics are written too."""
-    from pdhef_logtool.runs.pipeline import run_logs
+    from pdhef_logtool.runs.fleet import run_logs
 
     with console.progress() as bar:
         result = run_logs(logs, output, config, junit=junit, report=report, progress=bar, warn=console.warn)
