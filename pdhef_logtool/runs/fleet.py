@@ -12,6 +12,7 @@ import re
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -75,6 +76,7 @@ _PRELOAD = ("pdhef_logtool.runs.fleet", "pdhef_logtool.runs.guard")
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
 _NO_SETTING = frozenset({"keep", "annotate", "window_s", "car", "cars", "network", "intervals"})
 _FILES = ("mapping", "msgs", "thresholds", "cars")
+_READERS = 16
 _AGAIN = "they are tried again"
 _NOT_IN_FOLDERS = re.compile(r"[^\w.-]+")
 
@@ -181,8 +183,8 @@ def run_logs(
         full_worst = FULL_WORST if config.keep is None and many else 0
     if config.keep is None and many and not only:
         say(
-            f"{len(inputs)} logs: figures and a short report of each are kept, no tracks, recordings or pages; in full "
-            f"the worst {full_worst} and what --only NAME asks for later; --keep full keeps all of it"
+            f"{len(inputs)} logs: figures and a short report of each are kept, no tracks, recordings or pages; all of "
+            f"it of the {full_worst} worst, of any other later by --only NAME, of every one by --keep full"
         )
     config = replace(config, keep=config.keep or ("metrics" if many else "full"))
     journal = Journal.read(output) if resume else Journal.of(output)
@@ -221,6 +223,13 @@ def run_logs(
     return RunResult(output, tuple(results))
 
 
+def limits_of(silence_s: float | None, memory_mb: int | None) -> Limits | None:
+    """Return the limits of a log as a person gives them; None where none is given, so that the run decides."""
+    if silence_s is None and memory_mb is None:
+        return None
+    return Limits(SILENCE_S if silence_s is None else silence_s, None if memory_mb is None else memory_mb * 1_000_000)
+
+
 def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     """Run one drive, write its files, and return how it ended; it raises nothing but what ends the process."""
     warned: list[str] = []
@@ -232,11 +241,8 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
         own = isinstance(error, PdhefError)
         reason = str(error) if own else f"internal error, {type(error).__name__}: {error}"
         outcome = LogOutcome(log=task.log.stem, file=task.log.path.name, sha256=None, failed=reason)
-        identity = None
-        with suppress(PdhefError, OSError):
-            identity = identity_of(task.log)
         again = not own or isinstance(error, OutputError)
-        return DriveEnd(outcome, identity, warned=tuple(warned), again=again)
+        return DriveEnd(outcome, _identity(task.log), warned=tuple(warned), again=again)
 
 
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
@@ -258,7 +264,7 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         warned += _page_of(task.output, result.outcome)
     return DriveEnd(
         result.outcome,
-        result.outcome.sha256,
+        _known_as(task.log, str(result.outcome.sha256)),
         {"digest": digest_of(record["parts"]), **record},
         part,
         result.failed_checks,
@@ -356,16 +362,16 @@ def _plan(inputs: Sequence[LogInput], journal: Journal, *, twice: bool, warn: Ca
 
     later: list[tuple[int, str | None]] = []
     for number, (log, place) in enumerate(zip(inputs, places, strict=True)):
-        label, identity = journal.known(place) or ("", None)
+        label, identity = (place.is_local and journal.known(place)) or ("", None)
         if label and label not in claimed:
             claim(number, _Planned(replace(log, stem=label), place, identity))
         else:
             later.append((number, identity))
+    unknown = [n for n, identity in later if identity is None and _may_be_known(places[n], journal, sizes)]
+    identities = dict(later) | dict(zip(unknown, _identities([inputs[n] for n in unknown]), strict=True))
     taken = {as_taken(label) for label in journal.entries}
-    for number, identity in later:
+    for number, identity in identities.items():
         log, place = inputs[number], places[number]
-        if identity is None and (journal.may_know(place) or sizes[place.bytes] > 1):
-            identity = _identity(log)
         labels = [] if identity is None else journal.labels_of(identity)
         free = next((label for label in labels if label not in claimed), None)
         if identity in owner and not twice:
@@ -381,11 +387,27 @@ def _plan(inputs: Sequence[LogInput], journal: Journal, *, twice: bool, warn: Ca
     return [found[number] for number in sorted(found)]
 
 
+def _may_be_known(place: Place, journal: Journal, sizes: Counter[int]) -> bool:
+    """Whether a log that lies elsewhere than any that is known may be one of them, or what another one holds."""
+    return journal.may_know(place) or (place.is_local and sizes[place.bytes] > 1)
+
+
+def _identities(logs: Sequence[LogInput]) -> list[str | None]:
+    """Return what logs are known by, None for one that cannot be read; several at a time, as servers wait."""
+    with ThreadPoolExecutor(_READERS) as readers:
+        return list(readers.map(_identity, logs))
+
+
 def _identity(log: LogInput) -> str | None:
     try:
-        return identity_of(log)
+        return _known_as(log, identity_of(log))
     except (PdhefError, OSError):
         return None  # the run says what is wrong with it
+
+
+def _known_as(log: LogInput, identity: str) -> str:
+    """Return what a slice of a log is known by: the log's identity, and the slice."""
+    return identity if log.span_s is None else f"{identity} {log.span_s}"
 
 
 def _pools(

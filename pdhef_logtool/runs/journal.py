@@ -24,11 +24,16 @@ from pdhef_logtool.sinks.report import CarFacts, LogOutcome
 
 _FORMAT = {"format": "pdhef.journal", "version": 1}
 _DIGITS = 16
+#: Bytes of a log on a server, which nobody has asked for.
+_ELSEWHERE = -1
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where a log lies: digest of path and slice, size in bytes and time of change; of a folder those of its files."""
+    """Where a log lies: digest of path and slice, size in bytes and time of change; of a folder those of its files.
+
+    Of a log on a server the digest is the URL's, and its identity alone, which is asked for, says whether it changed.
+    """
 
     key: str
     bytes: int
@@ -37,13 +42,27 @@ class Place:
     @classmethod
     def of(cls, log: LogInput) -> Place:
         """Return the place of a log; of one that is not there no bytes."""
-        path = Path(os.path.realpath(log.path))
+        if log.local is None:
+            return cls(_key(str(log.path), log.span_s), _ELSEWHERE, 0)
+        path = Path(os.path.realpath(log.local))
         found = []
         with suppress(OSError):
             files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
             found = [p.stat() for p in files]
-        key = hashlib.sha256(os.fsencode(path) + repr(log.span_s).encode()).hexdigest()[:_DIGITS]
-        return cls(key, sum(f.st_size for f in found), max((f.st_mtime_ns for f in found), default=0))
+        return cls(
+            _key(os.fsdecode(path), log.span_s),
+            sum(f.st_size for f in found),
+            max((f.st_mtime_ns for f in found), default=0),
+        )
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is a place of this machine."""
+        return self.bytes != _ELSEWHERE
+
+
+def _key(path: str, span_s: tuple[float, float] | None) -> str:
+    return hashlib.sha256(os.fsencode(path) + repr(span_s).encode()).hexdigest()[:_DIGITS]
 
 
 @dataclass(frozen=True, slots=True)
