@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,6 +44,7 @@ from pdhef_logtool.learning.network.train_command import gap_free_runs, make_rec
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, ModelError, OutputError, UsageError
+from pdhef_logtool.records.supervisor import Ended, Failure
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
@@ -352,48 +352,29 @@ def test_a_fingerprint_follows_all_that_decides_a_file_and_nothing_else(tmp_path
     assert len({same, *(extract_command._fingerprint(*o) for o in others)}) == 8
 
 
-class DyingPool:
-    """A pool in which drive ``b`` kills its process, and ``c`` with it the first time."""
-
-    sizes: list[int]
-    ended: dict[str, bool]
-
-    def __init__(self, count: int, **_: Any) -> None:
-        self.sizes.append(count)
-
-    def shutdown(self, **how: bool) -> None:
-        type(self).ended = how
-
-    def submit(self, _function: Any, job: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        name = job.log_input.stem
-        if name == "b" or (name == "c" and self.sizes == [2]):
-            future.set_exception(BrokenProcessPool())
-        else:
-            future.set_result(extract_command._failure(job, "fine"))
-        return future
-
-    def __enter__(self) -> DyingPool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(DyingPool, "sizes", [], raising=False)
-    monkeypatch.setattr(extract_command, "ProcessPoolExecutor", DyingPool)
-    work = [_job(name) for name in "abc"]
-    found = extract_command._run_jobs(work, 2, lambda *_: None)
+    def supervise_(_work: Any, items: Any, *, jobs: int, **_: Any) -> Iterator[Ended[Any, Any]]:
+        assert jobs == 2
+        for number, item in enumerate(items):
+            lost = Failure("the worker was killed (signal 9)", "", 2) if number == 1 else None
+            yield Ended(number, item, None if lost else extract_command._failure(item, "fine"), lost)
+
+    monkeypatch.setattr(extract_command, "supervise", supervise_)
+    found = extract_command._run_jobs([_job(name) for name in "abc"], 2, lambda *_: None)
     assert sorted((r.record.name, r.record.left_out) for r in found) == [
-        ("a", "fine"), ("b", "the process that read it died (out of memory?)"), ("c", "fine"),
+        ("a", "fine"), ("b", "the worker was killed (signal 9)"), ("c", "fine"),
     ]  # fmt: skip
-    assert DyingPool.sizes == [2, 1, 1]
-    begun = extract_command._run_jobs(work, 2, lambda *_: None)
-    next(begun)
-    with pytest.raises(KeyboardInterrupt):
-        begun.throw(KeyboardInterrupt())
-    assert DyingPool.ended == {"wait": False, "cancel_futures": True}
+
+
+def test_progress_of_several_drives_at_once_adds_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    def extract(job: Any, progress: Any) -> Any:
+        progress(0.5)
+        return extract_command._failure(job, "fine")
+
+    monkeypatch.setattr(extract_command, "_extract", extract)
+    told: list[tuple[str, float]] = []
+    list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *what: told.append(what)))
+    assert told == [("a", 0.25), ("b", 0.75)]
 
 
 def test_an_error_of_one_log_is_a_reason_and_of_the_only_log_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -472,7 +453,7 @@ def test_long_sequences_are_cut_and_what_teaches_nothing_is_left_out() -> None:
     long = sequence(3100, 2.0)
     long.weight[1500:3000] = 0.0
     n = Normalisation((1.0, 0.0), (2.0, 1.0), (4.0, 8.0))
-    first, last = fit._pieces([long], TINY, n)
+    first, last = fit._pieces(long, TINY, n)
     assert (len(first.features), len(last.features)) == (1500, 100)
     assert first.features[:2].tolist() == [[-0.5, 2.0], [0.0, 2.0]]
     assert first.target[0].tolist() == [0.5, -0.5]
@@ -579,6 +560,7 @@ def test_training_stops_when_patience_ends_and_keeps_the_best_epoch(
     p = bundle.provenance
     assert (p["epochs"], p["best_epoch"], p["validation_loss"]) == (6, 3, 1.0)
     assert (p["training_sequences"], p["validation_sequences"]) == (5, 2)
+    assert p["training_hours"] == pytest.approx(300 * 0.01 / 3600.0, abs=5e-4)
     # Each epoch sees every piece once, in three batches of at most two, in an order of its own.
     orders = [[i for _, chosen in epoch for i in chosen] for epoch in batches[:6]]
     assert all(sorted(o) == [1, 2, 3, 4, 5] for o in orders) and len({tuple(o) for o in orders}) > 1
@@ -730,14 +712,14 @@ def test_a_training_tells_epochs_and_writes_history_plot_and_where_it_is_from(
     asked: list[Any] = []
 
     def fake(training: Any, validation: Any, recipe: Recipe, work: Path, *, progress: Any, **named: Any) -> Any:
-        asked.append((len(training), len(validation), recipe.target, work, named["init"], named["device"]))
+        asked.append((len([*training]), len([*validation]), recipe.target, work, named["init"], named["device"]))
         (work / CHECKPOINT).write_bytes(b"")
         for epoch in history:
             progress(epoch, 4)
         return replace(BUNDLE, provenance={"epochs": 2}), history
 
     monkeypatch.setattr(train_command, "train", fake)
-    monkeypatch.setattr(train_command, "mean_square", lambda bundle, sequences: len(sequences) / 2)
+    monkeypatch.setattr(train_command, "mean_square", lambda bundle, sequences: len([*sequences]) / 2)
     saved: list[Path] = []
     monkeypatch.setattr(ModelBundle, "save", lambda self, folder: saved.append(folder))
     data = dataset(a=("train", arrays(430)), b=("validation", arrays()), c=("test", arrays()), d=("train", arrays(430)))
@@ -752,7 +734,7 @@ def test_a_training_tells_epochs_and_writes_history_plot_and_where_it_is_from(
     assert found.bundle.provenance == {
         "epochs": 2, "dataset_sha256": "d" * 64, "vehicle": "a car",
         "identified_share": 0.5, "fine_tuned_from": BUNDLE.sha256,
-        "fine_tuned_on": "a car", "test_loss": 0.5, "training_hours": 0.002,
+        "fine_tuned_on": "a car", "test_loss": 0.5,
     }  # fmt: skip
     assert not (tmp_path / CHECKPOINT).exists()
     rows = pl.read_parquet(tmp_path / "history.parquet")

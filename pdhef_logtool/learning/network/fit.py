@@ -4,23 +4,28 @@ Sequences run in order through chunks of ``chunk_steps``; the LSTM state is carr
 (METHOD §5). The loss is the weighted mean square of the normalised residual rates; a piece counts by the inverse of its
 own mean square, so that calm driving is not drowned by the limit. Every epoch is a pure function of
 the state before it, the seed and its number, so that an interrupted training goes on as if nothing had happened.
+
+A set may be larger than the memory: sequences come one by one, and the pieces that they are cut into wait in a file on
+the disk of the output, from which a batch reads its own. What is held is one sequence and one batch.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import OUTPUT_COUNT, RESIDUAL, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, ODD_FEATURES, ONE_CAR_FEATURES, PAPER_FEATURES
@@ -31,6 +36,8 @@ CHECKPOINT = "checkpoint.safetensors"
 
 #: Longer sequences are cut into pieces for training; validation runs over them whole.
 PIECE_STEPS = 1500
+#: Steps that validation runs at once, its state carried on: an hour at once would take a gigabyte.
+VALIDATION_STEPS = 60_000
 GRADIENT_CLIP = 1.0
 #: Mean square of normalised targets that is added before a piece is weighted by its inverse.
 WEIGHT_FLOOR = 0.1
@@ -103,22 +110,30 @@ Progress = Callable[[Epoch, int], None]
 
 
 def normalisation_of(
-    sequences: Sequence[FeatureSequence], names: tuple[str, ...], *, odd: bool = False
+    sequences: Iterable[FeatureSequence], names: tuple[str, ...], *, odd: bool = False
 ) -> Normalisation:
     """Return mean and standard deviation of features and targets over the training sequences, by weight.
 
-    With ``odd`` those that change sign where left and right are mirrored are taken to have a mean of 0.
+    ``sequences`` are gone through twice. With ``odd`` features that change sign where left and right are mirrored are
+    taken to have a mean of 0.
     """
     columns = [FEATURES.index(n) for n in names]
-    features = np.concatenate([s.features[s.weight > 0][:, columns] for s in sequences])
-    target = np.concatenate([s.target[s.weight > 0] for s in sequences])
-    if features.shape[0] == 0:
+    count, total, squares = 0, np.zeros(len(columns)), np.zeros(0)
+    for s in sequences:
+        use = s.weight > 0
+        total = _summed(total, s.features[use][:, columns])
+        squares = _summed(squares if squares.size else np.zeros(s.target.shape[1]), s.target[use] ** 2)
+        count += int(np.count_nonzero(use))
+    if count == 0:
         raise ModelError(expected="training sequences with usable samples", got="none", where="train")
-    mean = features.mean(axis=0)
+    mean = total / count
     if odd:
         mean[[n in ODD_FEATURES for n in names]] = 0.0
-    std = np.maximum(np.sqrt(np.mean((features - mean) ** 2, axis=0)), 1e-6)
-    spread = np.maximum(np.sqrt(np.mean(target**2, axis=0)), 1e-6)
+    deviations = np.zeros(len(columns))
+    for s in sequences:
+        deviations = _summed(deviations, (s.features[s.weight > 0][:, columns] - mean) ** 2)
+    std = np.maximum(np.sqrt(deviations / count), 1e-6)
+    spread = np.maximum(np.sqrt(squares / count), 1e-6)
     return Normalisation(
         tuple(float(x) for x in mean),
         tuple(float(x) for x in std),
@@ -126,9 +141,15 @@ def normalisation_of(
     )
 
 
+def _summed(before: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return a sum [k] with rows [N, k] added one after the other: it does not matter how they come in sequences."""
+    found: FloatArray = np.add.reduce(np.ascontiguousarray(np.concatenate([before[None], rows])), axis=0)
+    return found
+
+
 def train(
-    training: Sequence[FeatureSequence],
-    validation: Sequence[FeatureSequence],
+    training: Iterable[FeatureSequence],
+    validation: Iterable[FeatureSequence],
     recipe: Recipe,
     work: Path,
     *,
@@ -140,6 +161,7 @@ def train(
 
     Parameters
     ----------
+    training, validation : gone through up to three times, one by one, before the first epoch.
     work : folder of the checkpoint; one of an earlier, interrupted call with the same recipe and data is resumed.
     init : bundle to start from (fine-tuning); it decides features, architecture and normalisation.
 
@@ -148,13 +170,14 @@ def train(
     ModelError
         There is nothing to train or to validate on, or a checkpoint of another recipe is in the way.
     """
-    if not training or not validation:
-        raise ModelError(
-            expected="training and validation drives",
-            got=f"{len(training)} and {len(validation)} sequences",
-            where="train",
-            remedy="extract more drives, so that every split has some",
-        )
+    for sequences, aim in ((training, "train"), (validation, "validate")):
+        if next(iter(sequences), None) is None:
+            raise ModelError(
+                expected="training and validation drives",
+                got=f"0 sequences to {aim} on",
+                where="train",
+                remedy="extract more drives, so that every split has some",
+            )
     if init is not None:
         recipe = replace(recipe, **{name: getattr(init, name) for name in (*_SHAPE, "target")})
     normalisation = (
@@ -163,34 +186,22 @@ def train(
     network = _new_network(recipe, init).to(device)
     optimiser = torch.optim.Adam(network.parameters(), lr=recipe.learning_rate)
     signs = _signs(recipe)
-    train_pieces = _pieces(training, recipe, normalisation)
-    validation_pieces = [_balanced(_scaled(s, recipe, normalisation)) for s in validation]
-    identity = _identity(recipe, normalisation, training, validation, init)
-    history, best, best_loss = _resume(work, identity, network, optimiser, device)
-    batches = max(1, math.ceil(len(train_pieces) / recipe.batch))
-    for epoch in range(len(history), recipe.epochs):
-        if len(history) - 1 - _best_epoch(history) >= recipe.patience:
-            break
-        began = time.perf_counter()
-        # Everything random in an epoch follows from seed and number, or a resumed training would differ.
-        torch.manual_seed(recipe.seed * 1_000_003 + epoch)
-        order = torch.randperm(len(train_pieces)).tolist()
-        network.train()
-        losses = []
-        for b in range(batches):
-            rate = _learning_rate(recipe, (epoch + b / batches) / recipe.epochs)
-            for group in optimiser.param_groups:
-                group["lr"] = rate
-            chosen = [train_pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
-            if recipe.odd:
-                chosen = [_mirrored(p, signs) if torch.rand(()) < 0.5 else p for p in chosen]
-            losses.append(_train_batch(network, optimiser, chosen, recipe.chunk_steps, device))
-        loss = _validate(network, validation_pieces, device, signs if recipe.odd else None)
-        history.append(Epoch(epoch + 1, float(np.mean(losses)), loss, rate, time.perf_counter() - began))
-        if loss < best_loss:
-            best, best_loss = _weights(network), loss
-        _write_checkpoint(work, identity, history, network, optimiser, best)
-        progress(history[-1], recipe.epochs)
+    with PieceFile(work) as train_pieces, PieceFile(work) as validation_pieces:
+        train_pieces.fill(training, lambda s: _pieces(s, recipe, normalisation))
+        validation_pieces.fill(validation, lambda s: [_balanced(_scaled(s, recipe, normalisation))])
+        identity = _identity(recipe, normalisation, train_pieces, validation_pieces, init)
+        history, best, best_loss = _resume(work, identity, network, optimiser, device)
+        for epoch in range(len(history), recipe.epochs):
+            if len(history) - 1 - _best_epoch(history) >= recipe.patience:
+                break
+            began = time.perf_counter()
+            train_loss, rate = _train_epoch(network, optimiser, train_pieces, recipe, epoch, device)
+            loss = _validate(network, validation_pieces, device, signs if recipe.odd else None)
+            history.append(Epoch(epoch + 1, train_loss, loss, rate, time.perf_counter() - began))
+            if loss < best_loss:
+                best, best_loss = _weights(network), loss
+            _write_checkpoint(work, identity, history, network, optimiser, best)
+            progress(history[-1], recipe.epochs)
     bundle = ModelBundle(
         **{name: getattr(recipe, name) for name in (*_SHAPE, "period_s")},
         normalisation=normalisation,
@@ -200,8 +211,9 @@ def train(
             "epochs": len(history),
             "best_epoch": _best_epoch(history) + 1,
             "validation_loss": best_loss,
-            "training_sequences": len(training),
-            "validation_sequences": len(validation),
+            "training_sequences": train_pieces.sequences,
+            "validation_sequences": validation_pieces.sequences,
+            "training_hours": round(train_pieces.steps * recipe.period_s / 3600.0, 3),
         },
         target=recipe.target,
     )
@@ -216,6 +228,83 @@ class _Piece:
     features: torch.Tensor
     target: torch.Tensor
     weight: torch.Tensor
+
+
+class PieceFile:
+    """Pieces in a file without a name, which is gone with the process; each is read when it is asked for.
+
+    Parameters
+    ----------
+    folder : on whose disk it lies; made when it is missing.
+
+    Attributes
+    ----------
+    sequences, steps : that it was filled from. sha256 : of all that it holds.
+
+    Raises
+    ------
+    OutputError
+        The disk is full, or the folder cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._places: list[tuple[int, int]] = []  # of each piece its place in the file and its steps
+        self._shape = (0, 0)
+        self._hash = hashlib.sha256()
+        self.sequences = self.steps = 0
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed as a context)
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let the file go."""
+        self._file.close()
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the content."""
+        return self._hash.hexdigest()
+
+    def fill(self, sequences: Iterable[FeatureSequence], cut: Callable[[FeatureSequence], Iterable[_Piece]]) -> None:
+        """Take the pieces of sequences, one sequence at a time."""
+        for s in sequences:
+            self.sequences += 1
+            self.steps += len(s.weight)
+            for piece in cut(s):
+                self._add(piece)
+        with writing(self._folder):
+            self._file.flush()
+
+    def _add(self, piece: _Piece) -> None:
+        self._shape = (piece.features.shape[1], piece.target.shape[1])
+        data = b"".join(x.numpy().tobytes() for x in (piece.features, piece.target, piece.weight))
+        with writing(self._folder):
+            self._places.append((self._file.tell(), len(piece.weight)))
+            self._file.write(data)
+        self._hash.update(data)
+
+    def __len__(self) -> int:
+        """Return the number of pieces."""
+        return len(self._places)
+
+    def __getitem__(self, number: int) -> _Piece:
+        """Read a piece; raises IndexError behind the last."""
+        at, steps = self._places[number]
+        k, m = self._shape
+        self._file.seek(at)
+        data = bytearray(self._file.read(4 * steps * (k + m + 1)))
+        values = torch.frombuffer(data, dtype=torch.float32)
+        features, target = values[: steps * k].view(steps, k), values[steps * k : steps * (k + m)].view(steps, m)
+        return _Piece(features, target, values[steps * (k + m) :])
+
+    def __iter__(self) -> Iterator[_Piece]:
+        """Read all of them, one by one."""
+        return (self[number] for number in range(len(self)))
 
 
 def _signs(recipe: Recipe) -> torch.Tensor:
@@ -235,15 +324,12 @@ def _scaled(s: FeatureSequence, recipe: Recipe, n: Normalisation) -> _Piece:
     )
 
 
-def _pieces(sequences: Sequence[FeatureSequence], recipe: Recipe, n: Normalisation) -> list[_Piece]:
-    out = []
-    for s in sequences:
-        whole = _scaled(s, recipe, n)
-        for at in range(0, whole.features.shape[0], PIECE_STEPS):
-            part = slice(at, at + PIECE_STEPS)
-            if float(whole.weight[part].sum()) > 0.0:
-                out.append(_balanced(_Piece(whole.features[part], whole.target[part], whole.weight[part])))
-    return out
+def _pieces(sequence: FeatureSequence, recipe: Recipe, n: Normalisation) -> Iterator[_Piece]:
+    whole = _scaled(sequence, recipe, n)
+    for at in range(0, whole.features.shape[0], PIECE_STEPS):
+        part = slice(at, at + PIECE_STEPS)
+        if float(whole.weight[part].sum()) > 0.0:
+            yield _balanced(_Piece(whole.features[part], whole.target[part], whole.weight[part]))
 
 
 def _balanced(piece: _Piece) -> _Piece:
@@ -261,6 +347,32 @@ def _padded(pieces: Sequence[_Piece], device: str) -> _Piece:
 
 
 # ---- one epoch ----
+
+
+def _train_epoch(
+    network: ResidualNetwork,
+    optimiser: torch.optim.Optimizer,
+    pieces: PieceFile,
+    recipe: Recipe,
+    epoch: int,
+    device: str,
+) -> tuple[float, float]:
+    """Go once through all pieces in an order that follows from the seed; return mean loss and last learning rate."""
+    # Everything random in an epoch follows from seed and number, or a resumed training would differ.
+    torch.manual_seed(recipe.seed * 1_000_003 + epoch)
+    order = torch.randperm(len(pieces)).tolist()
+    batches, signs = max(1, math.ceil(len(pieces) / recipe.batch)), _signs(recipe)
+    network.train()
+    losses = []
+    for b in range(batches):
+        rate = _learning_rate(recipe, (epoch + b / batches) / recipe.epochs)
+        for group in optimiser.param_groups:
+            group["lr"] = rate
+        chosen = [pieces[i] for i in order[b * recipe.batch : (b + 1) * recipe.batch]]
+        if recipe.odd:
+            chosen = [_mirrored(p, signs) if torch.rand(()) < 0.5 else p for p in chosen]
+        losses.append(_train_batch(network, optimiser, chosen, recipe.chunk_steps, device))
+    return float(np.mean(losses)), rate
 
 
 def _train_batch(
@@ -290,16 +402,20 @@ def _train_batch(
     return float(np.mean(losses)) if losses else 0.0
 
 
-def _validate(network: ResidualNetwork, pieces: Sequence[_Piece], device: str, signs: torch.Tensor | None) -> float:
+def _validate(network: ResidualNetwork, pieces: Iterable[_Piece], device: str, signs: torch.Tensor | None) -> float:
     """Return the loss as service has it; with ``signs`` the network is made odd."""
     network.eval()
     total, weight = 0.0, 0.0
     with torch.inference_mode():
         for p in pieces:
-            sides = p.features[None] if signs is None else torch.stack([p.features, p.features * signs])
-            output, _ = network(sides.to(device), None)
-            said = output[0] if signs is None else 0.5 * (output[0] - output[1])
-            square = ((said.cpu() - p.target) ** 2).mean(dim=1)
+            state: State | None = None
+            parts = []
+            for at in range(0, len(p.weight), VALIDATION_STEPS):
+                features = p.features[at : at + VALIDATION_STEPS]
+                sides = features[None] if signs is None else torch.stack([features, features * signs])
+                output, state = network(sides.to(device), state)
+                parts.append((output[0] if signs is None else 0.5 * (output[0] - output[1])).cpu())
+            square = ((torch.cat(parts) - p.target) ** 2).mean(dim=1)
             total += float((square * p.weight).sum())
             weight += float(p.weight.sum())
     return total / weight if weight else math.inf
@@ -340,15 +456,15 @@ def _best_epoch(history: Sequence[Epoch]) -> int:
 def _identity(
     recipe: Recipe,
     n: Normalisation,
-    training: Sequence[FeatureSequence],
-    validation: Sequence[FeatureSequence],
+    training: PieceFile,
+    validation: PieceFile,
     init: ModelBundle | None,
 ) -> dict[str, Any]:
     document = {
         "recipe": asdict(recipe),
         "normalisation": asdict(n),
-        "training": [(s.drive, int(s.weight.shape[0])) for s in training],
-        "validation": [(s.drive, int(s.weight.shape[0])) for s in validation],
+        "training": training.sha256,
+        "validation": validation.sha256,
         "init": None if init is None else init.sha256,
     }
     plain: dict[str, Any] = json.loads(json.dumps(document))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.learning.network.dataset import Dataset, DatasetDrive, DriveArrays, read_dataset
+from pdhef_logtool.learning.network.dataset import SPLITS, Dataset, DatasetDrive, DriveArrays, read_dataset
 from pdhef_logtool.learning.network.fit import CHECKPOINT, PAPER_RECIPE, Epoch, FeatureSequence, Recipe, train
 from pdhef_logtool.learning.plots import new_figure, png_bytes
 from pdhef_logtool.records.errors import ModelError, OutputError, UsageError
@@ -142,8 +142,8 @@ def train_on(
 ) -> TrainResult:
     """Train one network by a recipe, whose target says what it learns; the rest as :func:`run_training`."""
     splits = {
-        name: list(_sequences((d for d in data.drives if d.split == name), recipe.target, odd=recipe.odd))
-        for name in ("train", "validation", "test")
+        name: SplitSequences(tuple(d for d in data.drives if d.split == name), recipe.target, recipe.odd)
+        for name in SPLITS
     }
 
     def tell(epoch: Epoch, of: int) -> None:
@@ -155,7 +155,7 @@ def train_on(
     bundle, history = train(
         splits["train"], splits["validation"], recipe, output, init=init, device=device, progress=tell
     )
-    test_loss = mean_square(bundle, splits["test"]) if splits["test"] else None
+    test_loss = None if next(iter(splits["test"]), None) is None else mean_square(bundle, splits["test"])
     provenance = {
         **bundle.provenance,
         "dataset_sha256": data.sha256,
@@ -164,7 +164,6 @@ def train_on(
         "fine_tuned_from": None if init is None else init.sha256,
         "fine_tuned_on": None if init is None else data.vehicle_name,
         "test_loss": test_loss,
-        "training_hours": round(sum(len(s.weight) for s in splits["train"]) * recipe.period_s / 3600.0, 3),
     }
     bundle = replace(bundle, provenance=provenance, model=data.model, physics_sha256=data.physics_sha256)
     write_bytes(output / HISTORY_FILE, _history_table(history))
@@ -236,6 +235,19 @@ def steering_offset(rows: DriveArrays) -> FloatArray:
     angle = float(mean @ by_angle / (by_angle @ by_angle)) * seconds / (seconds + OFFSET_SHRINK_S)
     offset: FloatArray = angle * by_angle
     return offset
+
+
+@dataclass(frozen=True, slots=True)
+class SplitSequences:
+    """The sequences of the drives of a split, read anew each time that they are gone through."""
+
+    drives: tuple[DatasetDrive, ...]
+    target: str
+    odd: bool
+
+    def __iter__(self) -> Iterator[FeatureSequence]:
+        """Yield them in the order of the drives; one drive is held at a time."""
+        yield from _sequences(self.drives, self.target, odd=self.odd)
 
 
 def _sequences(

@@ -1,0 +1,102 @@
+"""Train on a set four times what memory is left for it, and say what a row costs beside a small set without a limit.
+
+Run by tests: ``python larger_than_memory.py FOLDER MEGABYTES UNITS EPOCHS``. The set is files on the disk, as extract
+writes them; the limit is that of the kernel on this process's own memory.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.learning.network.dataset import (
+    DriveWriter,
+    drive_file,
+    read_dataset,
+    vehicle_entry,
+    write_manifest,
+)
+from pdhef_logtool.learning.network.fit import Recipe
+from pdhef_logtool.learning.network.residuals import ResidualRows
+from pdhef_logtool.learning.network.train_command import train_on
+from pdhef_logtool.residual_model.features import FEATURES
+
+#: Of one drive: a minute.
+STEPS = 6000
+#: What a row takes as arrays: features, targets and weight as float32. They came as float64 before.
+ROW_BYTES = 4 * (len(FEATURES) + 3)
+
+
+def write_set(folder: Path, drives: int) -> Path:
+    """Write a set of random drives, one in ten of them to validate on."""
+    entries, some = [], np.random.default_rng(0).normal(size=(STEPS, len(FEATURES)))
+    for number in range(drives):
+        features = np.roll(some, number, axis=0)
+        weight = np.ones(STEPS)
+        weight[-1] = 0.0
+        rows = ResidualRows(
+            stamps_ns=np.arange(STEPS) * 10_000_000,
+            features=features,
+            targets=0.01 * features[:, :2],
+            step_s=np.full(STEPS, 0.01),
+            weight=weight,
+            segment=np.zeros(STEPS, dtype=np.int64),
+            truth_velocity=features[:, :2],
+        )
+        split = "validation" if number % 10 == 9 else "train"
+        entry = {
+            "name": f"d{number:05}", "log": f"d{number:05}", "split": split, "rows": STEPS, "usable_rows": STEPS - 1,
+            "period_s": 0.01, "signals_sha256": None, "cells": {}, "car": "a car", "vehicle_sha256": "f" * 64,
+        }  # fmt: skip
+        writer = DriveWriter(drive_file(folder, entry))
+        writer.append(rows)
+        writer.finish(entry)
+        entries.append(entry)
+    vehicle = vehicle_entry("f" * 64, Car.load(None).own, identified=False)
+    write_manifest(folder, entries, [], settings={"model": "physics"}, seed=0, vehicles={"f" * 64: vehicle})
+    return folder
+
+
+def held_bytes() -> int:
+    """Return what of this process counts against the limit."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmData"))
+
+
+def cost(folder: Path, work: Path, recipe: Recipe) -> tuple[float, str]:
+    """Return CPU seconds a row of a training, and the digest of its weights."""
+    data = read_dataset(folder)
+    began = time.process_time()
+    found = train_on(data, work, recipe)
+    return (time.process_time() - began) / sum(d.rows for d in data.drives), found.bundle.sha256
+
+
+def main() -> None:
+    """Measure and print one document."""
+    folder, limit = Path(sys.argv[1]), round(float(sys.argv[2]) * 1e6)
+    units, epochs = int(sys.argv[3]), int(sys.argv[4])
+    recipe = replace(Recipe(), hidden=units, head=(units,), epochs=epochs)
+    drives = -(-4 * limit // (STEPS * ROW_BYTES))
+    small, large = (write_set(folder / name, n) for name, n in (("small", max(10, drives // 8)), ("large", drives)))
+    cost(small, folder / "warm", recipe)  # what a first training loads is no part of a row
+    alone, _ = cost(small, folder / "a", recipe)
+    resource.setrlimit(resource.RLIMIT_DATA, (held_bytes() + limit,) * 2)
+    among, sha256 = cost(large, folder / "b", recipe)
+    holds = False
+    try:
+        np.ones(limit // 8 + 2**20)
+    except MemoryError:
+        holds = True
+    told = {"limit_mb": limit / 1e6, "set_mb": drives * STEPS * ROW_BYTES / 1e6, "limit_holds": holds}
+    print(json.dumps({**told, "us_a_row": [1e6 * alone, 1e6 * among], "ratio": among / alone, "sha256": sha256}))
+
+
+if __name__ == "__main__":
+    main()
