@@ -44,8 +44,10 @@ class _Column:
             values = np.concatenate([self._held, values])
             self._held = values if self.rows <= ROWS_HELD else None
         if self._held is None:
-            with writing(self.path), open_new(self.path, "ab") as file:
-                file.write(np.ascontiguousarray(values).data)
+            with writing(self.path):
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                with open_new(self.path, "ab") as file:
+                    file.write(np.ascontiguousarray(values).data)
 
     def read(self, start: int, end: int) -> NDArray[Any]:
         if self._held is not None:
@@ -120,13 +122,11 @@ class TrackStore:
     Raises
     ------
     OutputError
-        The folder, which is made, or a file in it cannot be written.
+        The folder, which is made when something is written to it, or a file in it cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        with writing(folder):
-            folder.mkdir(parents=True)
         self._stored: dict[str, _Columns] = {}
         self._windows: list[_Window] = []
 
@@ -184,7 +184,8 @@ class TrackStore:
 
     def close(self) -> None:
         """Remove everything; harmless when called twice."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        if self._folder.exists():
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     def __enter__(self) -> Self:
         """Return itself."""

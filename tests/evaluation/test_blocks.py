@@ -21,8 +21,8 @@ from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segme
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
-from pdhef_logtool.runs.scoring import segment_events
 from pdhef_logtool.runs import track_store
+from pdhef_logtool.runs.scoring import segment_events
 from pdhef_logtool.runs.track_store import TrackStore
 
 T0 = 1_700_000_000_000_000_000
