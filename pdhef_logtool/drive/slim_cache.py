@@ -54,16 +54,6 @@ class SlimCache:
         with scratch_folder() as scratch:
             yield self._found(log, Path(scratch), warn) or log
 
-    @contextmanager
-    def at_hand(self, log: LogInput) -> Iterator[LogInput]:
-        """Yield the slim log of a log if it is there, else the log as it is."""
-        with scratch_folder() as scratch:
-            try:
-                path = self._fetched(self._key(identity_of(log)), Path(scratch))
-            except (OSError, PdhefError):
-                path = None
-            yield log if path is None or not _is_sound(path) else replace(log, path=path)
-
     def _found(self, log: LogInput, scratch: Path, warn: Callable[[str], None]) -> LogInput | None:
         try:
             identity = identity_of(log)

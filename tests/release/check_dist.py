@@ -1,6 +1,6 @@
 """Looks at what was built: one wheel and one source archive of this version, with all that a run needs and no more.
 
-    python tests/release/check_dist.py dist
+python tests/release/check_dist.py dist
 """
 
 from __future__ import annotations
