@@ -7,19 +7,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.errors import SimulationError, UsageError
+from pdhef_logtool.records.errors import PdhefError, SimulationError, UsageError
 from pdhef_logtool.records.files import write_bytes, writing
-from pdhef_logtool.records.processes import follow_parent
+from pdhef_logtool.records.supervisor import Tell, supervise
 from pdhef_logtool.records.version import __version__
 from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
@@ -32,6 +31,8 @@ MANIFEST = "manifest.json"
 BINS: dict[str, float] = {"low": 0.0, "middle": 0.3, "high": 0.6}
 #: Drives between two writings of the manifest, which is what an interrupted batch goes on from.
 _SAVE_EVERY = 25
+#: Lost drives that an error names.
+_TOLD = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,17 +171,25 @@ def run_jobs(
     ------
     UsageError : ``processes`` is below 1.
     OutputError : the folder or a file cannot be written.
+    SimulationError : the process of a drive died twice; all others are made.
     """
     if processes < 1:
         raise UsageError(expected="at least one process", got=str(processes), where="--jobs")
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     entries = _kept(jobs, folder)
+    lost: list[str] = []
     todo = [i for i in range(len(jobs)) if i not in entries]
+    made = supervise(partial(_made, folder), (jobs[i] for i in todo), jobs=processes, preload=[__name__])
     try:
-        with _workers(processes) as work:
-            for done, (i, entry) in enumerate(work([(i, jobs[i]) for i in todo], folder), start=1):
-                entries[i] = entry
+        with closing(made):
+            for done, ended in enumerate(made, start=1):
+                if ended.failure is not None:
+                    lost.append(f"{ended.item.file}: {ended.failure.reason}")
+                elif isinstance(ended.result, PdhefError):
+                    raise ended.result
+                elif ended.result is not None:
+                    entries[todo[ended.number]] = ended.result
                 if progress is not None:
                     progress(f"{len(entries)} of {len(jobs)} drives", len(entries) / len(jobs))
                 if done % _SAVE_EVERY == 0:
@@ -190,7 +199,21 @@ def run_jobs(
         complete = len(ordered) == len(jobs)
         extra = finish(ordered) if finish is not None and complete else {}
         manifest = _write_manifest(folder, {**head, **extra}, ordered, complete=complete)
+    if lost:
+        raise SimulationError(
+            expected=f"{len(jobs)} drives",
+            got=f"{len(lost)} that were lost ({'; '.join(lost[:_TOLD])}{'; …' if len(lost) > _TOLD else ''})",
+            where="--jobs",
+            remedy="the same command again makes what is missing",
+        )
     return manifest
+
+
+def _made(folder: Path, job: Job, _tell: Tell) -> dict[str, Any] | PdhefError:
+    try:
+        return make_drive(job, folder)
+    except PdhefError as error:
+        return error
 
 
 def _kept(jobs: Sequence[Job], folder: Path) -> dict[int, dict[str, Any]]:
@@ -210,29 +233,6 @@ def _kept(jobs: Sequence[Job], folder: Path) -> dict[int, dict[str, Any]]:
         if wanted is None or (path.is_file() and hashlib.sha256(path.read_bytes()).hexdigest() == wanted):
             kept[i] = {**entry, **dict(job.facts)}
     return kept
-
-
-_Work = Callable[[list[tuple[int, Job]], Path], Iterator[tuple[int, dict[str, Any]]]]
-
-
-@contextmanager
-def _workers(processes: int) -> Iterator[_Work]:
-    """Yield a function that makes drives, here or in processes of their own, and yields entries as they are done."""
-    if processes == 1:
-        yield lambda todo, folder: ((i, make_drive(job, folder)) for i, job in todo)
-        return
-    # A fresh interpreter each: threads of the parent would not survive a fork.
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=follow_parent) as pool:
-
-        def work(todo: list[tuple[int, Job]], folder: Path) -> Iterator[tuple[int, dict[str, Any]]]:
-            futures = {pool.submit(make_drive, job, folder): i for i, job in todo}
-            try:
-                for future in as_completed(futures):
-                    yield futures[future], future.result()
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
-
-        yield work
 
 
 def _write_manifest(

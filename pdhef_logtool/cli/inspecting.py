@@ -36,6 +36,7 @@ def inspect(
     """Show what a log holds and what maps to what. Rates, gaps and jitter are shown too, and what is missing."""
     from pdhef_logtool.inspection import fields_of_log, inspect_log, render_fields, render_inspection
     from pdhef_logtool.inspection import write_mapping as write_mapping_file
+    from pdhef_logtool.logs.discovery import one_place
     from pdhef_logtool.mapping import load_mapping
 
     chosen = None if config.mapping is None else load_mapping(config.mapping)
@@ -43,10 +44,10 @@ def inspect(
     if topic is not None and not fields:
         raise UsageError(expected="one log", got=f"{log} and {topic}", where="LOG", remedy="a topic goes with --fields")
     if fields:
-        found = fields_of_log(Path(log), topic, budget=reading.limits, msgs=reading.msgs)
+        found = fields_of_log(one_place(log), topic, budget=reading.limits, msgs=reading.msgs)
         console.finish(found, render_fields, as_json, exit_code=EXIT_OK)
     inspection = inspect_log(
-        Path(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
+        one_place(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
     )
     if write_mapping is not None:
         write_mapping_file(inspection, write_mapping)
@@ -67,12 +68,13 @@ def map_(
     import sys
 
     from pdhef_logtool.inspection import ask_mapping, inspect_log, write_mapping
+    from pdhef_logtool.logs.discovery import one_place
     from pdhef_logtool.mapping import load_mapping
 
     chosen = None if config.mapping is None else load_mapping(config.mapping)
     reading = config.read_options
     inspection = inspect_log(
-        Path(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
+        one_place(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
     )
     if sys.stdin.isatty() and sys.stderr.isatty():
         answers = ask_mapping(inspection, _ask, console.say)

@@ -13,9 +13,11 @@ from pdhef_logtool.drive.friction import FrictionSource, friction_source
 from pdhef_logtool.drive.options import ReadOptions, time_slice
 from pdhef_logtool.drive.windows import DrivePlan, DriveReader, DriveWindow, plan_drive
 from pdhef_logtool.logs.byte_account import ByteLedger
-from pdhef_logtool.logs.discovery import LogInput, find_logs, hash_log
+from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace
 from pdhef_logtool.mapping import Mapping, check_mapping, choose_mapping, merge_losses
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
@@ -37,7 +39,7 @@ class WholeDrive:
     """A drive in memory: signals [N], and the truth [N] at their stamps (None if the log has none)."""
 
     name: str
-    path: Path
+    path: LogPlace
     plan: DrivePlan
     signals: Signals
     truth: StateTrack | None
@@ -90,8 +92,8 @@ class Drive:
     _sha256: str = ""
 
     @property
-    def path(self) -> Path:
-        """The file or folder."""
+    def path(self) -> LogPlace:
+        """The file, folder or object."""
         return self.log.path
 
     @property
@@ -111,8 +113,8 @@ class Drive:
 
     @property
     def sha256(self) -> str:
-        """Hash of the log, computed when it is first asked for."""
-        self._sha256 = self._sha256 or hash_log(self.path)
+        """What the log is known by (:func:`identity_of`), computed when it is first asked for."""
+        self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
         return self._sha256
 
     @property
@@ -209,7 +211,7 @@ class Drive:
 
 
 def read_drive(
-    log: LogInput | Path | str,
+    log: LogInput | LogPlace | str,
     car: Car,
     mapping: Mapping | None = None,
     options: ReadOptions = _AS_IT_IS,
@@ -222,7 +224,8 @@ def read_drive(
 
     Parameters
     ----------
-    log : a file or folder; a :class:`LogInput` brings the name that the drive has beside others, and may bring a slice.
+    log : a file, folder or URL; a :class:`LogInput` brings the name that the drive has beside others, and may bring
+        a slice.
     mapping : None recognises types.
     tell : called with ``NAME: text`` for all that a user must know of the drive; :attr:`Drive.notes` has it too.
     adjust : changes the mapping in effect.
@@ -240,7 +243,7 @@ def read_drive(
     ...     [len(window.signals.stamps_ns) for window in drive.windows()], drive.losses
     ([951], ())
     """
-    log_input = log if isinstance(log, LogInput) else one_log(str(log))
+    log_input = log if isinstance(log, LogInput) else one_log(log.url if isinstance(log, RemotePlace) else str(log))
     if log_input.span_s is not None:
         start_s, end_s = log_input.span_s
         options = replace(options, start=f"{start_s:.9f}", end=f"{end_s:.9f}")
@@ -251,7 +254,7 @@ def read_drive(
         notes.append(text)
         tell(f"{log_input.stem}: {text}")
 
-    opened = open_log(log_input.path, options.limits, options.msgs)
+    opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
         chosen, missing = choose_mapping(
             opened, mapping, told, remarks.append, prefer_truth=options.prefer_truth, require_signals=require_sensors
@@ -262,6 +265,9 @@ def read_drive(
         if opened.end_ns <= opened.start_ns:
             raise no_samples(log_input.path)
         slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
+        if not isinstance(log_input.path, Path):
+            opened = _reopened(opened, chosen, slice_ns, options)
+            slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         plan = plan_drive(opened, chosen, car.vehicle, *slice_ns, require_imu=require_sensors)
         for note in plan.mapping.notes[len(chosen.notes) :]:
             told(note)
@@ -273,6 +279,15 @@ def read_drive(
         opened.close()
         raise
     return Drive(log_input.stem, opened, car, options, plan, missing, notes, friction, tell, remarks)
+
+
+def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], options: ReadOptions) -> DriveLog:
+    """Open a log that is far again, now that it is known what of it is wanted; nothing is fetched twice."""
+    whole = slice_ns == (log.start_ns, log.end_ns)
+    wanted = Wanted(frozenset(s.topic for s in mapping.sources()), *((None, None) if whole else slice_ns))
+    opened = open_log(log.path, options.limits, options.msgs, wanted)
+    log.close()
+    return opened
 
 
 def one_log(argument: str) -> LogInput:
@@ -288,7 +303,7 @@ def lost_texts(losses: Iterable[Loss]) -> tuple[str, ...]:
     return tuple(f"{x.what} ({x.where})" for x in losses if x.severity == "lost")
 
 
-def no_samples(path: Path) -> EstimatorError:
+def no_samples(path: LogPlace) -> EstimatorError:
     """Return the error for a slice without a stamp."""
     return EstimatorError(
         expected="IMU samples in the chosen slice",

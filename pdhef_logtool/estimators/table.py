@@ -115,6 +115,8 @@ class Spec:
         return SelfCalibrated(estimator, car.self_calibrated, car.vehicle, compared=options.compared)
 
 
+#: What the fork server of workers that filter has loaded.
+FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.records.compiled:load_kept")
 #: In place of names: every estimator that the car suits.
 ALL_ESTIMATORS = "all"
 #: In the order of the tables.

@@ -16,6 +16,7 @@ from pdhef_logtool.inspection.report import COVARIANCE, INDEX, collapsed
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping.evidence import PIECE_NS, Pieces
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import UsageError
@@ -65,7 +66,7 @@ class FieldsOfLog:
 
 
 def fields_of_log(
-    path: Path, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None
+    path: LogPlace, topic: str | None = None, *, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None
 ) -> FieldsOfLog:
     """Read the numbers of a topic, or of all, in a few pieces of the log.
 

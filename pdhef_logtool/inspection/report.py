@@ -21,6 +21,7 @@ from pdhef_logtool.inspection.uses import uses_of
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import (
     Ambiguity,
     ClockModel,
@@ -191,7 +192,7 @@ class Inspection:
 
 
 def inspect_log(
-    path: Path,
+    path: LogPlace,
     mapping: Mapping | None = None,
     *,
     prefer_truth: Literal["perfect", "rtk"] = "perfect",

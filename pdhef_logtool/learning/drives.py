@@ -107,7 +107,7 @@ def check_file_output(inputs: Sequence[LogInput], config: RunConfig, output: Pat
         ``output`` is a log or another file of the command.
     """
     if output.suffix:
-        read = [*(i.path for i in inputs), *config.files]
+        read = [*(i.local for i in inputs), *config.files]
         check_no_input([path for path in read if path != config.car], [output])
 
 
@@ -139,7 +139,7 @@ def choose_drives(
         A drive is of a refused split, or none is left.
     """
     manifests = cache(set_manifest)
-    splits = {i.stem: str(manifests(i.path.parent).get(i.path.name, {}).get("split") or "") for i in inputs}
+    splits = {i.stem: str(manifests(i.folder).get(i.path.name, {}).get("split") or "") for i in inputs}
     if choice.split is not None:
         inputs = [i for i in inputs if splits[i.stem] == choice.split]
         if not inputs:
@@ -161,8 +161,10 @@ def choose_drives(
     return list(inputs), {i.stem: splits[i.stem] for i in inputs if splits[i.stem]}
 
 
-def set_manifest(folder: Path) -> Mapping[str, Mapping[str, Any]]:
+def set_manifest(folder: Path | None) -> Mapping[str, Mapping[str, Any]]:
     """Return the entries of a set's manifest.json (``drives``) or manifest.toml (``log``) by file name."""
+    if folder is None:
+        return {}
     documents: list[Any] = []
     for name, parse in (("manifest.json", json.loads), ("manifest.toml", tomllib.loads)):
         with suppress(OSError, ValueError, RecursionError):  # there is none, or it is somebody else's

@@ -9,8 +9,10 @@ from __future__ import annotations
 import os
 import stat
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from pathlib import Path
 
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError
 
 #: Small reads come from a block read ahead, which grows while reads follow each other and shrinks where they jump.
@@ -24,15 +26,24 @@ class CutError(Exception):
     """A file ends earlier than it did when it was opened; caught inside this package and turned into a loss."""
 
 
+class SourceError(LogError):
+    """The place of a log does not give its bytes (any more): no damage of the log, and so never one of its losses."""
+
+
+class ChangedError(SourceError):
+    """A log is another one than was opened."""
+
+
 class ByteSource(ABC):
     """Bytes that can be read at any offset.
 
     Attributes
     ----------
-    size : bytes when it was opened.
+    size : bytes when it was opened. far : whether each read costs a journey, so that few and large ones are better.
     """
 
     size: int
+    far = False
 
     def __init__(self, size: int) -> None:
         self.size = size
@@ -46,6 +57,15 @@ class ByteSource(ABC):
     @abstractmethod
     def close(self) -> None:
         """Release what is open."""
+
+    def at_hand(self, offset: int, size: int) -> int:
+        """Return how many of the ``size`` bytes from an offset on a read may as well take along."""
+        del offset
+        return size
+
+    def expect(self, extents: Iterable[tuple[int, int]]) -> None:
+        """Take note of bytes [start, end) that will be read soon, in this order."""
+        del extents
 
     def read(self, offset: int, size: int) -> bytes:
         """Return exactly these bytes; raises :class:`CutError` where the file has less."""
@@ -72,7 +92,7 @@ class ByteSource(ABC):
             return block, at
         follows = 0 <= at <= len(block)
         self._ahead_bytes = min(2 * self._ahead_bytes, _MOST_AHEAD_BYTES) if follows else _LEAST_AHEAD_BYTES
-        block = self.fetch(offset, max(size, self._ahead_bytes))
+        block = self.fetch(offset, max(size, self.at_hand(offset, self._ahead_bytes)))
         self._block = (offset, block)
         return block, 0
 
@@ -85,7 +105,7 @@ class LocalFile(ByteSource):
     LogError : it is a FIFO, a device or a socket. OSError : it cannot be opened.
     """
 
-    def __init__(self, path: Path, shown_path: Path | None = None) -> None:
+    def __init__(self, path: Path, shown_path: LogPlace | None = None) -> None:
         require_regular(path, shown_path)
         self._file = path.open("rb", buffering=0)
         super().__init__(os.fstat(self._file.fileno()).st_size)
@@ -108,7 +128,7 @@ class LocalFile(ByteSource):
         self._file.close()
 
 
-def require_regular(path: Path, shown_path: Path | None = None) -> None:
+def require_regular(path: Path, shown_path: LogPlace | None = None) -> None:
     """Refuse what is no regular file, without opening it: opening a FIFO waits for ever, some devices act on it.
 
     Raises

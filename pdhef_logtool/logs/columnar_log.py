@@ -12,6 +12,7 @@ import numpy as np
 
 from pdhef_logtool.logs.budget import BudgetError
 from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.logs.byte_source import SourceError
 from pdhef_logtool.logs.container import Block, ChannelRecord, Container, Span, told
 from pdhef_logtool.logs.decoding import (
     ChannelDecoder,
@@ -32,6 +33,7 @@ from pdhef_logtool.logs.message_schema import (
     resolve,
 )
 from pdhef_logtool.logs.occupied_time import OccupiedTime, survey
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
@@ -44,7 +46,7 @@ class ColumnarLog:
 
     Parameters
     ----------
-    path : file or folder as the user named it.
+    path : file, folder or object as the user named it.
     kind : ``mcap``, ``rosbag1``, ``rosbag2-sqlite3`` or ``rosbag2-mcap``.
     containers : the log's files in order of recording.
     lost : damage found while the log was opened, beside the containers' own.
@@ -52,7 +54,7 @@ class ColumnarLog:
     """
 
     def __init__(
-        self, path: Path, kind: str, containers: Sequence[Container], lost: Sequence[Loss] = (), distro: str = ""
+        self, path: LogPlace, kind: str, containers: Sequence[Container], lost: Sequence[Loss] = (), distro: str = ""
     ) -> None:
         self.path = path
         self.kind = kind
@@ -120,6 +122,8 @@ class ColumnarLog:
                 channel, log_time = container.times(span)
             known = np.isin(channel, list(container.channels))
             return channel[known], log_time[known]
+        except SourceError:
+            raise
         except Exception:  # noqa: BLE001 (a read of the span reports the damage)
             return None
 
@@ -401,11 +405,22 @@ class ColumnarLog:
     def _collect(self, plans: Mapping[str, _Plan], start_ns: int | None, end_ns: int | None) -> dict[str, Columns]:
         parts: dict[str, list[Columns]] = {topic: [] for topic in plans}
         for c, container in enumerate(self.containers):
+            container.expect(self._to_read(plans, container, start_ns, end_ns))
             with container.meter.running():
                 for span in container.spans:
                     if (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns):
                         self._collect_span(plans, c, span, (start_ns, end_ns), parts)
         return {topic: _join(topic, plans[topic], parts[topic]) for topic in plans}
+
+    @staticmethod
+    def _to_read(
+        plans: Mapping[str, _Plan], container: Container, start_ns: int | None, end_ns: int | None
+    ) -> Iterator[Span]:
+        """Yield the spans of a window that hold any of the topics asked for."""
+        for span in container.spans:
+            inside = (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
+            if inside and any(container.channels[id_].topic in plans for id_ in span.counts):
+                yield span
 
     def _collect_span(
         self,

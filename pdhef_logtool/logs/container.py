@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +12,8 @@ import numpy as np
 
 from pdhef_logtool.logs.budget import BudgetError, Meter
 from pdhef_logtool.logs.byte_account import ByteAccount
-from pdhef_logtool.logs.byte_source import CutError, LocalFile
+from pdhef_logtool.logs.byte_source import ByteSource, CutError, LocalFile, SourceError
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.signals import IntArray, Loss
 
@@ -156,12 +157,38 @@ class MetadataRecord:
     values: Mapping[str, str]
 
 
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Of which topics messages will be read, and of which log times [start, end); None: of all.
+
+    A hint that changes no byte of what is read: where reading is far, an index is believed for all else.
+    """
+
+    topics: frozenset[str] | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+    def has(self, topics: Iterable[str], first_ns: int, last_ns: int) -> bool:
+        """Tell whether something that holds messages of these topics and log times is wanted."""
+        inside = (self.start_ns is None or last_ns >= self.start_ns) and (self.end_ns is None or first_ns < self.end_ns)
+        return inside and (self.topics is None or not self.topics.isdisjoint(topics))
+
+
+#: What all of a log is read for.
+EVERYTHING = Wanted()
+
+
 class SpanDamageError(Exception):
     """A span cannot be decoded; caught inside this package and turned into a loss."""
 
 
 def told(error: Exception) -> tuple[str, str]:
-    """Return the kind of loss that an error makes, and what to tell of it: the one boundary's words."""
+    """Return the kind of loss that an error makes, and what to tell of it: the one boundary's words.
+
+    A log whose place fails is not damaged: that error goes on.
+    """
+    if isinstance(error, SourceError):
+        raise error
     if isinstance(error, BudgetError):
         return "over-budget", f"expected {error.expected}, got {error.got} ({error.where}); {error.remedy}"
     text = str(error) if isinstance(error, SpanDamageError | CutError) else f"{type(error).__name__}: {error}"
@@ -189,7 +216,7 @@ class Container(ABC):
     distro = ""
     remedy = ""
 
-    def __init__(self, path: Path, size: int, meter: Meter | None = None) -> None:
+    def __init__(self, path: LogPlace, size: int, meter: Meter | None = None) -> None:
         self.path = path
         self.channels: dict[int, ChannelRecord] = {}
         self.spans: list[Span] = []
@@ -225,6 +252,10 @@ class Container(ABC):
     def metadata_records(self) -> Iterator[MetadataRecord]:
         """Read the metadata records; a damaged one is among the losses and left out."""
         yield from ()
+
+    def expect(self, spans: Iterable[Span]) -> None:
+        """Take note of spans that will be loaded soon, in this order."""
+        del spans
 
     @abstractmethod
     def close(self) -> None:
@@ -271,7 +302,7 @@ class FileContainer(Container):
 
     Parameters
     ----------
-    path : file to read.
+    path : file to read, or its bytes wherever they lie.
     shown_path : what to call it in messages (a decompressed copy has another name than its source).
     undeclared : messages by span that are not in its counts, as no record declares their channels.
     meter : what reading may cost; None = the default budget.
@@ -284,9 +315,10 @@ class FileContainer(Container):
     magic = b""
     magic_text = ""
 
-    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
-        self.source = LocalFile(path, shown_path)
-        super().__init__(shown_path or path, self.source.size, meter)
+    def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
+        self.source = path if isinstance(path, ByteSource) else LocalFile(path, shown_path)
+        shown = shown_path or (Path() if isinstance(path, ByteSource) else path)
+        super().__init__(shown, self.source.size, meter)
         self.at = len(self.magic)  # where the walk is
         try:
             if self.source.size < self.at or self.source.read(0, self.at) != self.magic:

@@ -10,9 +10,11 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, takewhile
 from pathlib import Path
 
 from pdhef_logtool.logs.byte_source import require_regular
+from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.records.errors import UsageError
 
 #: Suffixes that a search through folders takes for logs; a file that is named outright may have any.
@@ -35,9 +37,19 @@ class LogInput:
     ``span_s``: only this slice of it, in seconds from its start; it goes before a slice that holds for all logs.
     """
 
-    path: Path
+    path: LogPlace
     stem: str
     span_s: tuple[float, float] | None = None
+
+    @property
+    def local(self) -> Path | None:
+        """The file or folder of this machine; None for a log that lies elsewhere."""
+        return self.path if isinstance(self.path, Path) else None
+
+    @property
+    def folder(self) -> Path | None:
+        """What holds it on this machine; None for a log that lies elsewhere, beside which nothing is looked at."""
+        return self.path.parent if isinstance(self.path, Path) else None
 
 
 #: Logs as people name them, or as a command has found and cut them.
@@ -45,47 +57,86 @@ Logs = Sequence[str] | Sequence[LogInput]
 
 
 def find_logs(arguments: Logs) -> list[LogInput]:
-    """Expand files, folders and glob patterns to logs in a stable order; each log once. What was found stays as it is.
+    """Expand what names logs to logs in a stable order; each log once. What was found stays as it is.
 
-    A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders are
-    searched for logs by suffix; a rosbag2 folder counts as one log.
+    A file or rosbag2 folder that is named outright is taken as it is, whether it is readable or not. Folders, and
+    ``s3://bucket/prefix/``, are searched for logs by suffix; a rosbag2 folder of this machine counts as one log. Any
+    other URL is one log. ``@list.txt`` stands for the lines of a file.
 
     Raises
     ------
-    UsageError : An argument stands for no log at all.
+    UsageError : An argument stands for no log at all. LogError : A store cannot be searched.
     """
-    found: dict[str, Path] = {}
+    found: dict[str, LogPlace] = {}
     if already := [a for a in arguments if isinstance(a, LogInput)]:
         return already
-    for argument in map(str, arguments):
-        paths = list(_expand(argument))
-        if not paths:
+    for argument in chain.from_iterable(map(_lines, map(str, arguments))):
+        places = list(_expand(argument))
+        if not places:
             raise UsageError(
                 expected="at least one log (.mcap, .bag, .db3 or a rosbag2 folder)",
                 got="none",
-                where=argument,
+                where=str(place_of(argument)),
                 remedy="name a log, a folder that holds some, or a glob pattern in quotes",
             )
-        for path in paths:
-            found.setdefault(os.path.realpath(path), path)
+        for place in places:
+            found.setdefault(place.url if isinstance(place, RemotePlace) else os.path.realpath(place), place)
     return _with_stems(list(found.values()))
+
+
+def one_place(argument: str) -> LogPlace:
+    """Return the place that an argument names outright; ``@list.txt`` may stand for it.
+
+    Raises
+    ------
+    UsageError : It names several, or none.
+    """
+    lines = list(_lines(argument))
+    if len(lines) != 1:
+        raise UsageError(expected="one log", got=f"{len(lines)} of them", where=argument)
+    return place_of(lines[0])
+
+
+def _lines(argument: str) -> Iterator[str]:
+    """Yield what an argument stands for: itself, or the lines of the file that it names by ``@``."""
+    listed = Path(argument[1:])
+    if not argument.startswith("@") or Path(argument).exists() or not listed.is_file():
+        yield argument
+        return
+    try:
+        lines = listed.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        got = "another encoding" if isinstance(error, ValueError) else error.strerror or "none"
+        raise UsageError(expected="a text file in UTF-8, a log a line", got=got, where=argument) from error
+    yield from (line for line in map(str.strip, lines) if line and not line.startswith("#"))
 
 
 def folders_of(inputs: Sequence[LogInput]) -> list[str]:
     """Return the folder of each log below the one that holds all of them, ``car/day``; empty for those right in it."""
-    folders = [os.path.realpath(i.path.parent) for i in inputs]
-    common = os.path.commonpath(folders) if folders else ""
-    return [Path(os.path.relpath(f, common)).as_posix().removeprefix(".") for f in folders]
+    folders = [_parts(i.path)[:-1] for i in inputs]
+    n = len(_common(folders))
+    return ["/".join(folder[n:]) for folder in folders]
 
 
 def identity_of(log: LogInput) -> str:
     """Return what a log is known by wherever it lies and whatever it is called: its content's sha256.
 
+    Of an object on a server, which is not fetched for this, it is that of its URL, size and ETag (or, where the server
+    gives none, time of modification).
+
     Raises
     ------
-    LogError : It is neither a folder nor a regular file.
+    LogError : It is neither a folder nor a regular file, or an object that cannot be asked for.
     """
-    return hash_log(log.path)
+    if isinstance(log.path, Path):
+        return hash_log(log.path)
+    from pdhef_logtool.logs.remote_source import RemoteSource
+
+    source = RemoteSource(log.path)
+    try:
+        return source.identity
+    finally:
+        source.close()
 
 
 def hash_log(path: Path) -> str:
@@ -107,12 +158,16 @@ def hash_log(path: Path) -> str:
     return total.hexdigest()
 
 
-def _expand(argument: str) -> Iterator[Path]:
-    path = Path(argument)
-    if path.is_dir():
-        yield from _search(path, set())
-    elif path.exists() or not glob.has_magic(argument):
-        yield path
+def _expand(argument: str) -> Iterator[LogPlace]:
+    place = place_of(argument)
+    if isinstance(place, RemotePlace):
+        yield from (
+            _search_store(place) if place.scheme == "s3" and (not place.key or argument.endswith("/")) else (place,)
+        )
+    elif place.is_dir():
+        yield from _search(place, set())
+    elif place.exists() or not glob.has_magic(argument):
+        yield place
     else:
         visited: set[str] = set()
         for match in _matches(argument):
@@ -120,6 +175,21 @@ def _expand(argument: str) -> Iterator[Path]:
                 yield from _search(match, visited)
             else:
                 yield match
+
+
+def _search_store(prefix: RemotePlace) -> list[RemotePlace]:
+    """Return the logs below a prefix of a store, by the rules for folders: no hidden ones, none of our outputs."""
+    from pdhef_logtool.logs.remote_objects import keys_below
+
+    keys = keys_below(prefix)
+    outputs = tuple(key.removesuffix(RUN_FILE) for key in keys if key.rpartition("/")[2] == RUN_FILE)
+    return [
+        RemotePlace(f"{prefix.scheme}://{prefix.host}/{key}")
+        for key in sorted(keys)
+        if _bare_name(key) != key
+        and not key.startswith(outputs)
+        and not any(part.startswith(".") for part in key.removeprefix(prefix.key).split("/"))
+    ]
 
 
 def _matches(pattern: str) -> list[Path]:
@@ -165,11 +235,24 @@ def _bare_name(name: str) -> str:
     return name
 
 
-def _with_stems(paths: list[Path]) -> list[LogInput]:
-    parents = [os.path.realpath(p.parent) for p in paths]
-    root = os.path.commonpath(parents)
-    relative = [Path(os.path.relpath(Path(parent) / p.name, root)) for parent, p in zip(parents, paths, strict=True)]
-    names = ["__".join([*r.parts[:-1], _bare_name(r.name)]) for r in relative]
+def _parts(place: LogPlace) -> tuple[str, ...]:
+    """Return the folders that lead to a place, and its name; links are followed but for the last one."""
+    if isinstance(place, RemotePlace):
+        return (place.host, *place.parts[1:])
+    return (*Path(os.path.realpath(place.parent)).parts[1:], place.name)
+
+
+def _common(paths: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the parts that all paths begin with."""
+    alike = takewhile(lambda parts: len(set(parts)) == 1, zip(*paths, strict=False))
+    return tuple(parts[0] for parts in alike)
+
+
+def _with_stems(paths: list[LogPlace]) -> list[LogInput]:
+    parts = [_parts(p) for p in paths]
+    n = len(_common([p[:-1] for p in parts]))
+    relative = [p[n:] for p in parts]
+    names = ["__".join([*r[:-1], _bare_name(r[-1])]) for r in relative]
     counts = Counter(map(_on_any_system, names))
     taken: set[str] = set()
     stems: dict[int, str] = {}
@@ -177,7 +260,7 @@ def _with_stems(paths: list[Path]) -> list[LogInput]:
     for i in sorted(range(len(names)), key=lambda i: not _stays(names[i], counts)):
         stems[i] = names[i]
         if not _stays(names[i], counts):
-            digits = hashlib.sha256(os.fsencode(relative[i])).hexdigest()
+            digits = hashlib.sha256(os.fsencode("/".join(relative[i]))).hexdigest()
             made = (_portable(names[i], digits[:n]) for n in range(8, len(digits) + 1))
             stems[i] = next(stem for stem in made if _on_any_system(stem) not in taken)
         taken.add(_on_any_system(stems[i]))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.signals import IntArray, Loss
 
 
@@ -65,8 +66,8 @@ class DriveLog(Protocol):
     """A readable log. Instances come from :func:`pdhef_logtool.logs.open_log.open_log`."""
 
     @property
-    def path(self) -> Path:
-        """The file or folder."""
+    def path(self) -> LogPlace:
+        """The file, folder or object."""
 
     @property
     def kind(self) -> str:

@@ -1,7 +1,8 @@
 """MCAP files as a container: one walk over the record headers, chunks decoded one at a time, every CRC checked.
 
 The walk visits every top-level record by its length and trusts no index, so that a file without a summary, with
-channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other.
+channels that only its chunks declare, with chunks that no index names, or with a cut end reads like any other. Where
+reading is far, chunks of which nothing is wanted are taken from the index, if it can be believed.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import zlib
 from array import array
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
 from itertools import accumulate
@@ -27,8 +28,10 @@ from mcap.records import Channel, Metadata, Schema
 from numpy.typing import NDArray
 
 from pdhef_logtool.logs.budget import BudgetError, Meter
+from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
+    EVERYTHING,
     MAX_TIME_NS,
     MCAP_MAGIC,
     Attachment,
@@ -39,9 +42,12 @@ from pdhef_logtool.logs.container import (
     RawChunk,
     Span,
     SpanDamageError,
+    Wanted,
     block_from_lists,
     told,
 )
+from pdhef_logtool.logs.mcap_index import IndexedChunk, read_index
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
 
@@ -98,8 +104,15 @@ class McapContainer(FileContainer):
     magic_text = "the MCAP magic bytes"
     remedy = "is it an MCAP 1.0 recording?"
 
-    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
+    def __init__(
+        self,
+        path: Path | ByteSource,
+        shown_path: LogPlace | None = None,
+        meter: Meter | None = None,
+        wanted: Wanted = EVERYTHING,
+    ) -> None:
         self.profile = ""
+        self._wanted = wanted
         self.library = ""
         self._schemas: dict[int, Schema] = {}
         self._raw_channels: dict[int, Channel] = {}
@@ -113,7 +126,11 @@ class McapContainer(FileContainer):
     def _walk(self) -> None:
         source, size, walk = self.source, self.source.size, self._walked
         header_seen = False
+        believed = self._believed() if source.far else {}
         for at in self._places():
+            if at in believed:
+                self.at = walk.believe(believed[at])
+                continue
             if size - at == len(MCAP_MAGIC) and source.read(at, len(MCAP_MAGIC)) == MCAP_MAGIC:
                 self.account.decode(at, size)
                 walk.closed = True
@@ -148,6 +165,30 @@ class McapContainer(FileContainer):
 
     def _finish(self) -> None:
         self._walked.finish()
+
+    def _believed(self) -> dict[int, IndexedChunk | tuple[int, int]]:
+        """Return the chunks and attachments that are not wanted by their place, and have all else fetched."""
+        index = None if self._wanted == EVERYTHING else read_index(self.source)
+        found: dict[int, IndexedChunk | tuple[int, int]] = {}
+        try:
+            for schema in index.schemas if index else ():
+                self.add_schema(schema)
+            for channel in index.channels if index else ():
+                self.add_channel(channel)
+        except Exception as error:  # noqa: BLE001 (the walk tells what is wrong)
+            told(error)
+            self._schemas.clear()
+            self._raw_channels.clear()
+            index = None
+        if index is not None:
+            topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
+            for chunk in index.chunks:
+                if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):
+                    found[chunk.at] = chunk
+            found |= {extent[0]: extent for extent in index.attachments}
+        ends = {at: (x.index_end if isinstance(x, IndexedChunk) else x[1]) for at, x in found.items()}
+        self.source.expect(zip([0, *ends.values()], [*ends, self.source.size], strict=True))
+        return found
 
     def _read_header(self, at: int, length: int) -> None:
         self.meter.budget.check("metadata_bytes", length, "the header record")
@@ -223,6 +264,12 @@ class McapContainer(FileContainer):
         """Return the bytes of the span's record or records."""
         extent = self._extents[span.index]
         return extent.at, extent.end
+
+    def expect(self, spans: Iterable[Span]) -> None:
+        """See :class:`~pdhef_logtool.logs.container.Container`."""
+        if self.source.far:
+            extents = (self._extents[span.index] for span in spans)
+            self.source.expect((extent.at, extent.index_end) for extent in extents)
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         """Decode one span."""
@@ -382,6 +429,10 @@ class McapContainer(FileContainer):
             self.lose("bad-attachment", f"attachment {name!r} has a wrong CRC", count=1)
             self.account.lose(at, end)
             return
+        self.add_attachment(at, end)
+
+    def add_attachment(self, at: int, end: int) -> None:
+        """Take note of an attachment record."""
         self._attachment_at.append((at, end))
 
     def metadata_records(self) -> Iterator[MetadataRecord]:
@@ -532,6 +583,18 @@ class _Walk:
             return False
         (n,) = _U32.unpack_from(head, 37)
         return n <= 4 and bool(49 + n + _U64.unpack_from(head, 41 + n)[0] == end - at)
+
+    def believe(self, known: IndexedChunk | tuple[int, int]) -> int:
+        """Take a chunk or an attachment as the index has it; returns where the next record begins."""
+        of = self.of
+        self._end_chunk()
+        self._end_run()
+        if not isinstance(known, IndexedChunk):
+            of.add_attachment(*known)
+            return known[1]
+        span = Span(0, known.first_ns, known.last_ns + 1, known.counts, ordered=True)
+        of.add_span(_Extent(known.at, known.end, True, known.index_end), span)
+        return known.index_end
 
     def messages(self, at: int) -> int:
         """Take the message records from here on whose heads are read ahead; returns where the next record begins."""

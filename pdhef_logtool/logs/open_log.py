@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from pdhef_logtool.logs.byte_source import require_regular
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.compression import decompress_file, decompress_message
 from pdhef_logtool.logs.container import (
+    EVERYTHING,
     MCAP_MAGIC,
     ROSBAG1_MAGIC,
     SQLITE_MAGIC,
@@ -23,10 +23,12 @@ from pdhef_logtool.logs.container import (
     Container,
     MetadataRecord,
     Span,
+    Wanted,
     told,
 )
 from pdhef_logtool.logs.definitions import read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
 from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.files import scratch_folder
@@ -38,16 +40,20 @@ _WHAT_IS_A_LOG = "an MCAP file, a ROS 1 bag, a rosbag2 database or a rosbag2 fol
 _REMEDY = "give the recording itself"
 
 
-def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None) -> DriveLog:
+def open_log(
+    path: LogPlace | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | None = None, wanted: Wanted = EVERYTHING
+) -> DriveLog:
     """Open a log, detected by its content.
 
     MCAP, ROS 1 bag (2.0), rosbag2 SQLite database, each also as a zstd-compressed file; a rosbag2 folder with its
-    ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file.
+    ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file. Each file also by its URL
+    (``https://``, ``s3://``).
 
     Parameters
     ----------
     budget : what reading it may cost; what claims more is among the log's losses.
     msgs : folder, zip file or wheel with definitions of types that the log does not define (:func:`read_definitions`).
+    wanted : what of a log that is far will be read.
 
     Raises
     ------
@@ -55,18 +61,21 @@ def open_log(path: Path | str, budget: Budget = DEFAULT_BUDGET, msgs: Path | Non
     UsageError : ``msgs`` holds no definitions.
     """
     definitions = read_definitions(msgs)
-    log = _opened(Path(path), Meter(budget))
+    log = _opened(place_of(path) if isinstance(path, str) else path, Meter(budget), wanted)
     log.definitions = definitions
     return log
 
 
-def _opened(path: Path, meter: Meter) -> ColumnarLog:
+def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> ColumnarLog:
     try:
-        if path.is_dir():
+        if isinstance(path, RemotePlace):
+            container = _open_remote(path, meter, wanted)
+        elif path.is_dir():
             return _open_folder(path, meter)
-        if not path.exists():
+        elif not path.exists():
             raise LogError(expected=_WHAT_IS_A_LOG, got="no such file", where=str(path), remedy="check the path")
-        container = _open_file(path, meter)
+        else:
+            container = _open_file(path, meter)
     except OSError as error:
         raise LogError(
             expected="a readable file",
@@ -82,14 +91,14 @@ def _opened(path: Path, meter: Meter) -> ColumnarLog:
     return ColumnarLog(path, kind, [container], distro=container.distro)
 
 
-def log_metadata(path: Path, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
+def log_metadata(path: LogPlace, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
     """Return what a log says of itself: MCAP metadata records by ``key`` and ``record.key``, rosbag2's ``custom_data``.
 
     Raises
     ------
     LogError : as for :func:`open_log`.
     """
-    log = open_log(path, budget)
+    log = open_log(path, budget, wanted=Wanted(frozenset()))
     try:
         return metadata_of(log, budget)
     finally:
@@ -103,7 +112,7 @@ def metadata_of(log: DriveLog, budget: Budget = DEFAULT_BUDGET) -> dict[str, str
     for container in log.containers:
         for record in container.metadata_records():
             found |= {**record.values, **{f"{record.name}.{key}": value for key, value in record.values.items()}}
-    if is_log_folder(log.path):
+    if isinstance(log.path, Path) and is_log_folder(log.path):
         custom = _read_metadata(log.path, budget).get("custom_data")
         found |= {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
     return found
@@ -129,8 +138,29 @@ def _open_file(path: Path, meter: Meter) -> Container:
     """Open one storage file."""
     head = _head_of(path)
     if head.startswith(_ZSTD):
-        return _open_compressed(path, meter)
+        return _open_compressed(path, path, meter)
     return _open_plain(path, path, head, meter)
+
+
+def _open_remote(place: RemotePlace, meter: Meter, wanted: Wanted) -> Container:
+    """Open an object; what has no index, or needs all of its file, is read from a copy that is fetched once."""
+    from pdhef_logtool.logs.remote_source import RemoteSource
+
+    source = RemoteSource(place)
+    try:
+        head = source.read(0, min(_MAGIC_BYTES, source.size))
+        if head.startswith(MCAP_MAGIC):
+            from pdhef_logtool.logs.mcap_log import McapContainer
+
+            return McapContainer(source, place, meter, wanted)
+        if head.startswith((ROSBAG1_MAGIC, SQLITE_MAGIC, _ZSTD)):
+            source.fetch_whole()
+        if head.startswith(_ZSTD):
+            return _CopiedContainer(_open_compressed(source.path, place, meter), source.close)
+        return _CopiedContainer(_open_plain(source.path, place, head, meter), source.close)
+    except BaseException:
+        source.close()
+        raise
 
 
 def _head_of(path: Path) -> bytes:
@@ -139,7 +169,7 @@ def _head_of(path: Path) -> bytes:
         return file.read(_MAGIC_BYTES)
 
 
-def _open_plain(path: Path, shown_path: Path, head: bytes, meter: Meter) -> Container:
+def _open_plain(path: Path, shown_path: LogPlace, head: bytes, meter: Meter) -> Container:
     if head.startswith(MCAP_MAGIC):
         from pdhef_logtool.logs.mcap_log import McapContainer
 
@@ -156,14 +186,14 @@ def _open_plain(path: Path, shown_path: Path, head: bytes, meter: Meter) -> Cont
     raise LogError(expected=_WHAT_IS_A_LOG, got=got, where=str(shown_path), remedy=_REMEDY)
 
 
-def _open_compressed(path: Path, meter: Meter) -> Container:
+def _open_compressed(path: Path, shown_path: LogPlace, meter: Meter) -> Container:
     """Decompress a file to a temporary one and open that."""
     folder = scratch_folder()
     try:
         copy = Path(folder.name) / path.stem
         with meter.running(path.stat().st_size):
             cut = decompress_file(path, copy, meter)
-        return _TemporaryContainer(_open_plain(copy, path, _head_of(copy), meter), folder, cut)
+        return _CopiedContainer(_open_plain(copy, shown_path, _head_of(copy), meter), folder.cleanup, cut)
     except BaseException:
         folder.cleanup()
         raise
@@ -297,23 +327,26 @@ class _Wrapped(Container):
     def metadata_records(self) -> Iterator[MetadataRecord]:
         return self.container.metadata_records()
 
+    def expect(self, spans: Iterable[Span]) -> None:
+        self.container.expect(spans)
+
     def close(self) -> None:
         self.container.close()
 
 
-class _TemporaryContainer(_Wrapped):
-    """A container in a temporary folder that goes with it; ``cut`` says why decompressing stopped early."""
+class _CopiedContainer(_Wrapped):
+    """A container of a copy that goes with it by ``remove``; ``cut`` says why copying stopped early."""
 
-    def __init__(self, container: Container, folder: tempfile.TemporaryDirectory[str], cut: str) -> None:
+    def __init__(self, container: Container, remove: Callable[[], None], cut: str = "") -> None:
         super().__init__(container)
-        self._folder = folder
+        self._remove = remove
         if cut:
             self.container.lose("truncated", cut)
             self.account.cut = True
 
     def close(self) -> None:
         super().close()
-        self._folder.cleanup()
+        self._remove()
 
 
 class _Rosbag2Container(_Wrapped):

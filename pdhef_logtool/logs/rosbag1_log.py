@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.logs.budget import Meter
+from pdhef_logtool.logs.byte_source import ByteSource
 from pdhef_logtool.logs.compression import decompress
 from pdhef_logtool.logs.container import (
     ROSBAG1_MAGIC,
@@ -27,6 +28,7 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     told,
 )
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.type_names import ros2_type_name
 
 _OP_MESSAGE, _OP_BAG_HEADER, _OP_INDEX, _OP_CHUNK, _OP_CHUNK_INFO, _OP_CONNECTION = 2, 3, 4, 5, 6, 7
@@ -60,7 +62,7 @@ class Rosbag1Container(FileContainer):
     magic_text = "'#ROSBAG V2.0' at its start"
     remedy = "is it a ROS 1 bag?"
 
-    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
+    def __init__(self, path: Path | ByteSource, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
         self._chunks: list[_Chunk] = []
         self._found = 0
         self._pending: _Chunk | None = None  # the chunk whose index records are being read

@@ -24,6 +24,7 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     told,
 )
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.files import scratch_folder
 from pdhef_logtool.records.signals import IntArray
@@ -47,7 +48,7 @@ class SqliteContainer(Container):
     selective = True  # rows of other topics are not read
     remedy = "is it a rosbag2 recording?"
 
-    def __init__(self, path: Path, shown_path: Path | None = None, meter: Meter | None = None) -> None:
+    def __init__(self, path: Path, shown_path: LogPlace | None = None, meter: Meter | None = None) -> None:
         require_regular(path, shown_path)
         super().__init__(shown_path or path, path.stat().st_size, meter)
         self._pages: list[tuple[int, int]] = []  # first and last row id

@@ -198,6 +198,8 @@ def iterate_copy(
     spans.sort(key=lambda item: (item[0], item[1], item[2].index))
     if whole:
         spans = _in_file_order_where_overlapping(spans, kept)
+    for c, container in enumerate(columnar.containers):
+        container.expect(span for _, of, span in spans if of == c)
     open_spans: list[tuple[int, int, int, int, _Cursor]] = []  # next log time, file, span, row: order of ties
     at = 0
     while at < len(spans) or open_spans:

@@ -23,6 +23,7 @@ import numba
 from numba.core import caching, config
 from numba.misc.appdirs import AppDirs
 
+from pdhef_logtool.records import processes
 from pdhef_logtool.records.shown import shown
 
 #: What the first run with all estimators compiles on one core, in seconds; told to the user as a rough figure.
@@ -36,7 +37,20 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
     compiled = numba.njit(function, **options)
     if cache and not config.DISABLE_JIT:
         compiled._cache = _Cache(function)
+        _kept.append(compiled)
     return compiled
+
+
+#: The functions of the modules imported so far whose machine code is kept.
+_kept: list[Any] = []
+
+
+def load_kept() -> None:
+    """Load all machine code that is kept for them; processes that are forked from this one have it then."""
+    for function in _kept:
+        codegen = function.targetctx.codegen()
+        for signature in function._cache.signatures(codegen):
+            function.compile(signature)
 
 
 @functools.cache
@@ -104,6 +118,10 @@ class _Cache:
         _announce(self.cache_path)
         return None
 
+    def signatures(self, codegen: Any) -> list[Any]:
+        """Return for which arguments there is code for this processor."""
+        return list(dict.fromkeys(s for place in self._places for s in place.signatures(codegen)))
+
     def save_overload(self, signature: Any, result: Any) -> None:
         with contextlib.suppress(OSError):  # a full disk: the next run compiles again
             if self._kept is not None:
@@ -120,6 +138,13 @@ class _Place(caching.FunctionCache):  # type: ignore[misc]
     def __init__(self, function: Any, folder: Path) -> None:
         self._impl_class = functools.partial(_Code, folder=folder)
         super().__init__(function)
+
+    def signatures(self, codegen: Any) -> list[Any]:
+        try:
+            index = self._cache_file._load_index()
+        except Exception:  # noqa: BLE001 (whatever a pickle that was cut short may raise)
+            return []
+        return [key[0] for key in index if key == self._index_key(key[0], codegen)]
 
 
 class _Code(caching.CompileResultCacheImpl):  # type: ignore[misc]
@@ -158,9 +183,7 @@ _announced: list[str | None] = []
 
 def _announce(folder: str | None) -> None:
     """Say on stderr, once, that compiling begins; of the workers of a command the first one does."""
-    from multiprocessing import current_process, parent_process
-
-    if _announced or (parent_process() is not None and not current_process().name.endswith("-1")):
+    if _announced or processes.worker_number > 1:
         return
     _announced.append(folder)
     if folder is None:

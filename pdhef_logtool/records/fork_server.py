@@ -11,6 +11,7 @@ import gc
 import importlib
 import os
 import pickle
+import pkgutil
 import signal
 import socket
 import struct
@@ -21,6 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pdhef_logtool.records import processes
 from pdhef_logtool.records.shown import shown
 
 #: One thread a worker: what libraries read when they are loaded.
@@ -73,8 +75,8 @@ def split(buffer: bytearray) -> Iterator[Any]:
         yield message
 
 
-def ask(control: socket.socket, what: bytes, number: int = 0, descriptors: Sequence[int] = ()) -> None:
-    """Send the server a request."""
+def ask(control: socket.socket, what: bytes, number: int, descriptors: Sequence[int] = ()) -> None:
+    """Send the server a request: the process id of a worker, or the number of a new one and its socket."""
     socket.send_fds(control, [_REQUEST.pack(what, number)], list(descriptors))
 
 
@@ -89,12 +91,12 @@ def serve(descriptor: int) -> None:
             data, descriptors, _, _ = socket.recv_fds(control, _REQUEST.size, 1)
             if not data:
                 return
-            what, pid = _REQUEST.unpack(data)
+            what, number = _REQUEST.unpack(data)
             if what == FORK:
-                workers |= _fork(control, socket.socket(fileno=descriptors[0]))
+                workers |= _fork(control, socket.socket(fileno=descriptors[0]), number)
             else:
-                _, status = os.waitpid(pid, 0)
-                workers.discard(pid)
+                _, status = os.waitpid(number, 0)
+                workers.discard(number)
                 send(control, os.waitstatus_to_exitcode(status))
     except (EOFError, ConnectionError):
         return
@@ -104,11 +106,14 @@ def serve(descriptor: int) -> None:
 
 
 def _prepare(preload: Sequence[str]) -> str | None:
-    """Import modules, call what stands after a colon; return what went wrong."""
+    """Import modules, with ``.*`` all of a package; call what stands after a colon; return what went wrong."""
     for name in preload:
         module, _, function = name.partition(":")
         try:
-            loaded = importlib.import_module(module)
+            loaded = importlib.import_module(module.removesuffix(".*"))
+            if module.endswith(".*"):
+                for inner in pkgutil.iter_modules(loaded.__path__, f"{loaded.__name__}."):
+                    importlib.import_module(inner.name)
             if function:
                 getattr(loaded, function)()
         except Exception as error:  # noqa: BLE001 (told by the parent, whatever it is)
@@ -118,7 +123,7 @@ def _prepare(preload: Sequence[str]) -> str | None:
     return None
 
 
-def _fork(control: socket.socket, channel: socket.socket) -> set[int]:
+def _fork(control: socket.socket, channel: socket.socket, number: int) -> set[int]:
     """Begin a worker on its channel; where the system has no process for it, the parent sees the channel close."""
     with channel:
         try:
@@ -128,6 +133,7 @@ def _fork(control: socket.socket, channel: socket.socket) -> set[int]:
         if pid:
             return {pid}
         try:
+            processes.worker_number = number
             control.close()
             _work(channel)
         finally:

@@ -11,6 +11,8 @@ from pathlib import Path
 
 #: What :func:`own_name` returns, as a regular expression.
 NAME = r"[0-9a-f]{8}-\d+-\d+"
+#: Which worker of a command this process is, from 1; 0 in the command itself.
+worker_number = 0
 
 
 def own_name() -> str:

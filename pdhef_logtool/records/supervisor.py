@@ -85,7 +85,7 @@ def supervise(
     limits: Limits = Limits(),
     preload: Sequence[str] = (),
     progress: Progress = lambda _number, _text, _share: None,
-) -> Iterator[Ended[T, R]]:
+) -> Generator[Ended[T, R], None, None]:
     """Do the work on every item and yield how each ended, in the order of ending.
 
     Items are pulled as workers become free, and nothing of an item is kept once it has ended. With one job and no
@@ -95,8 +95,9 @@ def supervise(
     ----------
     work : a function of a module; takes an item and what tells its progress, and returns something small.
     jobs : processes at once.
-    preload : modules that the fork server imports, ``package.module`` or ``package.module:function`` to call that too.
-        They must leave no thread behind, and no library that a fork breaks at work (polars, torch).
+    preload : modules that the fork server imports: ``package.module``, ``package.*`` for all of a package, or
+        ``package.module:function`` to call that too. ``pdhef_logtool.records.compiled:load_kept`` behind others
+        loads their compiled code. They must leave no thread behind that is needed, and run no query (polars) or tensor.
 
     Raises
     ------
@@ -230,10 +231,10 @@ class _Server:
         if problem:
             raise RuntimeError(problem)
 
-    def fork(self, channel: socket.socket) -> bool:
+    def fork(self, number: int, channel: socket.socket) -> bool:
         """Begin a worker on its channel; False if the server is dead."""
         try:
-            ask(self._control, FORK, descriptors=[channel.fileno()])
+            ask(self._control, FORK, number, [channel.fileno()])
         except OSError:
             self._hears = False
         return self._hears
@@ -264,6 +265,7 @@ class _Crew(Generic[T, R]):
         self._limits, self._preload, self._progress = limits, preload, progress
         self._server: _Server | None = None
         self._workers: list[_Worker[T]] = []
+        self._started = 0
         self._selector = selectors.DefaultSelector()
 
     def __enter__(self) -> Self:
@@ -314,13 +316,14 @@ class _Crew(Generic[T, R]):
 
     def _start(self, attempt: _Attempt[T]) -> None:
         ours, theirs = socket.socketpair()
+        self._started += 1
         with theirs:
-            if self._server is None or not self._server.fork(theirs):
+            if self._server is None or not self._server.fork(self._started, theirs):
                 if self._server is not None:
                     self._server.end()
                 self._server = _Server(self._preload)
                 self._server.start()
-                self._server.fork(theirs)
+                self._server.fork(self._started, theirs)
         ours.settimeout(_SEND_S)
         worker = _Worker(ours, self._server, attempt)
         self._workers.append(worker)

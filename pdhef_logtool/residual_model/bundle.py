@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +105,19 @@ class ModelBundle:
     def signs(self) -> FloatArray:
         """Signs of the bundle's features where left and right are mirrored, [k]."""
         return np.array([-1.0 if name in ODD_FEATURES else 1.0 for name in self.feature_names])
+
+    @property
+    def weight_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the weights of the architecture, by name."""
+        shapes: dict[str, tuple[int, ...]] = {}
+        for layer in range(self.layers):
+            rows, columns = 4 * self.hidden, self.hidden if layer else len(self.feature_names)
+            shapes |= {f"lstm.weight_ih_l{layer}": (rows, columns), f"lstm.weight_hh_l{layer}": (rows, self.hidden)}
+            shapes |= {f"lstm.bias_ih_l{layer}": (rows,), f"lstm.bias_hh_l{layer}": (rows,)}
+        for n, (columns, rows) in enumerate(pairwise((self.hidden, *self.head, OUTPUT_COUNT[self.target]))):
+            # Behind each layer of the head but the last stand a ReLU and a dropout, which have a number too.
+            shapes |= {f"head.{3 * n}.weight": (rows, columns), f"head.{3 * n}.bias": (rows,)}
+        return shapes
 
     def normalise(self, features: FloatArray) -> FloatArray:
         """Return the chosen features [N, k] of the full array [N, 28], normalised and limited to ±8."""
@@ -237,6 +251,9 @@ def load_network(folder: Path, target: str) -> ModelBundle:
         )
     except (LookupError, TypeError, ValueError, OverflowError) as error:
         raise ModelError(expected="the entries of model.json", got=f"{error!r}", where=where) from None
+    shapes = {name: w.shape for name, w in weights.items()}
+    if shapes != bundle.weight_shapes or any(w.dtype != np.float32 for w in weights.values()):
+        raise ModelError(expected="float32 weights of the architecture of model.json", got=f"{shapes}", where=where)
     unknown = [f for f in bundle.feature_names if f not in FEATURES]
     if unknown:
         raise ModelError(expected=f"features out of {', '.join(FEATURES)}", got=", ".join(unknown), where=where)

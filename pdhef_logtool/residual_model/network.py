@@ -47,9 +47,3 @@ class ResidualNetwork(nn.Module):
         """Run [batch, time, features] from ``state`` (None = zeros); [batch, time, outputs] and the state after."""
         hidden, after = self.lstm(features, state)
         return self.head(hidden), after
-
-    def initial_state(self, batch: int, device: torch.device | str = "cpu") -> State:
-        """Return a state of zeros."""
-        a = self.architecture
-        zeros = torch.zeros(a.layers, batch, a.hidden, device=device)
-        return zeros, zeros.clone()

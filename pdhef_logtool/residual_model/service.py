@@ -6,57 +6,34 @@ import hashlib
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TypeAlias
 
 import numpy as np
 
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, OUTPUT_COUNT, RESIDUAL, ModelBundle
+from pdhef_logtool.residual_model.forward_pass import SIDES, ForwardPass, NetworkState
 
-if TYPE_CHECKING:
-    from pdhef_logtool.residual_model.network import ResidualNetwork
-
-#: Steps of one pass. Always the same shape, counted from a sequence's start, so that no window changes a bit.
-BLOCK_STEPS = 256
 #: A residual beyond these is none: m/s² and rad/s².
 LIMITS = (4.0, 6.0)
 _LIMITS_OF = {RESIDUAL: LIMITS, LATERAL_VELOCITY: (30.0,)}  # m/s
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NetworkCarry:
-    """LSTM state at the last block's end (None = zeros), and the normalised features since, [M, k], M < block."""
-
-    state: tuple[Any, Any] | None
-    pending: FloatArray
+#: What the network takes from window to window; None: a sequence begins.
+NetworkCarry: TypeAlias = NetworkState | None
 
 
 @dataclass(frozen=True)
 class NetworkService:
-    """What one bundle predicts, step by step; PyTorch is loaded at the first use."""
+    """What one bundle predicts, step by step."""
 
     bundle: ModelBundle
 
     @cached_property
-    def _network(self) -> ResidualNetwork:
-        import torch
+    def _network(self) -> ForwardPass:
+        return ForwardPass.of(self.bundle.weights, self.bundle.layers, self.bundle.head)
 
-        from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-
-        b = self.bundle
-        network = ResidualNetwork(
-            Architecture(len(b.feature_names), b.hidden, b.layers, b.head, outputs=OUTPUT_COUNT[b.target])
-        )
-        network.load_state_dict({name: torch.from_numpy(np.array(w)) for name, w in b.weights.items()})
-        return network.eval()
-
-    def initial_carry(self) -> NetworkCarry:
-        """Return the carry of a new log."""
-        return NetworkCarry(None, np.empty((0, len(self.bundle.feature_names))))
-
-    def run(
-        self, features: FloatArray, starts: BoolArray, carry: NetworkCarry | None
-    ) -> tuple[FloatArray, NetworkCarry]:
+    def run(self, features: FloatArray, starts: BoolArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
         """Return residual rates [N, 2] in m/s² and rad/s² from each step on, or v_y [N, 1] in m/s; and the carry.
 
         Parameters
@@ -64,8 +41,6 @@ class NetworkService:
         features : [N, 28] as from :func:`~.features.make_features`; rows with NaN give 0 and end the sequence.
         starts : [N], where a sequence begins anew.
         """
-        if carry is None:
-            carry = self.initial_carry()
         out = np.zeros((features.shape[0], OUTPUT_COUNT[self.bundle.target]))
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
         breaks = np.logical_or(starts, ~known).astype(np.bool_)
@@ -75,40 +50,21 @@ class NetworkService:
             if a == b:
                 continue
             if breaks[a]:
-                carry = self.initial_carry()
+                carry = None
             if known[a]:
                 out[a:b], carry = self._sequence(self.bundle.normalise(features[a:b]), carry)
         target_std = np.array(self.bundle.normalisation.target_std)
         limits = np.array(_LIMITS_OF[self.bundle.target])
         return np.clip(out * target_std, -limits, limits), carry
 
-    def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
-        import torch
-
-        # Normalised, a mirrored feature has the other sign, for the means of those that change theirs are 0.
-        sides = [np.ones(len(self.bundle.feature_names)), self.bundle.signs][: 2 if self.bundle.odd else 1]
-        before = carry.pending.shape[0]
-        rows = np.concatenate([carry.pending, scaled])
-        whole = rows.shape[0] // BLOCK_STEPS * BLOCK_STEPS
-        state = carry.state
-        outputs = []
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)  # at batch 1 more threads are slower by far (METHOD §11)
-        try:
-            with torch.inference_mode():
-                for at in range(0, rows.shape[0], BLOCK_STEPS):
-                    part = rows[at : at + BLOCK_STEPS]
-                    block = np.zeros((len(sides), BLOCK_STEPS, rows.shape[1]), dtype=np.float32)
-                    for side, sign in enumerate(sides):
-                        block[side, : part.shape[0]] = sign * part
-                    result, after = self._network(torch.from_numpy(block), state)
-                    said = result[:, : part.shape[0]].numpy().astype(np.float64)
-                    outputs.append(0.5 * (said[0] - said[1]) if self.bundle.odd else said[0])
-                    if at < whole:
-                        state = after
-        finally:
-            torch.set_num_threads(threads)
-        return np.concatenate(outputs)[before:], NetworkCarry(state, rows[whole:])
+    def _sequence(self, scaled: FloatArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkState]:
+        both = np.zeros((len(scaled), SIDES, scaled.shape[1]), dtype=np.float32)
+        both[:, 0] = scaled
+        if self.bundle.odd:  # normalised, a mirrored feature has the other sign: the means of those that change are 0
+            both[:, 1] = scaled * self.bundle.signs
+        said, after = self._network.run(both, self._network.initial_state() if carry is None else carry)
+        straight, mirrored = said[:, 0].astype(np.float64), said[:, 1]
+        return 0.5 * (straight - mirrored) if self.bundle.odd else straight, after
 
 
 @dataclass(frozen=True)
@@ -117,9 +73,7 @@ class RememberingNetwork(NetworkService):
 
     _known: dict[bytes, tuple[FloatArray, NetworkCarry]] = field(default_factory=dict, compare=False)
 
-    def run(
-        self, features: FloatArray, starts: BoolArray, carry: NetworkCarry | None
-    ) -> tuple[FloatArray, NetworkCarry]:
+    def run(self, features: FloatArray, starts: BoolArray, carry: NetworkCarry) -> tuple[FloatArray, NetworkCarry]:
         """Return what the network says; what is remembered are whole drives, from their start."""
         if carry is not None:
             return super().run(features, starts, carry)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from itertools import accumulate
 from pathlib import Path
 from typing import Annotated
 
@@ -146,7 +147,11 @@ class RunCars:
 
     def _by_folder(self, log: LogInput) -> tuple[str, str] | None:
         assert self.table is not None
-        place = Path(os.path.realpath(log.path.parent)) / log.path.name  # a link lies where it was put
+        if log.folder is None:
+            urls = {name.rstrip("/"): (name, car) for name, car in self.table.folders.items()}
+            above = accumulate(log.path.parts, "{}/{}".format)
+            return next((urls[url] for url in reversed(list(above)) if url in urls), None)
+        place = Path(os.path.realpath(log.folder)) / log.path.name  # a link lies where it was put
         places = {Path(os.path.realpath(self._beside(name))): (name, car) for name, car in self.table.folders.items()}
         return next((places[folder] for folder in (place, *place.parents) if folder in places), None)
 

@@ -656,7 +656,7 @@ def check_places(
     folders = [] if output is None else [output / log_place(i.stem) for i in inputs]
     files += [folder / name for folder in folders for name in LOG_FILES]
     check_no_input(
-        [*(i.path for i in inputs), *config.files, *cars, *can], files if junit is None else [*files, junit], folders
+        [*(i.local for i in inputs), *config.files, *cars, *can], files if junit is None else [*files, junit], folders
     )
 
 

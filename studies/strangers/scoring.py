@@ -127,7 +127,7 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     said += [f"missing: {name}" for name in inspection.missing]
     suspects = frozenset(name for w in warnings for name in (w["suspects"] or w["signals"]))
     checks = list(document.get("checks") or ())
-    more, refused_run = _checks_of_a_run(Path(log.path))
+    more, refused_run = _checks_of_a_run(Path(str(log.path)))
     checks += [check for check in more if check["name"] not in {c["name"] for c in checks}]
     error = error or refused_run
     told = Told(tuple(checks), tuple(dict.fromkeys(said)), error, suspects)

@@ -113,7 +113,7 @@ def test_bounds_and_ends(sample_logs_dir: Path, car: Car, monkeypatch: pytest.Mo
     closed: list[str] = []
     open_log = reading.open_log
 
-    def watched_log(path: Path, budget: Budget, msgs: Path | None = None) -> DriveLog:
+    def watched_log(path: Path, budget: Budget, msgs: Path | None = None, **_: object) -> DriveLog:
         log = open_log(path, budget)
         close = log.close
         monkeypatch.setattr(type(log), "close", lambda _self: closed.append(path.name) or close())

@@ -472,6 +472,10 @@ def test_a_dataset_is_written_by_one_command_at_a_time(sample_logs_dir: Path, tm
     assert list(tmp_path.iterdir()) == []
 
 
+def _children(pid: int) -> list[int]:
+    return [int(c) for c in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="looks for processes in /proc")
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
@@ -483,10 +487,11 @@ def test_a_command_that_is_ended_takes_its_processes_with_it(
     command = [sys.executable, "-m", "pdhef_logtool", "extract", *logs, "-o", str(out), "--seed", "4", "--jobs", "2"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         children: list[int] = []
-        while len(children) < 2 or not list(out.glob("split=*/car=*/.*.partial")):
+        # The server and two workers.
+        while len(children) < 3 or not list(out.glob("split=*/car=*/.*.partial")):
             assert process.poll() is None
             time.sleep(0.01)
-            children = [int(c) for c in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
+            children = [c for server in _children(process.pid) for c in (server, *_children(server))]
         process.send_signal(number)
         said = process.communicate(timeout=30)[1]
     assert process.returncode == (143 if number == signal.SIGTERM else -number)

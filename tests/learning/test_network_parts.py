@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -45,6 +44,7 @@ from pdhef_logtool.learning.network.train_command import gap_free_runs, make_rec
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, ModelError, OutputError, UsageError
+from pdhef_logtool.records.supervisor import Ended, Failure
 from pdhef_logtool.residual_model.bundle import LATERAL_VELOCITY, ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES, NOMINAL_FEATURES
 from pdhef_logtool.residual_model.linear_model import LinearModel
@@ -352,48 +352,29 @@ def test_a_fingerprint_follows_all_that_decides_a_file_and_nothing_else(tmp_path
     assert len({same, *(extract_command._fingerprint(*o) for o in others)}) == 8
 
 
-class DyingPool:
-    """A pool in which drive ``b`` kills its process, and ``c`` with it the first time."""
-
-    sizes: list[int]
-    ended: dict[str, bool]
-
-    def __init__(self, count: int, **_: Any) -> None:
-        self.sizes.append(count)
-
-    def shutdown(self, **how: bool) -> None:
-        type(self).ended = how
-
-    def submit(self, _function: Any, job: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        name = job.log_input.stem
-        if name == "b" or (name == "c" and self.sizes == [2]):
-            future.set_exception(BrokenProcessPool())
-        else:
-            future.set_result(extract_command._failure(job, "fine"))
-        return future
-
-    def __enter__(self) -> DyingPool:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
 def test_a_process_that_dies_costs_its_own_drive_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(DyingPool, "sizes", [], raising=False)
-    monkeypatch.setattr(extract_command, "ProcessPoolExecutor", DyingPool)
-    work = [_job(name) for name in "abc"]
-    found = extract_command._run_jobs(work, 2, lambda *_: None)
+    def supervise_(_work: Any, items: Any, *, jobs: int, **_: Any) -> Iterator[Ended[Any, Any]]:
+        assert jobs == 2
+        for number, item in enumerate(items):
+            lost = Failure("the worker was killed (signal 9)", "", 2) if number == 1 else None
+            yield Ended(number, item, None if lost else extract_command._failure(item, "fine"), lost)
+
+    monkeypatch.setattr(extract_command, "supervise", supervise_)
+    found = extract_command._run_jobs([_job(name) for name in "abc"], 2, lambda *_: None)
     assert sorted((r.record.name, r.record.left_out) for r in found) == [
-        ("a", "fine"), ("b", "the process that read it died (out of memory?)"), ("c", "fine"),
+        ("a", "fine"), ("b", "the worker was killed (signal 9)"), ("c", "fine"),
     ]  # fmt: skip
-    assert DyingPool.sizes == [2, 1, 1]
-    begun = extract_command._run_jobs(work, 2, lambda *_: None)
-    next(begun)
-    with pytest.raises(KeyboardInterrupt):
-        begun.throw(KeyboardInterrupt())
-    assert DyingPool.ended == {"wait": False, "cancel_futures": True}
+
+
+def test_progress_of_several_drives_at_once_adds_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    def extract(job: Any, progress: Any) -> Any:
+        progress(0.5)
+        return extract_command._failure(job, "fine")
+
+    monkeypatch.setattr(extract_command, "_extract", extract)
+    told: list[tuple[str, float]] = []
+    list(extract_command._run_jobs([_job("a"), _job("b")], 1, lambda *what: told.append(what)))
+    assert told == [("a", 0.25), ("b", 0.75)]
 
 
 def test_an_error_of_one_log_is_a_reason_and_of_the_only_log_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

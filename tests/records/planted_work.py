@@ -81,9 +81,10 @@ def _slowly(value: str, tell: Tell) -> str:
     return value
 
 
-def _grow(_value: str, _tell: Tell) -> None:
+def _grow(_value: str, tell: Tell) -> None:
     held = []
     while True:
+        tell("at grow", 0.5)
         held.append(bytearray(os.urandom(1 << 16)) * 160)
         time.sleep(0.005)
 

@@ -15,7 +15,7 @@ from types import ModuleType
 
 import pytest
 
-from pdhef_logtool.records import compiled
+from pdhef_logtool.records import compiled, processes
 
 _ROOT = Path(__file__).parents[2]
 _CODE = "from pdhef_logtool.records.compiled import njit\n\n\n@njit(cache=True)\ndef more(x):\n    return x + 1\n"
@@ -176,3 +176,31 @@ def test_a_run_works_as_nobody_with_a_read_only_installation_and_no_home(tmp_pat
         again = subprocess.run(command, capture_output=True, text=True, cwd="/", env=environment)
         assert again.returncode == 0, again.stderr
         assert "compiling" not in again.stderr
+
+
+def test_kept_code_is_loaded_before_it_is_called(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = _load(module_file)
+    assert first.more(1) == 2
+    assert first.more(1.5) == 2.5
+    capsys.readouterr()
+    monkeypatch.setattr(compiled, "_announced", [])
+    monkeypatch.setattr(compiled, "_kept", [])
+    again = _load(module_file)
+    compiled.load_kept()
+    assert set(again.more.signatures) == set(first.more.signatures)
+    assert capsys.readouterr().err == ""
+    for file in _code_files(module_file.parent):
+        file.write_bytes(b"cut")
+    cut = _load(module_file)
+    compiled.load_kept()
+    assert cut.more.signatures == []
+
+
+def test_of_the_workers_only_the_first_says_that_it_compiles(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(processes, "worker_number", 2)
+    assert _load(module_file).more(1) == 2
+    assert capsys.readouterr().err == ""

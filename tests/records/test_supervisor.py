@@ -143,7 +143,7 @@ def test_items_are_pulled_as_workers_become_free() -> None:
             pulled += 1
             yield "well", ""
 
-    with closing(supervise(planted, items(), jobs=2, preload=PRELOAD)) as ended:  # type: ignore[type-var]
+    with closing(supervise(planted, items(), jobs=2, preload=PRELOAD)) as ended:
         for count, _ in zip(range(10), ended, strict=False):
             assert pulled <= count + 1 + 2
 

@@ -14,10 +14,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.records.errors import ModelError
-from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, WEIGHTS_FILE, ModelBundle, Normalisation, load_bundle
+from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.residual_model.bundle import (
+    DOCUMENT_FILE,
+    OUTPUT_COUNT,
+    SHIPPED_FOLDERS,
+    WEIGHTS_FILE,
+    ModelBundle,
+    Normalisation,
+    load_bundle,
+)
 from pdhef_logtool.residual_model.features import FEATURES, PAPER_FEATURES, make_features
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
-from pdhef_logtool.residual_model.service import BLOCK_STEPS, LIMITS, NetworkService
+from pdhef_logtool.residual_model.service import LIMITS, NetworkService
 
 
 def make_bundle(seed: int = 0, names: tuple[str, ...] = FEATURES, hidden: int = 16) -> ModelBundle:
@@ -128,22 +137,50 @@ def test_wrong_bundles_are_one_clear_error(tmp_path: Path, damage: str) -> None:
         load_bundle(tmp_path)
 
 
-@pytest.mark.slow
-def test_service_equals_the_network_step_by_step() -> None:
-    """The oracle runs PyTorch's own cell one step at a time."""
-    bundle = make_bundle(hidden=12)
-    rng = np.random.default_rng(0)
-    features = rng.normal(size=(BLOCK_STEPS + 37, len(FEATURES)))
-    rates, _ = NetworkService(bundle).run(features, np.zeros(len(features), dtype=np.bool_), None)
-    network = ResidualNetwork(Architecture(len(FEATURES), 12, 2, (8,)))
-    network.load_state_dict({k: torch.from_numpy(v) for k, v in bundle.weights.items()})
-    network.eval()
-    state = None
+def said_by_torch(bundle: ModelBundle, features: FloatArray) -> FloatArray:
+    """Run PyTorch's own network, the oracle, over normalised features [N, k]; returns normalised outputs [N, o]."""
+    head, outputs = bundle.head, OUTPUT_COUNT[bundle.target]
+    network = ResidualNetwork(
+        Architecture(len(bundle.feature_names), bundle.hidden, bundle.layers, head, outputs=outputs)
+    )
+    network.load_state_dict({k: torch.from_numpy(np.array(v)) for k, v in bundle.weights.items()})
     with torch.inference_mode():
-        for k, row in enumerate((features - 0.5) / 2.0):
-            output, state = network(torch.from_numpy(row.astype(np.float32))[None, None], state)
-            expected = output[0, 0].numpy() * np.array([0.7, 0.3])
-            np.testing.assert_allclose(rates[k], expected, atol=2e-6)
+        output, _ = network.eval()(torch.from_numpy(features.astype(np.float32))[None])
+    return np.asarray(output[0].numpy(), dtype=np.float64)
+
+
+@pytest.mark.parametrize("hidden", [12, 64])  # widths that fill the compiled blocks, and widths that do not
+def test_service_equals_torch(hidden: int) -> None:
+    bundle = make_bundle(hidden=hidden)
+    features = np.random.default_rng(0).normal(size=(300, len(FEATURES)))
+    rates, _ = NetworkService(bundle).run(features, np.zeros(len(features), dtype=np.bool_), None)
+    expected = said_by_torch(bundle, bundle.normalise(features)) * np.array(bundle.normalisation.target_std)
+    np.testing.assert_allclose(rates, expected, atol=2e-6)
+
+
+def test_shipped_networks_say_what_torch_makes_of_them() -> None:
+    for folder in SHIPPED_FOLDERS.values():
+        whole = load_bundle(folder)
+        for bundle in (whole, whole.pure_lstm, whole.paper_network):
+            if bundle is None:
+                continue
+            n, rng = bundle.normalisation, np.random.default_rng(3)
+            features = np.zeros((400, len(FEATURES)))
+            spread = 2.0 * rng.normal(size=(400, len(n.feature_std)))
+            features[:, bundle.columns] = np.array(n.feature_mean) + np.array(n.feature_std) * spread
+            said, _ = NetworkService(bundle).run(features, np.zeros(400, dtype=np.bool_), None)
+            scaled = bundle.normalise(features)
+            expected = said_by_torch(bundle, scaled)
+            if bundle.odd:
+                expected = 0.5 * (expected - said_by_torch(bundle, scaled * bundle.signs))
+            np.testing.assert_allclose(said / np.array(n.target_std), expected, rtol=0, atol=1e-5)
+
+
+def test_weights_of_another_shape_are_refused(tmp_path: Path) -> None:
+    # Compiled code would read beyond them.
+    replace(make_bundle(), hidden=32).save(tmp_path)
+    with pytest.raises(ModelError, match="architecture"):
+        load_bundle(tmp_path)
 
 
 @settings(derandomize=True, max_examples=15, deadline=None)

@@ -5,12 +5,16 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from pdhef_logtool.records.errors import SimulationError, UsageError, VehicleError
+from pdhef_logtool.records.errors import OutputError, SimulationError, UsageError, VehicleError
+from pdhef_logtool.records.supervisor import Ended, Failure
+from truthsim import batch
 from truthsim.batch import BINS, DriveSpec, Job, make_drive, run_jobs, sensor_noise, time_in_bins_s
 from truthsim.conditions import ROW_NAMES, plan_conditions, write_conditions
 from truthsim.suite import SHARES, is_held_out, plan_suite, write_suite
@@ -123,6 +127,31 @@ def test_an_interrupted_batch_goes_on(tmp_path: Path) -> None:
     done: list[str] = []
     whole = run_jobs(jobs, tmp_path, {}, processes=1, progress=lambda text, _share: done.append(text))
     assert done == ["3 of 3 drives"] and whole["complete"] and len(whole["drives"]) == 3
+
+
+def test_drives_whose_process_died_are_told_and_the_others_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def supervise(work: Any, items: Any, **_: Any) -> Iterator[Ended[Job, Any]]:
+        for number, item in enumerate(items):
+            lost = Failure("the worker was killed (signal 9)", "", 2) if number == 1 else None
+            yield Ended(number, item, None if lost else work(item, None), lost)
+
+    monkeypatch.setattr(batch, "supervise", supervise)
+    jobs = plan_suite(3, 3, duration_s=4.0)
+    with pytest.raises(SimulationError, match=rf"1 that were lost \({jobs[1].file}: the worker was killed"):
+        run_jobs(jobs, tmp_path, {}, processes=2)
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert not manifest["complete"] and len(manifest["drives"]) == 2
+    monkeypatch.undo()
+    assert run_jobs(jobs, tmp_path, {}, processes=1)["complete"]
+
+
+def test_what_cannot_be_written_ends_a_batch(tmp_path: Path) -> None:
+    jobs = plan_suite(1, 3, duration_s=4.0)
+    (tmp_path / jobs[0].file).mkdir()
+    with pytest.raises(OutputError):
+        run_jobs(jobs, tmp_path, {}, processes=1)
 
 
 def test_a_drive_that_spins_gives_way_to_the_next_and_is_reported(tmp_path: Path) -> None:

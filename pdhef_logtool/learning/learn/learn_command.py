@@ -56,6 +56,7 @@ from pdhef_logtool.learning.learn.steps import (
 from pdhef_logtool.learning.noise.tune_command import REFUSED
 from pdhef_logtool.learning.stages import Stages
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
@@ -135,7 +136,7 @@ class _Course:
     """One call of the command: what it learns with, the logs' hashes, where, and whom it tells."""
 
     lesson: Lesson
-    logs: Mapping[Path, str]
+    logs: Mapping[LogPlace, str]
     work: Path
     basis: str
     progress: Callable[[str, float], None]
@@ -175,7 +176,7 @@ def learn(
     if config.car is None:
         warn(f"no --car: mass, geometry and priors are those of the default {given.own.name}")
     inputs, splits = choose_drives(find_logs(arguments), settings, REFUSED)
-    read = [*(i.path for i in inputs), *(path for path in config.files if path != config.car)]
+    read = [*(i.local for i in inputs), *(path for path in config.files if path != config.car)]
     check_no_input(read, [], [output])
     mapping = open_mapping(config)
     records, times = _read(inputs, splits, given, mapping, settings, progress, warn)

@@ -6,12 +6,10 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,7 @@ from pdhef_logtool.drive.reading import Tell, friction_of, no_samples, read_driv
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.estimators.parallel_physics import filter_of
-from pdhef_logtool.estimators.table import spec_of
+from pdhef_logtool.estimators.table import FILTERS, spec_of
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     drives_document,
@@ -58,14 +56,14 @@ from pdhef_logtool.learning.network.residuals import (
     residual_windows,
 )
 from pdhef_logtool.learning.variation import vary
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
-from pdhef_logtool.records.processes import follow_parent
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.supervisor import supervise
 from pdhef_logtool.residual_model.bundle import MODELS, NO_MODEL, NOMINAL_MODEL, PHYSICS_MODEL
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import tool_versions
@@ -254,7 +252,7 @@ def extract(
         work = [replace(job, listed_split=splits[job.log_input.stem]) for job in work]
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
-    read = [*(i.path for i in inputs), *settings.config.files, *(j.car.source for j in work)]
+    read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
     check_no_input(read, [output / MANIFEST])
     kept = [_as_in_file(d) for d in before.get("drives", []) if d["name"] not in names]
     vehicles = {v["sha256"]: v for v in before.get("vehicles", [])}
@@ -409,7 +407,7 @@ def _plan_jobs(
     warn: Tell,
 ) -> Iterator[_Job]:
     cars, manifests = cache(_car), cache(set_manifest)
-    listed = [_listed(i.path, manifests(i.path.parent)) for i in inputs]
+    listed = [_listed(i, manifests(i.folder)) for i in inputs]
     for log_input, entry in zip(inputs, listed, strict=True):
         car = cars(settings.config.car or entry.vehicle)
         yield _Job(log_input, output, settings, car, mapping, entry.split, resume)
@@ -423,40 +421,29 @@ def _car(path: Path | None) -> Car:
 
 def _run_jobs(work: Sequence[_Job], jobs: int, progress: Progress) -> Iterator[DriveResult]:
     """Yield one result a job, in any order; a process that dies costs its own drive only."""
-    if jobs == 1 or len(work) == 1:
-        for number, job in enumerate(work):
-
-            def of_all(share: float, number: int = number, job: _Job = job) -> None:
-                progress(job.log_input.stem, (number + share) / len(work))
-
-            yield _extract_guarded(job, of_all) if len(work) > 1 else _extract(job, of_all)
+    if len(work) == 1:
+        yield _extract(work[0], partial(progress, work[0].log_input.stem))
         return
-    broken: list[_Job] = []
-    with ProcessPoolExecutor(min(jobs, len(work)), mp_context=get_context("spawn"), initializer=follow_parent) as pool:
-        futures = {pool.submit(_extract_guarded, job): job for job in work}
-        try:
-            for future in as_completed(futures):
-                try:
-                    yield future.result()
-                except BrokenProcessPool:
-                    broken.append(futures[future])
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-    # A dead process takes the whole pool with it: who it was is found out one by one.
-    for job in broken:
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=follow_parent) as pool:
-            try:
-                yield pool.submit(_extract_guarded, job).result()
-            except BrokenProcessPool:
-                yield _failure(job, "the process that read it died (out of memory?)")
+    shares: dict[int, float] = {}
+
+    def told(number: int, name: str, share: float) -> None:
+        shares[number] = share
+        progress(name, sum(shares.values()) / len(work))
+
+    preload = (__name__, *FILTERS)
+    with closing(supervise(_extract_guarded, work, jobs=min(jobs, len(work)), preload=preload, progress=told)) as ends:
+        for ended in ends:
+            shares[ended.number] = 1.0
+            yield ended.result or _failure(ended.item, ended.failure.reason if ended.failure else "")
 
 
-def _extract_guarded(job: _Job, progress: Callable[[float], None] = lambda _share: None) -> DriveResult:
+def _extract_guarded(job: _Job, progress: Progress) -> DriveResult:
     try:
-        return _extract(job, progress)
+        return _extract(job, partial(progress, job.log_input.stem))
     except PdhefError as error:
         return _failure(job, str(error))
+    except MemoryError:
+        raise  # it may have been another's: tried again, alone
     except Exception as error:  # noqa: BLE001 (one bad log never stops the others, whatever is wrong with it)
         return _failure(job, f"internal error, {type(error).__name__}: {error}")
 
@@ -467,7 +454,7 @@ def _failure(job: _Job, reason: str) -> DriveResult:
 
 def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
     stem, name, settings = job.log_input.stem, job.log_input.path.name, job.settings
-    source = hash_log(job.log_input.path)
+    source = identity_of(job.log_input)
     split, split_from = choose_split(source, settings.seed, chosen=settings.split, listed=job.listed_split)
     fingerprint = _fingerprint(job, split)
     target = job.target(split)
@@ -559,11 +546,12 @@ class _Listed:
     vehicle: Path | None = None
 
 
-def _listed(path: Path, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
+def _listed(log: LogInput, manifest: Mapping[str, Mapping[str, Any]]) -> _Listed:
     """Return what the manifest of a simulated set beside a log says of it: its split and its vehicle file."""
-    entry = manifest.get(path.name, {})
+    entry = manifest.get(log.path.name, {})
     split, vehicle = entry.get("split"), entry.get("vehicle_file", entry.get("vehicle"))
-    file = path.parent / vehicle if isinstance(vehicle, str) and vehicle.endswith(".toml") else None
+    named = log.folder is not None and isinstance(vehicle, str) and vehicle.endswith(".toml")
+    file = log.folder / str(vehicle) if log.folder is not None and named else None
     return _Listed(
         split=split if isinstance(split, str) and split else None,
         vehicle=file if file is not None and file.is_file() else None,

@@ -1,0 +1,400 @@
+"""Objects on servers, asked for ranges of their bytes: HTTP by aiohttp, S3 by aiobotocore, both as fsspec sets them up.
+
+Each answer is held against what the object was when it was opened. Whether asking again helps is told by which of two
+errors is raised: :class:`TryAgainError`, or one that ends it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from abc import ABC, abstractmethod
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+from pdhef_logtool.logs.byte_source import ChangedError, SourceError
+from pdhef_logtool.logs.remote_place import RemotePlace
+from pdhef_logtool.records.errors import UsageError
+
+_BLOCK_BYTES = 1 << 20
+#: Progress from which on a cut answer counts as none of the tries.
+_PROGRESS_BYTES = 64 << 10
+#: What a server says that will pass: too many requests, timeouts, restarts.
+_PASSING = frozenset({408, 425, 429, 500, 502, 503, 504, 520, 521, 522, 523, 524})
+_REFUSED = {401: "it asks who you are", 403: "it refuses access", 407: "the proxy asks who you are"}
+_CONTENT_RANGE = re.compile(r"bytes (?:(\d+)-(\d+)|\*)/(\d+|\*)")
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How long a server is waited for: silence of a connection, tries of a range without progress, waits between."""
+
+    connect_s: float = 15.0
+    silence_s: float = 30.0
+    tries: int = 5
+    first_wait_s: float = 0.5
+    most_wait_s: float = 20.0
+
+
+PATIENCE = Patience()
+
+
+class TryAgainError(Exception):
+    """The answer did not come whole; asking again may help. ``wait_s`` is what the server asks for, 0 without."""
+
+    def __init__(self, what: str, wait_s: float = 0.0) -> None:
+        super().__init__(what)
+        self.wait_s = wait_s
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectState:
+    """What an object was when it was opened: bytes, and what the server calls this version of it (empty: nothing)."""
+
+    size: int
+    etag: str
+    modified: str
+
+
+_EMPTY = ObjectState(0, "", "")
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """An answer on its way: the object's state, where its bytes begin, and the bytes. Size -1: known at the end."""
+
+    state: ObjectState
+    start: int
+    blocks: AsyncIterator[bytes]
+
+
+class RemoteObject(ABC):
+    """An object that gives ranges of its bytes."""
+
+    def __init__(self, place: RemotePlace) -> None:
+        self.place = place
+
+    @property
+    @abstractmethod
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """The loop that its requests run on, in another thread."""
+
+    @abstractmethod
+    def ask(self, start: int, end: int, pinned: ObjectState | None) -> AbstractAsyncContextManager[Answer]:
+        """Ask for bytes [start, end); with ``pinned`` only if the object still is what it was.
+
+        Raises
+        ------
+        TryAgainError : the server is busy, or does not answer. SourceError : it answers that there is no such thing.
+        """
+
+    def error(self, got: str, remedy: str, expected: str = "an object that can be read") -> SourceError:
+        """Return the one line for what is wrong."""
+        return SourceError(expected=expected, got=got, where=str(self.place), remedy=remedy)
+
+    def changed(self, what: str) -> ChangedError:
+        """Return the error for an object that is another one than was opened."""
+        return ChangedError(
+            expected="the object that was opened",
+            got=f"another one ({what})",
+            where=str(self.place),
+            remedy="run again when nothing writes to it any more",
+        )
+
+    def refuse(self, status: int, wait_s: float) -> NoReturn:
+        """Raise what a status that brings no bytes means."""
+        if status in _PASSING:
+            raise TryAgainError(f"status {status}", wait_s)
+        if status in (412, 416):
+            raise self.changed(f"status {status}")
+        if status in _REFUSED:
+            remedy = "give credentials by the environment: docs/remote.md"
+            raise self.error(f"status {status}: {_REFUSED[status]}", remedy)
+        if status in (404, 410):
+            raise self.error("no such object", "check the URL")
+        raise self.error(f"status {status}", "check the URL")
+
+    def hold_against(self, pinned: ObjectState | None, state: ObjectState) -> None:
+        """Raise the error for a changed object if two states are not of one."""
+        if pinned is None:
+            return
+        for was, now, what in (
+            (pinned.etag, state.etag, "its ETag changed"),
+            (pinned.modified, state.modified, "it was modified"),
+        ):
+            if was and now and was != now:
+                raise self.changed(what)
+        if state.size not in (-1, pinned.size):
+            raise self.changed(f"{state.size} bytes instead of {pinned.size}")
+
+
+def remote_object(place: RemotePlace) -> RemoteObject:
+    """Return the object at a place; nothing is asked yet.
+
+    Raises
+    ------
+    UsageError : What it takes to ask is not installed.
+    """
+    return S3Object(place) if place.scheme == "s3" else HttpObject(place)
+
+
+class HttpObject(RemoteObject):
+    """An object of a web server. Proxies and ``netrc`` are the environment's."""
+
+    def __init__(self, place: RemotePlace) -> None:
+        super().__init__(place)
+        aiohttp = _imported("aiohttp", "http", place)
+        import fsspec
+
+        timeout = aiohttp.ClientTimeout(total=None, sock_connect=PATIENCE.connect_s, sock_read=PATIENCE.silence_s)
+        client = {"trust_env": True, "auto_decompress": False, "timeout": timeout}
+        self._system = fsspec.filesystem("http", client_kwargs=client)
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """See :class:`RemoteObject`."""
+        loop: asyncio.AbstractEventLoop = self._system.loop
+        return loop
+
+    @asynccontextmanager
+    async def ask(self, start: int, end: int, pinned: ObjectState | None) -> AsyncIterator[Answer]:
+        """See :class:`RemoteObject`."""
+        import aiohttp
+        import yarl
+
+        headers = {"Range": f"bytes={start}-{end - 1}", "Accept-Encoding": "identity", **_conditions(pinned)}
+        url = self.place.url
+        try:
+            session = await self._system.set_session()
+            # What is encoded already is sent as it stands: a signature may be of just these characters.
+            asked = yarl.URL(url, encoded=url.isascii() and url.isprintable() and " " not in url)
+            async with session.get(asked, headers=headers) as response:
+                yield self._answer(response, start, end, pinned)
+        except (aiohttp.InvalidURL, aiohttp.NonHttpUrlClientError, aiohttp.TooManyRedirects, ValueError):
+            raise self.error("a URL that cannot be asked for", "check the URL") from None
+        except (aiohttp.ClientConnectorCertificateError, aiohttp.ClientSSLError):
+            raise self.error("a server without a valid certificate", "check the URL") from None
+        except aiohttp.ClientConnectorDNSError:
+            raise TryAgainError(f"no such server as {self.place.host}") from None
+        except (aiohttp.ServerTimeoutError, TimeoutError):
+            raise TryAgainError(f"silence of {PATIENCE.silence_s:g} s") from None
+        except aiohttp.ClientPayloadError:
+            raise TryAgainError("an answer that is cut") from None
+        except (aiohttp.ClientError, OSError) as error:  # without its text, which may hold the URL
+            why = getattr(error, "strerror", None) or type(error).__name__
+            raise TryAgainError(f"no connection ({why})") from None
+
+    def _answer(self, response: Any, start: int, end: int, pinned: ObjectState | None) -> Answer:
+        head: Mapping[str, str] = response.headers
+        etag, modified = head.get("ETag", ""), head.get("Last-Modified", "")
+        found = _CONTENT_RANGE.fullmatch(head.get("Content-Range", "").strip())
+        if response.status == 416 and pinned is None and found is not None and found[3] == "0":
+            return Answer(ObjectState(0, etag, modified), 0, _nothing())
+        if response.status == 206 and found is not None and found[1] is not None and found[3] != "*":
+            state = ObjectState(int(found[3]), etag, modified)
+            self.hold_against(pinned, state)
+            if int(found[1]) != start or int(found[2]) >= end:
+                raise self.error("other bytes than were asked for", "the server does not give ranges: read a copy")
+            return Answer(state, start, response.content.iter_chunked(_BLOCK_BYTES))
+        if response.status == 200:  # the server gives no ranges: all of it comes
+            if head.get("Content-Encoding", "identity") != "identity":
+                raise self.error("an answer that is compressed on its way", "read a copy")
+            state = ObjectState(int(head.get("Content-Length", -1)), etag, modified)
+            self.hold_against(pinned, state)
+            return Answer(state, 0, response.content.iter_chunked(_BLOCK_BYTES))
+        if response.status == 206:
+            raise self.error("a part of unknown size", "the server does not give ranges: read a copy")
+        return self.refuse(response.status, _seconds(head.get("Retry-After", "")))
+
+
+class S3Object(RemoteObject):
+    """An object of an S3 store. Credentials, region and endpoint are what the environment gives to any AWS tool."""
+
+    def __init__(self, place: RemotePlace) -> None:
+        super().__init__(place)
+        self._system = s3_system(place)
+
+    @property
+    def loop(self) -> asyncio.AbstractEventLoop:
+        """See :class:`RemoteObject`."""
+        loop: asyncio.AbstractEventLoop = self._system.loop
+        return loop
+
+    @asynccontextmanager
+    async def ask(self, start: int, end: int, pinned: ObjectState | None) -> AsyncIterator[Answer]:
+        """See :class:`RemoteObject`."""
+        asked: dict[str, str] = {"Bucket": self.place.host, "Key": self.place.key, "Range": f"bytes={start}-{end - 1}"}
+        if pinned is not None and pinned.etag:
+            asked["IfMatch"] = pinned.etag
+        async with self.client() as client:
+            found = await self._found(client, asked, pinned)
+            if found is None:
+                yield Answer(_EMPTY, 0, _nothing())
+                return
+            async with found["Body"] as body:
+                yield self._answer(found, body, start, pinned)
+
+    async def _found(self, client: Any, asked: Mapping[str, str], pinned: ObjectState | None) -> Any:
+        """Return what the store answers; None for an empty object, which has no range."""
+        from botocore.exceptions import ClientError
+
+        try:
+            return await client.get_object(**asked)
+        except ClientError as error:
+            if _status_of(error)[0] == 416 and pinned is None:
+                return None
+            raise
+
+    @asynccontextmanager
+    async def client(self) -> AsyncIterator[Any]:
+        """Give the client for a bucket, whose errors become ours."""
+        import aiohttp
+        from botocore.exceptions import (
+            BotoCoreError,
+            ClientError,
+            HTTPClientError,
+            IncompleteReadError,
+            NoCredentialsError,
+            ResponseStreamingError,
+        )
+
+        try:
+            await self._system.set_session()
+            yield await self._system.get_s3(self.place.host)
+        except ClientError as error:
+            self.refuse(*_status_of(error))
+        except NoCredentialsError:
+            raise self.error("no credentials", "give them by the environment: docs/remote.md") from None
+        except (IncompleteReadError, ResponseStreamingError, aiohttp.ClientPayloadError):
+            raise TryAgainError("an answer that is cut") from None
+        except (HTTPClientError, TimeoutError, aiohttp.ClientError, OSError) as error:
+            raise TryAgainError(f"no answer ({type(error).__name__})") from None
+        except BotoCoreError as error:
+            raise self.error(f"a request that cannot be made ({type(error).__name__})", "check the URL") from None
+
+    def _answer(self, found: Mapping[str, Any], body: Any, start: int, pinned: ObjectState | None) -> Answer:
+        modified = found.get("LastModified")
+        part = _CONTENT_RANGE.fullmatch(str(found.get("ContentRange", "")))
+        size = int(part[3]) if part is not None and part[3] != "*" else int(found["ContentLength"])
+        state = ObjectState(size, found.get("ETag", ""), "" if modified is None else modified.isoformat())
+        self.hold_against(pinned, state)
+        at = int(part[1]) if part is not None and part[1] is not None else 0
+        if part is not None and at != start:
+            raise self.error("other bytes than were asked for", "the store does not give ranges: read a copy")
+        return Answer(state, at, body.iter_chunks(_BLOCK_BYTES))
+
+
+def keys_below(prefix: RemotePlace) -> list[str]:
+    """Return the keys of all objects of a store that begin with a prefix.
+
+    Raises
+    ------
+    SourceError : The store does not tell.
+    """
+    store = S3Object(prefix)
+
+    async def listed() -> list[str]:
+        keys: list[str] = []
+        async with store.client() as client:
+            pages = client.get_paginator("list_objects_v2").paginate(Bucket=prefix.host, Prefix=prefix.key)
+            async for page in pages:
+                keys += [str(entry["Key"]) for entry in page.get("Contents", ())]
+        return keys
+
+    async def in_turn() -> list[str]:
+        keys: list[str] = []
+
+        async def once() -> None:
+            keys[:] = await listed()
+
+        await try_in_turn(once, store)
+        return keys
+
+    return asyncio.run_coroutine_threadsafe(in_turn(), store.loop).result()
+
+
+async def try_in_turn(
+    once: Callable[[], Awaitable[None]], remote: RemoteObject, place: Callable[[], int] = lambda: 0
+) -> None:
+    """Do something until it succeeds; give up after some tries in turn that brought nothing.
+
+    Parameters
+    ----------
+    place : how many bytes have come by now.
+
+    Raises
+    ------
+    SourceError : All tries failed, or one failed for good.
+    """
+    tries, reached = 0, place()
+    while True:
+        try:
+            await once()
+        except TryAgainError as error:
+            tries += 1
+            if place() - reached >= _PROGRESS_BYTES:
+                tries, reached = 1, place()
+            if tries >= PATIENCE.tries:
+                got = f"{error}, {tries} times in turn"
+                raise remote.error(got, "try again later", "a server that answers") from None
+            wait_s = max(error.wait_s, PATIENCE.first_wait_s * 2 ** (tries - 1))
+            await asyncio.sleep(min(wait_s, PATIENCE.most_wait_s))
+        else:
+            return
+
+
+def s3_system(place: RemotePlace) -> Any:
+    """Return fsspec's file system for S3, which asks once: how often a request is made again is decided here."""
+    _imported("s3fs", "s3", place)
+    import fsspec
+
+    client = {
+        "connect_timeout": PATIENCE.connect_s,
+        "read_timeout": PATIENCE.silence_s,
+        "retries": {"total_max_attempts": 1},
+    }
+    return fsspec.filesystem("s3", config_kwargs=client, use_listings_cache=False)
+
+
+def _imported(module: str, extra: str, place: RemotePlace) -> Any:
+    from importlib import import_module
+
+    try:
+        return import_module(module)
+    except ImportError:
+        raise UsageError(
+            expected=f"the package {module}, which reads {place.scheme}://",
+            got="an installation without it",
+            where=str(place),
+            remedy=f"pip install 'pdhef-logtool[{extra}]'",
+        ) from None
+
+
+def _conditions(pinned: ObjectState | None) -> dict[str, str]:
+    """Return the headers by which a server refuses another version; a weak ETag never matches a range."""
+    if pinned is None:
+        return {}
+    if pinned.etag and not pinned.etag.startswith("W/"):
+        return {"If-Match": pinned.etag}
+    return {"If-Unmodified-Since": pinned.modified} if pinned.modified else {}
+
+
+def _status_of(error: Any) -> tuple[int, float]:
+    """Return status and seconds to wait of an S3 error."""
+    found = error.response.get("ResponseMetadata", {})
+    status, code = int(found.get("HTTPStatusCode") or 0), str(error.response.get("Error", {}).get("Code", ""))
+    if code in ("SlowDown", "RequestTimeout", "ThrottlingException", "RequestLimitExceeded"):
+        status = 503
+    return status, _seconds(found.get("HTTPHeaders", {}).get("retry-after", ""))
+
+
+def _seconds(text: str) -> float:
+    """Return the seconds of a Retry-After header; 0 where it gives a date, or none."""
+    return float(text) if text.strip().isdecimal() else 0.0
+
+
+async def _nothing() -> AsyncIterator[bytes]:
+    for block in (b"",):
+        yield block

@@ -1,0 +1,108 @@
+"""Where a log lies that is not on this machine: a URL, and what of it may be shown."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TypeAlias
+from urllib.parse import SplitResult, parse_qsl, unquote, urlencode, urlsplit
+
+from pdhef_logtool.records.errors import UsageError
+
+SCHEMES = ("s3", "http", "https")
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+)://")
+#: What gives access, or is made anew for each link, is no part of what an object is called.
+_OF_ACCESS = re.compile(
+    r"x-(amz|goog|ms|oss|cos)-.*|aws.*|google.*|signature|expires|policy|key-pair-id|sig|s[etprkv]|sk[a-z]+|"
+    r".*(token|secret|password|credential|signature|auth|api[-_]?key).*",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True, repr=False)
+class RemotePlace:
+    """An object on a server. As text it has neither user, password nor query: these may give access to it."""
+
+    url: str
+
+    @cached_property
+    def _parts(self) -> SplitResult:
+        return urlsplit(self.url)
+
+    @property
+    def scheme(self) -> str:
+        """``s3``, ``http`` or ``https``."""
+        return self._parts.scheme.lower()
+
+    @property
+    def host(self) -> str:
+        """Server with port, or bucket."""
+        return self._parts.netloc.rpartition("@")[2]
+
+    @property
+    def key(self) -> str:
+        """What an object store calls it: all behind the bucket, as it stands there."""
+        return self.url.split("://", 1)[1].partition("/")[2]
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Scheme and server, folders, name, as they are shown: no part is empty."""
+        path = self.key if self.scheme == "s3" else unquote(self._parts.path)
+        return (f"{self.scheme}://{self.host}", *filter(None, path.split("/")))
+
+    @property
+    def name(self) -> str:
+        """Last part: what a file would be called."""
+        return self.parts[-1] if len(self.parts) > 1 else self.host
+
+    @property
+    def parent(self) -> str:
+        """All that stands before the name."""
+        return "/".join(self.parts[:-1])
+
+    @property
+    def identity(self) -> str:
+        """The URL without what gives access to it, in one spelling."""
+        if self.scheme == "s3":
+            return str(self)
+        asked = [(k, v) for k, v in parse_qsl(self._parts.query, keep_blank_values=True) if not _OF_ACCESS.fullmatch(k)]
+        return str(self) + (f"?{urlencode(asked)}" if asked else "")
+
+    def __repr__(self) -> str:
+        """Return what may be shown, as what it is."""
+        return f"RemotePlace({str(self)!r})"
+
+    def __str__(self) -> str:
+        """Return what may be shown."""
+        return "/".join(self.parts)
+
+
+#: A file or folder of this machine, or an object on another.
+LogPlace: TypeAlias = Path | RemotePlace
+
+
+def place_of(argument: str) -> LogPlace:
+    """Return the place that an argument names.
+
+    Raises
+    ------
+    UsageError : A URL that is none of ours.
+    """
+    found = _URL.match(argument)
+    if found is None or Path(argument).exists():
+        return Path(argument)
+    place = RemotePlace(argument)
+    try:
+        known = place.scheme in SCHEMES and bool(place.host)
+    except ValueError:  # a malformed server
+        known = False
+    if not known:
+        raise UsageError(
+            expected=", ".join(f"{scheme}://" for scheme in SCHEMES) + " and a server or bucket",
+            got=f"{found[1]}://",
+            where=argument.split("?")[0].rpartition("@")[2],
+            remedy="give such a URL, or a path of this machine",
+        )
+    return place

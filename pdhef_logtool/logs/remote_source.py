@@ -1,0 +1,356 @@
+"""Bytes of an object on a server: each is fetched once, into a file of this machine from which all reading is done.
+
+What is wanted is joined to ranges across gaps of at most 64 kB, of at most 8 MB each, several of which are under way at
+once. Nothing but blocks on their way is in memory. A cut range goes on where it was cut.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import os
+import shutil
+from collections.abc import Coroutine, Iterable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import TypeAlias
+
+from pdhef_logtool.logs.byte_source import ByteSource, ChangedError, SourceError
+from pdhef_logtool.logs.remote_objects import (
+    Answer,
+    ObjectState,
+    RemoteObject,
+    TryAgainError,
+    remote_object,
+    try_in_turn,
+)
+from pdhef_logtool.logs.remote_place import RemotePlace
+from pdhef_logtool.records.files import scratch_folder
+
+Extent: TypeAlias = tuple[int, int]
+
+#: Fetching this many bytes that nobody asked for is cheaper than one request more.
+JOINED_GAP_BYTES = 64 << 10
+MOST_RANGE_BYTES = 8 << 20
+AT_ONCE = 4
+#: Enough to tell what an object is.
+HEAD_BYTES = 4 << 10
+#: A scratch file leaves this much of the disk to others.
+_DISK_RESERVE_BYTES = 256 << 20
+#: Objects that were closed stay for the next opening, so that no pass over the same log fetches it again.
+_KEPT_BYTES = 4 << 30
+_KEPT_OBJECTS = 1000
+
+
+_NOTHING = ObjectState(0, "", "")
+
+
+def join_ranges(extents: Iterable[Extent], held: Sequence[Extent] = ()) -> list[Extent]:
+    """Return the ranges to ask for, ascending, to have all of ``extents``; bytes of ``held`` are in none of them."""
+    joined: list[Extent] = []
+    for start, end in without(extents, held):
+        last = joined[-1] if joined else (0, 0)
+        if joined and start - last[1] <= JOINED_GAP_BYTES and not _any_in(held, last[1], start):
+            joined[-1] = (last[0], end)
+        else:
+            joined.append((start, end))
+    return [
+        (at, min(at + MOST_RANGE_BYTES, end)) for start, end in joined for at in range(start, end, MOST_RANGE_BYTES)
+    ]
+
+
+def without(extents: Iterable[Extent], held: Sequence[Extent]) -> list[Extent]:
+    """Return what of some extents is in none of others, ascending, neighbours joined."""
+    found: list[Extent] = []
+    taken = sorted(held)
+    for start, end in sorted(extents):
+        at = max(start, found[-1][1]) if found else start
+        for low, high in taken:
+            if high <= at:
+                continue
+            if low >= end:
+                break
+            if low > at:
+                _append(found, at, low)
+            at = max(at, high)
+        if at < end:
+            _append(found, at, end)
+    return found
+
+
+def _append(found: list[Extent], start: int, end: int) -> None:
+    if found and found[-1][1] == start:
+        found[-1] = (found[-1][0], end)
+    else:
+        found.append((start, end))
+
+
+def _any_in(held: Sequence[Extent], start: int, end: int) -> bool:
+    return any(low < end and high > start for low, high in held)
+
+
+class RemoteSource(ByteSource):
+    """An object on a server, read through a scratch file.
+
+    Parameters
+    ----------
+    place : where it lies. What the object is (size, ETag, time of modification) is pinned now; that it became another
+        one ends any later read.
+
+    Raises
+    ------
+    SourceError : There is none, it may not be read, or the server does not answer.
+    UsageError : What it takes to ask is not installed.
+    """
+
+    far = True
+
+    def __init__(self, place: RemotePlace) -> None:
+        self._spool = _acquire(place)
+        self._closed = False
+        self.place = place
+        super().__init__(self._spool.state.size)
+
+    @property
+    def state(self) -> ObjectState:
+        """What the object was when it was opened."""
+        return self._spool.state
+
+    @property
+    def identity(self) -> str:
+        """Hash of the URL without what gives access to it, of the size, and of ETag or time of modification."""
+        known = (self.place.identity, str(self.size), self.state.etag or self.state.modified)
+        return hashlib.sha256("\0".join(known).encode()).hexdigest()
+
+    @property
+    def path(self) -> Path:
+        """The scratch file, of which what was fetched holds; all of it after :meth:`fetch_whole`."""
+        return self._spool.path
+
+    def fetch(self, offset: int, size: int) -> bytes:
+        """See :class:`ByteSource`."""
+        return self._spool.read(offset, min(offset + size, self.size))
+
+    def at_hand(self, offset: int, size: int) -> int:
+        """See :class:`ByteSource`."""
+        return self._spool.held_to(offset, offset + size) - offset
+
+    def expect(self, extents: Iterable[Extent]) -> None:
+        """See :class:`ByteSource`."""
+        self._spool.order([(max(start, 0), min(end, self.size)) for start, end in extents])
+
+    def fetch_whole(self) -> None:
+        """Have all of it in the scratch file."""
+        self.expect([(0, self.size)])
+        self._spool.wait(0, self.size)
+
+    def close(self) -> None:
+        """Release the scratch file, which stays for a while for who opens the same object again."""
+        if not self._closed:
+            self._closed = True
+            _release(self._spool)
+
+
+@dataclass(eq=False)
+class _Spool:
+    """A scratch file with what was fetched of one object.
+
+    Attributes
+    ----------
+    held : extents in the file, ascending, apart. coming : ranges under way. users : sources that read it.
+    """
+
+    place: RemotePlace
+    remote: RemoteObject
+    state: ObjectState = _NOTHING
+    held: list[Extent] = field(default_factory=list)
+    coming: list[tuple[Extent, Future[None]]] = field(default_factory=list)
+    users: int = 0
+    failure: SourceError | None = None
+
+    def __post_init__(self) -> None:
+        self._folder = scratch_folder()
+        self.path = Path(self._folder.name) / (self.place.name.replace("/", "_")[-80:] or "log")
+        self._file = -1
+        self._lock = Lock()
+        self._at_once = asyncio.Semaphore(AT_ONCE)
+        self._room = 0
+
+    def enter(self) -> None:
+        """Open the scratch file for one user more; the first one pins what the object is, others ask if it still is.
+
+        Raises
+        ------
+        ChangedError : It is another one by now. SourceError : It cannot be asked for.
+        """
+        if self.users == 0:
+            new = not self.path.exists()
+            self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
+            if new or self.state.size:
+                self._run(try_in_turn(self._first if new else self._ask_again, self.remote)).result()
+        self.users += 1
+
+    def leave(self) -> None:
+        """Close the scratch file for one user."""
+        self.users -= 1
+        if self.users <= 0:
+            for _, future in self.coming:
+                future.cancel()
+            self.coming.clear()
+            with self._lock:  # nothing that is still under way writes to what gets this number next
+                file, self._file = self._file, -1
+            if file >= 0:
+                os.close(file)
+
+    async def _first(self) -> None:
+        async with self.remote.ask(0, HEAD_BYTES, None) as answer:
+            written = await self._write(answer, answer.state.size)
+        size = written if answer.state.size < 0 else answer.state.size
+        self.state = ObjectState(size, answer.state.etag, answer.state.modified)
+        whole = min(size, HEAD_BYTES)
+        if written < whole:
+            raise TryAgainError("an answer that is cut")
+        self.held = [(0, written)] if written else []
+
+    async def _ask_again(self) -> None:
+        async with self.remote.ask(0, 1, self.state):
+            pass
+
+    def order(self, extents: Iterable[Extent]) -> None:
+        """Start to fetch what is neither held nor coming."""
+        with self._lock:
+            if self.failure:
+                return
+            there = [*self.held, *(extent for extent, _ in self.coming)]
+            for extent in join_ranges(extents, there):
+                self.coming.append((extent, self._run(self._get(*extent))))
+
+    def wait(self, start: int, end: int) -> None:
+        """Return when bytes [start, end) are held; raises SourceError where they cannot be had."""
+        self.order([(start, end)])
+        for (low, high), future in list(self.coming):
+            if (low < end and high > start) or future.done():
+                self._take((low, high), future)
+        if self.failure:
+            raise self.failure
+
+    def _take(self, extent: Extent, future: Future[None]) -> None:
+        try:
+            future.result()
+        except SourceError as error:
+            self.failure = self.failure or error
+            for _, other in self.coming:
+                other.cancel()
+            raise self.failure from None
+        with self._lock:
+            if (extent, future) in self.coming:
+                self.coming.remove((extent, future))
+                self.held = without([*self.held, extent], [])
+
+    def read(self, start: int, end: int) -> bytes:
+        """Return bytes [start, end)."""
+        if end <= start:
+            return b""
+        if self.held_to(start, end) < end:
+            self.wait(start, end)
+        return os.pread(self._file, end - start, start)
+
+    def held_to(self, start: int, end: int) -> int:
+        """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""
+        return next((min(high, end) for low, high in self.held if low <= start < high), start)
+
+    async def _get(self, start: int, end: int) -> None:
+        async with self._at_once:
+            at = start
+
+            async def rest() -> None:
+                nonlocal at
+                async with self.remote.ask(at, end, self.state) as answer:
+                    if answer.start != at:
+                        raise self.remote.error("all of it instead of a part", "the server stopped to give ranges")
+                    written = 0
+                    try:
+                        async for block in answer.blocks:
+                            written += self._put(block[: end - at - written], at + written)
+                            if at + written >= end:
+                                break
+                    finally:
+                        at += written
+                if at < end:
+                    raise TryAgainError("an answer that is cut")
+
+            await try_in_turn(rest, self.remote, lambda: at)
+
+    async def _write(self, answer: Answer, size: int) -> int:
+        """Write the blocks of a first answer, which may be all of the object; returns how many bytes came."""
+        at = 0
+        async for block in answer.blocks:
+            at += self._put(block, at)
+        if answer.start == 0 and size >= 0 and at > size:
+            raise self.remote.error("more bytes than it says it has", "read a copy")
+        return at
+
+    def _put(self, block: bytes, at: int) -> int:
+        """Write a block, leaving some of the disk to others."""
+        self._room -= len(block)
+        if self._room < 0:
+            self._room = shutil.disk_usage(self.path.parent).free - _DISK_RESERVE_BYTES - len(block)
+            self._room = min(self._room, _DISK_RESERVE_BYTES)
+        try:
+            if self._room < 0:
+                raise OSError("the disk is full")
+            with self._lock:
+                return os.pwrite(self._file, block, at)
+        except OSError:
+            raise self.remote.error("no room for its bytes on this disk", "set TMPDIR to another") from None
+
+    def _run(self, work: Coroutine[None, None, None]) -> Future[None]:
+        return asyncio.run_coroutine_threadsafe(work, self.remote.loop)
+
+    @property
+    def size(self) -> int:
+        """Bytes of the scratch file that take room."""
+        return sum(high - low for low, high in self.held)
+
+    def drop(self) -> None:
+        """Remove the scratch file."""
+        self.users = 0
+        self.leave()
+        self._folder.cleanup()
+
+
+#: By URL, in order of their last use.
+_spools: dict[str, _Spool] = {}
+
+
+def _acquire(place: RemotePlace) -> _Spool:
+    spool = _spools.pop(place.url, None) or _Spool(place, remote_object(place))
+    try:
+        spool.enter()
+    except ChangedError:  # since it was closed: opening pins what it is now
+        spool.drop()
+        return _acquire(place)
+    except BaseException:
+        spool.drop()
+        raise
+    _spools[place.url] = spool
+    return spool
+
+
+def _release(spool: _Spool) -> None:
+    spool.leave()
+    if spool.failure is not None and not spool.users:
+        _forget(spool)
+    idle = [s for s in _spools.values() if not s.users]
+    size = sum(s.size for s in idle)
+    while idle and (size > _KEPT_BYTES or len(idle) > _KEPT_OBJECTS):
+        size -= idle[0].size
+        _forget(idle.pop(0))
+
+
+def _forget(spool: _Spool) -> None:
+    if _spools.get(spool.place.url) is spool:
+        del _spools[spool.place.url]
+    spool.drop()

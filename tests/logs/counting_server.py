@@ -1,0 +1,189 @@
+"""A web server of the tests: files with ranges and ETags, every request counted, faults on demand."""
+
+from __future__ import annotations
+
+import hashlib
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from email.utils import formatdate
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+
+@dataclass(frozen=True)
+class Request:
+    """What was asked for, and the bytes [start, end) that went out."""
+
+    path: str
+    start: int
+    end: int
+    headers: dict[str, str]
+
+
+#: What a fault does with the n-th request of a path (from 0): True if it has dealt with it, and noted it.
+Fault = Callable[["_Handler", int], bool]
+
+
+@dataclass
+class CountingServer:
+    """Files by path; ``without``: headers that are not sent. ``ranges`` False answers with all of a file."""
+
+    files: dict[str, bytes] = field(default_factory=dict)
+    requests: list[Request] = field(default_factory=list)
+    fault: Fault | None = None
+    ranges: bool = True
+    without: frozenset[str] = frozenset()
+    url: str = ""
+    most_at_once: int = 0
+    _now: int = 0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def place(self, path: str) -> str:
+        return f"{self.url}/{path}"
+
+    @property
+    def bytes_sent(self) -> int:
+        return sum(r.end - r.start for r in self.requests)
+
+    def twice(self) -> int:
+        """Return how many bytes went out more than once, by file."""
+        total = 0
+        for path in {r.path for r in self.requests}:
+            reached = 0
+            for start, end in sorted((r.start, r.end) for r in self.requests if r.path == path):
+                total += max(0, min(reached, end) - start)
+                reached = max(reached, end)
+        return total
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    of: CountingServer
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+    def do_GET(self) -> None:
+        of, path = self.of, self.path.split("?")[0].lstrip("/")
+        with of._lock:
+            n = sum(r.path == path for r in of.requests)
+            of._now += 1
+            of.most_at_once = max(of.most_at_once, of._now)
+        try:
+            self._answer(path, n)
+        except (BrokenPipeError, ConnectionResetError):
+            self.close_connection = True
+        finally:
+            with of._lock:
+                of._now -= 1
+
+    def _answer(self, path: str, n: int) -> None:
+        of = self.of
+        if of.fault is not None and of.fault(self, n):
+            return
+        data = of.files.get(path)
+        if data is None:
+            self.note(path, 0, 0)
+            self.plain(404)
+            return
+        etag = f'"{hashlib.md5(data, usedforsecurity=False).hexdigest()}"'
+        if self.headers.get("If-Match", etag) != etag:
+            self.note(path, 0, 0)
+            self.plain(412)
+            return
+        asked = self.headers.get("Range", "") if of.ranges else ""
+        start, end, status = 0, len(data), 200
+        if asked:
+            low, _, high = asked.removeprefix("bytes=").partition("-")
+            start, end, status = int(low), min(int(high) + 1, len(data)), 206
+            if start >= len(data):
+                self.note(path, 0, 0)
+                self.plain(416, {"Content-Range": f"bytes */{len(data)}"})
+                return
+        self.note(path, start, end)
+        heads = {"ETag": etag, "Last-Modified": formatdate(1e9, usegmt=True), "Content-Length": str(end - start)}
+        if status == 206:
+            heads["Content-Range"] = f"bytes {start}-{end - 1}/{len(data)}"
+        self.send_response(status)
+        for name, value in heads.items():
+            if name not in of.without:
+                self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(data[start:end])
+
+    def note(self, path: str, start: int, end: int) -> None:
+        with self.of._lock:
+            self.of.requests.append(Request(path, start, end, dict(self.headers)))
+
+    def plain(self, status: int, headers: dict[str, str] | None = None) -> None:
+        self.send_response(status)
+        for name, value in {"Content-Length": "0", **(headers or {})}.items():
+            self.send_header(name, value)
+        self.end_headers()
+
+
+@contextmanager
+def serving(**files: bytes) -> Iterator[CountingServer]:
+    """Serve files, by path, until the block ends."""
+    of = CountingServer(dict(files))
+    handler = type("Handler", (_Handler,), {"of": of})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    server.daemon_threads = True
+    of.url = f"http://127.0.0.1:{server.server_address[1]}"
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield of
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def status(code: int, headers: dict[str, str] | None = None, times: int = 10**9, after: int = 0) -> Fault:
+    """Answer requests ``after`` .. ``after + times`` with a status and no bytes."""
+
+    def fault(handler: _Handler, n: int) -> bool:
+        if after <= n < after + times:
+            handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)
+            handler.plain(code, headers)
+            return True
+        return False
+
+    return fault
+
+
+def cutting(after_bytes: int, times: int = 10**9) -> Fault:
+    """Close the connection after some bytes of an answer."""
+
+    def fault(handler: _Handler, n: int) -> bool:
+        path = handler.path.lstrip("/")
+        data = handler.of.files[path]
+        low, _, high = handler.headers["Range"].removeprefix("bytes=").partition("-")
+        start, end = int(low), min(int(high) + 1, len(data))
+        if n >= times or end - start <= after_bytes:
+            return False
+        handler.send_response(206)
+        handler.send_header("Content-Range", f"bytes {start}-{end - 1}/{len(data)}")
+        handler.send_header("Content-Length", str(end - start))
+        handler.end_headers()
+        handler.wfile.write(data[start : start + after_bytes])
+        handler.wfile.flush()
+        handler.close_connection = True
+        handler.note(path, start, start + after_bytes)
+        return True
+
+    return fault
+
+
+def stalling(seconds: float) -> Fault:
+    """Say nothing."""
+
+    def fault(handler: _Handler, n: int) -> bool:
+        handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)
+        time.sleep(seconds)
+        handler.close_connection = True
+        return True
+
+    return fault
