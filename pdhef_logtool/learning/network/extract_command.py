@@ -290,7 +290,12 @@ def extract(
         manifest = write(results)
         with writing(output):
             remove_unnamed(output, manifest)
-    if splits is None and settings.split is None and manifest["drives"] and not all(manifest["splits"][s]["drives"] for s in SPLITS):
+    if (
+        splits is None
+        and settings.split is None
+        and manifest["drives"]
+        and not all(manifest["splits"][s]["drives"] for s in SPLITS)
+    ):
         empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
         warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)

@@ -19,6 +19,7 @@ from typing import Any
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import digest
 from pdhef_logtool.drive.reading import Tell, read_drive
+from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.learning.drives import (
     DriveRecord,
     LearnSettings,
@@ -40,7 +41,7 @@ from pdhef_logtool.learning.network.extract_command import ExtractSettings, extr
 from pdhef_logtool.learning.network.fine_tune import GENTLY
 from pdhef_logtool.learning.retrain.roles import GATE, INTERVALS, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
 from pdhef_logtool.learning.stages import Stages
-from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, PdhefError
 from pdhef_logtool.records.files import write_bytes, writing
@@ -113,12 +114,12 @@ class RetrainResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Retraining:
-    """One call: its settings, the car, the drives by role, and what each log is known by."""
+    """One call: its settings, the car, the drives by role, and what each log is known by, by its stem."""
 
     settings: RetrainSettings
     car: Car
     drives: Mapping[str, tuple[LogInput, ...]]
-    hashes: Mapping[Path, str]
+    hashes: Mapping[str, str]
     work: Path
     stages: Stages
     jobs: int
@@ -139,7 +140,7 @@ class _Retraining:
         mapping = None if config.mapping is None else digest(config.mapping.read_text(encoding="utf-8"))
         head = record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config, seed=self.settings.seed), self.car)
         source = None if self.car.source is None else hash_log(self.car.source)
-        return [head, mapping, source, sorted(self.hashes[i.path] for i in self.drives.get(role, ())), *rests_on]
+        return [head, mapping, source, sorted(self.hashes[i.stem] for i in self.drives.get(role, ())), *rests_on]
 
     def do(self, number: int, name: str, basis: list[Any], work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
         return self.stages.do(number, name, basis, number / 8.0, work)
@@ -177,14 +178,14 @@ def retrain(
     config = settings.config
     car = open_car(config, None, warn)
     inputs = find_logs(arguments)
-    read = [*(i.path for i in inputs), *config.files]
+    read = [*(i.local for i in inputs), *config.files]
     check_no_input(read, [], [output / name for name in (WORK, ACCEPTED, REJECTED)])
     work = output / WORK
     with OutputFolder(output, (WORK, ACCEPTED, REJECTED)):
         with writing(work):
             work.mkdir(exist_ok=True)
         stages = Stages(work, lambda found: str(found["shown"]), say, progress)
-        hashes = {i.path: hash_log(i.path) for i in inputs}
+        hashes = {i.stem: identity_of(i) for i in inputs}
         records, signals = _look(inputs, hashes, car, settings, work, jobs, progress)
         records, drives = _roles(inputs, records, signals, car, settings, work)
         told = set[str]()
@@ -251,7 +252,7 @@ def _unread(log_input: LogInput, reason: str) -> DriveRecord:
 
 def _look(
     inputs: Sequence[LogInput],
-    hashes: Mapping[Path, str],
+    hashes: Mapping[str, str],
     car: Car,
     settings: RetrainSettings,
     work: Path,
@@ -266,19 +267,19 @@ def _look(
     with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
         document = json.loads((work / SEEN_FILE).read_text(encoding="utf-8"))
         known = document["logs"] if document["basis"] == basis else {}
-    new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.path] not in known]
+    new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
 
     def tell(number: int, text: str, share: float) -> None:
         progress(f"reading {text}", (number + share) / len(new) / 8.0)
 
-    records = dict[Path, DriveRecord]()
-    for ended in supervise(_read_log, new, jobs=jobs, progress=tell):
+    records = dict[str, DriveRecord]()
+    for ended in supervise(_read_log, new, jobs=jobs, preload=("pdhef_logtool.drive.reading", *FILTERS), progress=tell):
         log_input, seen = ended.item.log_input, ended.result
         if seen is None:
             reason = "it could not be read" if ended.failure is None else ended.failure.reason
             seen = _Seen(_unread(log_input, reason), None)
-        records[log_input.path] = replace(seen.record, sha256=hashes[log_input.path])
-        known[hashes[log_input.path]] = {
+        records[log_input.stem] = replace(seen.record, sha256=hashes[log_input.stem])
+        known[hashes[log_input.stem]] = {
             "signals_sha256": seen.signals_sha256,
             "left_out": seen.record.left_out,
             "span_s": seen.record.span_s,
@@ -286,19 +287,19 @@ def _look(
     write_bytes(work / SEEN_FILE, json_bytes({"basis": basis, "logs": known}))
 
     def record(log_input: LogInput) -> DriveRecord:
-        found = known[hashes[log_input.path]]
+        found = known[hashes[log_input.stem]]
         span = None if found["span_s"] is None else (float(found["span_s"][0]), float(found["span_s"][1]))
         again = DriveRecord(
             log_input.stem,
             log_input.path.name,
-            hashes[log_input.path],
+            hashes[log_input.stem],
             seconds=0.0 if span is None else span[1] - span[0],
             span_s=span,
             left_out=found["left_out"],
         )
-        return records.get(log_input.path, again)
+        return records.get(log_input.stem, again)
 
-    return [record(i) for i in inputs], [known[hashes[i.path]]["signals_sha256"] for i in inputs]
+    return [record(i) for i in inputs], [known[hashes[i.stem]]["signals_sha256"] for i in inputs]
 
 
 def _roles(
@@ -319,7 +320,7 @@ def _roles(
     candidates = []
     for log_input, record, key in zip(inputs, records, signals, strict=True):
         if key is not None and first.setdefault(key, log_input.stem) == log_input.stem:
-            split = str(manifests(log_input.path.parent).get(log_input.path.name, {}).get("split") or "")
+            split = str(manifests(log_input.folder).get(log_input.path.name, {}).get("split") or "")
             candidates.append(Candidate(key, split, record.sha256 in taught))
     before: dict[str, str] = {}
     with suppress(OSError, ValueError, RecursionError):
@@ -358,7 +359,7 @@ def _check_counts(drives: Mapping[str, Sequence[LogInput]]) -> None:
 
 def _stages(this: _Retraining) -> dict[str, Any]:
     """Do all stages; return the record of the candidate."""
-    both = [sorted(this.hashes[i.path] for i in this.drives[role]) for role in (TRAIN, STOP)]
+    both = [sorted(this.hashes[i.stem] for i in this.drives[role]) for role in (TRAIN, STOP)]
     dataset = this.do(1, "extract", this.basis(both), lambda _: _extract(this))
     start = None if str(this.start) == NO_MODEL else open_model(this.start)
     init = None if start is None else start.sha256
