@@ -308,7 +308,7 @@ def retrain(
     jobs: options.Jobs = 1,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Train a car's network on and hold it against the old one. A gate on drives kept aside decides."""
+    """Train a car's network on, and let a gate judge it. The drives of the gate are kept aside."""
     from pdhef_logtool.learning.retrain.retrain_command import DEFAULT_GATE, RetrainSettings
     from pdhef_logtool.learning.retrain.retrain_command import retrain as train_again
     from pdhef_logtool.results.gate import load_gate

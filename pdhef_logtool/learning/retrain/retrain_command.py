@@ -278,8 +278,10 @@ def _look(
         if seen is None:
             reason = "it could not be read" if ended.failure is None else ended.failure.reason
             seen = _Seen(_unread(log_input, reason), None)
-        records[log_input.stem] = replace(seen.record, sha256=hashes[log_input.stem])
+        sha256 = seen.record.sha256 or hashes[log_input.stem]  # a slim log is known by that which it stands for
+        records[log_input.stem] = replace(seen.record, sha256=sha256)
         known[hashes[log_input.stem]] = {
+            "sha256": sha256,
             "signals_sha256": seen.signals_sha256,
             "left_out": seen.record.left_out,
             "span_s": seen.record.span_s,
@@ -292,7 +294,7 @@ def _look(
         again = DriveRecord(
             log_input.stem,
             log_input.path.name,
-            hashes[log_input.stem],
+            found["sha256"],
             seconds=0.0 if span is None else span[1] - span[0],
             span_s=span,
             left_out=found["left_out"],
