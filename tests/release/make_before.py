@@ -30,7 +30,7 @@ def main(folder: Path) -> None:
     car, bundle, dataset = (str(folder / name) for name in ("car", "bundle", "dataset"))
     road = ("sample_logs/road.mcap", "--end", "60", "--parts", "static")
     _pdhef("identify", *road, "--car", "sample_logs/vehicle.toml", "-o", car)
-    _pdhef("tune", SAMPLES[0], "--car", car, "-o", car, "--trials", "2", *SLICE)
+    _pdhef("tune", SAMPLES[0], "--car", car, "-o", car, "--trials", "4", *SLICE)
     _pdhef("extract", *SAMPLES, "--car", car, "-o", dataset, *SLICE)
     tiny = Recipe(hidden=4, layers=1, head=(4,), epochs=1)
     train_on(read_dataset(Path(dataset)), Path(bundle), tiny)
