@@ -105,6 +105,14 @@ def _cut(_value: str, _tell: Tell) -> None:
     time.sleep(600)
 
 
+held: list[str] = []
+
+
+def _hold(value: str, _tell: Tell) -> tuple[int, list[str]]:
+    held.append(value)
+    return os.getpid(), held
+
+
 def _alone(value: str, tell: Tell) -> int:
     """Be lost the first time; the second time return how many workers there are."""
     _kill_once(value, tell)
@@ -128,4 +136,5 @@ _FAULTS = {
     "odd": lambda _value, _tell: Odd(),
     "unreadable": lambda _value, _tell: Unreadable(),
     "alone": _alone,
+    "hold": _hold,
 }
