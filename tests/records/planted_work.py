@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.supervisor import Tell
 
 #: What to do, and the value to return or a path.
@@ -105,6 +106,19 @@ def _cut(_value: str, _tell: Tell) -> None:
     time.sleep(600)
 
 
+def _wait(value: str, tell: Tell) -> str:
+    """Note the process that it begins in, wait for the word to go on, and write a file that appears whole."""
+    path = Path(value)
+    with path.with_suffix(".begun").open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    while not (path.parent / "go").exists():
+        tell("at wait", 0.5)
+        time.sleep(0.01)
+    with PendingFile(path.with_suffix(".done")) as pending:
+        pending.path.write_text(value)
+    return value
+
+
 held: list[str] = []
 
 
@@ -137,4 +151,5 @@ _FAULTS = {
     "unreadable": lambda _value, _tell: Unreadable(),
     "alone": _alone,
     "hold": _hold,
+    "wait": _wait,
 }
