@@ -37,8 +37,9 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
-#: Neighbouring windows share the span at their border; this many decoded spans are kept for the next window.
-_KEPT_SPANS = 2
+#: Neighbouring windows share the span at their border: so many loaded spans are kept for the next window, and of a
+#: short log all that fit into so many bytes, for it is looked at several times before it is read.
+_KEPT_SPANS, _KEPT_BYTES = 2, 8 << 20
 
 
 class ColumnarLog:
@@ -74,6 +75,7 @@ class ColumnarLog:
         self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
+        self._fields: dict[tuple[int, int], tuple[FieldInfo, ...]] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
         self._wanted: set[tuple[int, int]] = set()  # and of these the ones whose messages somebody wanted
@@ -168,16 +170,18 @@ class ColumnarLog:
         for c, channel in self._by_topic.get(topic, ()):
             if not quiet:
                 self._asked.add((c, channel.id))
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if isinstance(schema, MessageSchema):
-                return tuple(leaves(schema.root))
+                if (c, channel.id) not in self._fields:
+                    self._fields[c, channel.id] = tuple(leaves(schema.root))
+                return self._fields[c, channel.id]
         return ()
 
     def unreadable(self, topic: str) -> str:
         """Return why no field of a topic is known: a definition that is missing, an encoding; empty where one is."""
         reasons = []
         for c, channel in self._by_topic.get(topic, ()):
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if isinstance(schema, MessageSchema):
                 return ""
             if isinstance(schema, MissingDefinitionError):
@@ -189,14 +193,14 @@ class ColumnarLog:
 
     def borrowed(self, topic: str) -> tuple[Path, ...]:
         """Return the files of an installed ROS that a topic's type is read by."""
-        schemas = (self._schema(c, channel) for c, channel in self._by_topic.get(topic, ()))
+        schemas = (self.schema_of(c, channel) for c, channel in self._by_topic.get(topic, ()))
         return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic whole; what does not decode is left out."""
         found: list[object] = []
         for c, channel in self._by_topic.get(topic, ()):
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if not isinstance(schema, MessageSchema):
                 continue
             decode = ChannelDecoder(schema, ()).single_decoder()
@@ -279,7 +283,7 @@ class ColumnarLog:
             container.account.decode(*extent)
             self._hold_against(c, span, block, want)
         self._kept[(*key, want)] = block
-        while len(self._kept) > _KEPT_SPANS:
+        while len(self._kept) > _KEPT_SPANS and sum(b.nbytes for b in self._kept.values()) > _KEPT_BYTES:
             self._kept.pop(next(iter(self._kept)))
         return block
 
@@ -311,7 +315,8 @@ class ColumnarLog:
                 self._partial[c, span.index, (kind, want)] = loss
                 container.account.lose_share((at, end), count / (len(block) + missing))
 
-    def _schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
+    def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
+        """Return the schema of a channel of the c-th container, or why there is none."""
         key = (c, channel.id)
         if key not in self._schemas:
             self._schemas[key] = self._parse_schema(c, channel)
@@ -367,7 +372,7 @@ class ColumnarLog:
         if topic not in self._by_topic:
             raise self._no_such_topic(topic)
         for c, channel in self._by_topic[topic] if paths else ():
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if isinstance(schema, SchemaError):
                 problems.append(
                     MappingError(

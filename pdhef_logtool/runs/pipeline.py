@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
-from pdhef_logtool.car.parts import PHYSICS, Algorithm
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.algorithm import resolve
@@ -387,7 +387,8 @@ def _run_estimators(
         shown = _shown(main, [e.name for e in ready])
         sinks = opened.enter_context(_open_sinks(change, drive, config, car, shown, outputs.path))
         _write(store, sinks)
-        rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
+        digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
+        rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in found.rows]
         events = found.events
         if not found.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
@@ -427,15 +428,11 @@ def _car_facts(car: Car) -> CarFacts:
     return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network)
 
 
-def _short(algorithm: Algorithm | None) -> str:
-    return "" if algorithm is None else algorithm.sha256[:SHOWN_DIGITS]
-
-
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     """Return how a log that was read is recorded in run.json."""
     return LogOutcome(
         log=drive.name,
-        file=drive.path.name,
+        file=drive.file,
         sha256=drive.sha256,
         signals_sha256=drive.signals_sha256,
         truth_sha256=drive.truth_sha256,
@@ -579,7 +576,7 @@ def report_facts(
     return ReportFacts(
         log=LogFacts(
             name=drive.name,
-            file=drive.path.name,
+            file=drive.file,
             kind=log.kind,
             sha256=drive.sha256,
             signals_sha256=drive.signals_sha256,

@@ -9,6 +9,7 @@ import platform
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
@@ -219,11 +220,15 @@ class LogOutcome:
 
 def tool_versions() -> dict[str, str]:
     """Return the versions of Python and of the installed distributions that decide what a run computes."""
-    versions = {"python": platform.python_version()}
-    for name in VERSIONED:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
+    return {"python": platform.python_version(), **{name: found for name in VERSIONED if (found := _installed(name))}}
+
+
+@cache
+def _installed(distribution: str) -> str | None:
+    """Return the version of a distribution, None where it is not installed; the file is read once a process."""
+    with suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(distribution)
+    return None
 
 
 def build_report(facts: ReportFacts) -> dict[str, Any]:

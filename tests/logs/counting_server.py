@@ -22,7 +22,7 @@ class Request:
     headers: dict[str, str]
 
 
-#: What a fault does with the n-th request of a path (from 0): True if it has dealt with it.
+#: What a fault does with the n-th request of a path (from 0): True if it has dealt with it, and noted it.
 Fault = Callable[["_Handler", int], bool]
 
 
@@ -82,7 +82,6 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, path: str, n: int) -> None:
         of = self.of
         if of.fault is not None and of.fault(self, n):
-            self.note(path, 0, 0)
             return
         data = of.files.get(path)
         if data is None:
@@ -147,6 +146,7 @@ def status(code: int, headers: dict[str, str] | None = None, times: int = 10**9,
 
     def fault(handler: _Handler, n: int) -> bool:
         if after <= n < after + times:
+            handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)
             handler.plain(code, headers)
             return True
         return False
@@ -181,6 +181,7 @@ def stalling(seconds: float) -> Fault:
     """Say nothing."""
 
     def fault(handler: _Handler, n: int) -> bool:
+        handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)
         time.sleep(seconds)
         handler.close_connection = True
         return True

@@ -1,0 +1,419 @@
+"""Logs on a server: the same figures as from the file, each byte once, few requests, faults in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from counting_server import CountingServer, cutting, serving, stalling, status
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.logs import remote_objects, remote_source
+from pdhef_logtool.logs.byte_source import SourceError
+from pdhef_logtool.logs.container import Wanted
+from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
+from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.open_log import log_metadata, open_log
+from pdhef_logtool.logs.remote_place import RemotePlace
+from pdhef_logtool.logs.remote_source import RemoteSource, join_ranges, without
+from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
+
+pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
+
+NOTHING_YET = Wanted(frozenset())
+
+
+@pytest.fixture(scope="module")
+def saloon() -> Car:
+    return Car.load("saloon")
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    quick = remote_objects.Patience(connect_s=2.0, silence_s=0.2, tries=3, first_wait_s=0.01, most_wait_s=0.02)
+    monkeypatch.setattr(remote_objects, "PATIENCE", quick)
+    yield
+    for spool in list(remote_source._spools.values()):
+        assert spool.users == 0, "a source was not closed"
+        remote_source._forget(spool)
+
+
+def _all_of(log: DriveLog) -> list[tuple[object, ...]]:
+    """Return every stamp and number of a log, its topics and losses."""
+    found: list[tuple[object, ...]] = []
+    for topic in log.topics:
+        fields = [f.path for f in log.fields(topic.name) if f.kind == "number"]
+        columns = log.read({topic.name: fields})[topic.name]
+        values = b"".join(np.asarray(v).tobytes() for v in columns.fields.values())
+        found.append((topic, columns.log_time_ns.tobytes(), columns.publish_time_ns.tobytes(), values))
+    return [*found, (log.start_ns, log.end_ns, [dataclasses.replace(x, where="") for x in log.lost])]
+
+
+def _read(place: Path | RemotePlace) -> list[tuple[object, ...]]:
+    log = open_log(place)
+    try:
+        return _all_of(log)
+    finally:
+        log.close()
+
+
+def _place(server: CountingServer, name: str) -> RemotePlace:
+    return RemotePlace(server.place(name))
+
+
+# ------------------------------------------------------------------------------------------------------- ranges
+
+_EXTENTS = st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 3 * 10**5)).map(lambda x: (x[0], x[0] + x[1])))
+
+
+def _covered(extents: list[tuple[int, int]]) -> set[int]:
+    return {at for start, end in extents for at in range(start // 1000, -(-end // 1000))}
+
+
+@settings(max_examples=40, deadline=None)
+@given(_EXTENTS, _EXTENTS)
+def test_ranges_cover_what_is_wanted_and_nothing_that_is_held(wanted, held) -> None:
+    ranges = join_ranges(wanted, held)
+    assert without(wanted, [*held, *ranges]) == []
+    assert without(ranges, held) == without(ranges, [])
+    assert ranges == sorted(ranges)
+    assert all(0 < end - start <= remote_source.MOST_RANGE_BYTES for start, end in ranges)
+    extra = sum(end - start for start, end in without(ranges, [*wanted, *held]))
+    assert extra <= remote_source.JOINED_GAP_BYTES * max(len(wanted) - 1, 0)
+
+
+def test_a_small_gap_is_fetched_along_and_a_large_range_is_cut() -> None:
+    gap = remote_source.JOINED_GAP_BYTES
+    assert join_ranges([(0, 10), (10 + gap, 20 + gap)]) == [(0, 20 + gap)]
+    assert join_ranges([(0, 10), (11 + gap, 20 + gap)]) == [(0, 10), (11 + gap, 20 + gap)]
+    assert join_ranges([(0, 10), (30, 40)], [(15, 20)]) == [(0, 10), (30, 40)]
+    most = remote_source.MOST_RANGE_BYTES
+    assert join_ranges([(0, 2 * most + 1)]) == [(0, most), (most, 2 * most), (2 * most, 2 * most + 1)]
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 400_000), st.integers(0, 200_000)), max_size=8), st.randoms())
+def test_any_split_of_ranges_gives_the_same_bytes(reads: list[tuple[int, int]], order: random.Random) -> None:
+    data = random.Random(1).randbytes(400_000)
+    with serving(x=data) as server:
+        source = RemoteSource(_place(server, "x"))
+        try:
+            source.expect([(at, at + n) for at, n in reads if order.random() < 0.5])
+            order.shuffle(reads)
+            for at, n in reads:
+                assert source.fetch(at, n) == data[at : at + n]
+            source.fetch_whole()
+            assert source.path.read_bytes() == data
+            assert source.fetch(0, len(data)) == data
+        finally:
+            source.close()
+            for spool in list(remote_source._spools.values()):
+                remote_source._forget(spool)
+        assert server.twice() == 0
+
+
+# -------------------------------------------------------------------------------------------------- the same log
+
+
+@pytest.mark.parametrize("name", ["dlc.mcap", "faults.mcap", "no_truth.mcap"])
+def test_same_as_the_file_and_each_byte_once(sample_logs_dir: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_source, "MOST_RANGE_BYTES", 30_000)
+    file = sample_logs_dir / name
+    with serving(**{name: file.read_bytes()}) as server:
+        assert _read(_place(server, name)) == _read(file)
+        assert server.twice() == 0
+        assert server.bytes_sent == file.stat().st_size
+        assert 1 < server.most_at_once <= remote_source.AT_ONCE
+
+
+def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car) -> None:
+    file = sample_logs_dir / "faults.mcap"
+    with serving(**{file.name: file.read_bytes()}) as server:
+        found = []
+        for place in (_place(server, file.name), file):
+            with read_drive(place, saloon) as drive:
+                signals = [w.signals for w in drive.windows()]
+                arrays = [getattr(s, f.name) for s in signals for f in dataclasses.fields(s)]
+                found.append(([a.tobytes() for a in arrays if isinstance(a, np.ndarray)], drive.signals_sha256))
+                found[-1] += (drive.losses, drive.notes, drive.byte_ledgers)
+                sha256 = drive.sha256
+            if place is not file:
+                assert server.bytes_sent <= 1.02 * file.stat().st_size
+                assert server.twice() == 0
+                assert len(server.requests) <= 12
+                assert sha256 == identity_of(LogInput(place, "x"))
+        assert found[0] == found[1]
+
+
+def _write_apart(path: Path, seconds: int, groups: dict[str, tuple[list[str], int]]) -> None:
+    """Write a log whose chunks hold the topics of one group each: topics and bytes a message."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 30)
+        writer.start()
+        schema = writer.register_schema("test_msgs/msg/Noisy", "ros2msg", b"float64 data\nuint8[] noise")
+        topics = [t for names, _ in groups.values() for t in names]
+        ids = {t: writer.register_channel(t, "cdr", schema) for t in topics}
+        noise = random.Random(2)
+        for block in range(seconds // 10):
+            for names, size in groups.values():
+                for i in range(1000):
+                    for topic in names:
+                        at = 1_700_000_000_000_000_000 + (block * 1000 + i) * 10_000_000
+                        data = b"\0\1\0\0" + struct.pack("<dI", i, size) + noise.randbytes(size)
+                        writer.add_message(ids[topic], at, data, at, i)
+                writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
+        writer.finish()
+
+
+def test_topics_apart_cost_three_requests_and_the_wanted_chunks(tmp_path: Path) -> None:
+    file = tmp_path / "apart.mcap"
+    _write_apart(file, 80, {"imu": (["/imu", "/wheels"], 20), "camera": (["/camera"], 500), "lidar": (["/lidar"], 300)})
+    with serving(**{file.name: file.read_bytes()}) as server:
+        place = _place(server, file.name)
+        whole = open_log(file)
+        first = open_log(place, wanted=NOTHING_YET)
+        assert len(server.requests) <= 3
+        assert first.topics == whole.topics
+        assert (first.start_ns, first.end_ns) == (whole.start_ns, whole.end_ns)
+        log = open_log(place, wanted=Wanted(frozenset({"/imu"})))
+        first.close()
+        asked = {"/imu": ["data"]}
+        here, there = whole.read(asked)["/imu"], log.read(asked)["/imu"]
+        assert here.fields["data"].tobytes() == there.fields["data"].tobytes()
+        assert here.log_time_ns.tobytes() == there.log_time_ns.tobytes()
+        assert log.lost == ()
+        log.close()
+        whole.close()
+        chunks = 8
+        assert len(server.requests) <= 3 + chunks
+        assert server.twice() == 0
+        assert server.bytes_sent < 0.2 * file.stat().st_size + 2 * remote_source.JOINED_GAP_BYTES + (256 << 10)
+
+
+def _stale_index(data: bytes) -> bytes:
+    """Return a log whose summary claims one message more than there is; its CRC is right again."""
+    import zlib
+
+    foot = len(data) - 8 - 29
+    start = int.from_bytes(data[foot + 9 : foot + 17], "little")
+    summary, at = bytearray(data[start:foot]), 0
+    while at < len(summary):
+        opcode, length = summary[at], int.from_bytes(summary[at + 1 : at + 9], "little")
+        if opcode == 0x0B:
+            summary[at + 9] += 1
+        at += 9 + length
+    footer = data[foot : foot + 25]
+    crc = struct.pack("<I", zlib.crc32(footer, zlib.crc32(bytes(summary))))
+    return data[:start] + bytes(summary) + footer + crc + data[-8:]
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda data: data[: len(data) * 2 // 3],
+        lambda data: data[:-40],
+        lambda data: data[:50_000] + bytes(64) + data[50_064:],
+        _stale_index,
+    ],
+    ids=["cut", "no footer", "damaged", "wrong statistics"],
+)
+def test_a_damaged_log_loses_the_same(tmp_path: Path, sample_logs_dir: Path, spoil: Callable[[bytes], bytes]) -> None:
+    file = tmp_path / "damaged.mcap"
+    file.write_bytes(spoil((sample_logs_dir / "dlc.mcap").read_bytes()))
+    with serving(**{file.name: file.read_bytes()}) as server:
+        first = open_log(_place(server, file.name), wanted=NOTHING_YET)
+        log = open_log(_place(server, file.name), wanted=Wanted(frozenset({"/imu/data"})))
+        first.close()
+        local = open_log(file)
+        assert _all_of(log) == _all_of(local)
+        assert any(True for _ in local.lost)
+        log.close()
+        local.close()
+        assert server.twice() == 0
+
+
+def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_dir: Path) -> None:
+    import zstandard
+
+    plain = (sample_logs_dir / "dlc.mcap").read_bytes()
+    database = next((sample_logs_dir / "step_rosbag2").glob("*.db3"), None)
+    files = {"dlc.mcap.zst": zstandard.ZstdCompressor(1).compress(plain)}
+    if database is not None:
+        files["step.db3"] = database.read_bytes()
+    with serving(**files) as server:
+        for name, data in files.items():
+            file = tmp_path / name
+            file.write_bytes(data)
+            assert _read(_place(server, name)) == _read(file)
+        assert server.twice() == 0
+
+
+def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> None:
+    file = sample_logs_dir / "dlc.mcap"
+    with serving(**{file.name: file.read_bytes()}) as server:
+        server.ranges = False
+        assert _read(_place(server, file.name)) == _read(file)
+        assert len(server.requests) == 1
+
+
+def test_metadata_is_read_from_head_and_tail(sample_logs_dir: Path) -> None:
+    file = sample_logs_dir / "road.mcap"
+    with serving(**{file.name: file.read_bytes()}) as server:
+        assert log_metadata(_place(server, file.name)) == log_metadata(file)
+        assert server.bytes_sent < 0.1 * file.stat().st_size
+
+
+# ------------------------------------------------------------------------------------------------------- faults
+
+
+def _error(server: CountingServer, name: str = "dlc.mcap") -> SourceError:
+    with pytest.raises(SourceError) as raised:
+        _read(_place(server, name))
+    text = str(raised.value)
+    assert "\n" not in text
+    assert f"{server.url}/{name}" in text
+    assert raised.value.exit_code == EXIT_FAILURE
+    return raised.value
+
+
+@pytest.fixture
+def served(sample_logs_dir: Path) -> Iterator[CountingServer]:
+    with serving(**{"dlc.mcap": (sample_logs_dir / "dlc.mcap").read_bytes()}) as server:
+        yield server
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "requests"),
+    [
+        (status(429, {"Retry-After": "1"}), "status 429, 3 times in turn", 3),
+        (status(503), "status 503, 3 times in turn", 3),
+        (status(503, after=1), "status 503, 3 times in turn", 4),
+        (status(404), "no such object", 1),
+        (status(403), "it refuses access", 1),
+        (status(302, {"Location": "/dlc.mcap"}), "cannot be asked for", None),
+        (cutting(100), "an answer that is cut, 3 times in turn", 3),
+        (stalling(0.4), "silence of 0.2 s, 3 times in turn", 3),
+    ],
+    ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "stalls"],
+)
+def test_faults_end_in_one_line(served: CountingServer, fault, words: str, requests: int | None) -> None:
+    served.fault = fault
+    assert words in str(_error(served))
+    assert requests is None or len(served.requests) == requests
+
+
+def test_a_server_that_is_busy_or_cuts_for_a_while_costs_time_only(served: CountingServer, sample_logs_dir) -> None:
+    served.fault = status(503, times=2)
+    assert _read(_place(served, "dlc.mcap")) == _read(sample_logs_dir / "dlc.mcap")
+    served.files["again.mcap"] = served.files["dlc.mcap"]
+    served.requests.clear()
+    served.fault = cutting(150_000, times=5)
+    assert _read(_place(served, "again.mcap")) == _read(sample_logs_dir / "dlc.mcap")
+    assert served.twice() == 0, "a cut range goes on where it was cut"
+
+
+@pytest.mark.parametrize("without_headers", [(), ("ETag",), ("ETag", "Last-Modified")])
+def test_a_changed_object_is_an_error(served: CountingServer, without_headers: tuple[str, ...]) -> None:
+    served.without = frozenset(without_headers)
+    log = open_log(_place(served, "dlc.mcap"), wanted=NOTHING_YET)
+    served.files["dlc.mcap"] = served.files["dlc.mcap"][:-1000]
+    with pytest.raises(SourceError, match=r"expected the object that was opened, got another one"):
+        _all_of(log)
+    log.close()
+    log = open_log(_place(served, "dlc.mcap"))  # opening pins what it is now
+    assert log.lost
+    log.close()
+
+
+def test_nobody_answers() -> None:
+    with serving(x=b"") as server:
+        gone = server.url
+    with pytest.raises(SourceError, match="no connection"):
+        open_log(f"{gone}/x.mcap")
+
+
+def test_empty_and_other_content(served: CountingServer) -> None:
+    served.files |= {"empty.mcap": b"", "page.html": b"<html>" * 1000}
+    with pytest.raises(LogError, match="an empty file"):
+        open_log(served.place("empty.mcap"))
+    with pytest.raises(LogError, match="none of these"):
+        open_log(served.place("page.html"))
+    assert served.bytes_sent <= remote_source.HEAD_BYTES
+
+
+def test_no_room_is_said(served: CountingServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_source, "_DISK_RESERVE_BYTES", 1 << 60)
+    assert "set TMPDIR" in str(_error(served))
+
+
+# -------------------------------------------------------------------------------------------- names and secrets
+
+
+def test_nothing_secret_is_shown(served: CountingServer) -> None:
+    secret = served.place("dlc.mcap").replace("http://", "http://me:hunter2@") + "?X-Amz-Signature=cafe&part=1"
+    place = RemotePlace(secret)
+    assert str(place) == served.place("dlc.mcap")
+    assert place.identity == served.place("dlc.mcap") + "?part=1"
+    assert "hunter2" not in repr(find_logs([secret]))
+    log = open_log(secret)
+    assert "hunter2" not in repr((log.path, log.lost, log.byte_ledgers))
+    log.close()
+    assert served.requests[0].headers["Authorization"].startswith("Basic ")
+    served.fault = status(500)
+    with pytest.raises(SourceError) as raised:
+        open_log(secret)
+    assert not {"hunter2", "cafe"} & set(str(raised.value).replace("=", " ").replace("@", " ").split())
+    assert [r.path for r in served.requests if r.path != "dlc.mcap"] == []
+
+
+def test_identity_is_url_size_and_etag(served: CountingServer) -> None:
+    (log,) = find_logs([served.place("dlc.mcap")])
+    first = identity_of(log)
+    assert len(served.requests) == 1
+    assert identity_of(log) == first
+    (signed,) = find_logs([served.place("dlc.mcap") + "?Signature=2"])
+    assert identity_of(signed) == first
+    served.files["dlc.mcap"] += b"x"
+    assert identity_of(log) != first
+
+
+def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_logs_dir: Path) -> None:
+    listed = tmp_path / "list.txt"
+    dlc = sample_logs_dir / "dlc.mcap"
+    listed.write_text(f"# drives\nhttps://host/a/one.mcap\n\n{dlc}\nhttps://host/b/one.mcap\n")
+    found = find_logs([f"@{listed}", str(dlc)])
+    assert [str(i.path) for i in found] == ["https://host/a/one.mcap", str(dlc), "https://host/b/one.mcap"]
+    assert len({i.stem for i in found}) == 3
+    assert [i.stem for i in find_logs(["https://host/a/one.mcap", "https://host/b/one.mcap"])] == ["a__one", "b__one"]
+    assert find_logs(["https://host/a/one.mcap?x=1"])[0].stem == "one"
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "@odd").mkdir()
+    (tmp_path / "@odd" / "drive.mcap").write_bytes(dlc.read_bytes())
+    assert [i.stem for i in find_logs(["@odd"])] == ["drive"]
+    assert [i.stem for i in find_logs(["@odd/*.mcap"])] == ["drive"]
+    with pytest.raises(UsageError, match="s3://, http://, https://"):
+        find_logs(["gs://bucket/one.mcap"])
+    with pytest.raises(UsageError, match="s3://, http://, https://"):
+        find_logs(["https://"])
+
+
+def test_a_hint_of_time_leaves_the_others_chunks_alone(tmp_path: Path) -> None:
+    file = tmp_path / "apart.mcap"
+    _write_apart(file, 40, {"imu": (["/imu"], 200), "camera": (["/camera"], 500)})
+    with serving(**{file.name: file.read_bytes()}) as server:
+        start = 1_700_000_000_000_000_000
+        wanted = Wanted(frozenset({"/imu"}), start, start + 5_000_000_000)
+        log = open_log(_place(server, file.name), wanted=wanted)
+        later = log.read({"/imu": ["data"]}, start + 35_000_000_000)["/imu"]  # a hint, and no bound
+        assert len(later) == 500
+        log.close()
+        assert server.bytes_sent < 0.5 * file.stat().st_size + (256 << 10)
