@@ -122,6 +122,7 @@ class ReadDrive:
 
     def __init__(self, whole: WholeDrive = WHOLE) -> None:
         self.name, self.path, self.plan, self.sha256 = whole.name, whole.path, whole.plan, "1" * 64
+        self.file = whole.path.name
         topic = SimpleNamespace(label="/ins.v")
         self.mapping = SimpleNamespace(truth={"vy_m_s": topic, "vx_m_s": topic})
         self.friction, self.losses, self.notes = SimpleNamespace(label="none"), (), ["a note"]
