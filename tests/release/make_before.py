@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-SAMPLES = [f"sample_logs/{name}.mcap" for name in ("dlc", "step", "fishhook")]
+SAMPLES = [f"sample_logs/{name}.mcap" for name in ("dlc", "step")]
 SLICE = ("--start", "2", "--end", "4.5")
 NOT_READ = ("*.png", "*.html", "*.rrd", "*.mcap", "*.xml", "foxglove.json", "*.jsonl")
 
@@ -31,13 +31,14 @@ def main(folder: Path) -> None:
     road = ("sample_logs/road.mcap", "--end", "60", "--parts", "static")
     _pdhef("identify", *road, "--car", "sample_logs/vehicle.toml", "-o", car)
     _pdhef("tune", SAMPLES[0], "--car", car, "-o", car, "--trials", "4", *SLICE)
-    _pdhef("extract", *SAMPLES, "--car", car, "-o", dataset, *SLICE)
+    for split, log in zip(("train", "validation"), SAMPLES, strict=True):
+        _pdhef("extract", log, "--car", car, "-o", dataset, "--split", split, *SLICE)
     tiny = Recipe(hidden=4, layers=1, head=(4,), epochs=1)
     train_on(read_dataset(Path(dataset)), Path(bundle), tiny)
-    _pdhef("calibrate", *SAMPLES[:2], "--car", car, "-o", car, "--vary", "0", "--network", bundle, *SLICE)
+    _pdhef("calibrate", *SAMPLES, "--car", car, "-o", car, "--vary", "0", "--network", bundle, *SLICE)
     estimators = ("-e", "pd-hef,physics,zero", "--annotate", "none", *SLICE)
-    _pdhef("run", *SAMPLES[:2], "-o", str(folder / "run"), "--car", car, "--network", bundle, *estimators)
-    _pdhef("run", *SAMPLES[:2], "-o", str(folder / "again"), "--car", "saloon", *estimators)
+    _pdhef("run", *SAMPLES, "-o", str(folder / "run"), "--car", car, "--network", bundle, *estimators)
+    _pdhef("run", *SAMPLES, "-o", str(folder / "again"), "--car", "saloon", *estimators)
     for pattern in NOT_READ:
         for path in folder.rglob(pattern):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
