@@ -481,7 +481,7 @@ def _open_sinks(
         if config.annotate != "none":
             source = drive.log if config.annotate == "full" else None
             names = None if config.estimators else frozenset({shown.main, TRUTH})
-            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names))
+            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names, shown={shown.main, TRUTH}))
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
             sinks.append(LayoutsSink(*layouts, names, colours))
         application_id = _application_id(output, config)
@@ -492,6 +492,7 @@ def _open_sinks(
                 log_name=drive.name,
                 input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
                 start_ns=drive.plan.start_ns,
+                end_ns=drive.plan.end_ns,
                 shown=shown,
                 min_speed_m_s=car.vehicle.low_speed_blend_m_s,
                 colours=colours,
