@@ -80,7 +80,7 @@ def find_logs(arguments: Logs) -> list[LogInput]:
                 remedy="name a log, a folder that holds some, or a glob pattern in quotes",
             )
         for place in places:
-            found.setdefault(place.url if isinstance(place, RemotePlace) else os.path.realpath(place), place)
+            found.setdefault(place.identity if isinstance(place, RemotePlace) else os.path.realpath(place), place)
     return _with_stems(list(found.values()))
 
 

@@ -10,6 +10,8 @@ import asyncio
 import hashlib
 import os
 import shutil
+import sys
+from bisect import bisect_right
 from collections.abc import Coroutine, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -44,6 +46,7 @@ _KEPT_BYTES = 4 << 30
 _KEPT_OBJECTS = 1000
 
 
+_AT_END = sys.maxsize
 _NOTHING = ObjectState(0, "", "")
 
 
@@ -85,6 +88,18 @@ def _append(found: list[Extent], start: int, end: int) -> None:
         found[-1] = (found[-1][0], end)
     else:
         found.append((start, end))
+
+
+def _insert(held: list[Extent], extent: Extent) -> None:
+    """Add an extent to others that are apart from it and each other, and ascend; neighbours are joined."""
+    at = bisect_right(held, extent)
+    start, end = extent
+    if at < len(held) and held[at][0] == end:
+        end = held.pop(at)[1]
+    if at > 0 and held[at - 1][1] == start:
+        at -= 1
+        start = held.pop(at)[0]
+    held.insert(at, (start, end))
 
 
 def _any_in(held: Sequence[Extent], start: int, end: int) -> bool:
@@ -247,7 +262,7 @@ class _Spool:
         with self._lock:
             if (extent, future) in self.coming:
                 self.coming.remove((extent, future))
-                self.held = without([*self.held, extent], [])
+                _insert(self.held, extent)
 
     def read(self, start: int, end: int) -> bytes:
         """Return bytes [start, end)."""
@@ -259,7 +274,8 @@ class _Spool:
 
     def held_to(self, start: int, end: int) -> int:
         """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""
-        return next((min(high, end) for low, high in self.held if low <= start < high), start)
+        at = bisect_right(self.held, (start, _AT_END)) - 1
+        return min(self.held[at][1], end) if at >= 0 and self.held[at][1] > start else start
 
     async def _get(self, start: int, end: int) -> None:
         async with self._at_once:
