@@ -28,10 +28,10 @@ SAMPLE = ROOT / "sample_logs" / "road.mcap"
 COMMANDS = {
     "inspect": ["inspect", "{}", "--json"],
     "run": ["run", "{}", "-o", "{out}"],
-    "run, a slice of 60 s": ["run", "{}", "--start", "+60s", "--end", "+120s", "-o", "{out}"],
+    "run --annotate sidecar": ["run", "{}", "--annotate", "sidecar", "-o", "{out}"],
 }
 _SLICE_NS = 20_000_000_000
-_IMAGE_BYTES, _IMAGE_NS = 40_000, 100_000_000
+_IMAGE_BYTES, _IMAGE_NS = 20_000, 200_000_000
 _CAMERA = ("sensor_msgs/msg/CompressedImage", "ros2msg", b"uint8[] data")
 
 #: Name, encoding and text of a message's definition.
@@ -64,9 +64,9 @@ def _with_camera(source: Path) -> Iterator[list[Message]]:
     sensors: list[Message] = []
 
     def images(start_ns: int) -> list[Message]:
-        size = len(noise_bytes := noise.randbytes(_IMAGE_BYTES))
-        data = b"\0\1\0\0" + size.to_bytes(4, "little") + noise_bytes
-        return [("/camera", _CAMERA, at, data) for at in range(start_ns, start_ns + _SLICE_NS, _IMAGE_NS)]
+        head = b"\0\1\0\0" + _IMAGE_BYTES.to_bytes(4, "little")
+        stamps = range(start_ns, start_ns + _SLICE_NS, _IMAGE_NS)
+        return [("/camera", _CAMERA, at, head + noise.randbytes(_IMAGE_BYTES)) for at in stamps]
 
     with source.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
