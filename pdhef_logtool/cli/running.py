@@ -105,6 +105,29 @@ def metrics(
     _finish(result, as_json)
 
 
+@options.command(
+    commands,
+    "pdhef slim fleet/ -o slim",
+    "pdhef run slim/ -o out --car mycar",
+    "pdhef slim drive.bag -o slim --mapping mapping.toml",
+    notes="A slim log needs no mapping, no definitions and no DBC: it holds what it was made with.",
+)
+def slim(
+    logs: options.Logs,
+    output: Annotated[Path, Option("--output", "-o", help="Folder for the slim logs, one NAME.mcap each.")],
+    config: RunConfig,
+    jobs: options.Jobs = 1,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Keep only what a run reads of logs. A run of a slim log has the same figures, bit for bit."""
+    from pdhef_logtool.cli.run_tables import render_slim
+    from pdhef_logtool.drive.slim import slim_logs
+
+    with console.progress() as bar:
+        result = slim_logs(logs, output, config.mapping, config.read_options, jobs=jobs, progress=bar)
+    console.finish(result, render_slim, as_json)
+
+
 @options.command(commands, "pdhef view out", "pdhef view out --log drive", "pdhef view out --web")
 def view(
     output: Annotated[Path, Argument(metavar="OUTPUT", help="Folder of a run or of one of its logs, or a .rrd file.")],

@@ -18,7 +18,8 @@ from pdhef_logtool.logs.discovery import LogInput, find_logs, identity_of
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace
-from pdhef_logtool.mapping import Mapping, check_mapping, choose_mapping, merge_losses
+from pdhef_logtool.logs.slim_log import SlimLog
+from pdhef_logtool.mapping import ChosenMapping, Mapping, check_mapping, choose_mapping, merge_losses
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
@@ -72,8 +73,8 @@ class Drive:
 
     Attributes
     ----------
-    name : of the log in tables and folders. missing : signals that the mapping lacks. plan : what was decided from the
-        first minutes; another one may be put in its place before reading.
+    name : of the log in tables and folders. chosen : the mapping as it was before anything was decided.
+    plan : what was decided from the first minutes; another one may be put in its place before reading.
     friction : what :meth:`windows` fills in; another one may be put in its place before reading.
     notes : everything that was told of this drive: what may be wrong. remarks : what else is worth knowing.
     """
@@ -83,7 +84,7 @@ class Drive:
     car: Car
     options: ReadOptions
     plan: DrivePlan
-    missing: tuple[str, ...]
+    chosen: ChosenMapping
     notes: list[str]
     friction: FrictionSource
     _tell: Tell
@@ -102,6 +103,16 @@ class Drive:
         return self.plan.mapping
 
     @property
+    def file(self) -> str:
+        """Name of the file or folder; of a slim log that of the one that it stands for."""
+        return self.log.record.file if isinstance(self.log, SlimLog) else self.path.name
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Signals that the mapping lacks."""
+        return self.chosen.missing
+
+    @property
     def available(self) -> frozenset[str]:
         """Aligned signals that the log provides."""
         return self.plan.alignment.available
@@ -113,7 +124,12 @@ class Drive:
 
     @property
     def sha256(self) -> str:
-        """What the log is known by (:func:`identity_of`), computed when it is first asked for."""
+        """What the log is known by (:func:`identity_of`), computed when it is first asked for.
+
+        Of a slim log it is that of the one that it stands for.
+        """
+        if isinstance(self.log, SlimLog):
+            return self.log.record.identity
         self._sha256 = self._sha256 or identity_of(LogInput(self.path, self.name))
         return self._sha256
 
@@ -133,14 +149,15 @@ class Drive:
         found = merge_losses(
             [self.log.lost, () if self._reader is None else self._reader.losses, damage(self.sample_ledger)]
         )
-        return tuple(replace(x, where=self._without_folder(x.where)) for x in found)
+        return tuple(replace(x, where=self.without_folder(x.where)) for x in found)
 
     @property
     def byte_ledgers(self) -> tuple[ByteLedger, ...]:
         """Where the bytes of each file of the log went so far. Files are named without their folder."""
-        return tuple(replace(x, file=self._without_folder(x.file)) for x in self.log.byte_ledgers)
+        return tuple(replace(x, file=self.without_folder(x.file)) for x in self.log.byte_ledgers)
 
-    def _without_folder(self, where: str) -> str:
+    def without_folder(self, where: str) -> str:
+        """Return a place in the log without the folder that the log lies in."""
         return where.removeprefix(f"{self.path.parent}/")
 
     @property
@@ -256,20 +273,24 @@ def read_drive(
 
     opened = open_log(log_input.path, options.limits, options.msgs, wanted=Wanted(frozenset()))
     try:
-        chosen, missing = choose_mapping(
-            opened, mapping, told, remarks.append, prefer_truth=options.prefer_truth, require_signals=require_sensors
-        )
+        chosen = choose_mapping(opened, mapping, prefer_truth=options.prefer_truth, require_signals=require_sensors)
+        for ambiguity in chosen.ambiguities:
+            told(str(ambiguity))
+        remarks += chosen.remarks
+        if isinstance(opened, SlimLog):
+            remarks.append(f"a slim log stands for {opened.record.file}")
+        used = chosen.mapping
         if adjust is not None:
-            chosen = adjust(opened, chosen, told)
-            check_mapping(chosen, opened)
+            used = adjust(opened, used, told)
+            check_mapping(used, opened)
         if opened.end_ns <= opened.start_ns:
             raise no_samples(log_input.path)
         slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
         if not isinstance(log_input.path, Path):
-            opened = _reopened(opened, chosen, slice_ns, options)
+            opened = _reopened(opened, used, slice_ns, options)
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
-        plan = plan_drive(opened, chosen, car.vehicle, *slice_ns, require_imu=require_sensors)
-        for note in plan.mapping.notes[len(chosen.notes) :]:
+        plan = plan_drive(opened, used, car.vehicle, *slice_ns, require_imu=require_sensors)
+        for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
         _tell_doubts(plan, options, told)
         friction = friction_of(plan, car.vehicle, options)
@@ -278,7 +299,7 @@ def read_drive(
     except BaseException:
         opened.close()
         raise
-    return Drive(log_input.stem, opened, car, options, plan, missing, notes, friction, tell, remarks)
+    return Drive(log_input.stem, opened, car, options, plan, chosen, notes, friction, tell, remarks)
 
 
 def _reopened(log: DriveLog, mapping: Mapping, slice_ns: tuple[int, int], options: ReadOptions) -> DriveLog:

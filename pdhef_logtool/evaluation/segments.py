@@ -203,18 +203,33 @@ def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: f
     The Gaussian runs over samples of the median step, cut off at 4 σ, and does not reach across steps of more than
     ``RUN_GAP_S``. ``step_ns``: the median step, of the whole drive for a part of it.
     """
-    from scipy.ndimage import gaussian_filter1d
-
     out = np.full(values.shape, np.nan)
     if values.shape[0] < 2:
         return values.astype(np.float64)
     sigma = _sigma_rows(float(np.median(np.diff(stamps_ns))) if step_ns is None else step_ns, cutoff_hz)
     known = np.isfinite(values)
     for a, b in _runs(stamps_ns, np.ones(values.shape[0], dtype=np.bool_)):
-        weight = gaussian_filter1d(known[a:b].astype(np.float64), sigma, mode="constant")
-        total = gaussian_filter1d(np.where(known[a:b], values[a:b], 0.0), sigma, mode="constant")
+        weight = _gaussian(known[a:b].astype(np.float64), sigma)
+        total = _gaussian(np.where(known[a:b], values[a:b], 0.0), sigma)
         here = known[a:b]
         out[a:b][here] = total[here] / weight[here]
+    return out
+
+
+def _gaussian(values: FloatArray, sigma_rows: float) -> FloatArray:
+    """Return values [N], 0 beyond their ends, under a Gaussian cut off at 4 σ.
+
+    The same sums in the same order as SciPy's ``gaussian_filter1d``, which takes longer to load than a short log.
+    """
+    reach = int(4.0 * sigma_rows + 0.5)
+    weights = np.exp(-0.5 / (sigma_rows * sigma_rows) * np.arange(-reach, reach + 1) ** 2)
+    weights /= weights.sum()
+    n = len(values)
+    padded = np.concatenate([np.zeros(reach), values, np.zeros(reach)])
+    out: FloatArray = values * weights[reach]
+    for first in range(reach):
+        before, behind = padded[first : first + n], padded[2 * reach - first : 2 * reach - first + n]
+        out += (before + behind) * weights[first]
     return out
 
 

@@ -29,13 +29,13 @@ from pdhef_logtool.mapping import (
     Mapping,
     QualityGate,
     SignalSource,
-    auto_map,
     check_mapping,
     clock_key,
     fit_clocks,
     mapping_to_toml,
     merge_losses,
     read_signals,
+    recognise,
     resolve_mapping,
 )
 from pdhef_logtool.mapping.candidates import Candidate
@@ -202,7 +202,7 @@ def inspect_log(
     """Read a log once through and report on it; without a mapping the well-known types are recognised.
 
     Memory is bounded by windows of ten minutes, whatever the log's length. ``prefer_truth`` is the choice of
-    :func:`pdhef_logtool.mapping.auto_map`; ``budget`` is what reading may cost, ``msgs`` a folder with
+    :func:`pdhef_logtool.mapping.recognise`; ``budget`` is what reading may cost, ``msgs`` a folder with
     definitions of types that the log does not define.
 
     Raises
@@ -221,7 +221,7 @@ def inspect_drive_log(
     ambiguities: tuple[Ambiguity, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     if given is None:
-        auto = auto_map(log, prefer_truth=prefer_truth)
+        auto = recognise(log, prefer_truth=prefer_truth)
         mapping, ambiguities, candidates = auto.mapping, auto.ambiguities, auto.candidates
     else:
         check_mapping(given, log)

@@ -234,7 +234,7 @@ def record_of(
     """Return the record of a drive, after it was read."""
     return DriveRecord(
         name=drive.name,
-        file=drive.path.name,
+        file=drive.file,
         sha256=drive.sha256,
         split=split,
         seconds=0.0 if whole is None else whole.seconds,

@@ -168,7 +168,7 @@ class ColumnarLog:
         for c, channel in self._by_topic.get(topic, ()):
             if not quiet:
                 self._asked.add((c, channel.id))
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if isinstance(schema, MessageSchema):
                 return tuple(leaves(schema.root))
         return ()
@@ -177,7 +177,7 @@ class ColumnarLog:
         """Return why no field of a topic is known: a definition that is missing, an encoding; empty where one is."""
         reasons = []
         for c, channel in self._by_topic.get(topic, ()):
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if isinstance(schema, MessageSchema):
                 return ""
             if isinstance(schema, MissingDefinitionError):
@@ -189,14 +189,14 @@ class ColumnarLog:
 
     def borrowed(self, topic: str) -> tuple[Path, ...]:
         """Return the files of an installed ROS that a topic's type is read by."""
-        schemas = (self._schema(c, channel) for c, channel in self._by_topic.get(topic, ()))
+        schemas = (self.schema_of(c, channel) for c, channel in self._by_topic.get(topic, ()))
         return tuple(dict.fromkeys(f for s in schemas if isinstance(s, MessageSchema) for f in s.borrowed))
 
     def first_messages(self, topic: str, most: int) -> list[object]:
         """Return the first messages of a topic whole; what does not decode is left out."""
         found: list[object] = []
         for c, channel in self._by_topic.get(topic, ()):
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if not isinstance(schema, MessageSchema):
                 continue
             decode = ChannelDecoder(schema, ()).single_decoder()
@@ -311,7 +311,8 @@ class ColumnarLog:
                 self._partial[c, span.index, (kind, want)] = loss
                 container.account.lose_share((at, end), count / (len(block) + missing))
 
-    def _schema(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
+    def schema_of(self, c: int, channel: ChannelRecord) -> MessageSchema | SchemaError:
+        """Return the schema of a channel of the c-th container, or why there is none."""
         key = (c, channel.id)
         if key not in self._schemas:
             self._schemas[key] = self._parse_schema(c, channel)
@@ -367,7 +368,7 @@ class ColumnarLog:
         if topic not in self._by_topic:
             raise self._no_such_topic(topic)
         for c, channel in self._by_topic[topic] if paths else ():
-            schema = self._schema(c, channel)
+            schema = self.schema_of(c, channel)
             if isinstance(schema, SchemaError):
                 problems.append(
                     MappingError(

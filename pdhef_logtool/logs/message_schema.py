@@ -226,7 +226,8 @@ def ros_schema(
             types = idl_types(text) if encoding == "ros2idl" else get_types_from_msg(text, type_name)
             store = get_typestore(Stores.EMPTY)
             try:
-                types = _completed(types, get_typestore(base).fielddefs, definitions, budget)
+                if referenced(types) - set(types):  # a distribution's types take long to load
+                    types = _completed(types, get_typestore(base).fielddefs, definitions, budget)
             except MissingDefinitionError as error:  # the log's own text is not whole: its messages are lost
                 raise SchemaError(str(error)) from error
             root = _ros_root(types, type_name, budget)

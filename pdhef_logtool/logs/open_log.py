@@ -29,6 +29,7 @@ from pdhef_logtool.logs.container import (
 from pdhef_logtool.logs.definitions import read_definitions
 from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace, place_of
+from pdhef_logtool.logs.slim_log import SlimLog, slim_record
 from pdhef_logtool.records.documents import read_text
 from pdhef_logtool.records.errors import LogError, PdhefError
 from pdhef_logtool.records.files import scratch_folder
@@ -47,7 +48,7 @@ def open_log(
 
     MCAP, ROS 1 bag (2.0), rosbag2 SQLite database, each also as a zstd-compressed file; a rosbag2 folder with its
     ``metadata.yaml`` (split files are one log), or a folder that holds exactly one such file. Each file also by its URL
-    (``https://``, ``s3://``).
+    (``https://``, ``s3://``). A slim log (:mod:`~pdhef_logtool.logs.slim_log`) reads like what it stands for.
 
     Parameters
     ----------
@@ -87,6 +88,13 @@ def _opened(path: LogPlace, meter: Meter, wanted: Wanted) -> ColumnarLog:
         raise
     except Exception as error:
         raise LogError(expected=_WHAT_IS_A_LOG, got=told(error)[1], where=str(path), remedy=_REMEDY) from error
+    try:
+        record = slim_record(container)
+    except BaseException:
+        container.close()
+        raise
+    if record is not None:
+        return SlimLog(path, container, record)
     kind = {"mcap": "mcap", "rosbag1": "rosbag1", "sqlite3": "rosbag2-sqlite3"}[container.form]
     return ColumnarLog(path, kind, [container], distro=container.distro)
 
@@ -108,6 +116,8 @@ def log_metadata(path: LogPlace, budget: Budget = DEFAULT_BUDGET) -> dict[str, s
 def metadata_of(log: DriveLog, budget: Budget = DEFAULT_BUDGET) -> dict[str, str]:
     """Return what an open log says of itself, as :func:`log_metadata` does."""
     assert isinstance(log, ColumnarLog)
+    if isinstance(log, SlimLog):
+        return dict(log.record.metadata)
     found: dict[str, str] = {}
     for container in log.containers:
         for record in container.metadata_records():

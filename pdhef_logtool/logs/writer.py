@@ -42,10 +42,10 @@ from pdhef_logtool.logs.schema_files import message_definition
 from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import IntArray
-from pdhef_logtool.records.version import __version__
+from pdhef_logtool.records.version import LIBRARY
 
-LIBRARY = f"pdhef-logtool {__version__}"
-_CHUNK_BYTES = 1 << 20
+#: Of message records, as far as they come together; in a chunk.
+CHUNK_BYTES = 1 << 20
 #: Of zstd.
 _LEVEL = 6
 _LARGEST_ID = 0xFFFF
@@ -116,7 +116,7 @@ class _Merged:
         """Take one chunk full."""
         first = self.at
         base = int(self.ends[first - 1]) if first else 0
-        self.at = max(int(np.searchsorted(self.ends, base + _CHUNK_BYTES, side="right")), first + 1)
+        self.at = max(int(np.searchsorted(self.ends, base + CHUNK_BYTES, side="right")), first + 1)
         return slice(first, self.at)
 
     @property
@@ -306,7 +306,7 @@ class McapLogWriter:
                 continue
             group.append(raw)
             size += len(raw.data) + MESSAGE_HEAD.itemsize
-            if size >= _CHUNK_BYTES:
+            if size >= CHUNK_BYTES:
                 self._write_merged(group, merged, merged.take_until(raw.log_time_ns))
                 group, size = [], 0
         self._write_merged(group, merged, merged.take_until(None))
@@ -332,8 +332,6 @@ class McapLogWriter:
 
     def _write_merged(self, raws: Sequence[RawMessage], merged: _Merged, part: slice) -> None:
         """Merge raw messages and a part of the batch rows by log time and cut into chunks."""
-        import zstandard
-
         if not raws and part.start == part.stop:
             return
         raw_bytes = [
@@ -357,18 +355,22 @@ class McapLogWriter:
         first = 0
         while first < len(log_time):
             base = int(ends[first - 1]) if first else 0
-            last = max(int(np.searchsorted(ends, base + _CHUNK_BYTES, side="right")), first + 1)
+            last = max(int(np.searchsorted(ends, base + CHUNK_BYTES, side="right")), first + 1)
             at = ends[first:last] - length[first:last] - base
             content = np.empty(int(ends[last - 1]) - base, dtype=np.uint8)
             part_source, part_row = source[first:last], row[first:last]
             for i in np.unique(part_source).tolist():
                 mine = part_source == i
-                _scatter(content, at[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
-            data = content.tobytes()
-            stored = zstandard.ZstdCompressor(level=_LEVEL).compress(data)
-            part_channel, part_time = channel[first:last], log_time[first:last]
-            self._emit_chunk(RawChunk("zstd", stored, len(data), zlib.crc32(data), part_channel, part_time, at))
+                scatter(content, at[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
+            self.write_chunk(content.tobytes(), channel[first:last], log_time[first:last], at)
             first = last
+
+    def write_chunk(self, records: bytes, channel: IntArray, log_time_ns: IntArray, offset: IntArray) -> None:
+        """Write message records as one chunk; channel, log time and offset [N] of each record in it."""
+        import zstandard
+
+        stored = zstandard.ZstdCompressor(level=_LEVEL).compress(records)
+        self._emit_chunk(RawChunk("zstd", stored, len(records), zlib.crc32(records), channel, log_time_ns, offset))
 
     def _emit_chunk(self, chunk: RawChunk) -> None:
         channel, log_time, offset, stored = chunk.channel, chunk.log_time_ns, chunk.offset, chunk.stored
@@ -522,10 +524,10 @@ class McapLogWriter:
         return at, len(data)
 
 
-def _scatter(
+def scatter(
     content: NDArray[np.uint8], at: IntArray, row: IntArray, source: NDArray[np.uint8] | Sequence[bytes]
 ) -> None:
-    """Copy records to their places in a chunk."""
+    """Copy records of ``source``, by their rows there, to their places in a chunk."""
     if isinstance(source, np.ndarray):
         size = source.shape[1]
         record = np.dtype((np.void, size))

@@ -2,16 +2,120 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.slim_log import SlimLog
 from pdhef_logtool.mapping.checking import check_mapping
-from pdhef_logtool.mapping.recognition import auto_map
+from pdhef_logtool.mapping.recognition import Ambiguity, AutoMapping, auto_map
 from pdhef_logtool.mapping.records import Mapping
-from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.errors import LogError, MappingError
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
+
+
+@dataclass(frozen=True, slots=True)
+class ChosenMapping:
+    """The mapping in effect, and what is to be said of it.
+
+    Attributes
+    ----------
+    missing : signals that it lacks. ambiguities : what may be wrong. remarks : what else is worth knowing.
+    prefer_truth : which truth of a simulated log was to count.
+    """
+
+    mapping: Mapping
+    missing: tuple[str, ...]
+    prefer_truth: Literal["perfect", "rtk"]
+    ambiguities: tuple[Ambiguity, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON-able values, from which :func:`recorded_mapping` makes it again; DBC files by name."""
+        document: dict[str, Any] = jsonable(self)
+        if self.mapping.can is not None:
+            document["mapping"]["can"]["dbc"] = list(self.dbc_names)
+        return document
+
+    @property
+    def dbc_names(self) -> tuple[str, ...]:
+        """What the DBC files of the mapping are called in a slim log."""
+        dbc = () if self.mapping.can is None else self.mapping.can.dbc
+        return tuple(f"dbc-{number}-{path.name}" for number, path in enumerate(dbc))
+
+
+def recorded_mapping(log: SlimLog, prefer_truth: Literal["perfect", "rtk"]) -> ChosenMapping:
+    """Return the mapping that a slim log was made with.
+
+    Raises
+    ------
+    LogError : its record holds none that is one. MappingError : it was made for another truth.
+    """
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        chosen = TypeAdapter(ChosenMapping).validate_python(log.record.mapped)
+    except ValidationError as error:
+        raise LogError(
+            expected="the mapping of a slim log",
+            got="; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3]),
+            where=str(log.path),
+            remedy="make it anew from its source: pdhef slim LOG -o DIR",
+        ) from error
+    mapping = chosen.mapping
+    if chosen.prefer_truth != prefer_truth and mapping.truth:
+        raise MappingError(
+            expected=f"--prefer-truth {chosen.prefer_truth}, which this slim log was made with",
+            got=prefer_truth,
+            where=str(log.path),
+            remedy=f"pdhef slim SOURCE -o DIR --prefer-truth {prefer_truth}",
+        )
+    if mapping.can is not None:
+        dbc = tuple(log.attached(path.name) for path in mapping.can.dbc)
+        mapping = replace(mapping, can=replace(mapping.can, dbc=dbc))
+    return replace(chosen, mapping=mapping)
+
+
+def recognise(log: DriveLog, *, prefer_truth: Literal["perfect", "rtk"]) -> AutoMapping:
+    """Return what :func:`auto_map` recognises, or for a slim log what it was made with."""
+    if not isinstance(log, SlimLog):
+        return auto_map(log, prefer_truth=prefer_truth)
+    recorded = recorded_mapping(log, prefer_truth)
+    return AutoMapping(recorded.mapping, recorded.ambiguities, recorded.missing)
+
+
+def choose_mapping(
+    log: DriveLog,
+    mapping: Mapping | None,
+    *,
+    prefer_truth: Literal["perfect", "rtk"],
+    require_signals: bool = True,
+) -> ChosenMapping:
+    """Return the mapping in effect: the one given, or what is recognised. Ambiguities are never settled silently.
+
+    Raises
+    ------
+    MappingError : The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
+    """
+    if mapping is not None:
+        if mapping.fill_recognised:
+            mapping = _filled(mapping, recognise(log, prefer_truth=prefer_truth).mapping)
+        check_mapping(mapping, log)
+        missing = tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
+        return ChosenMapping(mapping, missing, prefer_truth, (), (*mapping.notes, *_borrowed(log, mapping)))
+    if isinstance(log, SlimLog):
+        return recorded_mapping(log, prefer_truth)
+    found = auto_map(log, prefer_truth=prefer_truth)
+    if require_signals and not found.mapping.signals:
+        raise MappingError(
+            expected="fields that are a car's sensors",
+            got="; ".join(found.mapping.notes) or _topics_there_are(log),
+            where=str(log.path),
+            remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
+        )
+    remarks = (*found.mapping.notes, *_borrowed(log, found.mapping))
+    return ChosenMapping(found.mapping, found.missing, prefer_truth, found.ambiguities, remarks)
 
 
 def _filled(mapping: Mapping, found: Mapping) -> Mapping:
@@ -24,45 +128,6 @@ def _filled(mapping: Mapping, found: Mapping) -> Mapping:
         notes=(*mapping.notes, *found.notes),
         checks=tuple(c for c in found.checks if c.subject not in mapping.signals),
     )
-
-
-def choose_mapping(
-    log: DriveLog,
-    mapping: Mapping | None,
-    tell: Callable[[str], None],
-    remark: Callable[[str], None],
-    *,
-    prefer_truth: Literal["perfect", "rtk"],
-    require_signals: bool = True,
-) -> tuple[Mapping, tuple[str, ...]]:
-    """Return the mapping in effect and the signals that it lacks; ambiguities are told, never settled silently.
-
-    ``tell`` is called with what may be wrong, ``remark`` with what else is worth knowing.
-
-    Raises
-    ------
-    MappingError : The mapping names what the log lacks; or, with ``require_signals``, no type of the log is recognised.
-    """
-    if mapping is not None and mapping.fill_recognised:
-        mapping = _filled(mapping, auto_map(log, prefer_truth=prefer_truth).mapping)
-    if mapping is not None:
-        check_mapping(mapping, log)
-        for note in (*mapping.notes, *_borrowed(log, mapping)):
-            remark(note)
-        return mapping, tuple(n for n in ALIGNED_SIGNALS if n not in mapping.signals)
-    found = auto_map(log, prefer_truth=prefer_truth)
-    for ambiguity in found.ambiguities:
-        tell(str(ambiguity))
-    for note in (*found.mapping.notes, *_borrowed(log, found.mapping)):
-        remark(note)
-    if require_signals and not found.mapping.signals:
-        raise MappingError(
-            expected="fields that are a car's sensors",
-            got="; ".join(found.mapping.notes) or _topics_there_are(log),
-            where=str(log.path),
-            remedy="pdhef inspect LOG --fields shows every number, pdhef map LOG helps to write a mapping.toml",
-        )
-    return found.mapping, found.missing
 
 
 def _borrowed(log: DriveLog, mapping: Mapping) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pdhef_logtool.logs.drive_log import DriveLog
+from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.message_schema import value_at
 from pdhef_logtool.records.geometry import rotation_from_quat
 from pdhef_logtool.records.signals import FloatArray
@@ -55,12 +55,17 @@ def placement_of(log: DriveLog, topic: str) -> Placement | None:
     return Placement(frame, at, rotation, position) if at.rpartition("/")[2] in BASES and at != frame else None
 
 
+def holds_fixed_frames(topic: TopicInfo) -> bool:
+    """Tell whether a topic holds fixed frames."""
+    return topic.type_name.replace("/msg/", "/") in _TYPES and topic.name.endswith("tf_static")
+
+
 def _fixed_frames(log: DriveLog) -> Mapping[str, _Step]:
     """Return the frames that never move, by name; one that is told twice in different places is none."""
     found: dict[str, _Step] = {}
     moved: set[str] = set()
     for topic in log.topics:
-        if topic.type_name.replace("/msg/", "/") not in _TYPES or not topic.name.endswith("tf_static"):
+        if not holds_fixed_frames(topic):
             continue
         for message in log.first_messages(topic.name, MOST_MESSAGES):
             transforms = value_at(message, ("transforms",))

@@ -22,12 +22,34 @@ from typing import Any
 import numba
 from numba.core import caching, config
 from numba.misc.appdirs import AppDirs
+from numba.np import linalg
 
 from pdhef_logtool.records import processes
 from pdhef_logtool.records.shown import shown
 
 #: What the first run with all estimators compiles on one core, in seconds; told to the user as a rough figure.
 COMPILING_S = 45
+
+
+def _without_blas() -> None:
+    """Let numba load without SciPy's BLAS, which takes longer than a short log: nothing compiled here asks for it.
+
+    What needs LAPACK, such as the repair of a covariance, loads that when it is called.
+    """
+
+    def none() -> None:
+        raise ImportError
+
+    found = linalg.ensure_blas
+    linalg.ensure_blas = none
+    try:
+        from numba.np import arraymath
+    finally:
+        linalg.ensure_blas = found
+    arraymath.ensure_blas = found
+
+
+_without_blas()
 
 
 def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:

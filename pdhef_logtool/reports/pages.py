@@ -7,14 +7,15 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.reports.drive import FIGURES, DrivePage, drive_page
-from pdhef_logtool.reports.fleet import FIGURES as FLEET_FIGURES
-from pdhef_logtool.reports.fleet import FleetPage, fleet_page
 from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
+
+if TYPE_CHECKING:
+    from pdhef_logtool.reports.drive import DrivePage
+    from pdhef_logtool.reports.fleet import FleetPage
 
 #: Folder of a log's pictures within its outputs.
 PICTURES = "figures"
@@ -83,6 +84,10 @@ def write_pages(
     OutputError
         A page cannot be written.
     """
+    from pdhef_logtool.reports.drive import FIGURES, drive_page
+    from pdhef_logtool.reports.fleet import FIGURES as FLEET_FIGURES
+    from pdhef_logtool.reports.fleet import fleet_page
+
     pages = []
     for number, log in enumerate(run.logs):
         progress(f"{log.label}: page", number / len(run.logs))
@@ -93,8 +98,14 @@ def write_pages(
 
 def remove_pages(run: OpenedRun) -> None:
     """Remove the pages that an earlier run left in its folders: they are of other estimates."""
-    folders = [(run.folder, FLEET_FIGURES), *((log.folder, FIGURES) for log in run.logs)]
-    for folder, keys in folders:
+    folders = (run.folder, *(log.folder for log in run.logs))
+    if not any((folder / left).exists() for folder in folders for left in (PAGE_FILE, PICTURES)):
+        return  # what makes pages is not loaded for a run that has none
+
+    from pdhef_logtool.reports.drive import FIGURES
+    from pdhef_logtool.reports.fleet import FIGURES as FLEET_FIGURES
+
+    for folder, keys in zip(folders, (FLEET_FIGURES, *[FIGURES] * len(run.logs)), strict=True):
         for path in (folder / PAGE_FILE, *_pictures(folder, keys)):
             with suppress(OSError):
                 path.unlink(missing_ok=True)

@@ -435,7 +435,7 @@ def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
     """Return how a log that was read is recorded in run.json."""
     return LogOutcome(
         log=drive.name,
-        file=drive.path.name,
+        file=drive.file,
         sha256=drive.sha256,
         signals_sha256=drive.signals_sha256,
         truth_sha256=drive.truth_sha256,
@@ -579,7 +579,7 @@ def report_facts(
     return ReportFacts(
         log=LogFacts(
             name=drive.name,
-            file=drive.path.name,
+            file=drive.file,
             kind=log.kind,
             sha256=drive.sha256,
             signals_sha256=drive.signals_sha256,

@@ -115,7 +115,8 @@ def _look(log: DriveLog) -> tuple[SignalMapping | None, Told, dict[str, Channel]
     said: list[str] = []
     error = ""
     try:
-        choose_mapping(log, None, said.append, said.append, prefer_truth="perfect")
+        chosen = choose_mapping(log, None, prefer_truth="perfect")
+        said += [*map(str, chosen.ambiguities), *chosen.remarks]
     except PdhefError as refused:
         error = str(refused)
     inspection = inspect_drive_log(log)

@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
-    *("inspect", "map", "estimators", "run", "metrics", "report", "compare", "events", "view"),
+    *("inspect", "map", "estimators", "run", "metrics", "slim", "report", "compare", "events", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
     *("identify", "extract", "train", "tune", "trust", "calibrate", "learn"),
 )

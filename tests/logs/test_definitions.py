@@ -63,7 +63,7 @@ def test_a_missing_definition_is_the_cause_that_is_told(tmp_path: Path) -> None:
     assert log.fields("/steer") == ()
     assert "no definition of dbw_msgs/Steer" in log.unreadable("/steer")
     with pytest.raises(MappingError, match="no definition of dbw_msgs/Steer; give --msgs DIR"):
-        choose_mapping(log, None, lambda _: None, lambda _: None, prefer_truth="perfect")
+        choose_mapping(log, None, prefer_truth="perfect")
 
 
 @pytest.mark.parametrize("layout", ["msg", "flat", "package", "workspace"])
@@ -110,7 +110,7 @@ def test_an_empty_topic_is_said_to_be_empty(tmp_path: Path) -> None:
     with sqlite3.connect(next(path.glob("*.db3"))) as connection:
         connection.execute("insert into topics values (9, '/imu/data', 'sensor_msgs/msg/Imu', 'cdr', '', '')")
     with pytest.raises(MappingError, match=r"/imu/data \(sensor_msgs/Imu\) has no messages"):
-        choose_mapping(open_log(path), None, lambda _: None, lambda _: None, prefer_truth="perfect")
+        choose_mapping(open_log(path), None, prefer_truth="perfect")
 
 
 def test_a_folder_without_definitions_is_refused(tmp_path: Path) -> None:
@@ -145,8 +145,7 @@ def test_an_installed_ros_is_looked_in_and_named(
     log = open_log(path)
     assert [f.path for f in log.fields("/steer")] == ["steering_wheel_angle"]
     assert log.borrowed("/steer") == (folder / "Steer.msg",)
-    said: list[str] = []
-    choose_mapping(log, None, said.append, said.append, prefer_truth="perfect")
+    said = choose_mapping(log, None, prefer_truth="perfect").remarks
     assert any("Steer.msg of this machine, as the log does not define its type" in text for text in said)
 
 

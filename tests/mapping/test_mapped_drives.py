@@ -133,11 +133,10 @@ def test_a_file_may_name_one_signal_and_leave_the_rest_to_recognised_types(tmp_p
     recognised = auto_map(log).mapping
     for filled in (False, True):
         (tmp_path / "mapping.toml").write_text(("fill_recognised = true\n" if filled else "") + text)
-        told: list[str] = []
-        mapping, missing = choose_mapping(
-            log, load_mapping(tmp_path / "mapping.toml"), pytest.fail, told.append, prefer_truth="perfect"
-        )
-        assert len(told) == filled  # which truth it is
+        chosen = choose_mapping(log, load_mapping(tmp_path / "mapping.toml"), prefer_truth="perfect")
+        mapping, missing = chosen.mapping, chosen.missing
+        assert len(chosen.remarks) == filled  # which truth it is
+        assert chosen.ambiguities == ()
         assert mapping.signals["friction"].topic == "/truth/perfect/state"
         others = {n: s for n, s in mapping.signals.items() if n != "friction"}
         assert others == ({n: s for n, s in recognised.signals.items() if n != "friction"} if filled else {})

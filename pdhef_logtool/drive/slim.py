@@ -1,0 +1,158 @@
+"""Slim logs: what a run reads of a log, written so that a run of it gives the same figures bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
+from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
+from pdhef_logtool.logs.open_log import metadata_of
+from pdhef_logtool.logs.slim_copy import copy_topics, write_record
+from pdhef_logtool.logs.slim_log import FORMAT, SlimRecord
+from pdhef_logtool.logs.writer import McapLogWriter
+from pdhef_logtool.mapping import Mapping, load_mapping
+from pdhef_logtool.mapping.frames import holds_fixed_frames
+from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, PdhefError
+from pdhef_logtool.records.outputs import check_no_input
+from pdhef_logtool.records.supervisor import Tell, supervise
+from pdhef_logtool.records.version import __version__
+
+
+@dataclass(frozen=True, slots=True)
+class SlimmedLog:
+    """What became of one log: sizes in bytes, what of the log could not be read, and why there is no slim log."""
+
+    log: str
+    slim: str
+    source_bytes: int = 0
+    slim_bytes: int = 0
+    lost: tuple[str, ...] = ()
+    failed: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SlimResult:
+    """What became of all logs, in their order."""
+
+    output: str
+    logs: tuple[SlimmedLog, ...]
+
+    @property
+    def exit_code(self) -> int:
+        """0 if all is well, 3 if something was lost or some logs failed, 1 if all did."""
+        if all(one.failed for one in self.logs):
+            return EXIT_FAILURE
+        return EXIT_PARTIAL if any(one.failed or one.lost for one in self.logs) else EXIT_OK
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON-able values."""
+        return {"output": self.output, "exit_code": self.exit_code, "logs": jsonable(self.logs)}
+
+
+def slim_logs(
+    arguments: Logs,
+    output: Path,
+    mapping: Path | None,
+    options: ReadOptions,
+    *,
+    jobs: int = 1,
+    progress: Callable[[str, float], None] = lambda _text, _share: None,
+) -> SlimResult:
+    """Write ``output/NAME.mcap`` for every log; a log that fails never stops the others.
+
+    Parameters
+    ----------
+    mapping : file; None recognises types. options : as for :func:`slim_log`. jobs : processes at work.
+
+    Raises
+    ------
+    UsageError, MappingError : There is no log, the mapping is wrong, or an output would replace an input.
+    """
+    inputs = find_logs(arguments)
+    sources = None if mapping is None else load_mapping(mapping)
+    targets = [output / f"{log.stem}.mcap" for log in inputs]
+    check_no_input([*(log.local for log in inputs), mapping], targets)
+    items = [(log, target, sources, options) for log, target in zip(inputs, targets, strict=True)]
+    results: list[SlimmedLog] = [SlimmedLog(log.stem, "", failed="not reached") for log in inputs]
+    ended = supervise(_slim_one, items, jobs=jobs, preload=(__name__,))
+    for done, one in enumerate(ended, 1):
+        failed = "" if one.failure is None else one.failure.reason
+        results[one.number] = one.result or SlimmedLog(one.item[0].stem, "", failed=failed)
+        progress(one.item[0].stem, done / len(inputs))
+    return SlimResult(str(output), tuple(results))
+
+
+def _slim_one(item: tuple[LogInput, Path, Mapping | None, ReadOptions], tell: Tell) -> SlimmedLog:
+    log, target, mapping, options = item
+    tell(log.stem, 0.0)
+    try:
+        record = slim_log(log, target, mapping, options)
+    except PdhefError as error:
+        return SlimmedLog(log.stem, "", failed=str(error))
+    size = sum(file.size for file in record.byte_ledgers)
+    return SlimmedLog(log.stem, str(target), size, target.stat().st_size, lost_texts(record.losses))
+
+
+def slim_log(
+    log: LogInput,
+    target: Path,
+    mapping: Mapping | None,
+    options: ReadOptions,
+    tell: Callable[[str], None] = lambda _text: None,
+) -> SlimRecord:
+    """Write the slim log of a whole log, and return what is known of the log beside its messages.
+
+    Parameters
+    ----------
+    mapping : None recognises types. options : of them count those that say how a log is opened and which truth counts.
+    tell : as for :func:`~pdhef_logtool.drive.reading.read_drive`.
+
+    Raises
+    ------
+    PdhefError : Nothing of the log can be read, the mapping names what it lacks, or the file cannot be written.
+    """
+    whole = replace(options, start=None, end=None)
+    with read_drive(replace(log, span_s=None), Car.load(None), mapping, whole, tell=tell) as drive:
+        for _ in drive.windows(fill_friction=False):
+            pass
+        return write_slim(drive, target)
+
+
+def write_slim(drive: Drive, target: Path) -> SlimRecord:
+    """Write the slim log of a drive that was read from start to end, and return its record."""
+    log = drive.log
+    assert isinstance(log, ColumnarLog)
+    lost, ledgers = log.lost, drive.byte_ledgers  # before the copy, which may look at more than a run does
+    record = SlimRecord(
+        format=FORMAT,
+        tool=__version__,
+        file=drive.file,
+        kind=log.kind,
+        identity=drive.sha256,
+        distro=log.distro,
+        intervals=log.occupied.intervals,
+        left_out={topic: dict(by_reason) for topic, by_reason in log.occupied.left_out.items()},
+        topics=log.topics,
+        losses=tuple(replace(x, where=drive.without_folder(x.where)) for x in lost),
+        byte_ledgers=ledgers,
+        metadata=metadata_of(log, drive.options.limits),
+        mapped=drive.chosen.to_dict(),
+        signals_sha256=drive.signals_sha256,
+        truth_sha256=drive.truth_sha256,
+    )
+    mapping = drive.chosen.mapping
+    topics = {*mapping.topics, *(s.topic for named in mapping.estimates.values() for s in named.values())}
+    topics |= {t.name for t in log.topics if holds_fixed_frames(t)}
+    with McapLogWriter(target, profile="ros1" if log.kind == "rosbag1" else "ros2") as writer:
+        copy_topics(writer, log, topics)
+        for name, path in zip(drive.chosen.dbc_names, () if mapping.can is None else mapping.can.dbc, strict=True):
+            writer.attachment(name, "text/plain", path.read_bytes(), 0, 0)
+        write_record(writer, record)
+    return record

@@ -1,0 +1,142 @@
+"""A slim log: the topics that a run reads of a log, in one small MCAP that stands for it.
+
+Messages are kept as they were recorded, byte for byte, so that whatever is computed of them is the same bit for bit.
+What is known of the source beyond its messages stands in a record beside them: when it was recorded, what it lost, what
+else it held, and which mapping was used. Each chunk holds one topic, so that reading a topic costs its own bytes alone.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.logs.byte_account import ByteLedger
+from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.container import MAX_TIME_NS, Container
+from pdhef_logtool.logs.drive_log import TopicInfo
+from pdhef_logtool.logs.mcap_log import McapContainer
+from pdhef_logtool.logs.occupied_time import OccupiedTime
+from pdhef_logtool.logs.remote_place import LogPlace
+from pdhef_logtool.records.errors import LogError
+from pdhef_logtool.records.files import scratch_folder, write_bytes
+from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.version import LIBRARY
+
+#: Of the record's content; another one is not read.
+FORMAT = 1
+#: Name of the MCAP metadata record, and of its one entry.
+RECORD_NAME, RECORD_ENTRY = "pdhef_slim", "json"
+_LONGEST_NS = 366 * 86_400_000_000_000
+#: Losses that come up again when the kept messages are read.
+_FOUND_AGAIN = frozenset({"undecodable", "bad-schema"})
+_EXPECTED = f"a slim log of format {FORMAT}"
+_REMEDY = "make it anew from its source: pdhef slim LOG -o DIR"
+
+
+@dataclass(frozen=True, slots=True)
+class SlimRecord:
+    """What a slim log knows of its source beside the messages.
+
+    Attributes
+    ----------
+    file, kind, identity : the source's name, container, and what it is known by. tool : version that made this.
+    distro : ROS distribution of types that the source does not define.
+    intervals, left_out : of its :class:`OccupiedTime`. topics : all of them with their messages, kept or not.
+    losses, byte_ledgers : complete, as a run of the whole source tells them.
+    metadata : what the source says of itself. mapped : the mapping as the floor above has written it.
+    signals_sha256, truth_sha256 : hashes of the mapped channels.
+    """
+
+    format: int
+    tool: str
+    file: str
+    kind: str
+    identity: str
+    distro: str
+    intervals: tuple[tuple[int, int], ...]
+    left_out: dict[str, dict[str, int]]
+    topics: tuple[TopicInfo, ...]
+    losses: tuple[Loss, ...]
+    byte_ledgers: tuple[ByteLedger, ...]
+    metadata: dict[str, str]
+    mapped: dict[str, Any]
+    signals_sha256: str | None
+    truth_sha256: str | None
+
+
+class SlimLog(ColumnarLog):
+    """Reads like the log that it stands for; a topic that was not kept is there with its messages, but without fields.
+
+    Attributes
+    ----------
+    record : what is known of the source.
+    """
+
+    def __init__(self, path: LogPlace, container: Container, record: SlimRecord) -> None:
+        super().__init__(path, record.kind, [container], distro=record.distro)
+        self.record = record
+        self._occupied = OccupiedTime(record.intervals, left_out=record.left_out)
+        self._extracted: tempfile.TemporaryDirectory[str] | None = None
+
+    @property
+    def topics(self) -> tuple[TopicInfo, ...]:
+        """All topics of the source by name."""
+        return self.record.topics
+
+    @property
+    def lost(self) -> tuple[Loss, ...]:
+        """What of the source could not be read, and what of this file cannot."""
+        return (*self.record.losses, *(x for x in super().lost if x.kind not in _FOUND_AGAIN))
+
+    @property
+    def byte_ledgers(self) -> tuple[ByteLedger, ...]:
+        """Where the bytes of each file of the source went."""
+        return self.record.byte_ledgers
+
+    def attached(self, name: str) -> Path:
+        """Return a file that was attached, to be read until the log is closed; raises LogError where there is none."""
+        found = next((a for c in self.containers for a in c.attachments() if a.name == name), None)
+        if found is None:
+            raise LogError(expected=_EXPECTED, got=f"none with its {name}", where=str(self.path), remedy=_REMEDY)
+        if self._extracted is None:
+            self._extracted = scratch_folder()
+        path = Path(self._extracted.name) / Path(name).name
+        write_bytes(path, found.data)
+        return path
+
+    def close(self) -> None:
+        """Release the files."""
+        super().close()
+        if self._extracted is not None:
+            self._extracted.cleanup()
+
+
+def slim_record(container: Container) -> SlimRecord | None:
+    """Return the record of a slim log; None for any other file.
+
+    Raises
+    ------
+    LogError : it is one that this version cannot read.
+    """
+    if not isinstance(container, McapContainer) or not container.library.startswith(LIBRARY.partition(" ")[0]):
+        return None
+    text = next((m.values.get(RECORD_ENTRY) for m in container.metadata_records() if m.name == RECORD_NAME), None)
+    if text is None:
+        return None
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        record = TypeAdapter(SlimRecord).validate_json(text)
+    except ValidationError as error:
+        got = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors()[:3])
+        raise LogError(expected=_EXPECTED, got=got, where=str(container.path), remedy=_REMEDY) from error
+    if record.format != FORMAT:
+        got = f"format {record.format} of version {record.tool}"
+        raise LogError(expected=_EXPECTED, got=got, where=str(container.path), remedy=_REMEDY)
+    edges = [ns for interval in record.intervals for ns in interval]
+    lasts = sum(end - start for start, end in record.intervals)
+    if edges != sorted(edges) or not all(-MAX_TIME_NS <= ns <= MAX_TIME_NS + 1 for ns in edges) or lasts > _LONGEST_NS:
+        raise LogError(expected=_EXPECTED, got="times that no log has", where=str(container.path), remedy=_REMEDY)
+    return record
