@@ -28,6 +28,7 @@ commands = typer.Typer()
     "pdhef run drive.bag -o out --car mycar --mapping mapping.toml",
     "pdhef run logs/ -o out --estimators zero,phy-ukf --annotate sidecar",
     "pdhef run fleet/ -o out --cars cars.toml",
+    "pdhef run s3://bucket/day/ -o out --annotate sidecar",
     "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
     "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
