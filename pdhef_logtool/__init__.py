@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from pdhef_logtool.records.errors import PdhefError as PdhefError
     from pdhef_logtool.runs.config import RunConfig as RunConfig
     from pdhef_logtool.runs.estimating import estimate_windows as estimate_windows
+    from pdhef_logtool.runs.fleet import run_logs as run  # noqa: F401
     from pdhef_logtool.runs.frames import choose as choose
     from pdhef_logtool.runs.frames import estimate as estimate
     from pdhef_logtool.runs.frames import score as score
-    from pdhef_logtool.runs.pipeline import run_logs as run  # noqa: F401
 
 #: Where each name stands, ``module`` or ``module:name there``; it is imported when it is first asked for.
 _HOMES = {
@@ -60,7 +60,7 @@ _HOMES = {
     "choose": "runs.frames",
     "estimate": "runs.frames",
     "score": "runs.frames",
-    "run": "runs.pipeline:run_logs",
+    "run": "runs.fleet:run_logs",
 }
 __all__ = ["__version__", *sorted(_HOMES)]
 

@@ -30,8 +30,8 @@ from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
 from pdhef_logtool.records.errors import PdhefError, SimulationError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.guard import FACTOR, SIMPLE
-from pdhef_logtool.runs.pipeline import run_logs
 from pdhef_logtool.runs.self_calibrating import log_sensors
 from pdhef_logtool.self_calibration.calibration import (
     LEAST_KNOWN,

@@ -16,7 +16,7 @@ import pytest
 
 from pdhef_logtool.estimators import table
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.slow

@@ -55,6 +55,9 @@ _OPTIONS: dict[str, Any] = {
     "start": Annotated[_Text, Option(help="Start of the slice of each log: 12.5, +10s, end-5s, ns, or RFC 3339.")],
     "end": Annotated[_Text, Option(help="End of the slice of each log, as --start.")],
     "annotate": Annotated[_Text, Option(help="full: copy of the log with our topics; sidecar: our topics only; none.")],
+    "keep": Annotated[
+        _Text, Option(help="Of each drive: metrics, estimates, or full. Default: full, above 50 logs metrics.")
+    ],
     "sensors": Annotated[_Text, Option(help="full, or esp: no wheel speeds in the filters after the start.")],
     "friction": Annotated[
         _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/friction.md")

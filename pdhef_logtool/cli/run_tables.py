@@ -13,6 +13,7 @@ from rich.text import Text
 
 from pdhef_logtool.cli.console import cell, table
 from pdhef_logtool.records.geometry import DEGREES
+from pdhef_logtool.records.shown import all_shown
 from pdhef_logtool.results.opened_run import PAGE_FILE
 from pdhef_logtool.sinks.answer import NEARLY_HOLDS, degrees
 from pdhef_logtool.sinks.report import diverged_line, reasons_line
@@ -22,7 +23,8 @@ if TYPE_CHECKING:
 
     from pdhef_logtool.drive.slim import SlimResult
     from pdhef_logtool.evaluation.thresholds import Verdict
-    from pdhef_logtool.runs.pipeline import LogResult, RunResult
+    from pdhef_logtool.runs.pipeline import RunResult
+    from pdhef_logtool.sinks.report import LogOutcome
 
 _Report: TypeAlias = Mapping[str, Any]
 #: Head, signal, segment, metric, factor to the shown unit, digits.
@@ -68,7 +70,8 @@ _TEXTS = {
 
 def render_run(result: RunResult, console: Console) -> None:
     """Print the answer of each log, or of several in one table, and where the outputs are."""
-    reports = [r.report for r in result.results if r.report is not None]
+    told = [(r, all_shown(r.report)) for r in result.results]
+    reports = [report for _, report in told if report is not None]
     alike = None
     if len(reports) > 1 and all(report["answer"] for report in reports):
         alike = _Alike.of(reports)
@@ -77,11 +80,11 @@ def render_run(result: RunResult, console: Console) -> None:
         for remark, logs in alike.remarks.items():
             _print_indented(f"note: {remark} ({', '.join(logs)})", console)
         console.print()
-    for one in result.results:
-        _render_log(one, console, alike)
+    for one, report in told:
+        _render_log(one.outcome, report, console, alike)
     if result.verdicts:
         _render_verdicts(result.verdicts, console)
-    failed = [r for r in result.results if r.report is None]
+    failed = [r for r, report in told if report is None]
     lost = [r for r in result.results if r.outcome.lost]
     if len(result.results) > 1 or failed:
         done = f"{len(result.results) - len(failed)} done, {len(failed)} failed, {len(lost)} with input lost"
@@ -130,11 +133,10 @@ def _print_indented(line: str | Text, console: Console) -> None:
     console.print(Padding(line, (0, 0, 0, 2)))
 
 
-def _render_log(one: LogResult, console: Console, alike: _Alike | None) -> None:
+def _render_log(outcome: LogOutcome, report: _Report | None, console: Console, alike: _Alike | None) -> None:
     """Print one log; ``alike`` is what was said of several, whose joint table has the figures. None: it is alone."""
-    report = one.report
     if report is None:
-        console.print(Text.assemble((one.outcome.log, "bold"), f"  {one.outcome.outcome}\n"))
+        console.print(Text.assemble((outcome.log, "bold"), f"  {outcome.outcome}\n"))
         return
     answer = report["answer"]
     texts = _texts(report)
@@ -154,7 +156,7 @@ def _render_log(one: LogResult, console: Console, alike: _Alike | None) -> None:
     if not (tabled or texts or above or below):
         return
     about = f"  {report['log']['kind']}, {report['log']['duration_s']:.1f} s" if alike is None else ""
-    console.print(Text.assemble((one.outcome.log, "bold"), about))
+    console.print(Text.assemble((outcome.log, "bold"), about))
     for line in above:
         _print_indented(line, console)
     if texts:

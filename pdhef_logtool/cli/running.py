@@ -31,12 +31,15 @@ commands = typer.Typer()
     "pdhef run s3://bucket/day/ -o out --annotate sidecar",
     "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
     "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
+    "pdhef run fleet/ -o out --jobs 8 --keep metrics",
+    "pdhef run fleet/ new/ -o out --jobs 8 --resume",
+    "pdhef run fleet/ -o out --only drive_0312",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, its cars and folders beside it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate sensors friction thresholds config_file network intervals calibrate waived model "
-    "calibration",
+    shared="cars estimators annotate keep sensors friction thresholds config_file network intervals calibrate waived "
+    "model calibration",
     car="Your car (default: a sedan)",
 )
 def run(
@@ -45,13 +48,47 @@ def run(
     config: RunConfig,
     junit: options.JunitFile = None,
     report: Annotated[bool, Option(help="Write pages for people: report.html of every log.")] = True,
+    jobs: options.Jobs = 1,
+    resume: Annotated[
+        bool, Option("--resume", help="Go on with the run in the folder: only what is new or has changed.")
+    ] = False,
+    retry: Annotated[bool, Option("--retry", help="As --resume, and try the logs that failed once more.")] = False,
+    only: Annotated[
+        list[str] | None, Option(metavar="NAME", help="Everything of this log of the run; the rest stays. Repeatable.")
+    ] = None,
+    log_timeout_s: Annotated[
+        float | None,
+        Option("--log-timeout", metavar="S", min=1.0, help="Give up a log that is silent for S seconds."),
+    ] = None,
+    max_memory_mb: Annotated[
+        int | None, Option("--max-memory", metavar="MB", min=1, help="Give up a log that takes more, in a process.")
+    ] = None,
+    full_worst: Annotated[
+        int | None,
+        Option(metavar="K", min=0, help="Keep everything of the K worst drives; default above 50 logs: 5."),
+    ] = None,
     as_json: options.JsonFlag = False,
 ) -> None:
     """Run estimators on logs, score and annotate them. Recordings and metrics are written too."""
-    from pdhef_logtool.runs.pipeline import run_logs
+    from pdhef_logtool.runs.fleet import limits_of, run_logs
 
     with console.progress() as bar:
-        result = run_logs(logs, output, config, junit=junit, report=report, progress=bar, warn=console.warn)
+        result = run_logs(
+            logs,
+            output,
+            config,
+            jobs=jobs,
+            resume=resume,
+            retry=retry,
+            only=only or (),
+            limits=limits_of(log_timeout_s, max_memory_mb),
+            full_worst=full_worst,
+            junit=junit,
+            report=report,
+            progress=bar,
+            warn=console.warn,
+            say=console.say,
+        )
     _finish(result, as_json)
 
 

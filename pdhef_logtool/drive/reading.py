@@ -182,11 +182,14 @@ class Drive:
         ----------
         fill_friction : False leaves the friction that the log says. window_s : None: that of the options.
         """
-        self._reader = DriveReader(self.log, self.plan, self.options.window_s if window_s is None else window_s)
+        window_s = self.options.window_s if window_s is None else window_s
+        reader = self._reader
+        if reader is None or not reader.can_repeat or reader.plan is not self.plan or reader.window_s != window_s:
+            reader = self._reader = DriveReader(self.log, self.plan, window_s)
         if not fill_friction:
-            return self._reader.windows()
+            return reader.windows()
         self.friction = self.friction.afresh()
-        return self.friction.fill_windows(self._reader.windows())
+        return self.friction.fill_windows(reader.windows())
 
     def whole(self, *, fill_friction: bool = True, max_bytes: int | None = None) -> WholeDrive:
         """Read all of the drive into memory.

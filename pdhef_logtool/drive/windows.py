@@ -177,8 +177,9 @@ def with_gyro_delay(mapping: Mapping, vehicle: VehicleParameters) -> Mapping:
 class DriveReader:
     """Reads a planned drive once from start to end; ``losses``, ``samples`` and ``counts`` grow while it does.
 
-    ``counts`` are those of :class:`~pdhef_logtool.mapping.channels.MappedChannels`, of all windows so far;
-    ``hashes`` by role what the channels held, complete once all windows were read.
+    A drive of a single window keeps it for whoever asks again. ``counts`` are those of
+    :class:`~pdhef_logtool.mapping.channels.MappedChannels`, of all windows so far; ``hashes`` by role what the channels
+    held, complete once all windows were read.
     """
 
     log: DriveLog
@@ -189,9 +190,18 @@ class DriveReader:
     counts: dict[tuple[Role, str], Counter[str]] = field(default_factory=dict)
     hashes: dict[Role, ChannelHash] = field(default_factory=lambda: {"signal": ChannelHash(), "truth": ChannelHash()})
     _done: bool = False
+    _only: DriveWindow | None = None
+
+    @property
+    def can_repeat(self) -> bool:
+        """Whether :meth:`windows` can be asked again: it then yields what it has read."""
+        return self._only is not None
 
     def windows(self) -> Iterator[DriveWindow]:
         """Yield the drive's windows in order; joined, they are bit-identical to one window over all."""
+        if self._only is not None:
+            yield self._only
+            return
         plan = self.plan
         margin = plan.margin_ns
         signals: dict[str, Channel] = {}
@@ -230,7 +240,10 @@ class DriveReader:
                 continue
             self._hash(signals, truth, hashed_ns, None if last else until)
             hashed_ns = until
-            yield self._window(signals, truth, done_ns, until, (b - plan.start_ns) / (plan.end_ns - plan.start_ns))
+            window = self._window(signals, truth, done_ns, until, (b - plan.start_ns) / (plan.end_ns - plan.start_ns))
+            if len(ends) == 1:
+                self._done, self._only = True, window
+            yield window
             done_ns = until
             signals = {n: c.between(until - margin) for n, c in signals.items()}
             truth = {n: c.between(until - margin) for n, c in truth.items()}

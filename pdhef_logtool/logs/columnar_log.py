@@ -37,8 +37,9 @@ from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.records.errors import MappingError
 from pdhef_logtool.records.signals import BoolArray, IntArray, Loss
 
-#: Neighbouring windows share the span at their border; this many decoded spans are kept for the next window.
-_KEPT_SPANS = 2
+#: Neighbouring windows share the span at their border: so many loaded spans are kept for the next window, and of a
+#: short log all that fit into so many bytes, for it is looked at several times before it is read.
+_KEPT_SPANS, _KEPT_BYTES = 2, 8 << 20
 
 
 class ColumnarLog:
@@ -74,6 +75,7 @@ class ColumnarLog:
         self._late: dict[int, dict[int, Span]] = {}  # spans for which no time was left, by container
         self._partial: dict[tuple[int, int, object], Loss] = {}  # of a part of a span: container, span, and what of it
         self._schemas: dict[tuple[int, int], MessageSchema | SchemaError] = {}
+        self._fields: dict[tuple[int, int], tuple[FieldInfo, ...]] = {}
         self._parsed: dict[tuple[object, ...], MessageSchema | SchemaError] = {}  # by definition
         self._asked: set[tuple[int, int]] = set()  # channels of which somebody wanted something
         self._wanted: set[tuple[int, int]] = set()  # and of these the ones whose messages somebody wanted
@@ -170,7 +172,9 @@ class ColumnarLog:
                 self._asked.add((c, channel.id))
             schema = self.schema_of(c, channel)
             if isinstance(schema, MessageSchema):
-                return tuple(leaves(schema.root))
+                if (c, channel.id) not in self._fields:
+                    self._fields[c, channel.id] = tuple(leaves(schema.root))
+                return self._fields[c, channel.id]
         return ()
 
     def unreadable(self, topic: str) -> str:
@@ -279,7 +283,7 @@ class ColumnarLog:
             container.account.decode(*extent)
             self._hold_against(c, span, block, want)
         self._kept[(*key, want)] = block
-        while len(self._kept) > _KEPT_SPANS:
+        while len(self._kept) > _KEPT_SPANS and sum(b.nbytes for b in self._kept.values()) > _KEPT_BYTES:
             self._kept.pop(next(iter(self._kept)))
         return block
 

@@ -85,6 +85,12 @@ class Block:
         """Return the number of messages."""
         return int(self.channel.shape[0])
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        columns = self.channel, self.log_time_ns, self.publish_time_ns, self.sequence, self.offset, self.length
+        return memoryview(self.buffer).nbytes + sum(c.nbytes for c in columns)
+
     @cached_property
     def rows(self) -> dict[int, IntArray]:
         """Rows by channel, ascending."""

@@ -8,8 +8,8 @@ import os
 import re
 import unicodedata
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain, takewhile
 from pathlib import Path
 
@@ -82,6 +82,15 @@ def find_logs(arguments: Logs) -> list[LogInput]:
         for place in places:
             found.setdefault(place.identity if isinstance(place, RemotePlace) else os.path.realpath(place), place)
     return _with_stems(list(found.values()))
+
+
+def with_free_stem(log: LogInput, taken: Container[str]) -> LogInput:
+    """Return a log under its stem, or with digits behind it where :func:`as_taken` of the stem is among the taken."""
+    if as_taken(log.stem) not in taken:
+        return log
+    digits = hashlib.sha256(os.fsencode("/".join(_parts(log.path)))).hexdigest()
+    made = (_portable(log.stem, digits[:n]) for n in range(8, len(digits) + 1))
+    return replace(log, stem=next(stem for stem in made if as_taken(stem) not in taken))
 
 
 def one_place(argument: str) -> LogPlace:
@@ -253,7 +262,7 @@ def _with_stems(paths: list[LogPlace]) -> list[LogInput]:
     n = len(_common([p[:-1] for p in parts]))
     relative = [p[n:] for p in parts]
     names = ["__".join([*r[:-1], _bare_name(r[-1])]) for r in relative]
-    counts = Counter(map(_on_any_system, names))
+    counts = Counter(map(as_taken, names))
     taken: set[str] = set()
     stems: dict[int, str] = {}
     # Names that stay as they are come first, so that no other name can take theirs.
@@ -262,16 +271,16 @@ def _with_stems(paths: list[LogPlace]) -> list[LogInput]:
         if not _stays(names[i], counts):
             digits = hashlib.sha256(os.fsencode("/".join(relative[i]))).hexdigest()
             made = (_portable(names[i], digits[:n]) for n in range(8, len(digits) + 1))
-            stems[i] = next(stem for stem in made if _on_any_system(stem) not in taken)
-        taken.add(_on_any_system(stems[i]))
+            stems[i] = next(stem for stem in made if as_taken(stem) not in taken)
+        taken.add(as_taken(stems[i]))
     return [LogInput(p, stems[i]) for i, p in enumerate(paths)]
 
 
 def _stays(name: str, counts: Mapping[str, int]) -> bool:
-    return counts[_on_any_system(name)] == 1 and _portable(name) == name
+    return counts[as_taken(name)] == 1 and _portable(name) == name
 
 
-def _on_any_system(name: str) -> str:
+def as_taken(name: str) -> str:
     """Return what two names share that some file system takes for one."""
     return unicodedata.normalize("NFC", name).casefold()
 

@@ -220,12 +220,16 @@ def jsonable(value: Any) -> Any:
     TypeError
         For anything else.
     """
-    if value is None or isinstance(value, bool | int):
-        return value
-    if isinstance(value, str):
+    if isinstance(value, str):  # in order of how many there are in a report
         return utf8(value)
+    if value is None or isinstance(value, int):
+        return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {utf8(str(k)): jsonable(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(v) for v in value]
     if isinstance(value, PurePath):
         return utf8(str(value))
     if is_dataclass(value) and not isinstance(value, type):

@@ -55,4 +55,4 @@ def _all_shown(value: Any) -> Any:
 
 def utf8(text: str) -> str:
     r"""Return a text that UTF-8 can hold: bytes of a file name that is none stand as ``\udcff``."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode("utf-8")

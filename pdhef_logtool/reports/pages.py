@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.records.errors import EXIT_OK, EXIT_PARTIAL, OutputError
 from pdhef_logtool.records.files import write_bytes
-from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedRun
+from pdhef_logtool.results.opened_run import PAGE_FILE, OpenedLog, OpenedRun
 
 if TYPE_CHECKING:
     from pdhef_logtool.reports.drive import DrivePage
@@ -73,6 +73,7 @@ def write_pages(
     *,
     png: bool = False,
     by: Sequence[str] = (),
+    logs: Sequence[OpenedLog] | None = None,
 ) -> WrittenPages:
     """Write the page of each log of a run, then that of the run; one that cannot be made never stops the others.
 
@@ -84,16 +85,23 @@ def write_pages(
     OutputError
         A page cannot be written.
     """
-    from pdhef_logtool.reports.drive import FIGURES, drive_page
     from pdhef_logtool.reports.fleet import FIGURES as FLEET_FIGURES
     from pdhef_logtool.reports.fleet import fleet_page
 
     pages = []
-    for number, log in enumerate(run.logs):
-        progress(f"{log.label}: page", number / len(run.logs))
-        pages.append(_write(log.folder, log.label, partial(drive_page, log, f"../../{PAGE_FILE}"), FIGURES, png=png))
+    logs = run.logs if logs is None else logs
+    for number, log in enumerate(logs):
+        progress(f"{log.label}: page", number / len(logs))
+        pages.append(write_drive_page(log, png=png))
     fleet = _write(run.folder, "", partial(fleet_page, run, by), FLEET_FIGURES, png=png)
     return WrittenPages(run.folder, tuple(pages), fleet)
+
+
+def write_drive_page(log: OpenedLog, *, png: bool = False) -> WrittenPage:
+    """Write the page of a log; raises OutputError."""
+    from pdhef_logtool.reports.drive import FIGURES, drive_page
+
+    return _write(log.folder, log.label, partial(drive_page, log, f"../../{PAGE_FILE}"), FIGURES, png=png)
 
 
 def remove_pages(run: OpenedRun) -> None:

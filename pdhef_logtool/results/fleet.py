@@ -230,6 +230,18 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
     )
 
 
+def answer_errors(run: OpenedRun) -> dict[str, float]:
+    """Return the RMSE of sideslip of each drive's answer in rad, where the truth is independent of it."""
+    figures = _figures(run)
+    found = {}
+    for log in run.logs:
+        main, own = log.entry.get("main") or "", figures.get(log.label, {})
+        error = own.get((main, JUDGED, "rmse"), math.nan)
+        if math.isfinite(error) and (main, JUDGED, "not_independent") not in own:
+            found[log.label] = error
+    return found
+
+
 def exact_median(values: FloatArray) -> Median:
     """Return the median of values [N] with its interval by the bootstrap, of infinitely many resamples.
 

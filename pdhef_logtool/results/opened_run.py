@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 LOGS = "logs"
 METRICS_FILE = "metrics.parquet"
 REPORT_FILE = "report.json"
+#: What a run of several logs has done, a line a drive; and the folder of the figures of each, by run and car.
+JOURNAL_FILE = "journal.jsonl"
+PARTS = "metrics"
 ESTIMATES_FILE = "estimates.parquet"
 RECORDING_FILE = "recording.rrd"
 #: A page for people: of a log in its folder, of all logs in the run's.

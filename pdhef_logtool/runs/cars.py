@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from itertools import accumulate
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -19,6 +19,7 @@ from pdhef_logtool.logs.open_log import log_metadata
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.journal import digest_of
 
 _Name = Annotated[str, Field(min_length=1)]
 
@@ -161,3 +162,24 @@ class RunCars:
     def _beside(self, name: str) -> Path:
         assert self.config.cars is not None
         return self.config.cars.parent / name
+
+
+def car_record(car: Car) -> dict[str, Any]:
+    """Return what a car is to a run that goes on: its name, its network's name and digest, and a digest of each part.
+
+    The parts are named as a person is told which of them has changed.
+    """
+    network = None if car.network is None else [Path(car.network_name).name, car.network.sha256]
+    parts = {
+        "the car's physics": [car.vehicle.model_dump(mode="json"), car.own.model_dump(mode="json")],
+        "the car's fit": [_plain(car.fitted_physics), [_plain(d) for d in car.learnt_on]],
+        "the car's noise": {name: _plain(noise) for name, noise in car.noise.items()},
+        "the network": network,
+        "the car's trust": _plain(car.trust),
+        "the car's intervals": _plain(car.intervals),
+    }
+    return {"name": car.file_name or "", "network": network, "parts": {k: digest_of(v) for k, v in parts.items()}}
+
+
+def _plain(part: Record | None) -> Any:
+    return None if part is None else part.model_dump(mode="json")

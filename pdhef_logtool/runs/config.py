@@ -41,6 +41,7 @@ Time = Annotated[str, Field(max_length=64), BeforeValidator(_as_text)]
 Names = Annotated[
     tuple[str, ...], Field(strict=False), BeforeValidator(lambda v: v.split(",") if isinstance(v, str) else v)
 ]
+Keep = Literal["metrics", "estimates", "full"]
 Friction = Annotated[float, Field(ge=POSSIBLE_FRICTION[0], le=POSSIBLE_FRICTION[1])]
 
 
@@ -56,7 +57,10 @@ class RunConfig:
     cars : a table that says which car each log has, instead of ``car``; None = the same for all.
     mapping : file; None = recognised types.
     start, end : slice as given (:func:`~pdhef_logtool.drive.options.parse_time`); None = the log's own.
-    annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only.
+    annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only; None = ``full``
+        where everything is kept, else ``none``.
+    keep : what is written of a drive: ``metrics`` (report.json and figures), ``estimates`` (its tracks too) or
+        ``full``; None = ``full``, of many logs ``metrics`` (:mod:`~pdhef_logtool.runs.fleet`).
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
     friction : ``auto`` is the log's own, else the car's, else estimated; ``file``, ``estimate``, or a number.
     prefer_truth : which truth counts in a simulated log that has both.
@@ -77,7 +81,8 @@ class RunConfig:
     mapping: Path | None = None
     start: Time | None = None
     end: Time | None = None
-    annotate: Literal["full", "sidecar", "none"] = "full"
+    annotate: Literal["full", "sidecar", "none"] | None = None
+    keep: Keep | None = None
     sensors: Literal["full", "esp"] = "full"
     friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
@@ -96,6 +101,16 @@ class RunConfig:
         return ReadOptions(**{f.name: getattr(self, f.name) for f in fields(ReadOptions)})
 
     @property
+    def kept(self) -> Keep:
+        """What is written of a drive."""
+        return self.keep or "full"
+
+    @property
+    def annotation(self) -> Literal["full", "sidecar", "none"]:
+        """What annotated.mcap holds; what was asked for is never left out."""
+        return self.annotate or ("full" if self.kept == "full" else "none")
+
+    @property
     def files(self) -> list[Path]:
         """The files and folders that it names, with what may stand in place of one."""
         return [path for key in _FILES if (path := getattr(self, key)) is not None]
@@ -104,6 +119,7 @@ class RunConfig:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
         document["waived"] = list(self.waived)
+        document |= {"annotate": self.annotation, "keep": self.kept}
         document["estimators"] = None if self.estimators is None else list(self.estimators)
         for key in _FILES:
             path = document[key]

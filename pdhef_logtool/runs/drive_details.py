@@ -30,11 +30,20 @@ from pdhef_logtool.sinks.report import DriveDetails
 #: Entries of a log's metadata that a report keeps, and signs of each.
 _MOST_METADATA, _MOST_SIGNS = 64, 200
 
+_LEFT_OUT = "it is left out where not everything of a drive is kept"
+
 _Read = Callable[[str], StateTrack | None]
 
 
 def drive_details(
-    drive: Drive, ready: Sequence[Estimator], main: str, read: _Read, signals: Signals, limits: Sequence[Verdict]
+    drive: Drive,
+    ready: Sequence[Estimator],
+    main: str,
+    read: _Read,
+    signals: Signals,
+    limits: Sequence[Verdict],
+    *,
+    brief: bool = False,
 ) -> DriveDetails:
     """Return the details of a drive.
 
@@ -42,19 +51,24 @@ def drive_details(
     ----------
     ready : the estimators that ran. main : the name of the answer. read : returns the track of a name, ``truth`` too.
     signals : what the estimators saw. limits : how the figures stand against the thresholds.
+    brief : without innovations and error budget, for which estimators run once more.
     """
     truth, slow = read(TRUTH), drive.car.vehicle.low_speed_blend_m_s
     answer = read(main)
     assert answer is not None
     by_name = {e.name: e for e in ready}
     asked = [by_name[n] for n in dict.fromkeys((main, PHYSICS)) if n in by_name]
-    sample = sample_drive(signals, None, np.where(moving_mask(signals, truth, drive.car.vehicle), 1.0, np.nan))
+    sample = (
+        None
+        if brief
+        else sample_drive(signals, None, np.where(moving_mask(signals, truth, drive.car.vehicle), 1.0, np.nan))
+    )
     return DriveDetails(
         faults=next((f for e in asked if (f := _faults(read, e.name)) is not None), None),
         innovations=[] if sample is None else channel_innovations(asked, sample),
         standings=[] if truth is None else standings(main, _rivals(ready, by_name[main]), read, truth, slow),
         limits=limits,
-        error_budget=_budget(drive, by_name.get(PHYSICS), read, signals),
+        error_budget=no_budget(_LEFT_OUT) if brief else _budget(drive, by_name.get(PHYSICS), read, signals),
         operating_space=operating_space(signals, truth, answer, slow),
         metadata=_metadata(drive),
     )

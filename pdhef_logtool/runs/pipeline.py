@@ -1,4 +1,4 @@
-"""One log from start to end, and several of them in turn: read, estimate, compare, write."""
+"""One log from start to end: read, estimate, compare, write. Several of them: :mod:`~.fleet`."""
 
 from __future__ import annotations
 
@@ -11,23 +11,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
-from pdhef_logtool.car.parts import PHYSICS, Algorithm
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.stand_in import StandIn
 from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
-from pdhef_logtool.logs.discovery import RUN_FILE, LogInput, find_logs, folders_of
-from pdhef_logtool.mapping import Mapping, load_mapping, merge_losses
-from pdhef_logtool.records.checks import Check
+from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
+from pdhef_logtool.mapping import Mapping, merge_losses
 from pdhef_logtool.records.errors import (
     EXIT_FAILURE,
     EXIT_GATE,
     EXIT_OK,
     EXIT_PARTIAL,
     EstimatorError,
-    PdhefError,
     UsageError,
 )
 from pdhef_logtool.records.ledger import SampleCount
@@ -40,14 +38,13 @@ from pdhef_logtool.results.opened_run import (
     PAGE_FILE,
     RECORDING_FILE,
     REPORT_FILE,
-    open_run,
+    OpenedLog,
 )
-from pdhef_logtool.runs.cars import RunCars
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.guard import GUARDED, Distrust, choose_main, default_names, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
-from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, log_sensors, self_calibrated
+from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
 from pdhef_logtool.sinks.base import TRUTH, Event, Shown, Sink
 from pdhef_logtool.sinks.report import (
@@ -60,6 +57,7 @@ from pdhef_logtool.sinks.report import (
     SourceFacts,
     TopicFacts,
     TruthFacts,
+    brief_report,
     build_report,
     build_run,
     tool_versions,
@@ -76,6 +74,8 @@ if TYPE_CHECKING:
 #: ``update(text, share)`` with share in [0, 1].
 Progress = Callable[[str, float], None]
 
+#: Up to so many logs each is told of by itself, and everything is kept.
+FEW_LOGS = 50
 #: What a run writes into a log's folder.
 LOG_FILES = (
     "annotated.mcap",
@@ -97,23 +97,44 @@ _DERIVED_UNITS = {"position_m": "m"}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogResult:
-    """What came out of one log; ``report`` is the document of report.json, None if the log failed.
+    """What came out of one log; what is in no hand any more is read from the files that it was written to.
 
-    ``verdicts``: how its figures stand against the thresholds; None without thresholds. ``checks``: those of the drive.
+    Attributes
+    ----------
+    output : folder of the log, None where nothing was written.
+    document, figures : report and rows that are at hand, None where they stand in files; ``figures_file`` is theirs.
+    verdicts : how its figures stand against the thresholds; None without thresholds.
+    failed_checks : of the drive, those that count.
     """
 
     outcome: LogOutcome
     output: Path | None
-    report: dict[str, Any] | None
-    rows: tuple[MetricRow, ...]
+    document: dict[str, Any] | None = None
+    figures: tuple[MetricRow, ...] | None = ()
     verdicts: tuple[Verdict, ...] | None = None
-    checks: tuple[Check, ...] = ()
+    failed_checks: int = 0
+    figures_file: Path | None = None
+
+    @property
+    def report(self) -> dict[str, Any] | None:
+        """The document of report.json, None if the log failed; raises OutputError for a damaged one."""
+        if self.document is not None or self.output is None:
+            return self.document
+        return OpenedLog(self.outcome.log, self.outcome.outcome, self.output, {}).report()
+
+    @property
+    def rows(self) -> tuple[MetricRow, ...]:
+        """The figures; raises OutputError for a damaged file of them."""
+        from pdhef_logtool.sinks.parquet import read_metrics
+
+        if self.figures is not None:
+            return self.figures
+        return () if self.figures_file is None else tuple(read_metrics(self.figures_file))
 
     @property
     def is_whole(self) -> bool:
         """Whether all of the log could be used and no check failed that counts."""
-        failed = any(c.verdict == "failed" and not c.waived for c in self.checks)
-        return self.outcome.outcome == "ok" and not failed
+        return self.outcome.outcome == "ok" and not self.failed_checks
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,6 +143,11 @@ class RunResult:
 
     output: Path | None
     results: tuple[LogResult, ...]
+
+    @property
+    def is_fleet(self) -> bool:
+        """Whether there are too many logs to tell of each."""
+        return len(self.results) > FEW_LOGS
 
     @property
     def exit_code(self) -> int:
@@ -153,111 +179,6 @@ class RunResult:
                 for r in self.results
             ],
         }
-
-
-def run_logs(
-    arguments: Sequence[str],
-    output: Path,
-    config: RunConfig,
-    *,
-    junit: Path | None = None,
-    report: bool = True,
-    progress: Progress = lambda _text, _share: None,
-    warn: Callable[[str], None] = lambda _text: None,
-) -> RunResult:
-    """Run the configured estimators on logs and write everything of DESIGN §6 to ``output``.
-
-    A log that fails is reported and never stops the others.
-
-    Parameters
-    ----------
-    arguments : logs, folders, glob patterns. junit : where the verdicts of the thresholds are written as JUnit XML.
-    report : whether the pages of the run are written (:mod:`pdhef_logtool.reports`); those of an earlier run go.
-    progress, warn : called with lines for people.
-
-    Raises
-    ------
-    UsageError, VehicleError, MappingError
-        What holds for all logs is wrong: arguments, vehicle or mapping file, or an output would replace an input.
-    OutputError
-        The output folder cannot be written, or another command is writing to it.
-    """
-    inputs = find_logs(arguments)
-    cars = RunCars.of(config, warn)
-    mapping = None if config.mapping is None else load_mapping(config.mapping)
-    thresholds = read_thresholds(config, junit)
-    check_places(inputs, output, config, mapping, junit, cars.paths)
-    results: list[LogResult] = []
-    folders = folders_of(inputs)
-    had = [_car_of(cars, log_input, alone=len(inputs) == 1) for log_input in inputs]
-    pools = _pools(inputs, had, mapping, config) if config.calibrate == "pool" else {}
-    with OutputFolder(output, (LOGS,)) as outputs:
-        for number, log_input in enumerate(inputs):
-
-            def of_all(text: str, share: float, number: int = number) -> None:
-                progress(text, (number + share) / len(inputs))
-
-            car = had[number]
-            try:
-                if isinstance(car, Exception):
-                    raise car
-                pool = pools.get(id(car))
-                result = run_log(
-                    log_input, outputs, config, car, mapping,
-                    pool=pool, thresholds=thresholds, progress=of_all, warn=warn,
-                )  # fmt: skip
-            except Exception as error:  # one bad log never stops the others, whatever is wrong with it
-                if len(inputs) == 1:
-                    raise
-                result = _failed(log_input, error)
-                warn(f"{log_input.path.name} failed, the others go on")  # why stands with the results
-            except BaseException as stop:
-                stop.add_note(f"{number} of {len(inputs)} logs are done")
-                raise
-            result = replace(result, outcome=replace(result.outcome, folder=folders[number]))
-            results.append(judge(result, thresholds))
-        write_run(output, config.to_dict(), results, [car for car in had if isinstance(car, Car)])
-        write_verdicts(junit, results)
-        _write_pages(output, report, lambda text: progress(text, 1.0), warn)
-    return RunResult(output, tuple(results))
-
-
-def _write_pages(output: Path, report: bool, tell: Callable[[str], None], warn: Callable[[str], None]) -> None:
-    from pdhef_logtool.reports.pages import remove_pages, write_pages
-
-    run = open_run(output)
-    if not report:
-        return remove_pages(run)
-    for line in write_pages(run, lambda text, _: tell(text)).wrong:
-        warn(line)
-    return None
-
-
-def _car_of(cars: RunCars, log_input: LogInput, *, alone: bool) -> Car | Exception:
-    """Return the car of a log, or what is wrong with it; of a log that is ``alone`` that is raised."""
-    try:
-        return cars.of_log(log_input)
-    except Exception as error:  # one bad log never stops the others
-        if alone:
-            raise
-        return error
-
-
-def _pools(
-    inputs: Sequence[LogInput], had: Sequence[Car | Exception], mapping: Mapping | None, config: RunConfig
-) -> dict[int, SelfCalibration | None]:
-    """Return what all logs of a car together say of it, by the car's identity."""
-    logs: dict[int, list[LogInput]] = {}
-    cars = {id(car): car for car in had if isinstance(car, Car)}
-    for log_input, car in zip(inputs, had, strict=True):
-        logs.setdefault(id(car), []).append(log_input)
-    return {key: calibrate_pool(logs[key], car, mapping, config) for key, car in cars.items()}
-
-
-def _failed(log_input: LogInput, error: Exception) -> LogResult:
-    reason = str(error) if isinstance(error, PdhefError) else f"internal error, {type(error).__name__}: {error}"
-    outcome = LogOutcome(log=log_input.stem, file=log_input.path.name, sha256=None, failed=reason)
-    return LogResult(outcome, None, None, ())
 
 
 def read_thresholds(config: RunConfig, junit: Path | None) -> tuple[Threshold, ...] | None:
@@ -369,7 +290,8 @@ def _run_estimators(
     drive, car, ready = job.drive, job.car, job.ready
     algorithms = {e.name: resolve(e) for e in ready}
     intervals = calibrator(car, ready)
-    with outputs.begin(log_place(drive.name), stale=(PAGE_FILE,)) as change, ExitStack() as opened:
+    stale = (PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
+    with outputs.begin(log_place(drive.name), stale=stale) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         signals = _estimate(drive, ready, intervals, store, progress)
         sensors = log_sensors(drive.car.vehicle, job.calibration)
@@ -383,11 +305,12 @@ def _run_estimators(
                 raise _FallBackError(against)
         main = choose_main(ready, found.rows, proven=drive.car.has_evidence, named=config.estimators is not None)
         limits = check_thresholds(job.thresholds, found.rows, log=drive.name)
-        details = drive_details(drive, ready, main.name, store.read, signals, limits)
+        details = drive_details(drive, ready, main.name, store.read, signals, limits, brief=config.kept != "full")
         shown = _shown(main, [e.name for e in ready])
         sinks = opened.enter_context(_open_sinks(change, drive, config, car, shown, outputs.path))
         _write(store, sinks)
-        rows = [replace(r, algorithm=_short(algorithms.get(r.estimator))) for r in found.rows]
+        digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
+        rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in found.rows]
         events = found.events
         if not found.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
@@ -410,25 +333,25 @@ def _run_estimators(
         facts = replace(facts, friction=friction_facts(drive.friction), calibration=calibration)
         facts = replace(facts, main=main, details=details)
         report = build_report(facts)
-        from pdhef_logtool.sinks.parquet import write_metrics
-
         for sink in sinks:
             sink.finish(report, events)
-        write_metrics(change.file("metrics.parquet"), rows)
-        write_json(change.file("report.json"), report)
+        if config.kept == "metrics":
+            report = brief_report(report)
+        else:
+            from pdhef_logtool.sinks.parquet import write_metrics
+
+            write_metrics(change.file(METRICS_FILE), rows)
+        write_json(change.file(REPORT_FILE), report, brief=config.kept == "metrics")
     outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car), main=None if main is None else main.name)
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
-    return LogResult(outcome, change.target, report, tuple(rows), checks=drive.checks)
+    failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)
+    return LogResult(outcome, change.target, report, tuple(rows), failed_checks=failed_checks)
 
 
 def _car_facts(car: Car) -> CarFacts:
     network = None if car.network is None else car.network.sha256
     return CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, network)
-
-
-def _short(algorithm: Algorithm | None) -> str:
-    return "" if algorithm is None else algorithm.sha256[:SHOWN_DIGITS]
 
 
 def outcome_of(drive: Drive, losses: Sequence[Loss]) -> LogOutcome:
@@ -472,36 +395,49 @@ def _open_sinks(
     from pdhef_logtool.sinks.layouts import LayoutsSink
     from pdhef_logtool.sinks.mcap import AnnotatedMcapSink
     from pdhef_logtool.sinks.parquet import EstimatesSink
-    from pdhef_logtool.sinks.rerun import RerunSink
 
     sinks: list[Sink] = []
     colours = {s.name: s.colour for s in SPECS}
     try:
-        sinks.append(EstimatesSink(change.file("estimates.parquet")))
-        if config.annotate != "none":
-            source = drive.log if config.annotate == "full" else None
+        if config.kept != "metrics":
+            sinks.append(EstimatesSink(change.file(ESTIMATES_FILE)))
+        if config.annotation != "none":
+            source = drive.log if config.annotation == "full" else None
             names = None if config.estimators else frozenset({shown.main, TRUTH})
             sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names))
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
             sinks.append(LayoutsSink(*layouts, names, colours))
-        application_id = _application_id(output, config)
-        sinks.append(
-            RerunSink(
-                change.file("recording.rrd"),
-                application_id=application_id,
-                log_name=drive.name,
-                input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
-                start_ns=drive.plan.start_ns,
-                shown=shown,
-                min_speed_m_s=car.vehicle.low_speed_blend_m_s,
-                colours=colours,
-            )
-        )
+        if config.kept == "full":
+            sinks.append(_recording(change, drive, config, car, shown, output, colours))
         yield sinks
     except BaseException:
         for sink in sinks:
             sink.abort()
         raise
+
+
+def _recording(  # positional: what `_open_sinks` takes
+    change: Transaction,
+    drive: Drive,
+    config: RunConfig,
+    car: Car,
+    shown: Shown,
+    output: Path,
+    colours: dict[str, int],
+) -> Sink:
+    from pdhef_logtool.sinks.rerun import RerunSink
+
+    application_id = _application_id(output, config)
+    return RerunSink(
+        change.file(RECORDING_FILE),
+        application_id=application_id,
+        log_name=drive.name,
+        input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
+        start_ns=drive.plan.start_ns,
+        shown=shown,
+        min_speed_m_s=car.vehicle.low_speed_blend_m_s,
+        colours=colours,
+    )
 
 
 def _application_id(output: Path, config: RunConfig) -> str:
@@ -660,15 +596,11 @@ def check_places(
     )
 
 
-def write_run(output: Path, config: dict[str, Any], results: Sequence[LogResult], cars: Sequence[Car] = ()) -> None:
-    """Write metrics.parquet of all logs, then run.json with the configuration as JSON-able values.
-
-    ``cars`` : of the logs; the run has a network where all have the same.
-    """
+def write_run(output: Path, config: dict[str, Any], result: LogResult, car: Car | None = None) -> None:
+    """Write metrics.parquet and run.json of a run of one log, with the configuration as JSON-able values."""
     from pdhef_logtool.sinks.parquet import write_metrics
 
-    networks = {None if c.network is None else (Path(c.network_name).name, c.network.sha256) for c in cars}
-    only = networks.pop() if len(networks) == 1 else None
-    used = None if only is None else {"name": only[0], "sha256": only[1]}
-    write_metrics(output / METRICS_FILE, [row for r in results for row in r.rows])
-    write_json(output / RUN_FILE, build_run(tool_versions(), config, used, [r.outcome for r in results]))
+    known = None if car is None else car.network
+    network = None if known is None or car is None else {"name": Path(car.network_name).name, "sha256": known.sha256}
+    write_metrics(output / METRICS_FILE, result.rows)
+    write_json(output / RUN_FILE, build_run(tool_versions(), config, network, [result.outcome]))

@@ -97,7 +97,7 @@ def score_log(
     estimates : ``[SIGNAL=]TOPIC[.FIELD]``, together one estimator called ``name`` (default: its topic); without any,
         the mapping's ``[estimates.NAME.SIGNAL]`` tables, all or the one called ``name``.
     truth : likewise; without any, the mapping's or the recognised truth.
-    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.pipeline.run_logs`.
+    output : folder for the files, None to write none. junit : as for :func:`pdhef_logtool.runs.fleet.run_logs`.
 
     Raises
     ------
@@ -120,14 +120,14 @@ def score_log(
             result = judge(scoring.score(drive, outputs, progress), thresholds)
         if output is not None:
             document = _config_document(config, drive, scoring.estimates)
-            write_run(output, document, [result])
+            write_run(output, document, result)
         write_verdicts(junit, [result])
     return RunResult(output, (result,))
 
 
 def _config_document(config: RunConfig, drive: Drive, estimates: Sequence[EstimateSource]) -> dict[str, Any]:
     document = config.to_dict()
-    for key in ("estimators", "annotate", "sensors"):
+    for key in ("estimators", "annotate", "keep", "sensors"):
         del document[key]
     document["estimates"] = {e.name: {name: source.label for name, source in e.signals.items()} for e in estimates}
     document["truth"] = {name: source.label for name, source in drive.mapping.truth.items()}

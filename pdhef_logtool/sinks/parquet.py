@@ -24,6 +24,8 @@ from pdhef_logtool.sinks.schema import arrow_schema
 #: estimator, and what waits of six estimators stays below 30 MB.
 ROWS_A_GROUP = 32768
 
+#: Files of figures that are read before a row group of theirs is written.
+_PARTS_AT_ONCE = 256
 #: Columns that files of earlier versions have not.
 _LATER_COLUMNS = ("diverged", *OPTIONAL_COLUMNS)
 _LATER_METRIC_COLUMNS = ("algorithm",)
@@ -294,6 +296,28 @@ def write_metrics(path: Path, rows: Sequence[MetricRow]) -> None:
     arrays = [pa.array([getattr(r, f.name) for r in rows], type=f.type, from_pandas=True) for f in schema]
     with PendingFile(path) as pending, writing(path), open_new(pending.path) as file:
         pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
+
+
+def join_metrics(path: Path, parts: Sequence[Path]) -> None:
+    """Write metrics.parquet from those of drives, in their order, a few at a time; raises OutputError."""
+    schema = arrow_schema("metrics.parquet.json")
+    with (
+        PendingFile(path) as pending,
+        writing(path),
+        open_new(pending.path) as file,
+        pq.ParquetWriter(file, schema, compression="zstd") as writer,
+    ):
+        for first in range(0, len(parts), _PARTS_AT_ONCE):
+            tables = [_metrics_table(part, schema) for part in parts[first : first + _PARTS_AT_ONCE]]
+            writer.write_table(pa.concat_tables(tables).combine_chunks())
+
+
+def _metrics_table(path: Path, schema: pa.Schema) -> pa.Table:
+    with _open(path) as file:
+        try:
+            return file.read().select(schema.names).cast(schema)
+        except (OSError, KeyError, pa.ArrowException) as error:
+            raise _damaged(path, error) from error
 
 
 def read_metrics(path: Path) -> list[MetricRow]:

@@ -6,12 +6,14 @@ import importlib.metadata
 import json
 import math
 import platform
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.evaluation.operating_space import AY_EDGES_M_S2, SPEED_EDGES_M_S, Cell
 from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
@@ -33,6 +35,9 @@ if TYPE_CHECKING:
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
+#: Metrics of whole drives that tables show, and entries that a brief report keeps of a list.
+_SHOWN_METRICS = frozenset({"rmse", "coverage95", "nis", "nis_dof", "d2"})
+_MOST_LISTED = 20
 #: Distributions whose version decides what a run computes or writes.
 VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
 
@@ -219,11 +224,15 @@ class LogOutcome:
 
 def tool_versions() -> dict[str, str]:
     """Return the versions of Python and of the installed distributions that decide what a run computes."""
-    versions = {"python": platform.python_version()}
-    for name in VERSIONED:
-        with suppress(importlib.metadata.PackageNotFoundError):
-            versions[name] = importlib.metadata.version(name)
-    return versions
+    return {"python": platform.python_version(), **{name: found for name in VERSIONED if (found := _installed(name))}}
+
+
+@cache
+def _installed(distribution: str) -> str | None:
+    """Return the version of a distribution, None where it is not installed; the file is read once a process."""
+    with suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(distribution)
+    return None
 
 
 def build_report(facts: ReportFacts) -> dict[str, Any]:
@@ -297,11 +306,50 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
     return {key: jsonable(value) for key, value in found.items()}
 
 
+def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a report of a few kB, of many drives: figures that tables show, and no list that grows with the log.
+
+    All figures stand in metrics.parquet. Of topics those that were mapped stay, of algorithms the digest, of segments
+    the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
+    """
+    answer = report["answer"]
+    told = {answer["main"], answer["naive"], PHYSICS} if answer else set()
+    first = {key: report[key][:_MOST_LISTED] for key in ("losses", "warnings", "remarks")}
+    return {
+        **{key: value for key, value in report.items() if key not in ("innovations", "error_budget")},
+        **first,
+        "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
+        "estimators": [_brief_estimator(e, told) for e in report["estimators"]],
+        "metrics": [m for m in report["metrics"] if m["estimator"] in told and _is_shown(m)],
+        "segments": [s for s in report["segments"] if s["name"] in {f"{n} diverged" for n in told}][:_MOST_LISTED],
+        "ledger": {"bytes": report["ledger"]["bytes"][:_MOST_LISTED], "samples": _with_drops(report)},
+        "checks": [c for c in report["checks"] if c["verdict"] != "passed"],
+    }
+
+
+def _brief_estimator(estimator: Mapping[str, Any], told: Container[str | None]) -> dict[str, Any]:
+    algorithm, own = estimator["algorithm"], estimator["name"] in told
+    digest = None if algorithm is None else {k: v for k, v in algorithm.items() if k not in ("options", "noise")}
+    kept = estimator["notes"] if own else []
+    return {**estimator, "algorithm": digest, "notes": kept, "reasons": estimator["reasons"] if own else None}
+
+
+def _is_shown(metric: Mapping[str, Any]) -> bool:
+    whole = metric["segment"] == "all"
+    judged = metric["signal"] == "sideslip_rad" and metric["segment"] in ("linear", "nonlinear")
+    return (whole and metric["metric"] in _SHOWN_METRICS) or (judged and metric["metric"] == "rmse")
+
+
+def _with_drops(report: Mapping[str, Any]) -> list[Any]:
+    return [s for s in report["ledger"]["samples"] if s["dropped"]][:_MOST_LISTED]
+
+
 def build_run(
     versions: Mapping[str, str],
     config: Mapping[str, Any],
     model: Mapping[str, str] | None,
     outcomes: Iterable[LogOutcome],
+    remaining: int = 0,
 ) -> dict[str, Any]:
     """Return the document of run.json (schemas/run.schema.json).
 
@@ -309,8 +357,8 @@ def build_run(
     ----------
     versions : by distribution, see :func:`tool_versions`.
     config : the configuration in effect, as JSON-able values.
-    model : ``name`` and ``sha256`` of the model bundle; None when no network ran.
-    outcomes : one a log.
+    model : ``name`` and ``sha256`` of the network; None when none ran, or not the same for all.
+    outcomes : one a log. remaining : logs that are not done, for the run was ended.
     """
     document = {
         "format": "pdhef.run",
@@ -318,6 +366,7 @@ def build_run(
         "versions": dict(versions),
         "config": dict(config),
         "model": None if model is None else dict(model),
+        **({"remaining": remaining} if remaining else {}),
         "logs": [
             {
                 "log": o.log,
@@ -337,15 +386,19 @@ def build_run(
     return {key: jsonable(value) for key, value in document.items()}
 
 
-def json_bytes(document: Mapping[str, Any]) -> bytes:
-    """Return the document as indented UTF-8 JSON with sorted keys and a final line feed; NaN is null."""
-    text = json.dumps(jsonable(document), indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
+def json_bytes(document: Mapping[str, Any], *, brief: bool = False) -> bytes:
+    """Return the document as indented UTF-8 JSON with sorted keys and a final line feed; NaN is null.
+
+    ``brief``: without indentation.
+    """
+    layout: dict[str, Any] = {"separators": (",", ":")} if brief else {"indent": 2}
+    text = json.dumps(jsonable(document), sort_keys=True, ensure_ascii=False, allow_nan=False, **layout)
     return (text + "\n").encode()
 
 
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
+def write_json(path: Path, document: Mapping[str, Any], *, brief: bool = False) -> None:
     """Write a document through a temporary name (see :func:`json_bytes`); raises OutputError."""
-    write_bytes(path, json_bytes(document))
+    write_bytes(path, json_bytes(document, brief=brief))
 
 
 def report_markdown(report: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
     *("inspect", "map", "estimators", "run", "metrics", "slim", "report", "compare", "events", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
-    *("identify", "extract", "train", "tune", "trust", "calibrate", "learn"),
+    *("identify", "extract", "train", "tune", "trust", "calibrate", "learn", "retrain"),
 )
 
 
@@ -168,7 +168,7 @@ def test_bare_command_shows_its_help() -> None:
 
 def test_interrupt_is_one_line_and_exit_code_130() -> None:
     code = (
-        "import pdhef_logtool.runs.pipeline as p\n"
+        "import pdhef_logtool.runs.fleet as p\n"
         "def interrupted(*a, **k): raise KeyboardInterrupt\n"
         "p.run_logs = interrupted\n"
         "import sys; from pdhef_logtool.cli.app import main\n"

@@ -38,8 +38,7 @@ CHECK = {"subject": "steer_rad", "evidence": "its gain is -1.", "remedy": "scale
 
 def shown(*reports: dict[str, Any], width: int = 80, failed: str = "") -> str:
     results = [
-        LogResult(LogOutcome(r["log"]["name"], "a.mcap", SHA, lost=["x"] * len(r["losses"])), None, r, ())
-        for r in reports
+        LogResult(LogOutcome(r["log"]["name"], "a.mcap", SHA, lost=["x"] * len(r["losses"])), None, r) for r in reports
     ]
     if failed:
         results.append(LogResult(LogOutcome("bad", "bad.mcap", None, failed=failed), None, None, ()))

@@ -52,7 +52,7 @@ def test_closed_streams_are_no_error_and_no_output_gets_their_numbers(tmp_path: 
 
 STOP = """
 import os, signal, sys
-import pdhef_logtool.runs.pipeline as p
+import pdhef_logtool.runs.fleet as p
 def run(*a, **k):
     try:
         os.kill(os.getpid(), signal.{name})

@@ -10,6 +10,7 @@ import pytest
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive import reading
+from pdhef_logtool.drive import windows as windows_module
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, Tell, one_log, read_drive
 from pdhef_logtool.drive.windows import DriveWindow
@@ -17,7 +18,7 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.budget import Budget
 from pdhef_logtool.logs.discovery import hash_log
 from pdhef_logtool.logs.drive_log import DriveLog
-from pdhef_logtool.mapping import Mapping, SignalSource
+from pdhef_logtool.mapping import Mapping, SignalSource, read_signals
 from pdhef_logtool.records.errors import EstimatorError, MappingError, UsageError
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
@@ -58,6 +59,22 @@ def test_windows_are_the_whole_and_a_second_pass_is_the_first(sample_logs_dir: P
         _assert_equal(concatenate([w.truth for w in windows if w.truth is not None]), whole.truth)
     assert whole.seconds == pytest.approx(9.5, abs=0.1)
     assert whole.nbytes > 100 * len(whole.signals)
+
+
+def test_a_drive_of_one_window_is_read_once_and_says_the_same_again(
+    sample_logs_dir: Path, car: Car, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reads: list[object] = []
+    monkeypatch.setattr(windows_module, "read_signals", lambda *a: reads.append(a) or read_signals(*a))
+    with read_drive(sample_logs_dir / "dlc.mcap", car, options=ReadOptions(friction="estimate")) as drive:
+        (first,) = _windows(drive)
+        said = drive.samples, drive.sample_ledger, drive.signals_sha256, drive.truth_sha256, drive.losses
+        (second,) = _windows(drive)
+        assert said == (drive.samples, drive.sample_ledger, drive.signals_sha256, drive.truth_sha256, drive.losses)
+        assert len(reads) == 1
+        _assert_equal(first.signals, second.signals)
+        assert sum(len(w.signals) for w in drive.windows(window_s=2.0)) == len(first.signals)
+        assert len(reads) > 2  # windows of another length are read anew
 
 
 def test_estimates_of_windows_are_those_of_the_whole(sample_logs_dir: Path, car: Car) -> None:

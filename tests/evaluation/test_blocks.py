@@ -21,6 +21,7 @@ from pdhef_logtool.evaluation.segments import find_intervals, moving_mask, segme
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.runs import track_store
 from pdhef_logtool.runs.scoring import segment_events
 from pdhef_logtool.runs.track_store import TrackStore
 
@@ -206,7 +207,8 @@ def test_masks_take_a_bit_each_and_refuse_another_shape():
 
 
 @pytest.mark.slow
-def test_scoring_a_stored_track_holds_no_column(tmp_path):
+def test_scoring_a_stored_track_holds_no_column(tmp_path, monkeypatch):
+    monkeypatch.setattr(track_store, "ROWS_HELD", 0)
     signals, truth, estimate, _ = drive(3, seconds=600.0)
     with TrackStore(tmp_path / "tracks") as store, patch.object(metrics, "LAG_SPAN_NS", 10**10):
         expected = score_track(estimate, truth, {}, log="drive", low_speed_m_s=3.0)

@@ -32,7 +32,7 @@ from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.watches.error_features import grip_share
 from pdhef_logtool.watches.intervals import SIDESLIP_TERMS, YAW_RATE_TERMS, combined, grip_factor
 

@@ -24,7 +24,7 @@ from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 
 pytestmark = pytest.mark.slow
 

@@ -18,7 +18,7 @@ from pdhef_logtool.learning.network.extract_command import ExtractSettings, extr
 from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
 from pdhef_logtool.records.errors import EXIT_PARTIAL
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 
 pytestmark = pytest.mark.slow
 

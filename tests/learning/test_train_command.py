@@ -19,7 +19,7 @@ from pdhef_logtool.records.errors import OutputError, UsageError
 from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 
 pytestmark = pytest.mark.slow
 

@@ -44,7 +44,7 @@ from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 
 pytestmark = pytest.mark.slow
 

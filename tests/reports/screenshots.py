@@ -10,7 +10,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from browser import Browser
 
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 
 ROOT = Path(__file__).parents[2]
 #: Name of the picture, page within the run, and how much of its height is shown.

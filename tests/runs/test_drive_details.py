@@ -10,7 +10,7 @@ import jsonschema
 import pytest
 
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.schema import load_schema
 
 pytestmark = pytest.mark.slow

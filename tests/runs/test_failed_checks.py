@@ -15,7 +15,7 @@ from pdhef_logtool.inspection import inspect_log
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map, load_mapping, mapping_to_toml
 from pdhef_logtool.runs.config import RunConfig, load_config
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.schema import load_schema
 
 

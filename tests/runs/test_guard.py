@@ -17,8 +17,8 @@ from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS
 from pdhef_logtool.runs import frames, guard
 from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.guard import choose_main, default_names
-from pdhef_logtool.runs.pipeline import run_logs
 from pdhef_logtool.sinks.answer import MainFacts
 
 EVERY = frozenset(ALIGNED_SIGNALS)

@@ -18,7 +18,8 @@ from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
 from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import RunResult, run_logs
+from pdhef_logtool.runs.fleet import run_logs
+from pdhef_logtool.runs.pipeline import RunResult
 from studies.torture.numerics import NUMERICS, Drive, read_samples, write_samples
 
 

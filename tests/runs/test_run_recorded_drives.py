@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 
 pytestmark = pytest.mark.slow
 

@@ -20,7 +20,7 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.runs import guard
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, calibrate_pool, checked, read_driving, self_calibrated
 from pdhef_logtool.self_calibration.calibration import self_calibrate
 from pdhef_logtool.sinks.schema import load_schema

@@ -18,7 +18,7 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import MappingError, UsageError
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.recorded_estimates import score_log
 from pdhef_logtool.sinks.schema import load_schema
 

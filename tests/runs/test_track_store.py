@@ -9,12 +9,19 @@ import pytest
 
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import concatenate, make_track
+from pdhef_logtool.runs import track_store
 from pdhef_logtool.runs.track_store import TrackStore
 
 STAMPS = np.arange(10, dtype=np.int64)
 
 
-def test_rows_of_a_stored_record_are_those_of_the_record(tmp_path):
+@pytest.fixture(params=[0, 5, 1000], ids=["in files", "in files from the second window on", "in memory"])
+def held(request, monkeypatch):
+    monkeypatch.setattr(track_store, "ROWS_HELD", request.param)
+    return request.param
+
+
+def test_rows_of_a_stored_record_are_those_of_the_record(tmp_path, held):
     covariance = np.arange(90, dtype=float).reshape(10, 3, 3)
     windows = [
         make_track("ukf", STAMPS[p], vx_m_s=STAMPS[p] * 2.0, covariance=covariance[p]) for p in (slice(4), slice(4, 10))
@@ -41,12 +48,22 @@ def test_rows_of_a_stored_record_are_those_of_the_record(tmp_path):
             part = store.read("ukf").rows(2, 5).rows(1, 3)
             assert not read.called
             np.testing.assert_array_equal(part.vx_m_s, [6.0, 8.0])
-            assert [call.args[2] for call in read.call_args_list] == [2]
+            assert [call.args[2] for call in read.call_args_list] == ([] if held > 10 else [2])
         with pytest.raises(AttributeError):
             _ = part.no_such_column
+        assert (tmp_path / "tracks").exists() == (held < 10)
+    assert not (tmp_path / "tracks").exists()
 
 
-def test_windows_come_back_as_they_were_added_with_what_is_drawn(tmp_path):
+def test_what_is_stored_does_not_follow_the_array_that_it_came_from(tmp_path):
+    stamps, vx = STAMPS.copy(), STAMPS * 1.0
+    with TrackStore(tmp_path / "tracks") as store:
+        store.append(make_track("ukf", stamps, vx_m_s=vx))
+        vx[:] = 0.0
+        np.testing.assert_array_equal(store.read("ukf").vx_m_s, STAMPS * 1.0)
+
+
+def test_windows_come_back_as_they_were_added_with_what_is_drawn(tmp_path, held):
     parts = (slice(0, 4), slice(4, 4), slice(4, 10))
     columns = [STAMPS * float(i) for i in range(6)]
     signals = Signals(STAMPS, STAMPS, *columns, wheel_speed_m_s=np.ones((10, 4)), available=frozenset({"ay_m_s2"}))

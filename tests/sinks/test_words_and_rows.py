@@ -14,6 +14,7 @@ import pytest
 from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
 from pdhef_logtool.logs.container import Attachment
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.sinks import report as report_module
 from pdhef_logtool.sinks.junit import junit_bytes
 from pdhef_logtool.sinks.mcap import _is_our_report
 from pdhef_logtool.sinks.palette import colour_rgb
@@ -181,6 +182,8 @@ def test_versions_are_those_that_are_installed_and_json_is_the_same_everywhere(m
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "version", absent)
+    report_module._installed.cache_clear()
     assert list(tool_versions()) == ["python"]
+    report_module._installed.cache_clear()
     assert json_bytes({"b": "µ", "a": [float("nan")]}) == '{\n  "a": [\n    null\n  ],\n  "b": "µ"\n}\n'.encode()
     assert json.loads(json_bytes({"a": 1})) == {"a": 1}

@@ -29,7 +29,7 @@ from pdhef_logtool.mapping import auto_map
 from pdhef_logtool.records.signals import Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate, make_track
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.report import diverged_line, report_markdown
 from pdhef_logtool.watches.divergence import DivergenceCarry, DivergenceWatch, wrong_branch
 from truthsim.drive import simulate_drive, write_drive

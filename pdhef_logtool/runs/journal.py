@@ -1,0 +1,245 @@
+"""journal.jsonl: what a run of several logs has done, a line a drive, from which a run that was ended goes on.
+
+A line is on the disk before the next drive counts as done. A log is known by what it holds; its label was given when
+it was first seen. Where it lies stands as a digest, so that nobody's folders get out, with size and time of change:
+a log with the same ones is not read to be known again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.files import open_new, write_bytes, writing
+from pdhef_logtool.results.opened_run import JOURNAL_FILE
+from pdhef_logtool.sinks.report import CarFacts, LogOutcome
+
+_FORMAT = {"format": "pdhef.journal", "version": 1}
+_DIGITS = 16
+#: Bytes of a log on a server, which nobody has asked for.
+_ELSEWHERE = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a log lies: digest of path and slice, size in bytes and time of change; of a folder those of its files.
+
+    Of a log on a server the digest is the URL's, and its identity alone, which is asked for, says whether it changed.
+    """
+
+    key: str
+    bytes: int
+    changed_ns: int
+
+    @classmethod
+    def of(cls, log: LogInput) -> Place:
+        """Return the place of a log; of one that is not there no bytes."""
+        if log.local is None:
+            return cls(_key(str(log.path), log.span_s), _ELSEWHERE, 0)
+        path = Path(os.path.realpath(log.local))
+        found = []
+        with suppress(OSError):
+            files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
+            found = [p.stat() for p in files]
+        return cls(
+            _key(os.fsdecode(path), log.span_s),
+            sum(f.st_size for f in found),
+            max((f.st_mtime_ns for f in found), default=0),
+        )
+
+    @property
+    def is_local(self) -> bool:
+        """Whether it is a place of this machine."""
+        return self.bytes != _ELSEWHERE
+
+
+def _key(path: str, span_s: tuple[float, float] | None) -> str:
+    return hashlib.sha256(os.fsencode(path) + repr(span_s).encode()).hexdigest()[:_DIGITS]
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What the journal says of a drive; its outcome is read when it is asked for.
+
+    Attributes
+    ----------
+    identity : what the log is known by, None where nobody could read it. setting, car : digests of what it was run
+        with; car None where it has none. keep : what was written.
+    part : the file of its figures below the run's folder, None without. failed_checks : those that count.
+    failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
+    quarantined : whether it took its worker along.
+    at : bytes into the journal.
+    """
+
+    label: str
+    place: Place
+    identity: str | None
+    setting: str
+    car: str | None
+    keep: str
+    part: str | None = None
+    failed_checks: int = 0
+    failed: bool = False
+    again: bool = False
+    quarantined: bool = False
+    at: int = -1
+
+
+@dataclass(slots=True)
+class Journal:
+    """The journal of a run's folder.
+
+    Attributes
+    ----------
+    entries : the last of each label. settings, cars : by digest, in words what a drive was run with.
+    """
+
+    path: Path
+    entries: dict[str, Entry] = field(default_factory=dict)
+    settings: dict[str, dict[str, str]] = field(default_factory=dict)
+    cars: dict[str, dict[str, Any]] = field(default_factory=dict)
+    _places: dict[str, tuple[Place, str | None, str]] = field(default_factory=dict)
+    _labels: dict[str, list[str]] = field(default_factory=dict)
+    _sizes: set[int] = field(default_factory=set)
+    _end: int = 0
+
+    @classmethod
+    def of(cls, folder: Path) -> Journal:
+        """Return a new journal of a folder, whatever it has."""
+        return cls(folder / JOURNAL_FILE)
+
+    @classmethod
+    def read(cls, folder: Path) -> Journal:
+        """Return the journal of a folder, empty where it has none; a line that was cut off is left out."""
+        journal = cls.of(folder)
+        if not journal.path.is_file():
+            return journal
+        with journal.path.open("rb") as file:
+            for line in file:
+                try:
+                    document = json.loads(line) if line.endswith(b"\n") else None
+                except ValueError:
+                    document = None
+                if not isinstance(document, dict):
+                    break  # what follows a line that is none was not written by this command
+                journal._take(document, journal._end)
+                journal._end += len(line)
+        return journal
+
+    def begin(self) -> None:
+        """Make it a whole file: the new one in place of an old one, or without a line that was cut off."""
+        if not self._end:
+            data = _line(_FORMAT)
+            write_bytes(self.path, data)
+            self._end = len(data)
+        elif self.path.stat().st_size > self._end:
+            with writing(self.path):
+                os.truncate(self.path, self._end)
+
+    def known(self, place: Place) -> tuple[str, str | None] | None:
+        """Return label and identity of the log that lies there, if it lay there before and has not been changed."""
+        found = self._places.get(place.key)
+        return (found[2], found[1]) if found is not None and found[0] == place else None
+
+    def label_at(self, place: Place) -> str | None:
+        """Return the label of the log that lay there last, whatever it held."""
+        found = self._places.get(place.key)
+        return None if found is None else found[2]
+
+    def may_know(self, place: Place) -> bool:
+        """Whether a log of this size was seen, so that its content may be known."""
+        return place.bytes in self._sizes
+
+    def labels_of(self, identity: str) -> list[str]:
+        """Return the labels of drives with this content."""
+        return self._labels.get(identity, [])
+
+    def outcome(self, entry: Entry) -> LogOutcome:
+        """Return how a drive ended."""
+        with self.path.open("rb") as file:
+            file.seek(entry.at)
+            told = json.loads(file.readline())["outcome"]
+        car = None if told["car"] is None else CarFacts(**told["car"])
+        return LogOutcome(**{**told, "car": car, "lost": tuple(told["lost"])})
+
+    def add(self, entry: Entry, outcome: LogOutcome) -> None:
+        """Write down how a drive ended; raises OutputError."""
+        document = asdict(entry)
+        del document["at"]
+        at = self._append({**document, "outcome": jsonable(outcome)})
+        self._keep(replace(entry, at=at))
+
+    def add_place(self, label: str, place: Place, identity: str) -> None:
+        """Write down that a known log lies there too."""
+        self._append({"label": label, "place": asdict(place), "identity": identity, "moved": True})
+        self._places[place.key] = place, identity, label
+
+    def add_setting(self, digest: str, told: Mapping[str, str]) -> None:
+        """Write down what a setting is, once."""
+        if digest not in self.settings:
+            self._append({"setting": digest, "is": dict(told)})
+            self.settings[digest] = dict(told)
+
+    def add_car(self, digest: str, told: Mapping[str, Any]) -> None:
+        """Write down what a car is, once."""
+        if digest not in self.cars:
+            self._append({"car": digest, "is": dict(told)})
+            self.cars[digest] = dict(told)
+
+    def _append(self, document: Mapping[str, Any]) -> int:
+        at, data = self._end, _line(document)
+        with writing(self.path), open_new(self.path, "ab") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        self._end += len(data)
+        return at
+
+    def _take(self, document: dict[str, Any], at: int) -> None:
+        if "is" in document:
+            kind, known = ("setting", self.settings) if "setting" in document else ("car", self.cars)
+            known[document[kind]] = document["is"]
+        elif "moved" in document:
+            place = Place(**document["place"])
+            self._places[place.key] = place, document["identity"], document["label"]
+        elif "label" in document:
+            told = {k: v for k, v in document.items() if k != "outcome"}
+            self._keep(Entry(**{**told, "place": Place(**told["place"])}, at=at))
+
+    def _keep(self, entry: Entry) -> None:
+        self.entries[entry.label] = entry
+        self._places[entry.place.key] = entry.place, entry.identity, entry.label
+        self._sizes.add(entry.place.bytes)
+        if entry.identity is not None and entry.label not in (labels := self._labels.setdefault(entry.identity, [])):
+            labels.append(entry.label)
+
+
+def _line(document: Mapping[str, Any]) -> bytes:
+    text = json.dumps(document, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.encode("utf-8", "backslashreplace") + b"\n"
+
+
+def digest_of(told: Any) -> str:
+    """Return a short digest of JSON-able values."""
+    text = json.dumps(told, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:_DIGITS]
+
+
+def changes(old: Mapping[str, str], new: Mapping[str, str]) -> Iterator[str]:
+    """Yield in words what differs between two settings or cars."""
+    for name in sorted({*old, *new}):
+        before, after = old.get(name, "none"), new.get(name, "none")
+        if before != after:
+            yield f"{name} changed" if _is_digest(before) or _is_digest(after) else f"{name} {before} → {after}"
+
+
+def _is_digest(text: str) -> bool:
+    return len(text) >= _DIGITS and all(c in "0123456789abcdef" for c in text)

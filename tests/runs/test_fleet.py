@@ -1,0 +1,261 @@
+"""A run of several logs: what its journal keeps, what goes on, what is run anew, what is given up."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.supervisor import Limits, Tell
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
+from pdhef_logtool.sinks.report import LogOutcome
+from tests.fleet_soak.planted import planted_drive
+from tests.runs.stub_drives import stub_drive
+
+
+def named_logs(folder: Path, *names: str) -> Path:
+    """Write logs that a stub's work reads nothing of: each holds its name."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / f"{name}.mcap").write_text(f"this is {folder.name}/{name}")
+    return folder
+
+
+def labels(output: Path) -> list[str]:
+    return [log.label for log in open_run(output).logs]
+
+
+class Counted:
+    """A stub's work that counts what it is asked for."""
+
+    def __init__(self, ends: Callable[[DriveTask, Tell], DriveEnd] = stub_drive) -> None:
+        self.asked: list[str] = []
+        self._ends = ends
+
+    def __call__(self, task: DriveTask, tell: Tell) -> DriveEnd:
+        self.asked.append(task.log.stem)
+        return self._ends(task, tell)
+
+
+def run(folder: Path | list[str], output: Path, config: RunConfig | None = None, **options: Any) -> Any:
+    arguments = folder if isinstance(folder, list) else [str(folder)]
+    options = {"work": stub_drive, "report": False, "limits": Limits(), **options}
+    return run_logs(arguments, output, config or RunConfig(), **options)
+
+
+def test_what_is_done_is_not_done_again_and_a_folder_added_later_runs_alone(tmp_path: Path) -> None:
+    day = named_logs(tmp_path / "logs/day", "a", "b")
+    out, work = tmp_path / "out", Counted()
+    run(day, out, work=work)
+    assert (work.asked, labels(out)) == (["a", "b"], ["a", "b"])
+    named_logs(tmp_path / "logs/night", "a", "c")
+    run(tmp_path / "logs", out, work=work, resume=True)
+    # The labels that were given stay, although the new folder has an `a` too.
+    assert labels(out)[:2] == ["a", "b"]
+    assert work.asked == ["a", "b", *labels(out)[2:]]
+    metrics = pl.read_parquet(out / "metrics.parquet")
+    assert list(dict.fromkeys(metrics["log"])) == labels(out)
+    scanned = pl.scan_parquet(out / "metrics/**/*.parquet", hive_partitioning=True).collect()
+    assert {"run", "car"} <= set(scanned.columns)
+    assert scanned.drop("run", "car").sort("log").equals(metrics.sort("log"))
+
+
+def test_a_log_is_known_by_what_it_holds(tmp_path: Path) -> None:
+    logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
+    run(logs, out, work=work)
+    (logs / "later").mkdir()
+    (logs / "a.mcap").rename(logs / "later/moved.mcap")
+    os.utime(logs / "b.mcap", ns=(1, 1))
+    run(logs, out, work=work, resume=True)
+    assert (labels(out), work.asked) == (["b", "a"], ["a", "b"])
+    said: list[str] = []
+    (logs / "b.mcap").write_text("recorded again")
+    run(logs, out, work=work, resume=True, say=said.append)
+    assert (labels(out), work.asked) == (["b", "a"], ["a", "b", "b"])
+    assert said == ["1 of 2 drives are run anew: their logs have changed"]
+
+
+def test_the_same_drive_under_two_names_is_run_once_and_that_is_said(tmp_path: Path) -> None:
+    logs, out, work = named_logs(tmp_path / "logs", "a"), tmp_path / "out", Counted()
+    shutil.copy(logs / "a.mcap", logs / "b.mcap")
+    warned: list[str] = []
+    for options in ({}, {"resume": True}):
+        run(logs, out, work=work, warn=warned.append, **options)
+    assert (labels(out), work.asked) == (["a"], ["a"])
+    assert warned == ["b.mcap holds what a.mcap holds: the drive is run once"] * 2
+
+
+def test_resuming_reads_no_log_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    logs, out = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out"
+    run(logs, out)
+
+    def read(_: object) -> str:
+        raise AssertionError("a log was read to be known again")
+
+    monkeypatch.setattr("pdhef_logtool.runs.fleet.identity_of", read)
+    work = Counted()
+    run(logs, out, resume=True, work=work)
+    assert work.asked == []
+
+
+def test_what_is_run_anew_is_said_and_why(tmp_path: Path, sample_logs_dir: Path) -> None:
+    car = tmp_path / "car.toml"
+    text = (sample_logs_dir / "vehicle.toml").read_text()
+    car.write_text(text)
+    logs, out, work, said = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted(), list[str]()
+    run(logs, out, RunConfig(car=car), work=work)
+    car.write_text(text.replace("1440.0", "1450.0"))
+    run(logs, out, RunConfig(car=car), work=work, resume=True, say=said.append)
+    run(logs, out, RunConfig(car=car, friction=0.4), work=work, resume=True, say=said.append)
+    run(logs, out, RunConfig(car=car, friction=0.4, window_s=60.0), work=work, resume=True, say=said.append)
+    assert said == [
+        "2 of 2 drives are run anew: the car's physics changed",
+        "2 of 2 drives are run anew: --friction auto → 0.4",
+    ]
+    assert work.asked == ["a", "b"] * 3
+    assert len(list((out / "metrics").rglob("*.parquet"))) == 2  # those of before are gone
+
+
+def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> None:
+    logs, out, work = named_logs(tmp_path / "logs", "a", "b"), tmp_path / "out", Counted()
+    run(logs, out, RunConfig(keep="metrics"), work=work)
+    run(logs, out, RunConfig(keep="metrics"), work=work, only=["b"])
+    assert work.asked == ["a", "b", "b"]
+    assert labels(out) == ["a", "b"]
+    run(logs, out, RunConfig(keep="estimates"), work=work, resume=True)
+    assert work.asked == ["a", "b", "b", "a"]
+    with pytest.raises(UsageError, match="--only: expected the name of a log"):
+        run(logs, out, RunConfig(keep="metrics"), only=["c"])
+    with pytest.raises(UsageError, match="friction"):
+        run(logs, out, RunConfig(keep="metrics", friction=0.4), only=["a"])
+
+
+def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(tmp_path: Path) -> None:
+    logs = named_logs(tmp_path / "logs", *(f"drive{i:02d}" for i in range(51)))
+    work, said = Counted(), list[str]()
+    result = run(logs, tmp_path / "out", work=work, say=said.append, full_worst=2)
+    assert result.is_fleet
+    assert said[0].startswith("51 logs: figures and a short report of each are kept, no tracks")
+    errors = pl.read_parquet(tmp_path / "out/metrics.parquet").filter(pl.col("metric") == "rmse")
+    worst = errors.sort("value", "log", descending=[True, False])["log"][:2].to_list()
+    assert work.asked[51:] == sorted(worst)
+    entries = [json.loads(line) for line in (tmp_path / "out" / JOURNAL_FILE).read_text().splitlines()]
+    assert [e["keep"] for e in entries if e.get("label") in worst] == ["metrics"] * 2 + ["full"] * 2
+    again = Counted()
+    run(logs, tmp_path / "out", work=again, full_worst=2, resume=True)
+    assert again.asked == []
+
+
+def test_a_run_that_is_ended_tells_of_what_is_done_and_goes_on(tmp_path: Path) -> None:
+    logs = named_logs(tmp_path / "logs", "a", "b", "c", "d")
+    undisturbed, out = tmp_path / "undisturbed", tmp_path / "out"
+    run(logs, undisturbed)
+    for stops_at in ("b", "d"):
+
+        def stopped(task: DriveTask, tell: Tell, at: str = stops_at) -> DriveEnd:
+            if task.log.stem == at:
+                raise KeyboardInterrupt
+            return stub_drive(task, tell)
+
+        with pytest.raises(KeyboardInterrupt):
+            run(logs, out, work=stopped, resume=True)
+        document = json.loads((out / "run.json").read_text())
+        assert [e["log"] for e in document["logs"]] == ["a", "b", "c"][: 1 if stops_at == "b" else 3]
+        assert document["remaining"] == (3 if stops_at == "b" else 1)
+        with (out / JOURNAL_FILE).open("ab") as file:
+            file.write(b'{"label":"cut off by a k')
+    run(logs, out, resume=True)
+    assert contents(out) == contents(undisturbed)
+
+
+def contents(output: Path) -> dict[str, bytes]:
+    """Return all files but the journal, in which drives stand as they ended."""
+    files = (p for p in output.rglob("*") if p.is_file() and p.name != JOURNAL_FILE)
+    return {p.relative_to(output).as_posix(): p.read_bytes() for p in files}
+
+
+def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: Path) -> None:
+    logs, out = named_logs(tmp_path / "logs", "a", "full", "bad"), tmp_path / "out"
+
+    def failing(task: DriveTask, tell: Tell) -> DriveEnd:
+        if task.log.stem in ("bad", "full"):
+            outcome = LogOutcome(task.log.stem, task.log.path.name, None, failed="for a test")
+            return DriveEnd(outcome, None, again=task.log.stem == "full")
+        return stub_drive(task, tell)
+
+    result = run(logs, out, work=failing)
+    assert result.exit_code == 3
+    for options, asked in (({"resume": True}, ["full"]), ({"retry": True}, ["bad", "full"])):
+        work = Counted(failing)
+        assert run(logs, out, work=work, **options).exit_code == 3
+        assert work.asked == asked
+    assert run(logs, out, retry=True).exit_code == 0
+
+
+@pytest.mark.slow
+def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(tmp_path: Path) -> None:
+    logs, out = named_logs(tmp_path / "logs", "a", "hangs", "b", "kills"), tmp_path / "out"
+    result = run(logs, out, work=planted_stub, jobs=2, limits=Limits(3.0))
+    assert result.exit_code == 3
+    outcomes = {r.outcome.log: r.outcome.outcome for r in result.results}
+    assert outcomes["a"] == outcomes["b"] == "ok"
+    assert outcomes["hangs"] == "failed: nothing heard for 3 s, 2 tries; last heard: before it hangs"
+    assert outcomes["kills"].startswith("failed: the worker was killed (signal 9), 2 tries")
+    work = Counted()
+    assert run(logs, out, work=work, resume=True).exit_code == 3
+    assert work.asked == []
+    assert run(logs, out, work=work, retry=True).exit_code == 0
+    assert work.asked == ["hangs", "kills"]
+
+
+def planted_stub(task: DriveTask, tell: Tell) -> DriveEnd:
+    return planted_drive(task, tell, stub_drive)
+
+
+@pytest.mark.slow
+def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(sample_logs_dir: Path, tmp_path: Path) -> None:
+    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
+    config = RunConfig(car=Path("saloon"), estimators=("zero", "kinematic"), keep="estimates", end="3")
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert run_logs(logs, one, config).exit_code == 0
+
+    def killed(line: str, share: float) -> None:
+        if share > 0.5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_logs(logs, two, config, jobs=2, progress=killed)
+    assert run_logs(logs, two, config, jobs=2, resume=True).exit_code == 0
+    assert contents(one) == contents(two)
+    folder = two / "logs/dlc"
+    assert {p.name for p in folder.iterdir()} == {"estimates.parquet", "metrics.parquet", "report.json"}
+
+
+@pytest.mark.slow
+def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path, tmp_path: Path) -> None:
+    import jsonschema
+
+    from pdhef_logtool.sinks.schema import load_schema
+
+    logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
+    config = RunConfig(car=Path("saloon"), keep="metrics", end="4")
+    result = run_logs(logs, tmp_path, config, full_worst=1)
+    worst = "step"
+    report = tmp_path / "logs/dlc/report.json"
+    assert [p.name for p in report.parent.iterdir()] == ["report.json"]
+    assert report.stat().st_size < 20_000
+    jsonschema.validate(json.loads(report.read_text()), load_schema("report.schema.json"))
+    jsonschema.validate(json.loads((tmp_path / "run.json").read_text()), load_schema("run.schema.json"))
+    assert (tmp_path / "logs" / worst / "recording.rrd").is_file()
+    assert (tmp_path / "logs" / worst / "report.html").is_file()
+    assert (tmp_path / "report.html").is_file()
+    assert {r.metric for r in result.results[0].rows} >= {"rmse", "nees", "lag_s"}
