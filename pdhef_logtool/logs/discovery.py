@@ -141,7 +141,7 @@ def identity_of(log: LogInput) -> str:
         return hash_log(log.path)
     from pdhef_logtool.logs.remote_source import RemoteSource
 
-    source = RemoteSource(log.path)
+    source = RemoteSource(log.path, head_bytes=1)
     try:
         return source.identity
     finally:

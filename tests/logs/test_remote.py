@@ -6,6 +6,7 @@ import dataclasses
 import random
 import struct
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -397,6 +398,16 @@ def test_identity_is_url_size_and_etag(served: CountingServer) -> None:
     assert identity_of(signed) == first
     served.files["dlc.mcap"] += b"x"
     assert identity_of(log) != first
+
+
+def test_identities_are_asked_for_in_threads(served: CountingServer) -> None:
+    served.files |= {f"{i}.mcap": bytes([i]) * 5000 for i in range(30)}
+    logs = find_logs([served.place(f"{i}.mcap") for i in range(30)] * 2)
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(identity_of, [*logs, *logs]))
+    assert found[:30] == found[30:]
+    assert len(set(found)) == 30
+    assert served.bytes_sent <= 60
 
 
 def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_logs_dir: Path) -> None:
