@@ -58,6 +58,10 @@ _OPTIONS: dict[str, Any] = {
     "keep": Annotated[
         _Text, Option(help="Of each drive: metrics, estimates, or full. Default: full, above 50 logs metrics.")
     ],
+    "cache": Annotated[
+        _Text,
+        Option(metavar="DIR|URL", help="Keep a slim log of each log there and read that the next time: docs/slim.md."),
+    ],
     "sensors": Annotated[_Text, Option(help="full, or esp: no wheel speeds in the filters after the start.")],
     "friction": Annotated[
         _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/friction.md")
