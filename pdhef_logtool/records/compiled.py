@@ -50,13 +50,13 @@ def _without_blas() -> None:
     arraymath.ensure_blas = found
 
 
-def _sizes_differ(given: Any, expected: Any) -> None:
+def _sizes_differ(_given: Any, _expected: Any) -> None:
     """Stand for what numba calls where an array is assigned to a slice of another shape."""
 
 
 @overload(_sizes_differ)
-def _raise_that_sizes_differ(given: Any, expected: Any) -> Any:
-    def raising(given: Any, expected: Any) -> None:
+def _raise_that_sizes_differ(_given: Any, _expected: Any) -> Any:
+    def raising(_given: Any, _expected: Any) -> None:
         raise ValueError("cannot assign slice from input of different size")
 
     return raising
