@@ -404,7 +404,7 @@ def _open_sinks(
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
             names = None if config.estimators else frozenset({shown.main, TRUTH})
-            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names))
+            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names, shown={shown.main, TRUTH}))
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
             sinks.append(LayoutsSink(*layouts, names, colours))
         if config.kept == "full":
@@ -434,6 +434,7 @@ def _recording(  # positional: what `_open_sinks` takes
         log_name=drive.name,
         input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
         start_ns=drive.plan.start_ns,
+        end_ns=drive.plan.end_ns,
         shown=shown,
         min_speed_m_s=car.vehicle.low_speed_blend_m_s,
         colours=colours,
