@@ -256,3 +256,10 @@ def test_spoilt_labels_are_those_of_usable_rows_and_the_set_still_opens(tmp_path
         np.testing.assert_array_equal(after.features, before.features)
         assert not np.array_equal(after.targets, before.targets)
         np.testing.assert_allclose(np.sort(np.abs(after.targets), axis=0), np.sort(np.abs(before.targets), axis=0))
+
+
+@pytest.mark.fleet
+def test_sound_drives_pass_the_gate_and_spoilt_labels_do_not(tmp_path: Path) -> None:
+    from studies.retrain import main
+
+    assert main(["-o", str(tmp_path), "--jobs", "2"]) == 0
