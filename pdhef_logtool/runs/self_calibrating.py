@@ -11,7 +11,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.base import Estimator, run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
@@ -19,6 +19,7 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.runs import guard
+from pdhef_logtool.runs.cached import read_cached
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -51,7 +52,7 @@ def calibrate_pool(
     found = []
     for log_input in inputs:
         try:
-            with read_drive(log_input, car, mapping, config.read_options) as drive:
+            with read_cached(log_input, car, mapping, config) as drive:
                 if not lacking(drive):
                     found.append(read_driving(drive))
         except PdhefError:
