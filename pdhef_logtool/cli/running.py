@@ -34,7 +34,7 @@ commands = typer.Typer()
     "pdhef run fleet/ -o out --jobs 8 --keep metrics",
     "pdhef run fleet/ new/ -o out --jobs 8 --resume",
     "pdhef run fleet/ -o out --only drive_0312",
-    "pdhef run @fleet.txt -o /shared/out --ray auto --keep metrics",
+    "pdhef run @list.txt -o /shared/out --ray auto --keep metrics",
     "pdhef run @list.txt -o out --jobs 8 --keep metrics --cache ~/slim",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
