@@ -647,10 +647,12 @@ class _Fleet:
 
     def worst(self, count: int) -> list[str]:
         """Return the labels of the scored drives whose answers have the largest errors of sideslip."""
-        from pdhef_logtool.results.fleet import answer_errors
+        import polars as pl
 
-        errors = answer_errors(open_run(self.output))
-        return sorted(errors, key=lambda label: (-errors[label], label))[:count]
+        from pdhef_logtool.results.summary import sideslip_errors
+
+        errors = sideslip_errors(open_run(self.output)).filter(pl.col("estimator") == pl.col("main"))
+        return errors.sort("value", "log", descending=[True, False])["log"].head(count).to_list()
 
     def write_pages(self) -> None:
         """Write the page of the run, and those of drives that no worker has written; or remove what there is."""
