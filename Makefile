@@ -10,7 +10,7 @@ CAR := saloon
 JOBS ?= 2
 
 .PHONY: help demo test quick pages mutants check lint format bench train-default samples conditions real switches torture \
-  docs docs-truthsim paper strangers clean
+  retrain docs docs-truthsim paper strangers clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -23,6 +23,8 @@ help:
 	@echo "make strangers  docs/strangers.md: logs that the tool has not met, and what it gets right (under two minutes)"
 	@echo "make bench    speed against peers"
 	@echo "make train-default  simulate, train and tune the model that the package ships (two cores, 20 minutes or so)"
+	@echo "make retrain  a retraining on simulated drives: sound ones are accepted, spoilt ones are not (docs/retrain.md);"
+	@echo "              LOGS=drives/ CAR=mycar OUT=folder: on your own"
 	@echo "make samples  write sample_logs/ anew with the simulator"
 	@echo "make conditions CAR=car NETWORK=folder  docs/conditions.md: every estimator on the condition table"
 	@echo "make real NETWORK=folder  docs/real.md: every estimator on the recorded drives in ../shared"
@@ -97,6 +99,11 @@ bench: $(VENV)/installed-dev $(VENV)/compiled
 train-default: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m studies.defaults.train_default
 	$(BIN)/python -m studies.model_card
+
+# Without LOGS the check of the whole chain, 15 minutes or so on two cores.
+retrain: $(VENV)/installed-dev $(VENV)/compiled
+	$(if $(LOGS),$(BIN)/pdhef retrain $(LOGS) -o $(if $(filter out/demo,$(OUT)),out/retrain,$(OUT)) --car $(CAR) --jobs $(JOBS),\
+	  OMP_NUM_THREADS=1 $(BIN)/python -m studies.retrain --jobs $(JOBS))
 
 $(VENV)/installed-docs: $(VENV)/installed pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'

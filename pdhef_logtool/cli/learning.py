@@ -1,4 +1,4 @@
-"""``pdhef identify``, ``extract``, ``train``, ``tune``, ``trust``, ``calibrate``, ``learn``: what drives teach."""
+"""``pdhef identify``, ``extract``, ``train``, ``tune``, ``trust``, ``calibrate``, ``learn``, ``retrain``."""
 
 from __future__ import annotations
 
@@ -276,3 +276,45 @@ def learn(
     with console.progress() as bar:
         result = teach(logs, output, settings, fresh=fresh, progress=bar, warn=console.warn, say=console.say)
     console.finish(result, learning_tables.render_course, as_json)
+
+
+@options.command(
+    commands,
+    "pdhef retrain logs/ -o retrained --car mycar --jobs 2",
+    "pdhef retrain logs/ -o retrained --car mycar --gate gate.toml --strict",
+    "pdhef run new/ -o out --car retrained/accepted/0123456789ab/car",
+    notes="Every drive has one part in it: it trains the network, stops the training, says how far the network may be "
+    "followed, fits intervals, or decides at the end. Car and candidate run on the last ones, and pdhef compare says "
+    "whether the candidate is worse: then it is kept under rejected/ with the reason, else under accepted/ "
+    "(docs/retrain.md). The same command again does what is new and nothing else. Exit codes: 0 accepted, 3 accepted "
+    "with drives left out, 4 rejected.",
+    shared="sensors friction",
+    car="The car whose network is trained on",
+)
+def retrain(
+    *,
+    logs: options.TruthLogs,
+    output: Annotated[Path, Option("--output", "-o", metavar="DIR", help="Folder of stages and candidates.")],
+    config: RunConfig,
+    gate: Annotated[
+        Path | None, Option(metavar="FILE", help="gate.toml of pdhef compare. Default: pd-hef at most 2 % worse.")
+    ] = None,
+    strict: Annotated[bool, Option("--strict", help="That nobody can tell closes the gate.")] = False,
+    init: Annotated[
+        Path | None, Option(help="Model bundle to begin with, many-cars, or none. Default: the car's, else many-cars.")
+    ] = None,
+    epochs: Annotated[int | None, Option(help="Default: 15, from nothing 30.")] = None,
+    seed: Annotated[int, Option(help="Of who does what, of training and of bootstraps.")] = 0,
+    jobs: options.Jobs = 1,
+    as_json: options.JsonFlag = False,
+) -> None:
+    """Train a car's network on, and let a gate judge it. The drives of the gate are kept aside."""
+    from pdhef_logtool.learning.retrain.retrain_command import DEFAULT_GATE, RetrainSettings
+    from pdhef_logtool.learning.retrain.retrain_command import retrain as train_again
+    from pdhef_logtool.results.gate import load_gate
+
+    asked = DEFAULT_GATE if gate is None else load_gate(gate)
+    settings = RetrainSettings(config=config, seed=seed, init=init, epochs=epochs, gate=asked, strict=strict)
+    with console.progress() as bar:
+        result = train_again(logs, output, settings, jobs=jobs, progress=bar, warn=console.warn, say=console.say)
+    console.finish(result, learning_tables.render_retraining, as_json)

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.network.extract_command import ExtractResult
     from pdhef_logtool.learning.network.train_command import TrainResult
     from pdhef_logtool.learning.noise.tune_command import TuneResult
+    from pdhef_logtool.learning.retrain.retrain_command import RetrainResult
 
 
 def render_identification(result: IdentifyResult, console: Console) -> None:
@@ -78,25 +79,25 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
     splits = result.manifest["splits"].items()
     told = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
     console.print(", ".join(told))
-    _print_cells(result.manifest, console)
+    _print_cells(result.manifest["cells"], result.manifest["choice"], console)
     console.print(f"dataset in {result.output}", soft_wrap=True)
 
 
-def _print_cells(manifest: Mapping[str, Any], console: Console) -> None:
+def _print_cells(held: Mapping[str, Any], choice: Mapping[str, Any] | None, console: Console) -> None:
     """Print how much of each cell of driving split train holds, and how many hold nothing."""
     from pdhef_logtool.learning.network.cells import AY_M_S2, FRICTION, SPEED_M_S, cells
     from pdhef_logtool.learning.network.dataset import CHOSEN_SPLIT
 
-    seconds, empty = (manifest["cells"][key][CHOSEN_SPLIT] for key in ("usable_s", "empty"))
-    most = math.inf if manifest["choice"] is None else manifest["choice"]["per_cell_s"]
+    seconds, empty = (held[key][CHOSEN_SPLIT] for key in ("usable_s", "empty"))
+    most = math.inf if choice is None else choice["per_cell_s"]
     shown = table("friction", "|a_y|\nm/s²", *(f">{_span(SPEED_M_S, i)}\nm/s" for i in range(len(SPEED_M_S))))
     for first in range(0, len(seconds), len(SPEED_M_S)):
         row, bins = first // len(SPEED_M_S), cells()[first : first + len(SPEED_M_S)]
-        held = zip(bins, seconds[first : first + len(bins)], strict=True)
+        row_of = zip(bins, seconds[first : first + len(bins)], strict=True)
         shown.add_row(
             _span(FRICTION, row // len(AY_M_S2)),
             _span(AY_M_S2, row % len(AY_M_S2)),
-            *(f"{min(s, most):.0f}" if s >= 0.5 else "<1" if s else "-" if c.in_reach else "" for c, s in held),
+            *(f"{min(s, most):.0f}" if s >= 0.5 else "<1" if s else "-" if c.in_reach else "" for c, s in row_of),
         )
     console.print(f"seconds to learn from in split {CHOSEN_SPLIT}" + ("" if most == math.inf else ", as chosen"))
     console.print(shown)
@@ -201,3 +202,24 @@ def render_course(result: CourseResult, console: Console) -> None:
     for text in result.more:
         console.print(f"  {text}")
     console.print(f"car in {result.car}, what each decision rests on in learn.md there", soft_wrap=True)
+
+
+def render_retraining(result: RetrainResult, console: Console) -> None:
+    """Print what the candidate learnt on, how it compares on the drives of the gate, and the verdict."""
+    from pdhef_logtool.results.gate import Figure
+
+    found = result.document
+    _print_cells(found["cells"], None, console)
+    console.print(", ".join(f"{role}: {count}" for role, count in found["drives_by_role"].items()) + " drives")
+    shown = table("figure", ">drives", ">median change", ">95 % interval", "verdict", fold=1)
+    for one in found["comparison"]["figures"]:
+        figure = Figure(one["signal"], one["metric"], one["segment"], one["estimator"])
+        median, low, high = ("-" if one[k] is None else f"{100.0 * one[k]:+.1f} %" for k in ("median", "low", "high"))
+        shown.add_row(figure.label, str(one["drives"]), median, f"{low} to {high}", one["verdict"])
+    console.print("the candidate against the car as it is, on the drives of the gate")
+    console.print(shown)
+    if found["judged"] > 1:
+        console.print(f"{found['judged']} candidates were judged on these drives: the more there are, the less it says")
+    for reason in found["reasons"]:
+        console.print(f"rejected: {reason}")
+    console.print(f"{'accepted' if result.accepted else 'rejected'}: {result.folder}", soft_wrap=True)

@@ -15,7 +15,7 @@ PDHEF = [sys.executable, "-m", "pdhef_logtool"]
 COMMANDS = (
     *("inspect", "map", "estimators", "run", "metrics", "slim", "report", "compare", "events", "view"),
     *("simulate", "simulate suite", "simulate conditions"),
-    *("identify", "extract", "train", "tune", "trust", "calibrate", "learn"),
+    *("identify", "extract", "train", "tune", "trust", "calibrate", "learn", "retrain"),
 )
 
 

@@ -114,8 +114,8 @@ def _extract(
     (tmp_path / "drive.mcap").write_bytes(b"in memory")
     (tmp_path / "m.toml").write_text(MAPPING)
     (tmp_path / "v.toml").write_text(vehicle_toml(car))
-    monkeypatch.setattr(reading, "open_log", lambda *_: log)
-    monkeypatch.setattr(reading, "hash_log", lambda _: "0" * 64)
+    monkeypatch.setattr(reading, "open_log", lambda *_, **__: log)
+    monkeypatch.setattr(reading, "identity_of", lambda _: "0" * 64)
     config = RunConfig(car=tmp_path / "v.toml", mapping=tmp_path / "m.toml", window_s=settings.pop("window_s", 7.0))
     return extract(
         [str(tmp_path / "drive.mcap")], tmp_path / "out", ExtractSettings(config, **{"model": "phy-ukf", **settings})

@@ -236,7 +236,7 @@ def test_settings_say_what_decides_a_dataset() -> None:
 
 def test_a_manifest_gives_split_and_vehicle_file(tmp_path: Path) -> None:
     (tmp_path / "car.toml").write_text("")
-    log = tmp_path / "a.mcap"
+    log = LogInput(tmp_path / "a.mcap", "a")
     listed = extract_command._listed(log, {"a.mcap": {"split": "test", "vehicle_file": "car.toml", "vehicle": "x"}})
     assert (listed.split, listed.vehicle) == ("test", tmp_path / "car.toml")
     assert extract_command._listed(log, {"a.mcap": {"vehicle": "car.toml"}}).vehicle == tmp_path / "car.toml"

@@ -10,7 +10,6 @@ import hashlib
 import json
 import math
 import shutil
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
@@ -55,12 +54,13 @@ from pdhef_logtool.learning.learn.steps import (
     what_more_would_pay,
 )
 from pdhef_logtool.learning.noise.tune_command import REFUSED
+from pdhef_logtool.learning.stages import Stages
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.records.errors import EstimatorError, UsageError
-from pdhef_logtool.records.files import write_bytes, writing
-from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder, check_no_input
+from pdhef_logtool.records.files import write_bytes
+from pdhef_logtool.records.outputs import OutputFolder, check_no_input
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import NO_MODEL
 from pdhef_logtool.sinks.report import json_bytes
@@ -68,7 +68,7 @@ from pdhef_logtool.sinks.report import json_bytes
 FORMAT, FORMAT_VERSION = "pdhef-learn", 1
 #: In the car's folder: the steps' results, and what is told of them.
 WORK, RECORD_FILE, PAGE_FILE, PLOT_FILE = "learn", "learn.record.json", "learn.md", "learn.png"
-STEP_FILE, CAR, LOOKS_FILE = "step.json", "car", "looks.json"
+CAR, LOOKS_FILE = "car", "looks.json"
 #: What may come of a step.
 KEPT, UNDONE, NOT_DONE = "kept", "undone", "not done"
 #: Steps that do not stay where they change nothing, or where the 95 % intervals then hold less than a share of the
@@ -319,28 +319,9 @@ def _teach(course: _Course, start: Path) -> tuple[list[StepResult], Path]:
 def _cached(
     course: _Course, number: int, name: str, kept: Sequence[str], work: Callable[[Path], dict[str, Any]]
 ) -> dict[str, Any]:
-    """Return what a step came to, from an earlier call if all that it rests on is as it was then.
-
-    Parameters
-    ----------
-    kept : steps before it that stay. work : does the step in a folder, which then stands whole or not at all.
-    """
-    basis = digest([course.basis, name, list(kept)])
-    folder = course.work / f"{number}-{name}"
-    with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
-        document = json.loads((folder / STEP_FILE).read_text(encoding="utf-8"))
-        if document["basis"] == basis:
-            course.say(f"{name}: {document['shown']} (as found before)")
-            return dict(document["found"])
-    began = time.monotonic()
-    course.progress(name, _share(number))
-    with writing(folder), FolderTransaction(folder, keep=False) as transaction:
-        found = work(transaction.file("."))
-        shown = _shown(found)
-        write_bytes(transaction.file(STEP_FILE), json_bytes({"basis": basis, "shown": shown, "found": found}))
-    course.say(f"{name}: {shown} ({time.monotonic() - began:.0f} s)")
-    found_again: dict[str, Any] = json.loads(json_bytes(found))
-    return found_again
+    """Return what a step came to; it rests on the course and on the steps before it that stay (``kept``)."""
+    stages = Stages(course.work, _shown, course.say, course.progress)
+    return stages.do(number, name, [course.basis, list(kept)], _share(number), work)
 
 
 def _share(number: int) -> float:

@@ -222,6 +222,7 @@ def extract(
     *,
     jobs: int = 1,
     resume: bool = False,
+    splits: Mapping[str, str] | None = None,
     progress: Progress = lambda _text, _share: None,
     warn: Tell = lambda _text: None,
 ) -> ExtractResult:
@@ -233,6 +234,7 @@ def extract(
     ----------
     arguments : logs, folders, glob patterns. jobs : processes at work; changes nothing that is written.
     resume : keep drives whose log and settings are as they were.
+    splits : of each log by its stem, instead of what the manifests of sets say.
 
     Raises
     ------
@@ -246,6 +248,8 @@ def extract(
     inputs = find_logs(arguments)
     mapping = open_mapping(settings.config)
     work = list(_plan_jobs(inputs, output, settings, mapping, resume, warn))
+    if splits is not None:
+        work = [replace(job, listed_split=splits[job.log_input.stem]) for job in work]
     before = _earlier(output, settings)
     names = {settings.name_of(i.stem) for i in inputs}
     read = [*(i.local for i in inputs), *settings.config.files, *(j.car.source for j in work)]
@@ -271,8 +275,8 @@ def extract(
             duplicates=copies,
         )
 
-    splits = {*SPLITS, settings.split, *(job.listed_split for job in work)} - {None}
-    with OutputFolder(output, sorted(split_folder(str(s)) for s in splits)):
+    folders = {split_folder(s) for s in (*SPLITS, settings.split, *(job.listed_split for job in work)) if s}
+    with OutputFolder(output, sorted(folders)):
         # Until the new manifest stands, what the old one says of the files that change is no longer true.
         if kept:
             write([])
@@ -286,7 +290,12 @@ def extract(
         manifest = write(results)
         with writing(output):
             remove_unnamed(output, manifest)
-    if settings.split is None and manifest["drives"] and not all(manifest["splits"][s]["drives"] for s in SPLITS):
+    if (
+        splits is None
+        and settings.split is None
+        and manifest["drives"]
+        and not all(manifest["splits"][s]["drives"] for s in SPLITS)
+    ):
         empty = [s for s in SPLITS if not manifest["splits"][s]["drives"]]
         warn(f"no drive fell to {' and '.join(empty)}: with few drives choose with --split, or another --seed")
     return ExtractResult(output, manifest, results)

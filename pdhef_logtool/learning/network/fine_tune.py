@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pdhef_logtool.logs.discovery import Logs
 from pdhef_logtool.residual_model.bundle import ModelBundle
 from pdhef_logtool.runs.config import RunConfig
 
 #: How gently a trained network moves; a network from nothing is a small one, for a minute or two of driving.
-GENTLY, SMALL = {"learning_rate": 5e-4, "epochs": 15}, {"hidden": 32, "layers": 1}
+GENTLY: dict[str, Any] = {"learning_rate": 5e-4, "epochs": 15}
+SMALL: dict[str, Any] = {"hidden": 32, "layers": 1}
 
 
 def train_on_parts(

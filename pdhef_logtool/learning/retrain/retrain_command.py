@@ -1,0 +1,518 @@
+"""``pdhef retrain`` from logs and a car to a verdict: its network trained on, trust and intervals found anew, a gate.
+
+Each stage stands in ``work/`` of the output and is skipped while what it rests on is as it was. Each does one thing
+with drives of its own (``roles.py``). The candidate ends under ``accepted/`` or ``rejected/`` with what decided.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.parts import digest
+from pdhef_logtool.drive.reading import Tell, read_drive
+from pdhef_logtool.estimators.table import FILTERS
+from pdhef_logtool.learning.drives import (
+    DriveRecord,
+    LearnSettings,
+    drives_document,
+    exit_code,
+    no_true_sideslip,
+    open_car,
+    open_mapping,
+    record_head,
+    record_of,
+    set_manifest,
+    tell_drive,
+)
+from pdhef_logtool.learning.evidence.calibrate import MIN_DRIVES
+from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
+from pdhef_logtool.learning.evidence.trust_command import trust
+from pdhef_logtool.learning.network.dataset import MANIFEST
+from pdhef_logtool.learning.network.extract_command import ExtractSettings, extract
+from pdhef_logtool.learning.network.fine_tune import GENTLY
+from pdhef_logtool.learning.retrain.roles import GATE, INTERVALS, LEAST, SHARES, STOP, TRAIN, TRUST, Candidate, deal
+from pdhef_logtool.learning.stages import Stages
+from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
+from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, PdhefError
+from pdhef_logtool.records.files import write_bytes, writing
+from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder, check_no_input
+from pdhef_logtool.records.supervisor import supervise
+from pdhef_logtool.residual_model.bundle import MANY_CARS, NO_MODEL, open_model
+from pdhef_logtool.results.comparing import compare_runs
+from pdhef_logtool.results.gate import Figure, Gate
+from pdhef_logtool.results.opened_run import open_run
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.sinks.report import json_bytes
+
+FORMAT, FORMAT_VERSION = "pdhef-retrain", 1
+#: In the output: stages, candidates that may take the car's place, and those that may not.
+WORK, ACCEPTED, REJECTED = "work", "accepted", "rejected"
+#: In the folder of a candidate, and in work/.
+RECORD_FILE, PAGE_FILE, CAR_FOLDER, ROLES_FILE, SEEN_FILE = (
+    "retrain.json", "change.html", "car", "roles.json", "seen.json",
+)  # fmt: skip
+#: The estimator that follows the network; what runs beside it, and whose intervals are fitted.
+HYBRID, BESIDE = "pd-hef", ("physics", "zero")
+CALIBRATED = (HYBRID, "pd-hef-smoothed", "physics")
+#: Without a gate.toml: the error of the hybrid filter over the whole drive may grow by so much.
+DEFAULT_LIMIT = 0.02
+DEFAULT_GATE = Gate((Figure(estimator=HYBRID, limit=DEFAULT_LIMIT),))
+#: Digits of a network's hash that name its folder.
+_NAME = 12
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RetrainSettings(LearnSettings):
+    """With the network to begin with, the epochs of training (None: the recipe's), and the gate.
+
+    ``init``: a bundle or ``none``; None = the car's network, else that of many cars. ``strict``: that nobody can tell
+    closes the gate.
+    """
+
+    init: Path | None = None
+    epochs: int | None = None
+    gate: Gate = DEFAULT_GATE
+    strict: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RetrainResult:
+    """What came of it: the folder of the candidate, its record, and a record of every drive."""
+
+    folder: Path
+    records: tuple[DriveRecord, ...]
+    document: dict[str, Any]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the candidate may take the car's place."""
+        return bool(self.document["accepted"])
+
+    @property
+    def exit_code(self) -> int:
+        """4 if the candidate is rejected; else as every command that learns of drives."""
+        return exit_code(self.records) if self.accepted else EXIT_GATE
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the result as one JSON-able document."""
+        drives = drives_document(self.records)
+        return {"folder": str(self.folder), "exit_code": self.exit_code, **self.document, **drives}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Retraining:
+    """One call: its settings, the car, the drives by role, and what each log is known by, by its stem."""
+
+    settings: RetrainSettings
+    car: Car
+    drives: Mapping[str, tuple[LogInput, ...]]
+    hashes: Mapping[str, str]
+    work: Path
+    stages: Stages
+    jobs: int
+    warn: Tell
+
+    @property
+    def start(self) -> Path:
+        """The network to begin with, as a bundle is named."""
+        own = self.car.residual_network is not None and self.car.network_folder
+        return self.settings.init or own or Path(MANY_CARS)
+
+    def config_for(self, car: Path | None, network: Path | None = None) -> RunConfig:
+        return replace(self.settings.config, car=car, network=network, intervals=None, estimators=None)
+
+    def basis(self, *rests_on: Any, role: str = "") -> list[Any]:
+        """Return what a stage rests on: the settings of all, the drives of a role, and what else."""
+        config = self.settings.config
+        mapping = None if config.mapping is None else digest(config.mapping.read_text(encoding="utf-8"))
+        head = record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config, seed=self.settings.seed), self.car)
+        source = None if self.car.source is None else hash_log(self.car.source)
+        return [head, mapping, source, sorted(self.hashes[i.stem] for i in self.drives.get(role, ())), *rests_on]
+
+    def do(self, number: int, name: str, basis: list[Any], work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
+        return self.stages.do(number, name, basis, number / 8.0, work)
+
+    def step(self, number: int, text: str, share: float) -> None:
+        self.stages.progress(text, (number + share) / 8.0)
+
+
+def retrain(
+    arguments: Logs,
+    output: Path,
+    settings: RetrainSettings,
+    *,
+    jobs: int = 1,
+    progress: Progress = lambda _text, _share: None,
+    warn: Tell = lambda _text: None,
+    say: Tell = lambda _text: None,
+) -> RetrainResult:
+    """Train the network of a car on logs with truth, and hold the car with it against the car as it is.
+
+    Parameters
+    ----------
+    arguments : logs, folders, glob patterns. jobs : processes that read and extract; changes nothing that is written.
+    say : told of each stage with the time it took.
+
+    Raises
+    ------
+    UsageError
+        An option is wrong, or no car is named.
+    EstimatorError
+        There are too few drives with truth.
+    PdhefError
+        A stage fails.
+    """
+    config = settings.config
+    car = open_car(config, None, warn)
+    inputs = find_logs(arguments)
+    read = [*(i.local for i in inputs), *config.files]
+    check_no_input(read, [], [output / name for name in (WORK, ACCEPTED, REJECTED)])
+    work = output / WORK
+    with OutputFolder(output, (WORK, ACCEPTED, REJECTED)):
+        with writing(work):
+            work.mkdir(exist_ok=True)
+        stages = Stages(work, lambda found: str(found["shown"]), say, progress)
+        hashes = {i.stem: identity_of(i) for i in inputs}
+        records, signals = _look(inputs, hashes, car, settings, work, jobs, progress)
+        records, drives = _roles(inputs, records, signals, car, settings, work)
+        told = set[str]()
+
+        def once(text: str) -> None:
+            if text not in told:
+                told.add(text)
+                warn(text)
+
+        for record in records:
+            tell_drive(record, once)
+        _check_counts(drives)
+        this = _Retraining(settings, car, drives, hashes, work, stages, jobs, once)
+        document = _stages(this)
+        name = document["network_sha256"][:_NAME]
+        judged = {p.name for group in (ACCEPTED, REJECTED) for p in (output / group).glob("*") if p.is_dir()} | {name}
+        counts = {role: len(drives[role]) for role in SHARES}
+        document = {**document, "drives_by_role": counts, "judged": len(judged)}
+        folder = _publish(this, output, name, document)
+    progress("done", 1.0)
+    return RetrainResult(folder, tuple(records), document)
+
+
+# ---- drives ----
+
+
+@dataclass(frozen=True, slots=True)
+class _Log:
+    log_input: LogInput
+    car: Car
+    mapping: SignalMapping | None
+    config: RunConfig
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What a log holds; ``signals_sha256`` is None where it cannot be used."""
+
+    record: DriveRecord
+    signals_sha256: str | None
+
+
+def _read_log(log: _Log, tell: Progress) -> _Seen:
+    """Read a log once, for what its signals are known by and whether it has a truth."""
+    try:
+        with read_drive(log.log_input, log.car, log.mapping, log.config.read_options) as drive:
+            if left_out := no_true_sideslip(drive.plan):
+                return _Seen(record_of(drive, left_out=left_out), None)
+            first, last = math.inf, -math.inf
+            for window in drive.windows(fill_friction=False):
+                if len(stamps := window.signals.stamps_ns):
+                    first, last = min(first, float(stamps[0])), max(last, float(stamps[-1]))
+                tell(log.log_input.stem, window.share_done)
+            span = tuple((t - drive.log.start_ns) * 1e-9 for t in (first, last))
+            record = replace(record_of(drive), seconds=span[1] - span[0], span_s=(span[0], span[1]))
+            return _Seen(record, drive.signals_sha256)
+    except PdhefError as error:
+        return _Seen(_unread(log.log_input, str(error)), None)
+
+
+def _unread(log_input: LogInput, reason: str) -> DriveRecord:
+    return DriveRecord(log_input.stem, log_input.path.name, left_out=reason)
+
+
+def _look(
+    inputs: Sequence[LogInput],
+    hashes: Mapping[str, str],
+    car: Car,
+    settings: RetrainSettings,
+    work: Path,
+    jobs: int,
+    progress: Progress,
+) -> tuple[list[DriveRecord], list[str | None]]:
+    """Return a record of every log and the hash of its signals; what earlier calls have read is not read again."""
+    config, mapping = settings.config, open_mapping(settings.config)
+    vehicle = None if car.source is None else hash_log(car.source)
+    basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), vehicle, repr(mapping)])
+    known: dict[str, Any] = {}
+    with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
+        document = json.loads((work / SEEN_FILE).read_text(encoding="utf-8"))
+        known = document["logs"] if document["basis"] == basis else {}
+    new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
+
+    def tell(number: int, text: str, share: float) -> None:
+        progress(f"reading {text}", (number + share) / len(new) / 8.0)
+
+    records = dict[str, DriveRecord]()
+    for ended in supervise(_read_log, new, jobs=jobs, preload=("pdhef_logtool.drive.reading", *FILTERS), progress=tell):
+        log_input, seen = ended.item.log_input, ended.result
+        if seen is None:
+            reason = "it could not be read" if ended.failure is None else ended.failure.reason
+            seen = _Seen(_unread(log_input, reason), None)
+        sha256 = seen.record.sha256 or hashes[log_input.stem]  # a slim log is known by that which it stands for
+        records[log_input.stem] = replace(seen.record, sha256=sha256)
+        known[hashes[log_input.stem]] = {
+            "sha256": sha256,
+            "signals_sha256": seen.signals_sha256,
+            "left_out": seen.record.left_out,
+            "span_s": seen.record.span_s,
+        }
+    write_bytes(work / SEEN_FILE, json_bytes({"basis": basis, "logs": known}))
+
+    def record(log_input: LogInput) -> DriveRecord:
+        found = known[hashes[log_input.stem]]
+        span = None if found["span_s"] is None else (float(found["span_s"][0]), float(found["span_s"][1]))
+        again = DriveRecord(
+            log_input.stem,
+            log_input.path.name,
+            found["sha256"],
+            seconds=0.0 if span is None else span[1] - span[0],
+            span_s=span,
+            left_out=found["left_out"],
+        )
+        return records.get(log_input.stem, again)
+
+    return [record(i) for i in inputs], [known[hashes[i.stem]]["signals_sha256"] for i in inputs]
+
+
+def _roles(
+    inputs: Sequence[LogInput],
+    records: Sequence[DriveRecord],
+    signals: Sequence[str | None],
+    car: Car,
+    settings: RetrainSettings,
+    work: Path,
+) -> tuple[list[DriveRecord], dict[str, tuple[LogInput, ...]]]:
+    """Return the records with the roles as their splits, and the drives by role; copies of a drive are left out."""
+    manifests = cache(set_manifest)
+    parts = (car.learnt_on, () if car.trust is None else car.trust.drives)
+    taught = {d.sha256 for part in parts for d in part} | (
+        set() if car.intervals is None else {d.sha256 for d in car.intervals.drives}
+    )
+    first: dict[str, str] = {}
+    candidates = []
+    for log_input, record, key in zip(inputs, records, signals, strict=True):
+        if key is not None and first.setdefault(key, log_input.stem) == log_input.stem:
+            split = str(manifests(log_input.folder).get(log_input.path.name, {}).get("split") or "")
+            candidates.append(Candidate(key, split, record.sha256 in taught))
+    before: dict[str, str] = {}
+    with suppress(OSError, ValueError, RecursionError):
+        before = {str(k): str(v) for k, v in json.loads((work / ROLES_FILE).read_text(encoding="utf-8")).items()}
+    roles = deal(candidates, before, settings.seed)
+    write_bytes(work / ROLES_FILE, json_bytes(dict(sorted(roles.items()))))
+    told = list[DriveRecord]()
+    drives: dict[str, list[LogInput]] = {role: [] for role in SHARES}
+    for log_input, record, key in zip(inputs, records, signals, strict=True):
+        if key is None:
+            told.append(record)
+        elif first[key] != log_input.stem:
+            told.append(replace(record, notes=(f"left out, it holds the same signals as {first[key]}",)))
+        else:
+            told.append(replace(record, split=roles[key]))
+            drives[roles[key]].append(log_input)
+    return told, {role: tuple(found) for role, found in drives.items()}
+
+
+def _check_counts(drives: Mapping[str, Sequence[LogInput]]) -> None:
+    short = [
+        f"{role} has {len(drives[role])}" for role in (TRAIN, STOP, TRUST, GATE) if len(drives[role]) < LEAST[role]
+    ]
+    if short:
+        wanted = ", ".join(f"{LEAST[role]} for {role}" for role in (TRAIN, STOP, TRUST, GATE))
+        raise EstimatorError(
+            expected=f"drives with truth for every part of a retraining: at least {wanted}",
+            got=", ".join(short),
+            where="retrain",
+            remedy="give more drives with truth; those of a set keep to its splits",
+        )
+
+
+# ---- stages ----
+
+
+def _stages(this: _Retraining) -> dict[str, Any]:
+    """Do all stages; return the record of the candidate."""
+    both = [sorted(this.hashes[i.stem] for i in this.drives[role]) for role in (TRAIN, STOP)]
+    dataset = this.do(1, "extract", this.basis(both), lambda _: _extract(this))
+    start = None if str(this.start) == NO_MODEL else open_model(this.start)
+    init = None if start is None else start.sha256
+    basis = this.basis(dataset["sha256"], init, this.settings.epochs)
+    model = this.do(2, "train", basis, lambda folder: _train(this, folder, digest(basis)))
+    network = this.stages.place(2, "train") / "model"
+    basis = this.basis(model["sha256"], role=TRUST)
+    trusted = this.do(3, "trust", basis, lambda folder: _trust(this, folder, network))
+    basis = this.basis(digest(basis), role=INTERVALS)
+    intervals = this.do(4, "intervals", basis, lambda folder: _intervals(this, folder))
+    rests_on = [digest(basis), this.settings.strict, repr(this.settings.gate)]
+    own = None if this.car.residual_network is not None else Path(MANY_CARS)
+    source = this.settings.config.car
+    this.do(5, "before", this.basis(role=GATE), lambda folder: _run(this, 5, folder, source, own))
+    candidate = this.stages.place(4, "intervals") / CAR_FOLDER
+    this.do(6, "after", this.basis(digest(basis), role=GATE), lambda folder: _run(this, 6, folder, candidate, None))
+    judged = this.do(7, "gate", this.basis(*rests_on, role=GATE), lambda folder: _judge(this, folder, trusted))
+    return {
+        **record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=this.settings.config), this.car),
+        "accepted": judged["accepted"],
+        "reasons": judged["reasons"],
+        "network_sha256": model["sha256"],
+        "fine_tuned_from": init,
+        **{k: dataset[k] for k in ("cells", "splits")},
+        "dataset_sha256": dataset["sha256"],
+        "training": model,
+        "trust": trusted,
+        "intervals": intervals,
+        "comparison": judged["comparison"],
+    }
+
+
+def _extract(this: _Retraining) -> dict[str, Any]:
+    """Extract the residuals of the drives that train and stop; what is there of others goes."""
+    folder = this.work / "dataset"
+    with writing(folder):
+        (folder / MANIFEST).unlink(missing_ok=True)
+    splits = {i.stem: role for role in (TRAIN, STOP) for i in this.drives[role]}
+    inputs = sorted((i for role in (TRAIN, STOP) for i in this.drives[role]), key=lambda i: i.stem)
+    settings = ExtractSettings(this.config_for(this.settings.config.car), seed=this.settings.seed)
+    result = extract(
+        inputs,
+        folder,
+        settings,
+        jobs=this.jobs,
+        resume=True,
+        splits=splits,
+        progress=lambda text, share: this.step(1, text, share),
+        warn=this.warn,
+    )
+    found = result.manifest
+    rows = {split: found["splits"][split]["usable_rows"] for split in (TRAIN, STOP)}
+    empty = len(found["cells"]["empty"][TRAIN])
+    return {
+        "shown": f"{rows[TRAIN]} rows to train on, {rows[STOP]} to stop by; {empty} cells of driving are empty",
+        **{k: found[k] for k in ("sha256", "cells", "splits")},
+    }
+
+
+def _train(this: _Retraining, folder: Path, basis: str) -> dict[str, Any]:
+    """Train; what an interrupted call has left goes on, if it was of the same basis."""
+    from pdhef_logtool.learning.network.train_command import dataset_for, make_recipe, train_on
+    from pdhef_logtool.residual_model.bundle import PHYSICS_MODEL
+
+    training, mark = this.work / "training", "basis"
+    with writing(training):
+        if training.is_dir() and not ((training / mark).is_file() and (training / mark).read_text() == basis):
+            shutil.rmtree(training)
+    write_bytes(training / mark, basis.encode())
+    init = None if str(this.start) == NO_MODEL else open_model(this.start)
+    recipe = make_recipe(paper=False, seed=this.settings.seed, epochs=None, device="cpu")
+    recipe = recipe if init is None else replace(recipe, **GENTLY)
+    if this.settings.epochs is not None:
+        recipe = replace(recipe, epochs=this.settings.epochs)
+    if not (this.work / "dataset" / MANIFEST).is_file():
+        _extract(this)  # somebody has tidied up
+    data = dataset_for(this.work / "dataset", PHYSICS_MODEL)
+    found = train_on(data, training, recipe, init=init, progress=lambda text, share: this.step(2, text, share))
+    with writing(training):
+        (training / mark).unlink()
+        shutil.move(training, folder / "model")
+    loss = found.bundle.provenance["validation_loss"]
+    return {
+        "shown": f"{len(found.history)} epochs, validation {loss:.4f}",
+        "sha256": found.bundle.sha256,
+        "provenance": found.bundle.provenance,
+    }
+
+
+def _trust(this: _Retraining, folder: Path, network: Path) -> dict[str, Any]:
+    config = this.config_for(this.settings.config.car, network)
+    settings = LearnSettings(config=config, seed=this.settings.seed, any_split=True)
+    result = trust(
+        this.drives[TRUST], folder / CAR_FOLDER, settings, progress=lambda text, share: this.step(3, text, share)
+    )
+    cap = result.decision.cap
+    return {"shown": f"trust {cap:g}: {result.decision.reason}", "cap": cap, "evidence": result.trust.evidence}
+
+
+def _intervals(this: _Retraining, folder: Path) -> dict[str, Any]:
+    """Calibrate the intervals of the candidate, or leave it as it is where there are too few drives for that."""
+    before, drives = this.stages.place(3, "trust") / CAR_FOLDER, this.drives[INTERVALS]
+    if len(drives) < MIN_DRIVES:
+        shutil.copytree(before, folder / CAR_FOLDER)
+        return {"shown": f"not fitted: {len(drives)} drives, {MIN_DRIVES} are needed", "coverage": {}}
+    config = replace(this.config_for(before), estimators=CALIBRATED)
+    settings = CalibrateSettings(config=config, seed=this.settings.seed, any_split=True)
+    result = calibrate(
+        drives, folder / CAR_FOLDER, settings, progress=lambda text, share: this.step(4, text, share)
+    )  # fmt: skip
+    names = ", ".join(e.estimator for e in result.intervals.entries)
+    return {
+        "shown": f"{names}, on {len(drives)} drives",
+        "coverage": {e.estimator: list(e.coverage) for e in result.intervals.entries},
+    }
+
+
+def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network: Path | None) -> dict[str, Any]:
+    config = replace(this.config_for(car, network), estimators=(HYBRID, *BESIDE), annotate="none")
+    logs = [str(i.path) for i in this.drives[GATE]]
+    result = run_logs(
+        logs, folder / "run", config, report=False, progress=lambda text, share: this.step(number, text, share)
+    )
+    return {"shown": f"{len(logs)} drives of the gate", "exit_code": result.exit_code}
+
+
+def _judge(this: _Retraining, folder: Path, trusted: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare both runs; the candidate is rejected where the gate closes, or where it may not be followed at all."""
+    a, b = (open_run(this.stages.place(n, name) / "run") for n, name in ((5, "before"), (6, "after")))
+    found = compare_runs(a, b, this.settings.gate, strict=this.settings.strict)
+    reasons = list(found.failures)
+    if not trusted["cap"]:
+        reasons.append(f"trust 0 on drives that it has not seen: {trusted['evidence']}")
+    from pdhef_logtool.reports.comparison import comparison_page
+
+    write_bytes(folder / PAGE_FILE, comparison_page(found))
+    shown = f"rejected: {'; '.join(reasons)}" if reasons else f"accepted: {found.verdict}"
+    return {"shown": shown, "accepted": not reasons, "reasons": reasons, "comparison": found.to_dict()}
+
+
+def _publish(this: _Retraining, output: Path, name: str, document: Mapping[str, Any]) -> Path:
+    """Put the candidate where its verdict belongs, with its record and the page; return its folder."""
+    right, wrong = (ACCEPTED, REJECTED) if document["accepted"] else (REJECTED, ACCEPTED)
+    folder, data = output / right / name, json_bytes(dict(document))
+    with suppress(OSError):
+        if (folder / RECORD_FILE).read_bytes() == data and (folder / CAR_FOLDER).is_dir():
+            return folder
+    with writing(folder), FolderTransaction(folder, keep=False) as transaction:
+        shutil.copytree(this.stages.place(4, "intervals") / CAR_FOLDER, transaction.file(CAR_FOLDER))
+        shutil.copyfile(this.stages.place(7, "gate") / PAGE_FILE, transaction.file(PAGE_FILE))
+        write_bytes(transaction.file(RECORD_FILE), data)
+    with writing(folder):
+        shutil.rmtree(output / wrong / name, ignore_errors=True)
+    return folder
