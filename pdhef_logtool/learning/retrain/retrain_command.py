@@ -52,7 +52,7 @@ from pdhef_logtool.results.comparing import compare_runs
 from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT, FORMAT_VERSION = "pdhef-retrain", 1
@@ -480,10 +480,15 @@ def _intervals(this: _Retraining, folder: Path) -> dict[str, Any]:
 
 
 def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network: Path | None) -> dict[str, Any]:
-    config = replace(this.config_for(car, network), estimators=(HYBRID, *BESIDE), annotate="none")
+    config = replace(this.config_for(car, network), estimators=(HYBRID, *BESIDE), keep="metrics")
     logs = [str(i.path) for i in this.drives[GATE]]
     result = run_logs(
-        logs, folder / "run", config, report=False, progress=lambda text, share: this.step(number, text, share)
+        logs,
+        folder / "run",
+        config,
+        jobs=this.jobs,
+        report=False,
+        progress=lambda text, share: this.step(number, text, share),
     )
     return {"shown": f"{len(logs)} drives of the gate", "exit_code": result.exit_code}
 
