@@ -9,13 +9,14 @@ CAR := saloon
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: help demo test quick pages mutants check lint format bench train-default samples conditions real switches torture \
+.PHONY: help demo test quick fleet pages mutants check lint format bench train-default samples conditions real switches torture \
   retrain docs docs-truthsim paper strangers clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
 	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
+	@echo "make fleet    the tests of fleets, which take long, and need pip install '.[ray]' for those on a cluster"
 	@echo "make pages    look at the pages in a browser: their tests, and the pictures of docs/report.md anew (needs Chromium)"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
@@ -74,6 +75,10 @@ pages: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m pytest tests/reports tests/results
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
 	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
+
+# What takes too long for `make test`, or needs extras: Ray, S3.
+fleet: $(VENV)/installed-dev $(VENV)/compiled
+	PDHEF_FLEET=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m fleet
 
 # Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.
 SEED ?= 1

@@ -1,0 +1,88 @@
+"""``python -m tests.fleet_soak.run_fleet LOGS OUT MEASURES``: a run with trouble planted, in a process of its own.
+
+It is what a person starts, but for its work on a drive, which plants trouble and writes down what a drive cost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import sys
+import time
+from pathlib import Path
+
+from pdhef_logtool.records.supervisor import Limits, Tell
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
+from tests.fleet_soak.planted import planted_drive
+from tests.runs.stub_drives import stub_drive
+
+#: Where workers write what a drive cost; they have it from the process that started them.
+_MEASURES = "PDHEF_SOAK_MEASURES"
+
+
+def rss_bytes() -> int:
+    """Return the memory that this process has now."""
+    return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def measured_drive(task: DriveTask, tell: Tell) -> DriveEnd:
+    """Work on a drive and note process, processor seconds and memory."""
+    return _measured(planted_drive(task, tell), task)
+
+
+def measured_stub(task: DriveTask, tell: Tell) -> DriveEnd:
+    """Return a stub's end, as fast as it goes."""
+    return _measured(stub_drive(task, tell), task)
+
+
+def _measured(end: DriveEnd, task: DriveTask) -> DriveEnd:
+    line = json.dumps([os.getpid(), time.process_time(), rss_bytes(), task.log.stem])
+    with Path(os.environ[_MEASURES]).open("a") as file:
+        file.write(line + "\n")
+    return end
+
+
+def main() -> int:
+    """Run a fleet; print the parent's wall and processor seconds and its memory over the run."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("logs", nargs="+")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--measures", type=Path, required=True)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--stub", action="store_true")
+    parser.add_argument("--silence", type=float, default=60.0)
+    given = parser.parse_args()
+    os.environ[_MEASURES] = str(given.measures)
+    memory: list[int] = []
+    said: list[str] = []
+    since = time.monotonic()
+    result = run_logs(
+        given.logs,
+        given.output,
+        RunConfig(car=Path("saloon")),
+        jobs=given.jobs,
+        resume=given.resume,
+        limits=Limits(given.silence, 3_000_000_000),
+        report=not given.stub,
+        work=measured_stub if given.stub else measured_drive,
+        progress=lambda _text, _share: memory.append(rss_bytes()),
+        say=said.append,
+    )
+    found = {
+        "exit_code": result.exit_code,
+        "wall_s": time.monotonic() - since,
+        "cpu_s": time.process_time(),
+        "rss_bytes": memory,
+        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "said": said,
+    }
+    print(json.dumps(found))
+    return result.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
