@@ -117,13 +117,21 @@ def render_fleet(summary: RunSummary, console: Console) -> None:
         console.print(worst)
         console.print()
     for kind in summary.failed:
-        more = f" and {kind.count - _MOST_FAILED} more" if kind.count > _MOST_FAILED else ""
         console.print(Text.assemble((f"{kind.count} failed: ", "bold"), kind.reason))
-        _print_indented(", ".join(kind.labels[:_MOST_FAILED]) + more, console)
+        _print_some(kind.labels, kind.count, console)
+    if summary.checks_failed:
+        console.print(Text.assemble((f"{len(summary.checks_failed)} with failed checks", "bold"), ", see report.json:"))
+        _print_some(summary.checks_failed, len(summary.checks_failed), console)
     left = f", {summary.remaining} not done" if summary.remaining else ""
     failed = summary.logs - summary.done
     console.print(f"{summary.logs} logs: {summary.done} done, {failed} failed, {summary.lost} with input lost{left}")
     _print_outputs(summary.output, console)
+
+
+def _print_some(labels: Sequence[str], count: int, console: Console) -> None:
+    """Name the first of so many logs."""
+    more = f" and {count - _MOST_FAILED} more" if count > _MOST_FAILED else ""
+    _print_indented(", ".join(labels[:_MOST_FAILED]) + more, console)
 
 
 def _print_outputs(output: Path, console: Console) -> None:

@@ -196,7 +196,8 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         from pdhef_logtool.results.opened_run import open_run
         from pdhef_logtool.results.summary import summarise
 
-        console.show(summarise(open_run(result.output), result.exit_code), render_fleet, as_json)
+        checks_failed = [r.outcome.log for r in result.results if r.failed_checks]
+        console.show(summarise(open_run(result.output), result.exit_code, checks_failed), render_fleet, as_json)
     else:
         console.show(result, render_run, as_json)
         for one in result.results:
@@ -241,7 +242,7 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
             expected=f"a log named {missing[0]}" if missing else RECORDING_FILE,
             got=", ".join(found) or "none",
             where=str(output),
-            remedy="" if found else "pdhef run LOG -o OUT writes one",
+            remedy="" if found else "pdhef run LOG -o OUT --keep full writes one",
         )
     return [found[name] for name in dict.fromkeys(logs)] if logs else list(found.values())
 

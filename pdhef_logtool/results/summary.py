@@ -6,7 +6,7 @@ Only the figures of sideslip are read, as columns: what a drive costs here is so
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +49,8 @@ class RunSummary:
     Attributes
     ----------
     output : folder. exit_code : of the run. logs, done, lost : logs, those with figures, those with input lost.
-    scored : drives whose answer is scored. remaining : logs that are not done.
+    scored : drives whose answer is scored. remaining : logs that are not done. checks_failed : logs with failed checks
+        that count.
     """
 
     output: Path
@@ -62,13 +63,14 @@ class RunSummary:
     errors: tuple[ErrorsOf, ...]
     worst: tuple[WorstDrive, ...]
     failed: tuple[Failures, ...]
+    checks_failed: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the summary as one JSON-able document; its drives stand one by one in run.json."""
         return {**asdict(self), "output": str(self.output)}
 
 
-def summarise(run: OpenedRun, exit_code: int) -> RunSummary:
+def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> RunSummary:
     """Return the summary of a run; raises OutputError where metrics.parquet is damaged."""
     import polars as pl
 
@@ -91,6 +93,7 @@ def summarise(run: OpenedRun, exit_code: int) -> RunSummary:
         errors=tuple(told),
         worst=tuple(_worst(errors, answers)),
         failed=grouped(failed),
+        checks_failed=tuple(checks_failed),
     )
 
 

@@ -512,7 +512,7 @@ class _Fleet:
                 self._warn(f"{one.log.path.name} failed, the others go on")  # why stands with the results
             for line in end.warned:
                 self._warn(line)
-            self._note(one, end, keep, quarantined=ended.failure is not None)
+            self._note(one, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
             told.end(ended.number)
 
     def _task(self, one: _Planned, keep: Keep) -> DriveTask:
@@ -529,8 +529,9 @@ class _Fleet:
         self.lost += 1
         log, failure = ended.item.log, ended.failure
         last = f"; last heard: {failure.last}" if failure.last else ""
-        reason = f"{failure.reason}, {failure.tries} tries{last}"
-        return DriveEnd(LogOutcome(log=log.stem, file=log.path.name, sha256=None, failed=reason), None)
+        tries = f", {failure.tries} tries" if failure.tries > 1 else ""
+        outcome = LogOutcome(log=log.stem, file=log.path.name, sha256=None, failed=f"{failure.reason}{tries}{last}")
+        return DriveEnd(outcome, None, again=True)
 
     def _note(self, one: _Planned, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
         """Write down how a drive ended; then the figures that it had before go."""

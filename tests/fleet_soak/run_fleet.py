@@ -13,36 +13,10 @@ import sys
 import time
 from pathlib import Path
 
-from pdhef_logtool.records.supervisor import Limits, Tell
+from pdhef_logtool.records.supervisor import Limits
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
-from tests.fleet_soak.planted import planted_drive
-from tests.runs.stub_drives import stub_drive
-
-#: Where workers write what a drive cost; they have it from the process that started them.
-_MEASURES = "PDHEF_SOAK_MEASURES"
-
-
-def rss_bytes() -> int:
-    """Return the memory that this process has now."""
-    return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def measured_drive(task: DriveTask, tell: Tell) -> DriveEnd:
-    """Work on a drive and note process, processor seconds and memory."""
-    return _measured(planted_drive(task, tell), task)
-
-
-def measured_stub(task: DriveTask, tell: Tell) -> DriveEnd:
-    """Return a stub's end, as fast as it goes."""
-    return _measured(stub_drive(task, tell), task)
-
-
-def _measured(end: DriveEnd, task: DriveTask) -> DriveEnd:
-    line = json.dumps([os.getpid(), time.process_time(), rss_bytes(), task.log.stem])
-    with Path(os.environ[_MEASURES]).open("a") as file:
-        file.write(line + "\n")
-    return end
+from pdhef_logtool.runs.fleet import run_logs
+from tests.fleet_soak.planted import MEASURES, measured_drive, measured_stub, rss_bytes
 
 
 def main() -> int:
@@ -56,7 +30,7 @@ def main() -> int:
     parser.add_argument("--stub", action="store_true")
     parser.add_argument("--silence", type=float, default=60.0)
     given = parser.parse_args()
-    os.environ[_MEASURES] = str(given.measures)
+    os.environ[MEASURES] = str(given.measures)
     memory: list[int] = []
     said: list[str] = []
     since = time.monotonic()

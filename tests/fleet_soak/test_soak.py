@@ -129,22 +129,23 @@ def measures(output: Path) -> list[tuple[int, float, int, str]]:
 def test_exactly_the_planted_ones_are_given_up(undisturbed: tuple[Path, dict[str, Any]]) -> None:
     output, found = undisturbed
     assert found["exit_code"] == 3
-    given_up = {d["label"]: d["outcome"]["failed"] for d in drives_of(output) if d["quarantined"]}
+    quarantined = [d["outcome"] for d in drives_of(output) if d["quarantined"]]
+    given_up = {o["file"].partition(".")[0]: o["failed"] for o in quarantined}
     assert set(given_up) == set(PLANTED)
     assert given_up["hangs"] == "nothing heard for 60 s, 2 tries; last heard: before it hangs"
     assert "took more than 3000 MB" in given_up["takes_8_gb"]
     assert given_up["kills"].startswith("the worker was killed (signal 9), 2 tries")
     run = open_run(output)
-    ended = {log.label: log.outcome for log in run.logs}
-    assert sum(ended[label].startswith(("ok", "lost")) for label in ended if label.startswith("drive_")) == DRIVES
-    assert sum(label.startswith("no_truth") for label in ended) == WITHOUT_TRUTH
-    assert all(ended[f"no_truth_{n}"] == "ok" for n in range(WITHOUT_TRUTH))
-    assert {log.label for log in run.logs if log.file("recording.rrd") is not None} <= set(ended)
+    ended = {log.entry["file"].partition(".")[0]: log.outcome for log in run.logs}
+    assert sum(outcome == "ok" for name, outcome in ended.items() if name.startswith("drive_")) == DRIVES
+    assert [ended[f"no_truth_{n}"] for n in range(WITHOUT_TRUTH)] == ["ok"] * WITHOUT_TRUTH
+    assert all(outcome != "ok" for name, outcome in ended.items() if name.startswith("damaged_"))
+    assert sum(log.file("recording.rrd") is not None for log in run.logs) == 5
     sizes = [p.stat().st_size for log in run.logs if (p := log.file("report.json")) is not None]
     assert "figures and a short report of each are kept" in found["said"][0]
     largest = sorted(sizes)[-6]  # the five worst are kept in full
-    assert largest <= 20_000
     note(logs=len(run.logs), largest_short_report_bytes=largest)
+    assert largest <= 20_000
 
 
 def test_killed_twice_and_resumed_is_undisturbed(
