@@ -10,7 +10,7 @@ CAR := saloon
 JOBS ?= 2
 
 .PHONY: help demo test quick fleet pages mutants check lint format bench train-default samples conditions real switches torture \
-  retrain docs docs-truthsim paper strangers clean
+  retrain docs docs-truthsim paper strangers wheel release clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
@@ -33,6 +33,8 @@ help:
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
+	@echo "make wheel    dist/: the wheel and the source archive of what is committed, looked at"
+	@echo "make release  the same, installed into a new environment, where the sample job runs"
 	@echo "make clean    remove the virtual environment and everything that was built"
 
 $(BIN)/python:
@@ -146,6 +148,21 @@ strangers: $(VENV)/installed-dev $(VENV)/compiled
 
 switches: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches
+
+# Of what is committed, in a clone: nothing else that lies about here gets in.
+wheel: $(VENV)/installed-dev
+	rm -rf build/clone dist
+	git clone --quiet . build/clone
+	$(BIN)/python -m build --outdir dist build/clone >/dev/null
+	$(BIN)/python tests/release/check_dist.py dist
+
+# As a stranger installs and runs it, away from the source tree; the same steps as in the Dockerfile.
+release: wheel
+	rm -rf build/fresh
+	$(PYTHON) -m venv build/fresh
+	build/fresh/bin/python -m pip install --quiet dist/*.whl
+	cd build/fresh && bin/pdhef --version && bin/pdhef --help >/dev/null
+	cd build/fresh && bin/pdhef run ../../sample_logs/dlc.mcap --car saloon --estimators all --annotate none -o out
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

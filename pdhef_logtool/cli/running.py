@@ -30,17 +30,19 @@ _MOST_VERDICTS = 50
     "pdhef run drive.bag -o out --car mycar --mapping mapping.toml",
     "pdhef run logs/ -o out --estimators zero,phy-ukf --annotate sidecar",
     "pdhef run fleet/ -o out --cars cars.toml",
+    "pdhef run s3://bucket/day/ -o out --annotate sidecar",
     "pdhef run drive.mcap -o out --start +60s --end end-5s --json",
     "pdhef run logs/ -o out --thresholds limits.toml --junit out/gate.xml",
     "pdhef run fleet/ -o out --jobs 8 --keep metrics",
     "pdhef run fleet/ new/ -o out --jobs 8 --resume",
     "pdhef run fleet/ -o out --only drive_0312",
+    "pdhef run @list.txt -o out --jobs 8 --keep metrics --cache ~/slim",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, its cars and folders beside it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep sensors friction thresholds config_file network intervals calibrate waived "
-    "model calibration",
+    shared="cars estimators annotate keep cache sensors friction thresholds config_file network intervals calibrate "
+    "waived model calibration",
     car="Your car (default: a sedan)",
 )
 def run(

@@ -74,7 +74,7 @@ _KEPT = ("metrics", "estimates", "full")
 #: What the workers have loaded; polars starts threads at its first query, and none of these makes one.
 _PRELOAD = ("pdhef_logtool.runs.fleet", "pdhef_logtool.runs.guard")
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
-_NO_SETTING = frozenset({"keep", "annotate", "window_s", "car", "cars", "network", "intervals"})
+_NO_SETTING = frozenset({"keep", "annotate", "cache", "window_s", "car", "cars", "network", "intervals"})
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"

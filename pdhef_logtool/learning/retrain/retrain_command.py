@@ -68,6 +68,8 @@ CALIBRATED = (HYBRID, "pd-hef-smoothed", "physics")
 #: Without a gate.toml: the error of the hybrid filter over the whole drive may grow by so much.
 DEFAULT_LIMIT = 0.02
 DEFAULT_GATE = Gate((Figure(estimator=HYBRID, limit=DEFAULT_LIMIT),))
+#: What is remembered of each log.
+_SEEN_KEYS = {"sha256", "signals_sha256", "left_out", "span_s"}
 #: Digits of a network's hash that name its folder.
 _NAME = 12
 
@@ -264,9 +266,10 @@ def _look(
     vehicle = None if car.source is None else hash_log(car.source)
     basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), vehicle, repr(mapping)])
     known: dict[str, Any] = {}
-    with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
+    with suppress(OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
         document = json.loads((work / SEEN_FILE).read_text(encoding="utf-8"))
-        known = document["logs"] if document["basis"] == basis else {}
+        logs = document["logs"] if document["basis"] == basis else {}
+        known = {key: found for key, found in logs.items() if set(found) == _SEEN_KEYS}
     new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
 
     def tell(number: int, text: str, share: float) -> None:
@@ -325,8 +328,9 @@ def _roles(
             split = str(manifests(log_input.folder).get(log_input.path.name, {}).get("split") or "")
             candidates.append(Candidate(key, split, record.sha256 in taught))
     before: dict[str, str] = {}
-    with suppress(OSError, ValueError, RecursionError):
-        before = {str(k): str(v) for k, v in json.loads((work / ROLES_FILE).read_text(encoding="utf-8")).items()}
+    with suppress(OSError, ValueError, RecursionError, AttributeError, TypeError):
+        kept = json.loads((work / ROLES_FILE).read_text(encoding="utf-8"))
+        before = {key: role for key, role in kept.items() if role in SHARES}
     roles = deal(candidates, before, settings.seed)
     write_bytes(work / ROLES_FILE, json_bytes(dict(sorted(roles.items()))))
     told = list[DriveRecord]()
@@ -499,7 +503,7 @@ def _judge(this: _Retraining, folder: Path, trusted: Mapping[str, Any]) -> dict[
     found = compare_runs(a, b, this.settings.gate, strict=this.settings.strict)
     reasons = list(found.failures)
     if not trusted["cap"]:
-        reasons.append(f"trust 0 on drives that it has not seen: {trusted['evidence']}")
+        reasons.append(f"{trusted['shown']} (on drives that it has not seen)")
     from pdhef_logtool.reports.comparison import comparison_page
 
     write_bytes(folder / PAGE_FILE, comparison_page(found))
