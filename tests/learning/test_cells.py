@@ -167,7 +167,7 @@ def test_a_fleet_is_told_by_what_gave_nothing_and_by_its_cells(capsys: pytest.Ca
     seconds[3], seconds[-1] = 0.2, 1234.0
     manifest = {
         "splits": {s: {"drives": 1, "usable_rows": 90} for s in SPLITS},
-        "cells": table_of({s: seconds for s in SPLITS}),
+        "cells": table_of(dict.fromkeys(SPLITS, seconds)),
         "choice": {"per_cell_s": 600.0},
     }
     good = [DriveResult(DriveRecord(f"d{i}", ""), entry) for i in range(MOST_DRIVES)]
