@@ -54,7 +54,7 @@ def _sizes_differ(_given: Any, _expected: Any) -> None:
     """Stand for what numba calls where an array is assigned to a slice of another shape."""
 
 
-@overload(_sizes_differ)
+@overload(_sizes_differ)  # type: ignore[untyped-decorator]
 def _raise_that_sizes_differ(_given: Any, _expected: Any) -> Any:
     def raising(_given: Any, _expected: Any) -> None:
         raise ValueError("cannot assign slice from input of different size")

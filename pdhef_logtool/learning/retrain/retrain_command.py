@@ -120,6 +120,7 @@ class _Retraining:
 
     settings: RetrainSettings
     car: Car
+    car_sha256: str | None
     drives: Mapping[str, tuple[LogInput, ...]]
     hashes: Mapping[str, str]
     work: Path
@@ -141,8 +142,13 @@ class _Retraining:
         config = self.settings.config
         mapping = None if config.mapping is None else digest(config.mapping.read_text(encoding="utf-8"))
         head = record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config, seed=self.settings.seed), self.car)
-        source = None if self.car.source is None else hash_log(self.car.source)
-        return [head, mapping, source, sorted(self.hashes[i.stem] for i in self.drives.get(role, ())), *rests_on]
+        return [
+            head,
+            mapping,
+            self.car_sha256,
+            sorted(self.hashes[i.stem] for i in self.drives.get(role, ())),
+            *rests_on,
+        ]
 
     def do(self, number: int, name: str, basis: list[Any], work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
         return self.stages.do(number, name, basis, number / 8.0, work)
@@ -188,7 +194,9 @@ def retrain(
             work.mkdir(exist_ok=True)
         stages = Stages(work, lambda found: str(found["shown"]), say, progress)
         hashes = {i.stem: identity_of(i) for i in inputs}
-        records, signals = _look(inputs, hashes, car, settings, work, jobs, progress)
+        car_sha256 = None if car.source is None else hash_log(car.source)
+        basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), car_sha256])
+        records, signals = _look(inputs, hashes, car, config, work / SEEN_FILE, basis, jobs, progress)
         records, drives = _roles(inputs, records, signals, car, settings, work)
         told = set[str]()
 
@@ -200,7 +208,7 @@ def retrain(
         for record in records:
             tell_drive(record, once)
         _check_counts(drives)
-        this = _Retraining(settings, car, drives, hashes, work, stages, jobs, once)
+        this = _Retraining(settings, car, car_sha256, drives, hashes, work, stages, jobs, once)
         document = _stages(this)
         name = document["network_sha256"][:_NAME]
         judged = {p.name for group in (ACCEPTED, REJECTED) for p in (output / group).glob("*") if p.is_dir()} | {name}
@@ -252,22 +260,22 @@ def _unread(log_input: LogInput, reason: str) -> DriveRecord:
     return DriveRecord(log_input.stem, log_input.path.name, left_out=reason)
 
 
-def _look(
+def _look(  # positional: what reading takes, where it is remembered, and how it is done
     inputs: Sequence[LogInput],
     hashes: Mapping[str, str],
     car: Car,
-    settings: RetrainSettings,
-    work: Path,
+    config: RunConfig,
+    file: Path,
+    basis: str,
     jobs: int,
     progress: Progress,
 ) -> tuple[list[DriveRecord], list[str | None]]:
     """Return a record of every log and the hash of its signals; what earlier calls have read is not read again."""
-    config, mapping = settings.config, open_mapping(settings.config)
-    vehicle = None if car.source is None else hash_log(car.source)
-    basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), vehicle, repr(mapping)])
+    mapping = open_mapping(config)
+    basis = digest([basis, repr(mapping)])
     known: dict[str, Any] = {}
     with suppress(OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
-        document = json.loads((work / SEEN_FILE).read_text(encoding="utf-8"))
+        document = json.loads(file.read_text(encoding="utf-8"))
         logs = document["logs"] if document["basis"] == basis else {}
         known = {key: found for key, found in logs.items() if set(found) == _SEEN_KEYS}
     new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
@@ -289,7 +297,7 @@ def _look(
             "left_out": seen.record.left_out,
             "span_s": seen.record.span_s,
         }
-    write_bytes(work / SEEN_FILE, json_bytes({"basis": basis, "logs": known}))
+    write_bytes(file, json_bytes({"basis": basis, "logs": known}))
 
     def record(log_input: LogInput) -> DriveRecord:
         found = known[hashes[log_input.stem]]
