@@ -17,7 +17,7 @@ from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.runs.drive_sample import BLOCKS, SETTLE_S, sample_drive
+from pdhef_logtool.runs.drive_sample import BLOCKS, SETTLE_S, DriveSample, sample_drive
 from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget
 
 #: Rolls not: the accelerometer of the reference car stands upright.
