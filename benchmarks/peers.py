@@ -76,7 +76,7 @@ def run_pipeline(log: Path, output: Path, end_ns: int) -> int:
         writer = Writer(out)
         schema = writer.register_msgdef(STATE_TYPE, message_definition(STATE_TYPE))
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        for _, channel, raw, message in reader.iter_decoded_messages([_IMU, _STEER, _WHEELS], end_time=end_ns):
+        for _, channel, raw, message in reader.iter_decoded_messages([_IMU, _STEER, _WHEELS], ending_before=end_ns):
             if channel.topic == _STEER:
                 steer = float(message.steering_tire_angle)
                 continue
