@@ -419,6 +419,9 @@ def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.Monke
     assert len({i.stem for i in found}) == 3
     assert [i.stem for i in find_logs(["https://host/a/one.mcap", "https://host/b/one.mcap"])] == ["a__one", "b__one"]
     assert find_logs(["https://host/a/one.mcap?x=1"])[0].stem == "one"
+    asked = [f"https://host/get?id={i}&sig=x" for i in (1, 2)]
+    assert {i.stem for i in find_logs(asked)} == {i.stem for i in find_logs(asked[::-1])}
+    assert len(find_logs([*asked, "https://host/get?id=1&sig=y"])) == 2
     monkeypatch.chdir(tmp_path)
     (tmp_path / "@odd").mkdir()
     (tmp_path / "@odd" / "drive.mcap").write_bytes(dlc.read_bytes())
