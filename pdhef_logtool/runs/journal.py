@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.files import open_new, write_bytes, writing
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
@@ -42,9 +43,9 @@ class Place:
     @classmethod
     def of(cls, log: LogInput) -> Place:
         """Return the place of a log; of one that is not there no bytes."""
-        if log.local is None:
-            return cls(_key(str(log.path), log.span_s), _ELSEWHERE, 0)
-        path = Path(os.path.realpath(log.local))
+        if isinstance(log.path, RemotePlace):
+            return cls(_key(log.path.identity, log.span_s), _ELSEWHERE, 0)
+        path = Path(os.path.realpath(log.path))
         found = []
         with suppress(OSError):
             files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
