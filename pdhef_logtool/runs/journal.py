@@ -75,6 +75,7 @@ class Entry:
     identity : what the log is known by, None where nobody could read it. setting, car : digests of what it was run
         with; car None where it has none. keep : what was written.
     part : the file of its figures below the run's folder, None without. failed_checks : those that count.
+    error_rad : RMSE of the answer's sideslip, None where it is not scored against an independent truth.
     failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
     quarantined : whether it took its worker along.
     at : bytes into the journal.
@@ -88,6 +89,7 @@ class Entry:
     keep: str
     part: str | None = None
     failed_checks: int = 0
+    error_rad: float | None = None
     failed: bool = False
     again: bool = False
     quarantined: bool = False
