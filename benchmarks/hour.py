@@ -1,6 +1,6 @@
 """An hour of a simulated road drive through the commands, and where the seconds of its run go.
 
-Each command runs in a process of its own on one core with compiled code at hand, start included. The peer is the
+Each command runs once, in a process of its own on one core with compiled code at hand, start included. The peer is the
 straightforward pipeline of `benchmarks/peers.py` on the first 30 s, scaled to the hour by its steps.
 """
 
