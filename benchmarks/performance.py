@@ -23,8 +23,9 @@ _SECTION = "\n## "
 _INTRODUCTION = """# Performance
 
 Written by `python -m benchmarks.performance --write-docs`; `make bench` prints the same tables. Seconds are processor
-seconds (user and system, with those of child processes), the best of several interleaved rounds if nothing else is said;
-a ratio to a peer is measured in the same run. A section that is named on the command line is measured anew alone.
+seconds (user and system, with those of child processes), the best of several interleaved rounds unless a section says
+otherwise; a ratio to a peer is measured in the same run. A section that is named on the command line is measured anew
+alone.
 """
 
 
