@@ -9,13 +9,14 @@ CAR := saloon
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
 
-.PHONY: help demo test quick pages mutants check lint format bench train-default samples conditions real switches torture \
-  retrain docs docs-truthsim paper strangers clean
+.PHONY: help demo test quick fleet pages mutants check lint format bench train-default samples conditions real switches torture \
+  retrain docs docs-truthsim paper strangers wheel release clean
 
 help:
 	@echo "make demo     run the main job on the sample logs and say where the outputs are"
 	@echo "make test     run all tests"
 	@echo "make quick    run the quick tests, which touch every package: under a minute on two cores once compiled"
+	@echo "make fleet    the tests of fleets, which take long, and need pip install '.[ray]' for those on a cluster"
 	@echo "make pages    look at the pages in a browser: their tests, and the pictures of docs/report.md anew (needs Chromium)"
 	@echo "make mutants  put small faults into the code and see which of them the tests notice (SEED=1 COUNT=30)"
 	@echo "make check    formatting, lint, types, import contracts, tests"
@@ -32,6 +33,8 @@ help:
 	@echo "make docs     the documentation as a site: out/site/index.html (a broken link is an error)"
 	@echo "make docs-truthsim  figures and tables of docs/truthsim.md anew"
 	@echo "make paper    the paper's experiment: docs/paper.md, its figures and results"
+	@echo "make wheel    dist/: the wheel and the source archive of what is committed, looked at"
+	@echo "make release  the same, installed into a new environment, where the sample job runs"
 	@echo "make clean    remove the virtual environment and everything that was built"
 
 $(BIN)/python:
@@ -74,6 +77,10 @@ pages: $(VENV)/installed-dev $(VENV)/compiled
 	$(BIN)/python -m pytest tests/reports tests/results
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
 	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
+
+# What takes too long for `make test`, or needs extras: Ray, S3.
+fleet: $(VENV)/installed-dev $(VENV)/compiled
+	PDHEF_FLEET=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m fleet
 
 # Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.
 SEED ?= 1
@@ -141,6 +148,21 @@ strangers: $(VENV)/installed-dev $(VENV)/compiled
 
 switches: $(VENV)/installed-dev $(VENV)/compiled
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.switches
+
+# Of what is committed, in a clone: nothing else that lies about here gets in.
+wheel: $(VENV)/installed-dev
+	rm -rf build/clone dist
+	git clone --quiet . build/clone
+	$(BIN)/python -m build --outdir dist build/clone >/dev/null
+	$(BIN)/python tests/release/check_dist.py dist
+
+# As a stranger installs and runs it, away from the source tree; the same steps as in the Dockerfile.
+release: wheel
+	rm -rf build/fresh
+	$(PYTHON) -m venv build/fresh
+	build/fresh/bin/python -m pip install --quiet dist/*.whl
+	cd build/fresh && bin/pdhef --version && bin/pdhef --help >/dev/null
+	cd build/fresh && bin/pdhef run ../../sample_logs/dlc.mcap --car saloon --estimators all --annotate none -o out
 
 clean:
 	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

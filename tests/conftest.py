@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,12 @@ def shared_dir() -> Path:
 @pytest.fixture(scope="session")
 def sample_logs_dir() -> Path:
     return ROOT / "sample_logs"
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave what takes long or needs extras to ``make fleet``."""
+    if item.get_closest_marker("fleet") is not None and not os.environ.get("PDHEF_FLEET"):
+        pytest.skip("make fleet runs it")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -84,9 +84,11 @@ class FakeLog:
         end_ns: int | None = None,
         *,
         quiet: bool = False,
+        stamps: Collection[str] = (),
     ) -> dict[str, Columns]:
         self.reads.append({t: list(p) for t, p in requests.items()})
-        return {name: self._columns(name, paths, start_ns, end_ns) for name, paths in requests.items()}
+        wanted = {**dict.fromkeys(stamps, ()), **requests}
+        return {name: self._columns(name, paths, start_ns, end_ns) for name, paths in wanted.items()}
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
         return {name: self._columns(name, (), start_ns, end_ns) for name in self.contents}

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from pdhef_logtool.learning.retrain.retrain_command import RetrainResult
 
 
+#: Of more drives than these only those that gave nothing are listed.
+MOST_DRIVES = 40
+
+
 def render_identification(result: IdentifyResult, console: Console) -> None:
     """Print what was identified, how well it is known, and how well the filter then does."""
     found = result.identification
@@ -59,7 +63,9 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
     """Print what each drive gave, and the dataset as a whole."""
     residuals = (">v̇_y residual\nRMS m/s²", ">ṙ residual\nRMS rad/s²")
     drives = table("drive", ">seconds", ">usable", *residuals, "split", "truth", fold=1)
-    for drive in result.results:
+    few = len(result.results) <= MOST_DRIVES
+    shown = [r for r in result.results if few or r.entry is None]
+    for drive in shown:
         if drive.entry is None:
             said = f"as {drive.copy_of}" if drive.copy_of else "failed"
             drives.add_row(drive.record.name, "-", "-", "-", "-", "-", said)
@@ -75,7 +81,11 @@ def render_extraction(result: ExtractResult, console: Console) -> None:
             e["split"],
             truth["kind"] + (f", ±{half_s:g} s" if half_s else "") + (", kept" if drive.kept else ""),
         )
-    console.print(drives)
+    if not few:
+        what = "these gave nothing of their own" if shown else "all gave something"
+        console.print(f"{len(result.results)} drives, listed in manifest.json; {what}")
+    if shown:
+        console.print(drives)
     splits = result.manifest["splits"].items()
     told = (f"{name}: {s['drives']} drives, {s['usable_rows']} usable rows" for name, s in splits)
     console.print(", ".join(told))

@@ -17,9 +17,15 @@ from pdhef_logtool.records.errors import UsageError
 if TYPE_CHECKING:
     from pdhef_logtool.runs.config import RunConfig
 
-Log = Annotated[str, Argument(metavar="LOG", help="MCAP file, rosbag1 file, rosbag2 folder or .db3 file.")]
-Logs = Annotated[list[str], Argument(metavar="LOG", help="Logs, folders that hold some, or glob patterns.")]
-TruthLogs = Annotated[list[str], Argument(metavar="LOG", help="Logs with truth, folders that hold some, or globs.")]
+Log = Annotated[
+    str, Argument(metavar="LOG", help="MCAP file, rosbag1 file, rosbag2 folder, .db3 file, or URL of a file.")
+]
+Logs = Annotated[
+    list[str], Argument(metavar="LOG", help="Logs, folders that hold some, glob patterns, URLs, or @list.txt.")
+]
+TruthLogs = Annotated[
+    list[str], Argument(metavar="LOG", help="Logs with truth, folders that hold some, globs, URLs, or @list.txt.")
+]
 CarOutput = Annotated[
     Path, Option("--output", "-o", metavar="CAR", help="Car to write: a folder (may be that of --car), or a .toml.")
 ]
@@ -51,6 +57,10 @@ _OPTIONS: dict[str, Any] = {
     "annotate": Annotated[_Text, Option(help="full: copy of the log with our topics; sidecar: our topics only; none.")],
     "keep": Annotated[
         _Text, Option(help="Of each drive: metrics, estimates, or full. Default: full, above 50 logs metrics.")
+    ],
+    "cache": Annotated[
+        _Text,
+        Option(metavar="DIR|URL", help="Keep a slim log of each log there and read that the next time: docs/slim.md."),
     ],
     "sensors": Annotated[_Text, Option(help="full, or esp: no wheel speeds in the filters after the start.")],
     "friction": Annotated[

@@ -235,10 +235,10 @@ def inspect_drive_log(
     gathered: dict[tuple[str, str], _Gathered] = {}
     losses: list[tuple[Loss, ...]] = []
     for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
-        for name, columns in log.read_stamps(start, end).items():
+        channels = read_signals(log, mapping, clocks, start, end, stamps=tuple(steps))
+        for name, columns in channels.stamps.items():
             steps[name].add(columns.log_time_ns)
             delays[name].add(columns.log_time_ns, columns.publish_time_ns)
-        channels = read_signals(log, mapping, clocks, start, end)
         losses.append(channels.losses)
         _gather(channels, gathered)
     reading = merge_losses(losses)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -221,10 +221,12 @@ class ColumnarLog:
         end_ns: int | None = None,
         *,
         quiet: bool = False,
+        stamps: Collection[str] = (),
     ) -> dict[str, Columns]:
         """Read the fields asked for of messages with log time in [start, end).
 
         ``quiet`` only looks: messages that do not decode are no loss of whoever wants nothing of the topic.
+        ``stamps`` are further topics, of which only the times are read.
 
         Raises
         ------
@@ -235,7 +237,8 @@ class ColumnarLog:
             wanted = {(c, channel.id) for topic in requests for c, channel in self._by_topic[topic]}
             self._asked |= wanted
             self._wanted |= wanted
-        return self._collect(plans, start_ns, end_ns)
+        times = {topic: _Plan((), {}) for topic in stamps if topic not in plans}
+        return self._collect(plans | times, start_ns, end_ns)
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:
         """Read only log and publish times of every topic."""

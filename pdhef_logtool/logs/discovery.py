@@ -80,7 +80,7 @@ def find_logs(arguments: Logs) -> list[LogInput]:
                 remedy="name a log, a folder that holds some, or a glob pattern in quotes",
             )
         for place in places:
-            found.setdefault(place.url if isinstance(place, RemotePlace) else os.path.realpath(place), place)
+            found.setdefault(place.identity if isinstance(place, RemotePlace) else os.path.realpath(place), place)
     return _with_stems(list(found.values()))
 
 
@@ -141,7 +141,7 @@ def identity_of(log: LogInput) -> str:
         return hash_log(log.path)
     from pdhef_logtool.logs.remote_source import RemoteSource
 
-    source = RemoteSource(log.path)
+    source = RemoteSource(log.path, head_bytes=1)
     try:
         return source.identity
     finally:

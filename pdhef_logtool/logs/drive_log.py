@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -122,10 +122,12 @@ class DriveLog(Protocol):
         end_ns: int | None = None,
         *,
         quiet: bool = False,
+        stamps: Collection[str] = (),
     ) -> dict[str, Columns]:
         """Read the fields asked for of messages with log time in [start, end). Unasked topics are not decoded.
 
-        ``quiet`` only looks: messages that do not decode are no loss then.
+        ``quiet`` only looks: messages that do not decode are no loss then. ``stamps`` are further topics, of which
+        only the times are read.
         """
 
     def read_stamps(self, start_ns: int | None = None, end_ns: int | None = None) -> dict[str, Columns]:

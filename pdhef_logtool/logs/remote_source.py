@@ -10,6 +10,8 @@ import asyncio
 import hashlib
 import os
 import shutil
+import sys
+from bisect import bisect_right
 from collections.abc import Coroutine, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
@@ -44,6 +46,7 @@ _KEPT_BYTES = 4 << 30
 _KEPT_OBJECTS = 1000
 
 
+_AT_END = sys.maxsize
 _NOTHING = ObjectState(0, "", "")
 
 
@@ -87,6 +90,18 @@ def _append(found: list[Extent], start: int, end: int) -> None:
         found.append((start, end))
 
 
+def _insert(held: list[Extent], extent: Extent) -> None:
+    """Add an extent to others that are apart from it and each other, and ascend; neighbours are joined."""
+    at = bisect_right(held, extent)
+    start, end = extent
+    if at < len(held) and held[at][0] == end:
+        end = held.pop(at)[1]
+    if at > 0 and held[at - 1][1] == start:
+        at -= 1
+        start = held.pop(at)[0]
+    held.insert(at, (start, end))
+
+
 def _any_in(held: Sequence[Extent], start: int, end: int) -> bool:
     return any(low < end and high > start for low, high in held)
 
@@ -96,6 +111,7 @@ class RemoteSource(ByteSource):
 
     Parameters
     ----------
+    head_bytes : that are fetched at once.
     place : where it lies. What the object is (size, ETag, time of modification) is pinned now; that it became another
         one ends any later read.
 
@@ -107,11 +123,12 @@ class RemoteSource(ByteSource):
 
     far = True
 
-    def __init__(self, place: RemotePlace) -> None:
-        self._spool = _acquire(place)
+    def __init__(self, place: RemotePlace, head_bytes: int = HEAD_BYTES) -> None:
+        self._spool = _acquire(place, head_bytes)
         self._closed = False
         self.place = place
         super().__init__(self._spool.state.size)
+        self.expect([(0, head_bytes)])
 
     @property
     def state(self) -> ObjectState:
@@ -175,42 +192,46 @@ class _Spool:
         self.path = Path(self._folder.name) / (self.place.name.replace("/", "_")[-80:] or "log")
         self._file = -1
         self._lock = Lock()
+        self._entering = Lock()
         self._at_once = asyncio.Semaphore(AT_ONCE)
         self._room = 0
 
-    def enter(self) -> None:
-        """Open the scratch file for one user more; the first one pins what the object is, others ask if it still is.
+    def enter(self, head_bytes: int) -> None:
+        """Open the scratch file; who is first pins what the object is, whoever comes later asks if it still is.
 
         Raises
         ------
         ChangedError : It is another one by now. SourceError : It cannot be asked for.
         """
-        if self.users == 0:
-            new = not self.path.exists()
+        with self._entering:
+            if self._file >= 0:
+                return
             self._file = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o600)
-            if new or self.state.size:
-                self._run(try_in_turn(self._first if new else self._ask_again, self.remote)).result()
-        self.users += 1
+            try:
+                if self.state is _NOTHING:
+                    self._run(try_in_turn(lambda: self._first(head_bytes), self.remote)).result()
+                elif self.state.size:
+                    self._run(try_in_turn(self._ask_again, self.remote)).result()
+            except BaseException:
+                self.leave()
+                raise
 
     def leave(self) -> None:
-        """Close the scratch file for one user."""
-        self.users -= 1
-        if self.users <= 0:
-            for _, future in self.coming:
-                future.cancel()
-            self.coming.clear()
-            with self._lock:  # nothing that is still under way writes to what gets this number next
-                file, self._file = self._file, -1
-            if file >= 0:
-                os.close(file)
+        """Close the scratch file, when nobody uses it any more."""
+        for _, future in self.coming:
+            future.cancel()
+        self.coming.clear()
+        with self._lock:  # nothing that is still under way writes to what gets this number next
+            file, self._file = self._file, -1
+        if file >= 0:
+            os.close(file)
 
-    async def _first(self) -> None:
-        async with self.remote.ask(0, HEAD_BYTES, None) as answer:
+    async def _first(self, head_bytes: int) -> None:
+        async with self.remote.ask(0, head_bytes, None) as answer:
             written = await self._write(answer, answer.state.size)
         size = written if answer.state.size < 0 else answer.state.size
         self.state = ObjectState(size, answer.state.etag, answer.state.modified)
-        whole = min(size, HEAD_BYTES)
-        if written < whole:
+        if written < min(size, head_bytes):
             raise TryAgainError("an answer that is cut")
         self.held = [(0, written)] if written else []
 
@@ -247,7 +268,7 @@ class _Spool:
         with self._lock:
             if (extent, future) in self.coming:
                 self.coming.remove((extent, future))
-                self.held = without([*self.held, extent], [])
+                _insert(self.held, extent)
 
     def read(self, start: int, end: int) -> bytes:
         """Return bytes [start, end)."""
@@ -259,7 +280,8 @@ class _Spool:
 
     def held_to(self, start: int, end: int) -> int:
         """Return up to where, at most to ``end``, bytes from ``start`` on are held; ``start``: none is."""
-        return next((min(high, end) for low, high in self.held if low <= start < high), start)
+        at = bisect_right(self.held, (start, _AT_END)) - 1
+        return min(self.held[at][1], end) if at >= 0 and self.held[at][1] > start else start
 
     async def _get(self, start: int, end: int) -> None:
         async with self._at_once:
@@ -316,38 +338,46 @@ class _Spool:
 
     def drop(self) -> None:
         """Remove the scratch file."""
-        self.users = 0
         self.leave()
         self._folder.cleanup()
 
 
 #: By URL, in order of their last use.
 _spools: dict[str, _Spool] = {}
+_registry = Lock()
 
 
-def _acquire(place: RemotePlace) -> _Spool:
-    spool = _spools.pop(place.url, None) or _Spool(place, remote_object(place))
+def _acquire(place: RemotePlace, head_bytes: int) -> _Spool:
+    with _registry:
+        spool = _spools.pop(place.url, None) or _Spool(place, remote_object(place))
+        _spools[place.url] = spool
+        spool.users += 1
     try:
-        spool.enter()
-    except ChangedError:  # since it was closed: opening pins what it is now
-        spool.drop()
-        return _acquire(place)
-    except BaseException:
-        spool.drop()
+        spool.enter(head_bytes)
+    except BaseException as error:
+        with _registry:
+            spool.users -= 1
+            if not spool.users:
+                _forget(spool)
+        if isinstance(error, ChangedError) and spool.state is not _NOTHING:
+            return _acquire(place, head_bytes)  # another one since it was closed: opening pins what it is now
         raise
-    _spools[place.url] = spool
     return spool
 
 
 def _release(spool: _Spool) -> None:
-    spool.leave()
-    if spool.failure is not None and not spool.users:
-        _forget(spool)
-    idle = [s for s in _spools.values() if not s.users]
-    size = sum(s.size for s in idle)
-    while idle and (size > _KEPT_BYTES or len(idle) > _KEPT_OBJECTS):
-        size -= idle[0].size
-        _forget(idle.pop(0))
+    with _registry:
+        spool.users -= 1
+        if spool.users:
+            return
+        spool.leave()
+        if spool.failure is not None:
+            _forget(spool)
+        idle = [s for s in _spools.values() if not s.users]
+        size = sum(s.size for s in idle)
+        while idle and (size > _KEPT_BYTES or len(idle) > _KEPT_OBJECTS):
+            size -= idle[0].size
+            _forget(idle.pop(0))
 
 
 def _forget(spool: _Spool) -> None:

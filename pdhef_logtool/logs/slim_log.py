@@ -7,14 +7,18 @@ else it held, and which mapping was used. Each chunk holds one topic, so that re
 
 from __future__ import annotations
 
+import struct
 import tempfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mcap.opcode import Opcode
+
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.columnar_log import ColumnarLog
-from pdhef_logtool.logs.container import MAX_TIME_NS, Container
+from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC, Container
 from pdhef_logtool.logs.drive_log import TopicInfo
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.occupied_time import OccupiedTime
@@ -28,6 +32,8 @@ from pdhef_logtool.records.version import LIBRARY
 FORMAT = 1
 #: Name of the MCAP metadata record, and of its one entry.
 RECORD_NAME, RECORD_ENTRY = "pdhef_slim", "json"
+#: Opcode, size, then: start of summary and of its offsets, CRC of the summary; CRC of all before it.
+_FOOTER, _DATA_END = struct.Struct("<BQQQI"), struct.Struct("<BQI")
 _LONGEST_NS = 366 * 86_400_000_000_000
 #: Losses that come up again when the kept messages are read.
 _FOUND_AGAIN = frozenset({"undecodable", "bad-schema"})
@@ -140,3 +146,18 @@ def slim_record(container: Container) -> SlimRecord | None:
     if edges != sorted(edges) or not all(-MAX_TIME_NS <= ns <= MAX_TIME_NS + 1 for ns in edges) or lasts > _LONGEST_NS:
         raise LogError(expected=_EXPECTED, got="times that no log has", where=str(container.path), remedy=_REMEDY)
     return record
+
+
+def is_whole(path: Path) -> bool:
+    """Tell by its checksums whether a file that our writer wrote is as it was written."""
+    data = path.read_bytes()
+    foot = len(data) - _FOOTER.size - len(MCAP_MAGIC)
+    if foot < _DATA_END.size or not data.endswith(MCAP_MAGIC):
+        return False
+    opcode, _, summary, _, summary_crc = _FOOTER.unpack_from(data, foot)
+    if opcode != Opcode.FOOTER or not _DATA_END.size <= summary <= foot:
+        return False
+    end, _, data_crc = _DATA_END.unpack_from(data, summary - _DATA_END.size)
+    view = memoryview(data)
+    checked = zlib.crc32(view[: summary - _DATA_END.size]), zlib.crc32(view[summary : foot + _FOOTER.size - 4])
+    return bool(end == Opcode.DATA_END and checked == (data_crc, summary_crc))

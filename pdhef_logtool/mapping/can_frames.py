@@ -11,7 +11,7 @@ most significant bit.
 from __future__ import annotations
 
 import stat
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import lru_cache
@@ -224,6 +224,7 @@ class CanSignalLog:
         end_ns: int | None = None,
         *,
         quiet: bool = False,
+        stamps: Collection[str] = (),
     ) -> dict[str, Columns]:
         """Read fields; each topic of frames is read once, however many signals are taken from it."""
         raw: dict[str, list[str]] = {}
@@ -232,9 +233,9 @@ class CanSignalLog:
             own = paths if view is None else (*view.paths.all, *(p for p in paths if p not in view.source.paths))
             merged = raw.setdefault(topic if view is None else view.source.topic, [])
             merged += [p for p in own if p not in merged]
-        read = self._log.read(raw, start_ns, end_ns, quiet=quiet) if raw else {}
+        read = self._log.read(raw, start_ns, end_ns, quiet=quiet, stamps=stamps) if raw or stamps else {}
         short: dict[str, Loss] = {}
-        found = {}
+        found = {topic: read[topic] for topic in stamps}
         for topic, paths in requests.items():
             view = self._views.get(topic)
             found[topic] = read[topic] if view is None else self._view_columns(view, read, topic, paths, short)

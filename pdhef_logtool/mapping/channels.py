@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, field, replace
 
@@ -39,13 +39,15 @@ LOST_KINDS = frozenset({"nan", "bad-stamp"})
 class MappedChannels:
     """Channels of one window of log time; every mapped name is there, if need be with no samples.
 
-    ``counts`` has by role and name the messages ``read``, and those of them that were dropped, by reason.
+    ``counts`` has by role and name the messages ``read``, and those of them that were dropped, by reason. ``stamps``:
+    times of the topics for which they were asked for.
     """
 
     signals: dict[str, Channel]
     truth: dict[str, Channel]
     losses: tuple[Loss, ...]
     counts: dict[tuple[Role, str], Counter[str]] = field(default_factory=dict)
+    stamps: Mapped[str, Columns] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +137,12 @@ def gate_mask(
 
 
 def read_signals(
-    log: DriveLog, mapping: Mapping, clocks: dict[str, ClockModel], start_ns: int, end_ns: int
+    log: DriveLog,
+    mapping: Mapping,
+    clocks: dict[str, ClockModel],
+    start_ns: int,
+    end_ns: int,
+    stamps: Collection[str] = (),
 ) -> MappedChannels:
     """Read the mapped fields of the messages with log time in [start, end) into clean channels.
 
@@ -145,6 +152,7 @@ def read_signals(
     Parameters
     ----------
     clocks : from :func:`pdhef_logtool.mapping.fit_clocks` over the whole span that is going to be read.
+    stamps : topics of which the times are wanted too, mapped or not.
     """
     resolved = resolve_mapping(log, mapping)
     log = with_can_signals(log, resolved)
@@ -152,7 +160,7 @@ def read_signals(
     requests: dict[str, list[str]] = {}
     for source in (*resolved.signals.values(), *resolved.truth.values()):
         request_source(log, source, requests)
-    columns = log.read(requests, start_ns, end_ns) if requests else {}
+    columns = log.read(requests, start_ns, end_ns, stamps=stamps) if requests or stamps else {}
     losses = _topic_losses(log, resolved, clocks, columns)
     if isinstance(log, CanSignalLog):
         losses += log.short_frames
@@ -172,7 +180,8 @@ def read_signals(
         truth = _apply_gate(log, gate, truth, clocks, start_ns, end_ns, losses)
         for name, channel in truth.items():
             counts["truth", name]["truth-quality"] += len(before[name]) - len(channel)
-    return MappedChannels(signals=signals, truth=truth, losses=merge_losses([losses]), counts=counts)
+    times = {topic: columns[topic] for topic in stamps}
+    return MappedChannels(signals, truth, merge_losses([losses]), counts, times)
 
 
 def join_channels(parts: Sequence[Channel]) -> Channel:

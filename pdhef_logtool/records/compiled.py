@@ -21,8 +21,9 @@ from typing import Any
 
 import numba
 from numba.core import caching, config
+from numba.extending import overload
 from numba.misc.appdirs import AppDirs
-from numba.np import linalg
+from numba.np import arrayobj, linalg
 
 from pdhef_logtool.records import processes
 from pdhef_logtool.records.shown import shown
@@ -49,7 +50,21 @@ def _without_blas() -> None:
     arraymath.ensure_blas = found
 
 
+def _sizes_differ(_given: Any, _expected: Any) -> None:
+    """Stand for what numba calls where an array is assigned to a slice of another shape."""
+
+
+@overload(_sizes_differ)  # type: ignore[untyped-decorator]
+def _raise_that_sizes_differ(_given: Any, _expected: Any) -> Any:
+    def raising(_given: Any, _expected: Any) -> None:
+        raise ValueError("cannot assign slice from input of different size")
+
+    return raising
+
+
 _without_blas()
+# Numba's own writes both shapes into the message, and compiles its text functions for that: a sixth of all compiling.
+arrayobj.raise_with_shape_context = _sizes_differ
 
 
 def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:

@@ -107,10 +107,6 @@ def supervise(
         raise UsageError(expected="at least one process", got=str(jobs), where="--jobs")
     if jobs == 1 and limits == Limits():
         return _in_this_process(work, items, progress)
-    if not hasattr(os, "fork"):
-        raise UsageError(
-            expected="a system with fork", got=sys.platform, where="--jobs", remedy="--jobs 1, and no limits"
-        )
     return _in_processes(work, items, jobs, limits, preload, progress)
 
 
@@ -143,26 +139,15 @@ def _in_processes(  # positional: the arguments of `supervise`, which checked th
     preload: Sequence[str],
     progress: Progress,
 ) -> Generator[Ended[T, R], None, None]:
-    with _Crew[T, R](work, limits, preload, progress) as crew:
-        lost: list[_Attempt[T]] = []
-        for attempt, ended in crew.run((_Attempt(n, item) for n, item in enumerate(items)), jobs):
-            if ended is None:
-                lost.append(attempt)
-            else:
-                yield ended
-            del attempt, ended
-        while lost:
-            crew.dismiss()
-            for _, ended in crew.run(iter([lost.pop(0)]), 1):
-                assert ended is not None
-                yield ended
-                del ended
+    with Crew[T, R](work, jobs=jobs, limits=limits, preload=preload) as crew:
+        yield from crew.each(items, progress)
 
 
 @dataclass(slots=True)
 class _Attempt(Generic[T]):
     number: int
     item: T
+    place: int | None
     tries: int = 0
     last: str = ""
 
@@ -174,6 +159,7 @@ class _Worker(Generic[T]):
     channel: socket.socket
     server: _Server
     attempt: _Attempt[T] | None
+    place: int | None
     pid: int | None = None
     silent_s: float = 0.0
     buffer: bytearray = field(default_factory=bytearray)
@@ -254,40 +240,90 @@ class _Server:
         self._process.wait()
 
 
-class _Crew(Generic[T, R]):
-    """The workers of a run."""
+class Crew(Generic[T, R]):
+    """Workers for several lists of items; arguments and errors as those of :func:`supervise`."""
 
     def __init__(
-        self, work: Callable[[T, Tell], R], limits: Limits, preload: Sequence[str], progress: Progress
+        self,
+        work: Callable[[T, Tell], R],
+        *,
+        jobs: int,
+        limits: Limits = Limits(),
+        preload: Sequence[str] = (),
     ) -> None:
+        if not hasattr(os, "fork"):
+            raise UsageError(
+                expected="a system with fork", got=sys.platform, where="--jobs", remedy="--jobs 1, and no limits"
+            )
         most = limits.memory_bytes
         self._orders = (pickle.dumps(work), None if most is None else most + _RESERVED_BYTES)
-        self._limits, self._preload, self._progress = limits, preload, progress
+        self._jobs, self._limits, self._preload = jobs, limits, preload
+        self._progress: Progress = lambda _number, _text, _share: None
         self._server: _Server | None = None
         self._workers: list[_Worker[T]] = []
         self._started = 0
         self._selector = selectors.DefaultSelector()
 
     def __enter__(self) -> Self:
+        """Return itself."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        """End all processes."""
         self._selector.close()
         for worker in self._workers:
             worker.channel.close()
+        self._workers.clear()
         if self._server is not None:
             self._server.end()
 
-    def dismiss(self) -> None:
-        """End all workers, so that what they hold is free."""
-        for worker in list(self._workers):
+    def each(
+        self,
+        items: Iterable[T],
+        progress: Progress = lambda _number, _text, _share: None,
+        *,
+        place: Callable[[T], int] | None = None,
+    ) -> Generator[Ended[T, R], None, None]:
+        """Do the work on every item, as :func:`supervise` does.
+
+        Parameters
+        ----------
+        place : which worker an item is for, by a number below ``jobs``, for work that goes on from what an earlier
+            item has left in its process; that is gone when the process is lost.
+        """
+        self._progress = progress
+        lost: list[_Attempt[T]] = []
+        attempts = (_Attempt(n, item, place and place(item)) for n, item in enumerate(items))
+        try:
+            for attempt, ended in self._run(attempts, self._jobs):
+                if ended is None:
+                    lost.append(attempt)
+                else:
+                    yield ended
+                del attempt, ended
+            while lost:
+                self._dismiss(self._workers)
+                for _, ended in self._run(iter([lost.pop(0)]), 1):
+                    assert ended is not None
+                    yield ended
+                    del ended
+        finally:
+            self._dismiss([w for w in self._workers if w.attempt is not None])
+
+    def _dismiss(self, workers: Sequence[_Worker[T]]) -> None:
+        for worker in tuple(workers):
             self._end(worker)
 
-    def run(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
+    def _run(self, attempts: Iterator[_Attempt[T]], jobs: int) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
         """Try items, so many at once; yield how each ended, None if it was lost and may be tried again."""
         since = time.monotonic()
+        coming: _Attempt[T] | None = None
         while True:
-            while self._busy() < jobs and (attempt := next(attempts, None)) is not None:
+            while self._busy() < jobs:
+                coming = coming or next(attempts, None)
+                if coming is None or self._is_taken(coming):
+                    break
+                attempt, coming = coming, None
                 yield from self._give(attempt)
                 del attempt
             if not self._busy():
@@ -301,13 +337,17 @@ class _Crew(Generic[T, R]):
                 yield from self._hear(worker)
             yield from self._watch()
 
+    def _is_taken(self, attempt: _Attempt[T]) -> bool:
+        """Tell whether the worker that an item is for is at work."""
+        return attempt.place is not None and any(w.attempt and w.place == attempt.place for w in self._workers)
+
     def _busy(self) -> int:
         return sum(w.attempt is not None for w in self._workers)
 
     def _give(self, attempt: _Attempt[T]) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
         """Hand an item to a worker that is free, or to a new one; an item that cannot be sent ends here."""
         attempt.tries, attempt.last = attempt.tries + 1, ""
-        free = next((w for w in self._workers if w.attempt is None), None)
+        free = next((w for w in self._workers if w.attempt is None and w.place == attempt.place), None)
         if free is None:
             self._start(attempt)
         else:
@@ -325,7 +365,7 @@ class _Crew(Generic[T, R]):
                 self._server.start()
                 self._server.fork(self._started, theirs)
         ours.settimeout(_SEND_S)
-        worker = _Worker(ours, self._server, attempt)
+        worker = _Worker(ours, self._server, attempt, attempt.place)
         self._workers.append(worker)
         self._selector.register(ours, selectors.EVENT_READ, worker)
 

@@ -58,7 +58,7 @@ class RunConfig:
     mapping : file; None = recognised types.
     start, end : slice as given (:func:`~pdhef_logtool.drive.options.parse_time`); None = the log's own.
     annotate : ``full`` copies the source into annotated.mcap, ``sidecar`` writes our topics only; None = ``full``
-        where everything is kept, else ``none``.
+        where everything is kept (``sidecar`` with a cache, as the source is not read), else ``none``.
     keep : what is written of a drive: ``metrics`` (report.json and figures), ``estimates`` (its tracks too) or
         ``full``; None = ``full``, of many logs ``metrics`` (:mod:`~pdhef_logtool.runs.fleet`).
     sensors : ``esp`` is the paper's suite without wheel speeds in the filters.
@@ -73,6 +73,7 @@ class RunConfig:
     thresholds : limits that the figures are held against; None = no gate.
     waived : names of checks whose failure does not count.
     calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.
+    cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
     """
 
     estimators: Names | None = None
@@ -94,6 +95,7 @@ class RunConfig:
     intervals: Path | None = None
     calibrate: Literal["off", "log", "pool"] = "log"
     waived: Names = ()
+    cache: str | None = None
 
     @property
     def read_options(self) -> ReadOptions:
@@ -108,7 +110,8 @@ class RunConfig:
     @property
     def annotation(self) -> Literal["full", "sidecar", "none"]:
         """What annotated.mcap holds; what was asked for is never left out."""
-        return self.annotate or ("full" if self.kept == "full" else "none")
+        whole: Literal["full", "sidecar"] = "full" if self.cache is None else "sidecar"
+        return self.annotate or (whole if self.kept == "full" else "none")
 
     @property
     def files(self) -> list[Path]:
@@ -118,6 +121,7 @@ class RunConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
+        del document["cache"]
         document["waived"] = list(self.waived)
         document |= {"annotate": self.annotation, "keep": self.kept}
         document["estimators"] = None if self.estimators is None else list(self.estimators)
@@ -149,6 +153,13 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
         config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
     if config.estimators is not None:
         check_names(config.estimators)
+    if config.cache is not None and config.annotate == "full":
+        raise UsageError(
+            expected="--annotate sidecar or none with --cache",
+            got="full",
+            where="--annotate",
+            remedy="a full copy reads all of each log: leave out --cache",
+        )
     # Times are understood without a log, so that a typing error is told before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:
@@ -161,6 +172,8 @@ def _read_file(path: Path) -> dict[str, Any]:
     if twice := [f"{old} and {new}" for old, new in FORMER_KEYS.items() if old in raw and new in raw]:
         raise UsageError(expected="an entry or its former name", got=", ".join(twice), where=str(path))
     raw = {FORMER_KEYS.get(key, key): value for key, value in raw.items()}
+    if isinstance(raw.get("cache"), str) and "://" not in raw["cache"]:
+        raw["cache"] = str(path.parent / raw["cache"])
     for key in _FILES:
         value = raw.get(key)
         if isinstance(value, str):

@@ -74,7 +74,7 @@ _KEPT = ("metrics", "estimates", "full")
 #: What the workers have loaded; polars starts threads at its first query, and none of these makes one.
 _PRELOAD = ("pdhef_logtool.runs.fleet", "pdhef_logtool.runs.guard")
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
-_NO_SETTING = frozenset({"keep", "annotate", "window_s", "car", "cars", "network", "intervals"})
+_NO_SETTING = frozenset({"keep", "annotate", "cache", "window_s", "car", "cars", "network", "intervals"})
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"
@@ -512,7 +512,7 @@ class _Fleet:
                 self._warn(f"{one.log.path.name} failed, the others go on")  # why stands with the results
             for line in end.warned:
                 self._warn(line)
-            self._note(one, end, keep, quarantined=ended.failure is not None)
+            self._note(one, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
             told.end(ended.number)
 
     def _task(self, one: _Planned, keep: Keep) -> DriveTask:
@@ -529,8 +529,9 @@ class _Fleet:
         self.lost += 1
         log, failure = ended.item.log, ended.failure
         last = f"; last heard: {failure.last}" if failure.last else ""
-        reason = f"{failure.reason}, {failure.tries} tries{last}"
-        return DriveEnd(LogOutcome(log=log.stem, file=log.path.name, sha256=None, failed=reason), None)
+        tries = f", {failure.tries} tries" if failure.tries > 1 else ""
+        outcome = LogOutcome(log=log.stem, file=log.path.name, sha256=None, failed=f"{failure.reason}{tries}{last}")
+        return DriveEnd(outcome, None, again=True)
 
     def _note(self, one: _Planned, end: DriveEnd, keep: str, *, quarantined: bool) -> None:
         """Write down how a drive ended; then the figures that it had before go."""
@@ -647,10 +648,12 @@ class _Fleet:
 
     def worst(self, count: int) -> list[str]:
         """Return the labels of the scored drives whose answers have the largest errors of sideslip."""
-        from pdhef_logtool.results.fleet import answer_errors
+        import polars as pl
 
-        errors = answer_errors(open_run(self.output))
-        return sorted(errors, key=lambda label: (-errors[label], label))[:count]
+        from pdhef_logtool.results.summary import sideslip_errors
+
+        errors = sideslip_errors(open_run(self.output)).filter(pl.col("estimator") == pl.col("main"))
+        return errors.sort("value", "log", descending=[True, False])["log"].head(count).to_list()
 
     def write_pages(self) -> None:
         """Write the page of the run, and those of drives that no worker has written; or remove what there is."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.drive.friction import FrictionSource
-from pdhef_logtool.drive.reading import Drive, lost_texts, read_drive
+from pdhef_logtool.drive.reading import Drive, lost_texts
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.stand_in import StandIn
@@ -40,6 +40,7 @@ from pdhef_logtool.results.opened_run import (
     REPORT_FILE,
     OpenedLog,
 )
+from pdhef_logtool.runs.cached import read_cached
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.guard import GUARDED, Distrust, choose_main, default_names, distrust
@@ -237,7 +238,7 @@ def run_log(
         Nothing of the log can be used; nothing is then left under a final name.
     """
     progress(log_input.stem, 0.0)
-    with read_drive(log_input, car, mapping, config.read_options, tell=warn) as drive:
+    with read_cached(log_input, car, mapping, config, warn) as drive:
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
@@ -404,7 +405,7 @@ def _open_sinks(
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
             names = None if config.estimators else frozenset({shown.main, TRUTH})
-            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names))
+            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names, shown={shown.main, TRUTH}))
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
             sinks.append(LayoutsSink(*layouts, names, colours))
         if config.kept == "full":
@@ -434,6 +435,7 @@ def _recording(  # positional: what `_open_sinks` takes
         log_name=drive.name,
         input_hash=sha256(f"{application_id} {drive.sha256} {drive.name}".encode()).hexdigest(),
         start_ns=drive.plan.start_ns,
+        end_ns=drive.plan.end_ns,
         shown=shown,
         min_speed_m_s=car.vehicle.low_speed_blend_m_s,
         colours=colours,

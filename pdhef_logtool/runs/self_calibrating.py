@@ -11,8 +11,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
-from pdhef_logtool.drive.options import WINDOW_S
-from pdhef_logtool.drive.reading import Drive, read_drive
+from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.base import Estimator, run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
@@ -20,6 +19,7 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.runs import guard
+from pdhef_logtool.runs.cached import read_cached
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.self_calibration.calibration import SelfCalibration
     from pdhef_logtool.self_calibration.driving import Driving
 
+#: Squares are summed window by window, over spans that no window cuts: another length would be another figure.
+_WINDOW_S = 600.0
 _NEEDS = ("steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
 
@@ -50,7 +52,7 @@ def calibrate_pool(
     found = []
     for log_input in inputs:
         try:
-            with read_drive(log_input, car, mapping, config.read_options) as drive:
+            with read_cached(log_input, car, mapping, config) as drive:
                 if not lacking(drive):
                     found.append(read_driving(drive))
         except PdhefError:
@@ -104,7 +106,7 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -
     carries: list[Any] = [None] * len(estimators)
     squares, counts = [0.0] * len(estimators), [0] * len(estimators)
     products, seconds = [np.zeros((4, 4)) for _ in estimators], [0.0] * len(estimators)
-    for window in drive.windows(fill_friction=_told(drive), window_s=WINDOW_S):
+    for window in drive.windows(fill_friction=_told(drive), window_s=_WINDOW_S):
         signals = window.signals
         whole = {ALL: np.ones(len(signals), dtype=np.bool_)}
         for i, estimator in enumerate(estimators):

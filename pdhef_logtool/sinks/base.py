@@ -7,11 +7,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pdhef_logtool.records.signals import Loss, Signals
+import numpy as np
+
+from pdhef_logtool.records.signals import FloatArray, IntArray, Loss, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 #: Name of the track that holds the truth.
 TRUTH = "truth"
+
+#: What positions are rounded to in files: a power of two, so that their last bytes are zero.
+_PLACE_M = 2.0**-13
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +35,24 @@ class Shown:
 
     main: str
     baseline: str | None = None
+
+
+def single(values: FloatArray) -> FloatArray:
+    """Round to single precision: the bytes that are zero then take no space in a compressed file."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, dtype=np.float32).astype(np.float64)
+
+
+def to_place(values: FloatArray) -> FloatArray:
+    """Round positions in m to 0.12 mm."""
+    return np.asarray(np.round(values / _PLACE_M) * _PLACE_M, dtype=np.float64)
+
+
+def first_of_slots(stamps_ns: IntArray, step_ns: int, before_ns: int | None) -> IntArray:
+    """Return the rows [K] that open a slot of ``step_ns``; none that ``before_ns``, the stamp before, has opened."""
+    slot = stamps_ns // step_ns
+    before = slot[:1] - 1 if before_ns is None else np.array([before_ns // step_ns])
+    return np.flatnonzero(np.diff(slot, prepend=before) != 0)
 
 
 class Sink(ABC):

@@ -27,7 +27,7 @@ from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.geometry import quat_from_yaw
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import Event, Sink
+from pdhef_logtool.sinks.base import Event, Sink, first_of_slots, single, to_place
 
 #: Everything below this name in a source log is ours and is replaced.
 NAMESPACE = "/pdhef/"
@@ -52,10 +52,8 @@ _STATE_FIELDS = (
 )
 #: Places of v_x, v_y and yaw rate among x, y, z and the rotations about x, y, z.
 _PLANAR = np.array([0, 1, 5])
-
-
-#: What positions are rounded to: a power of two, so that their last bytes are zero.
-_PLACE_M = 2.0**-13
+#: Between two poses of a track that is not shown first.
+_POSE_STEP_NS = 50_000_000
 
 
 def topic_of(estimator: str, what: str) -> str:
@@ -70,7 +68,8 @@ class AnnotatedMcapSink(Sink):
     Sound chunks that hold nothing but what stays are written as they are, others message by message.
 
     Each track becomes ``state`` (:data:`STATE_TYPE`, every stamp) and ``odometry`` (``nav_msgs/msg/Odometry``, the
-    stamps that are valid and have a pose, as the message can say neither). Log and publish time are the scored stamp.
+    stamps that are valid and have a pose, as the message can say neither; of a track that is not shown first, 20 a
+    second). Log and publish time are the scored stamp.
     Numbers are rounded to single precision, 6e-8 of their size, positions to 0.12 mm: a quarter less of ours.
     Everything that an earlier annotation left in the source is replaced.
 
@@ -79,6 +78,7 @@ class AnnotatedMcapSink(Sink):
     path : where the finished file stands.
     source : the log to copy in full; None for a sidecar that holds our topics alone.
     names : of the tracks that are written; None: all.
+    shown : of the tracks whose pose is written at every stamp; of others every 50 ms. None: all.
     span_ns : only what of it was recorded in [start, end); None: all of it.
 
     Raises
@@ -92,10 +92,12 @@ class AnnotatedMcapSink(Sink):
         source: DriveLog | None,
         names: Container[str] | None = None,
         *,
+        shown: Container[str] | None = None,
         span_ns: tuple[int, int] | None = None,
     ) -> None:
         self._source = source
-        self._names = names
+        self._names, self._shown = names, shown
+        self._last_ns: dict[str, int] = {}  # of the tracks that are not shown
         self._topics: dict[str, str] = {}
         self._window: dict[str, list[TopicBatch]] = {}
         self._raws: Iterator[RawMessage | RawChunk] = iter(())
@@ -119,7 +121,17 @@ class AnnotatedMcapSink(Sink):
             self._write_window()
         if track.name not in self._topics:
             self._add_topics(track.name)
-        self._window[track.name] = [_state_batch(track), _odometry_batch(track)]
+        self._window[track.name] = [_state_batch(track), _odometry_batch(track, self._posed(track))]
+
+    def _posed(self, track: StateTrack) -> BoolArray:
+        """Tell the stamps [N] at which the pose is written."""
+        known: BoolArray = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+        if self._shown is None or track.name in self._shown or not len(track):
+            return known
+        opens = np.zeros(len(track), dtype=np.bool_)
+        opens[first_of_slots(track.stamps_ns, _POSE_STEP_NS, self._last_ns.get(track.name))] = True
+        self._last_ns[track.name] = int(track.stamps_ns[-1])
+        return known & opens
 
     def finish(self, report: Mapping[str, Any], events: Sequence[Event] = ()) -> None:  # noqa: ARG002
         """Write what is left of the source, the metrics record and report.json, and give the file its name."""
@@ -208,36 +220,30 @@ def _state_batch(track: StateTrack) -> TopicBatch:
     n = len(track)
     known = track.covariance.shape[0] == n
     covariance = track.covariance.reshape(n, 9) if known else np.full((n, 9), np.nan)
-    fields: dict[str, NDArray[Any]] = {name: _single(getattr(track, name)) for name in _STATE_FIELDS}
+    fields: dict[str, NDArray[Any]] = {name: single(getattr(track, name)) for name in _STATE_FIELDS}
     fields |= {"valid": track.valid, "diverged": track.diverged}
-    fields["mixture_weight"] = _single(track.mixture_weight) if len(track.mixture_weight) == n else np.full(n, np.nan)
+    fields["mixture_weight"] = single(track.mixture_weight) if len(track.mixture_weight) == n else np.full(n, np.nan)
     fields["reason"] = track.reason if len(track.reason) == n else np.zeros(n, dtype=np.int64)
     return TopicBatch(
         topic_of(track.name, "state"),
         track.stamps_ns,
         track.stamps_ns,
-        {"header.stamp": track.stamps_ns, "covariance": _single(covariance), **fields},
+        {"header.stamp": track.stamps_ns, "covariance": single(covariance), **fields},
     )
 
 
-def _single(values: FloatArray) -> FloatArray:
-    """Round to single precision: the bytes that are zero then take no space in a compressed chunk."""
-    return np.asarray(values, dtype=np.float32).astype(np.float64)
-
-
-def _odometry_batch(track: StateTrack) -> TopicBatch:
-    use = track.valid & np.isfinite(track.x_m) & np.isfinite(track.y_m) & np.isfinite(track.yaw_rad)
+def _odometry_batch(track: StateTrack, use: BoolArray) -> TopicBatch:
     stamps_ns = track.stamps_ns[use]
     n = len(stamps_ns)
     zero = np.zeros(n)
     covariance = track.covariance[use] if track.covariance.shape[0] == len(track) else np.empty((0, 3, 3))
     fields = {
         "header.stamp": stamps_ns,
-        "pose.pose.position": np.round(np.stack([track.x_m[use], track.y_m[use], zero], axis=1) / _PLACE_M) * _PLACE_M,
-        "pose.pose.orientation": _single(quat_from_yaw(track.yaw_rad[use])),
-        "twist.twist.linear": _single(np.stack([track.vx_m_s[use], track.vy_m_s[use], zero], axis=1)),
-        "twist.twist.angular": _single(np.stack([zero, zero, track.yaw_rate_rad_s[use]], axis=1)),
-        "twist.covariance": _single(_twist_covariance(covariance, n)),
+        "pose.pose.position": to_place(np.stack([track.x_m[use], track.y_m[use], zero], axis=1)),
+        "pose.pose.orientation": single(quat_from_yaw(track.yaw_rad[use])),
+        "twist.twist.linear": single(np.stack([track.vx_m_s[use], track.vy_m_s[use], zero], axis=1)),
+        "twist.twist.angular": single(np.stack([zero, zero, track.yaw_rate_rad_s[use]], axis=1)),
+        "twist.covariance": single(_twist_covariance(covariance, n)),
     }
     return TopicBatch(topic_of(track.name, "odometry"), stamps_ns, stamps_ns, fields)
 

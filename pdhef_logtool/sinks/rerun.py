@@ -24,7 +24,7 @@ from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import TRUTH, Event, Shown, Sink
+from pdhef_logtool.sinks.base import TRUTH, Event, Shown, Sink, first_of_slots
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
 
@@ -40,8 +40,11 @@ LONGEST_BRIDGE_NS = 1_000_000_000
 #: Points of one trajectory in the plan view; it is thinned when it would grow beyond.
 MOST_TRAJECTORY_POINTS = 20_000
 
-#: Steps of the moving dot in the plan view.
+#: Steps of the moving dot in the plan view, and between the rows of a long drive.
 DOT_STEP_NS = 50_000_000
+
+#: A drive that takes longer is long: of it are drawn 20 rows a second.
+LONGEST_WHOLE_NS = 600_000_000_000
 
 #: How long Rerun may keep one call waiting before the recording is given up.
 LONGEST_WAIT_S = 60.0
@@ -95,10 +98,10 @@ _REASON_TEXTS = {r.name: r.text for r in REASONS}
 class RerunSink(Sink):
     """Writes recording.rrd window by window; memory does not grow with the log but for the thinned trajectories.
 
-    Each track is one entity with a row a stamp and a component a quantity, which holds value and band. Entities are
-    named by what a track is for (``/truth``, ``/main``, ``/baseline``, ``/other/1``), so that one blueprint suits all
-    drives of a run whatever ran on them; the lines carry the estimators' names. Errors stand where truth and estimate
-    share a stamp.
+    Each track is one entity with a row a stamp (of a drive above ten minutes, 20 rows a second) and a component a
+    quantity, which holds value and band. Entities are named by what a track is for (``/truth``, ``/main``,
+    ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run whatever ran on them; the lines carry
+    the estimators' names. Errors stand where truth and estimate share a stamp.
 
     Parameters
     ----------
@@ -106,7 +109,7 @@ class RerunSink(Sink):
     application_id : the same for all logs of a run; the viewer shows them as one dataset with one blueprint.
     log_name : shown as the recording's name.
     input_hash : hexadecimal hash of the log, by which the viewer tells the recordings of a run from one another.
-    start_ns : zero of the timeline ``elapsed``.
+    start_ns : zero of the timeline ``elapsed``. end_ns : of the drive, which tells whether it is long; None: it is not.
     shown : which estimators the recording opens on.
     min_speed_m_s : sideslip is not drawn below, where it has no meaning. colours : 0xRRGGBB by estimator.
 
@@ -123,12 +126,14 @@ class RerunSink(Sink):
         log_name: str,
         input_hash: str,
         start_ns: int,
+        end_ns: int | None = None,
         shown: Shown,
         min_speed_m_s: float = 1.0,
         colours: Mapping[str, int] | None = None,
     ) -> None:
         self._colours = colours or {}
         self._start_ns = start_ns
+        self._is_long = end_ns is not None and end_ns - start_ns > LONGEST_WHOLE_NS
         self._min_speed_m_s = min_speed_m_s
         self._places = {TRUTH: "truth", shown.main: "main"}
         if shown.baseline is not None:
@@ -311,8 +316,16 @@ class RerunSink(Sink):
     ) -> None:
         """Send the rows of one entity: [N] stamps, and by component [N, k] values, NaN where unknown.
 
-        Lines of ``sparse`` components go on over what is unknown for less than LONGEST_BRIDGE_NS.
+        Lines of ``sparse`` components go on over what is unknown for less than LONGEST_BRIDGE_NS. Of a long drive the
+        first row of each step is sent, with the largest value that a sparse component has in the step.
         """
+        if len(stamps_ns) and self._is_long:
+            first = first_of_slots(stamps_ns, DOT_STEP_NS, rows.last_ns)
+            columns = {
+                name: np.fmax.reduceat(values, first) if name in sparse and len(first) else values[first]
+                for name, values in columns.items()
+            }
+            stamps_ns = stamps_ns[first]
         if len(stamps_ns) == 0:
             return
         gaps = rows.gaps(stamps_ns)

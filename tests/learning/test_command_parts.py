@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,6 +42,7 @@ from pdhef_logtool.learning.noise.tune_drives import Benches, DriveBench, TuneSe
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.records.supervisor import Ended, Failure
 from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.runs.config import RunConfig
 
@@ -122,6 +122,7 @@ class ReadDrive:
 
     def __init__(self, whole: WholeDrive = WHOLE) -> None:
         self.name, self.path, self.plan, self.sha256 = whole.name, whole.path, whole.plan, "1" * 64
+        self.file = whole.path.name
         topic = SimpleNamespace(label="/ins.v")
         self.mapping = SimpleNamespace(truth={"vy_m_s": topic, "vx_m_s": topic})
         self.friction, self.losses, self.notes = SimpleNamespace(label="none"), (), ["a note"]
@@ -619,37 +620,42 @@ class FakeBench:
         return {n: {index: index for index, *_ in self.loaded} for n in tunings}
 
 
-class FakePool:
-    """A pool whose one process is this one."""
+class FakeCrew:
+    """A crew whose workers are this process, a bench each; what is asked of them ends as late as it can."""
 
-    made: list[FakePool]
+    made: list[FakeCrew]
 
-    def __init__(self, count: int, **named: Any) -> None:
-        assert count == 1
-        self.bench = FakeBench()
-        self.ended: dict[str, Any] | None = None
-        self.waiting = self.most = 0
+    def __class_getitem__(cls, _: Any) -> type[FakeCrew]:
+        return cls
+
+    def __init__(self, work: Any, *, jobs: int, **_: Any) -> None:
+        self.work, self.jobs = work, jobs
+        self.benches: list[dict[str, FakeBench]] = [{} for _ in range(jobs)]
+        self.ended = False
         self.made.append(self)
 
-    def submit(self, function: Any, *arguments: Any) -> Future[Any]:
-        pool, future = self, Future[Any]()
-        self.waiting += 1
-        self.most = max(self.most, self.waiting)
+    def each(self, parts: Any, *, place: Any) -> Iterator[Ended[Any, Any]]:
+        under_way: list[tuple[int, Any]] = []
+        for number, part in enumerate(parts):
+            under_way.append((number, part))
+            if len(under_way) == self.jobs:
+                yield from map(self.end, reversed(under_way))
+                under_way.clear()
+        yield from map(self.end, under_way)
 
-        def result(timeout: float | None = None) -> Any:
-            pool.waiting -= 1
-            return getattr(pool.bench, function.__name__.lstrip("_"))(*arguments)
+    def end(self, what: tuple[int, Any]) -> Ended[Any, Any]:
+        number, part = what
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(tune_drives, "_here", self.benches[part.place])
+            return Ended(number, part, self.work(part, None))
 
-        future.result = result
-        return future
-
-    def shutdown(self, **named: Any) -> None:
-        self.ended = named
+    def __exit__(self, *_: Any) -> None:
+        self.ended = True
 
 
 def test_drives_are_dealt_out_in_turn_within_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(FakePool, "made", [], raising=False)
-    monkeypatch.setattr(tune_drives, "ProcessPoolExecutor", FakePool)
+    monkeypatch.setattr(FakeCrew, "made", [], raising=False)
+    monkeypatch.setattr(tune_drives, "Crew", FakeCrew)
     monkeypatch.setattr(tune_drives, "DriveBench", FakeBench)
     monkeypatch.setattr(tune_drives, "MAX_BYTES", 200)
     inputs = [LogInput(Path(n), n) for n in "abcde"]
@@ -663,15 +669,30 @@ def test_drives_are_dealt_out_in_turn_within_the_memory(monkeypatch: pytest.Monk
             if jobs == 1:
                 seen = benches._local.loaded
                 assert seen == [(i, n, "test" if n == "b" else None, 200 - 40 * i) for i, n in enumerate("abcde")]
-    assert [[one[1] for one in pool.bench.loaded] for pool in FakePool.made] == [["a", "c", "e"], ["b", "d"]]
-    # No more than one drive a process ahead of what is known to be held.
-    assert max(p.most for p in FakePool.made) <= 2
-    assert [one[3] for one in FakePool.made[0].bench.loaded] == [200, 200, 120]
-    assert [pool.ended for pool in FakePool.made] == [{"wait": True, "cancel_futures": True}] * 2
+    crew = FakeCrew.made[0]
+    assert [[one[1] for one in place["bench"].loaded] for place in crew.benches] == [["a", "c", "e"], ["b", "d"]]
+    assert [one[3] for one in crew.benches[0]["bench"].loaded] == [200, 120, 40]
+    assert crew.ended
     monkeypatch.setattr(tune_drives, "MAX_BYTES", 199)
     with pytest.raises(EstimatorError, match="e: expected"), Benches(setup, 2) as benches:
         benches.load(inputs, {}, lambda _: None)
-    assert FakePool.made[-1].ended == {"wait": False, "cancel_futures": True}
+    assert FakeCrew.made[-1].ended
+
+
+def test_drives_that_went_with_their_process_end_the_tuning(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(FakeCrew, "made", [], raising=False)
+    monkeypatch.setattr(tune_drives, "Crew", FakeCrew)
+    monkeypatch.setattr(tune_drives, "DriveBench", FakeBench)
+    setup: Any = None
+    with Benches(setup, 2) as benches:
+        benches.load([LogInput(Path(n), n) for n in "abc"], {}, lambda _: None)
+        FakeCrew.made[0].benches[1].clear()
+        with pytest.raises(EstimatorError, match="one that died with its drives"):
+            benches.score({"x": FilterNoise()})
+        lost = Ended(0, None, failure=Failure("the worker was killed (signal 9)"))
+        monkeypatch.setattr(FakeCrew, "each", lambda *_, **__: iter([lost]))
+        with pytest.raises(EstimatorError, match="killed"):
+            benches.score({"x": FilterNoise()})
 
 
 # ---- extract ----

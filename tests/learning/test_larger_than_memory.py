@@ -79,3 +79,9 @@ def test_validation_in_parts_is_that_at_once(monkeypatch: pytest.MonkeyPatch) ->
     whole = fit._validate(network, [piece], "cpu", signs)
     monkeypatch.setattr(fit, "VALIDATION_STEPS", 300)
     assert fit._validate(network, [piece], "cpu", signs) == pytest.approx(whole, rel=1e-5)
+
+
+@pytest.mark.fleet
+def test_twenty_hours_of_driving_are_trained_on_in_a_quarter_of_their_size(tmp_path: Path) -> None:
+    found = measured(tmp_path, 220.0, 64, 1)
+    assert found["limit_holds"] and found["ratio"] < 1.3

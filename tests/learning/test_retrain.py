@@ -132,7 +132,7 @@ class Fleet:
 
     def _trust(self, this: Any, folder: Path, network: Path) -> dict[str, Any]:
         self.done.append("trust")
-        return {"shown": "", "cap": self.cap, "evidence": "some"}
+        return {"shown": f"trust {self.cap:g}", "cap": self.cap, "evidence": "some"}
 
     def _intervals(self, this: Any, folder: Path) -> dict[str, Any]:
         self.done.append("intervals")
@@ -234,6 +234,10 @@ def test_a_car_that_took_part_elsewhere_is_not_lost_when_the_stages_are(fleet: F
     found = fleet.retrain()
     shutil.rmtree(found.folder)
     assert fleet.retrain().folder.is_dir() and fleet.done == []
+    for damaged in ("[]", "no json", '{"basis": 1}'):
+        for name in ("seen.json", "roles.json"):
+            (fleet.folder / "out/work" / name).write_text(damaged)
+        assert fleet.retrain().document == found.document
     shutil.rmtree(fleet.folder / "out/work")
     assert fleet.retrain().document == found.document, "parts are drawn by content and seed"
 
@@ -252,3 +256,10 @@ def test_spoilt_labels_are_those_of_usable_rows_and_the_set_still_opens(tmp_path
         np.testing.assert_array_equal(after.features, before.features)
         assert not np.array_equal(after.targets, before.targets)
         np.testing.assert_allclose(np.sort(np.abs(after.targets), axis=0), np.sort(np.abs(before.targets), axis=0))
+
+
+@pytest.mark.fleet
+def test_sound_drives_pass_the_gate_and_spoilt_labels_do_not(tmp_path: Path) -> None:
+    from studies.retrain import main
+
+    assert main(["-o", str(tmp_path), "--jobs", "2"]) == 0

@@ -6,14 +6,13 @@ import dataclasses
 import random
 import struct
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from counting_server import CountingServer, cutting, serving, stalling, status
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.drive.reading import read_drive
@@ -26,6 +25,8 @@ from pdhef_logtool.logs.open_log import log_metadata, open_log
 from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource, join_ranges, without
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
+from studies.counting_server import CountingServer, cutting, serving, slow, stalling, status, trickling
+from studies.remote import write_apart
 
 pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 
@@ -41,6 +42,7 @@ def saloon() -> Car:
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     quick = remote_objects.Patience(connect_s=2.0, silence_s=0.2, tries=3, first_wait_s=0.01, most_wait_s=0.02)
     monkeypatch.setattr(remote_objects, "PATIENCE", quick)
+    monkeypatch.setattr(remote_objects, "_LONG_RUN_SILENCES", 1)
     yield
     for spool in list(remote_source._spools.values()):
         assert spool.users == 0, "a source was not closed"
@@ -132,7 +134,6 @@ def test_same_as_the_file_and_each_byte_once(sample_logs_dir: Path, name: str, m
         assert _read(_place(server, name)) == _read(file)
         assert server.twice() == 0
         assert server.bytes_sent == file.stat().st_size
-        assert 1 < server.most_at_once <= remote_source.AT_ONCE
 
 
 def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car) -> None:
@@ -154,29 +155,31 @@ def test_a_drive_costs_no_more_than_its_file(sample_logs_dir: Path, saloon: Car)
         assert found[0] == found[1]
 
 
-def _write_apart(path: Path, seconds: int, groups: dict[str, tuple[list[str], int]]) -> None:
-    """Write a log whose chunks hold the topics of one group each: topics and bytes a message."""
-    with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1 << 30)
-        writer.start()
-        schema = writer.register_schema("test_msgs/msg/Noisy", "ros2msg", b"float64 data\nuint8[] noise")
-        topics = [t for names, _ in groups.values() for t in names]
-        ids = {t: writer.register_channel(t, "cdr", schema) for t in topics}
-        noise = random.Random(2)
+def _write_groups(path: Path, seconds: int, groups: dict[str, tuple[list[str], int]]) -> None:
+    """Write a log whose chunks of 10 s hold the topics of one group each: topics and bytes a message."""
+    schema = ("test_msgs/msg/Noisy", "ros2msg", b"float64 data\nuint8[] noise")
+    noise = random.Random(2)
+
+    def chunks() -> Iterator[list[tuple[str, tuple[str, str, bytes], int, bytes]]]:
         for block in range(seconds // 10):
             for names, size in groups.values():
-                for i in range(1000):
-                    for topic in names:
-                        at = 1_700_000_000_000_000_000 + (block * 1000 + i) * 10_000_000
-                        data = b"\0\1\0\0" + struct.pack("<dI", i, size) + noise.randbytes(size)
-                        writer.add_message(ids[topic], at, data, at, i)
-                writer._Writer__finalize_chunk()  # type: ignore[attr-defined]
-        writer.finish()
+                yield [
+                    (topic, schema, 1_700_000_000_000_000_000 + (block * 1000 + i) * 10_000_000, data)
+                    for i in range(1000)
+                    for topic in names
+                    for data in [b"\0\1\0\0" + struct.pack("<dI", i, size) + noise.randbytes(size)]
+                ]
+
+    write_apart(path, chunks())
+
+
+#: Topics and bytes a message of the chunks of a log.
+_APART = {"imu": (["/imu", "/wheels"], 20), "camera": (["/camera"], 500), "lidar": (["/lidar"], 300)}
 
 
 def test_topics_apart_cost_three_requests_and_the_wanted_chunks(tmp_path: Path) -> None:
     file = tmp_path / "apart.mcap"
-    _write_apart(file, 80, {"imu": (["/imu", "/wheels"], 20), "camera": (["/camera"], 500), "lidar": (["/lidar"], 300)})
+    _write_groups(file, 80, _APART)
     with serving(**{file.name: file.read_bytes()}) as server:
         place = _place(server, file.name)
         whole = open_log(file)
@@ -257,6 +260,16 @@ def test_other_formats_are_fetched_once_as_a_whole(tmp_path: Path, sample_logs_d
         assert server.twice() == 0
 
 
+def test_several_ranges_at_once_but_not_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(remote_source, "MOST_RANGE_BYTES", 10_000)
+    with serving(x=bytes(200_000)) as server:
+        server.fault = slow(0.02)
+        source = RemoteSource(_place(server, "x"))
+        source.fetch_whole()
+        source.close()
+        assert server.most_at_once == remote_source.AT_ONCE
+
+
 def test_a_server_without_ranges_gives_all_at_once(sample_logs_dir: Path) -> None:
     file = sample_logs_dir / "dlc.mcap"
     with serving(**{file.name: file.read_bytes()}) as server:
@@ -301,9 +314,10 @@ def served(sample_logs_dir: Path) -> Iterator[CountingServer]:
         (status(403), "it refuses access", 1),
         (status(302, {"Location": "/dlc.mcap"}), "cannot be asked for", None),
         (cutting(100), "an answer that is cut, 3 times in turn", 3),
+        (trickling(), "bytes in", None),
         (stalling(0.4), "silence of 0.2 s, 3 times in turn", 3),
     ],
-    ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "stalls"],
+    ids=["429", "503", "503 later", "404", "403", "round and round", "cuts", "trickles", "stalls"],
 )
 def test_faults_end_in_one_line(served: CountingServer, fault, words: str, requests: int | None) -> None:
     served.fault = fault
@@ -386,6 +400,16 @@ def test_identity_is_url_size_and_etag(served: CountingServer) -> None:
     assert identity_of(log) != first
 
 
+def test_identities_are_asked_for_in_threads(served: CountingServer) -> None:
+    served.files |= {f"{i}.mcap": bytes([i]) * 5000 for i in range(30)}
+    logs = find_logs([served.place(f"{i}.mcap") for i in range(30)] * 2)
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(identity_of, [*logs, *logs]))
+    assert found[:30] == found[30:]
+    assert len(set(found)) == 30
+    assert served.bytes_sent <= 60
+
+
 def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sample_logs_dir: Path) -> None:
     listed = tmp_path / "list.txt"
     dlc = sample_logs_dir / "dlc.mcap"
@@ -408,7 +432,7 @@ def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_a_hint_of_time_leaves_the_others_chunks_alone(tmp_path: Path) -> None:
     file = tmp_path / "apart.mcap"
-    _write_apart(file, 40, {"imu": (["/imu"], 200), "camera": (["/camera"], 500)})
+    _write_groups(file, 40, {"imu": (["/imu"], 200), "camera": (["/camera"], 500)})
     with serving(**{file.name: file.read_bytes()}) as server:
         start = 1_700_000_000_000_000_000
         wanted = Wanted(frozenset({"/imu"}), start, start + 5_000_000_000)

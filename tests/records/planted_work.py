@@ -9,6 +9,7 @@ import threading
 import time
 from pathlib import Path
 
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.supervisor import Tell
 
 #: What to do, and the value to return or a path.
@@ -105,6 +106,27 @@ def _cut(_value: str, _tell: Tell) -> None:
     time.sleep(600)
 
 
+def _wait(value: str, tell: Tell) -> str:
+    """Note the process that it begins in, wait for the word to go on, and write a file that appears whole."""
+    path = Path(value)
+    with path.with_suffix(".begun").open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    while not (path.parent / "go").exists():
+        tell("at wait", 0.5)
+        time.sleep(0.01)
+    with PendingFile(path.with_suffix(".done")) as pending:
+        pending.path.write_text(value)
+    return value
+
+
+held: list[str] = []
+
+
+def _hold(value: str, _tell: Tell) -> tuple[int, list[str]]:
+    held.append(value)
+    return os.getpid(), held
+
+
 def _alone(value: str, tell: Tell) -> int:
     """Be lost the first time; the second time return how many workers there are."""
     _kill_once(value, tell)
@@ -128,4 +150,6 @@ _FAULTS = {
     "odd": lambda _value, _tell: Odd(),
     "unreadable": lambda _value, _tell: Unreadable(),
     "alone": _alone,
+    "hold": _hold,
+    "wait": _wait,
 }

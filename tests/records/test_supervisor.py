@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pdhef_logtool.records.errors import UsageError
-from pdhef_logtool.records.supervisor import Ended, Failure, Limits, supervise
+from pdhef_logtool.records.supervisor import Crew, Ended, Failure, Limits, supervise
 from tests.records.planted_work import Item, Unreadable, called, planted
 
 LIMITS = Limits(silence_s=0.5, memory_bytes=400_000_000)
@@ -122,6 +122,18 @@ def test_the_fork_server_may_die_too() -> None:
     ended = outcomes([("kill server", ""), *[("well", "x")] * 3], 2, Limits())
     assert ended[0].failure == Failure("the worker died", "at kill server", 2)
     assert [e.result for e in ended[1:]] == ["x"] * 3
+
+
+def test_items_of_a_place_go_to_its_worker_as_long_as_it_lives() -> None:
+    items = [("hold", str(i)) for i in range(6)]
+    with Crew(planted, jobs=3, preload=PRELOAD) as crew:
+        for turn in (1, 2):
+            ended = sorted(crew.each(items, place=lambda item: int(item[1]) % 3), key=lambda e: e.number)
+            assert [e.result[1] for e in ended[3:]] == [[str(i), str(i + 3)] * turn for i in range(3)]  # type: ignore[index]
+        next(crew.each([("hang", ""), ("well", "")], place=lambda item: int(item[0] == "well")))
+        # What was left at work is gone with what it held; the others are not.
+        ended = sorted(crew.each(items[:3], place=lambda item: int(item[1])), key=lambda e: e.number)
+        assert [len(e.result[1]) for e in ended] == [1, 5, 5]  # type: ignore[index]
 
 
 def test_what_cannot_be_loaded_is_told_at_once() -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -497,3 +498,19 @@ def test_unwritable_place_is_one_line(tmp_path):
 def test_a_track_of_all_windows_equals_the_joined_one(circle):
     joined = concatenate([circle("zero", 0, 300), circle("zero", 300, 300)])
     np.testing.assert_array_equal(joined.sideslip_rad, circle("zero", 0, 600).sideslip_rad)
+
+
+def test_the_pose_of_what_is_not_shown_first_stands_20_times_a_second_however_windows_fall(tmp_path, circle):
+    def poses(cuts: list[int]) -> dict[str, list[int]]:
+        path = tmp_path / "annotated.mcap"
+        sink = AnnotatedMcapSink(path, None, shown={"phy-ukf"})
+        for a, b in pairwise(cuts):
+            for name in ("phy-ukf", "zero"):
+                sink.append(circle(name, a, b - a))
+        sink.finish(REPORT)
+        return {t: [s for s, _ in decoded(path, f"/pdhef/{t}/odometry")] for t in ("phy_ukf", "zero")}
+
+    found = poses([0, 300, 600])
+    assert found == poses([0, 7, 333, 600])
+    assert len(found["phy_ukf"]) > 4 * len(found["zero"]) > 0
+    assert np.median(np.diff(found["zero"])) == 50_000_000

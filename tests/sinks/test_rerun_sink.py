@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
 from pdhef_logtool.records.errors import OutputError
+from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.sinks import rerun
 from pdhef_logtool.sinks.base import Event, Shown
 from pdhef_logtool.sinks.palette import colour_rgb
@@ -417,6 +418,7 @@ from pathlib import Path
 import numpy as np
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.tracks import make_track
+from pdhef_logtool.records.tracks import make_track
 from pdhef_logtool.sinks import rerun
 from pdhef_logtool.sinks.base import Shown
 
@@ -506,3 +508,28 @@ def test_a_trajectory_stays_small_and_evenly_spaced(lengths):
         assert strip[0, 0] == 0
         assert len(set(np.diff(strip[:, 0]))) == 1
         assert total - strip[-1, 0] <= np.diff(strip[:, 0])[0]
+
+
+def test_of_a_long_drive_20_rows_a_second_are_drawn_with_the_largest_nis(tmp_path):
+    n, step_ns = 61_000, 10_000_000
+    stamps = START_NS + np.arange(n) * step_ns
+    nis = np.full(n, np.nan)
+    nis[1::2] = 1.0
+    nis[31_013] = 9.0
+    path = tmp_path / "recording.rrd"
+    sink = RerunSink(
+        path,
+        application_id="x",
+        shown=Shown("zero"),
+        log_name="d",
+        input_hash=HASH,
+        start_ns=START_NS,
+        end_ns=int(stamps[-1]) + 1,
+    )
+    for part in (slice(0, 30_003), slice(30_003, n)):  # a window may end inside of a step
+        speed = np.full(part.stop - part.start, 20.0)
+        sink.append(make_track("zero", stamps[part], vx_m_s=speed, vy_m_s=0 * speed, nis=nis[part]))
+    sink.finish(REPORT)
+    timed, _ = tables(path)
+    assert timed["/main"].num_rows == n // 5
+    assert np.nanmax([v[0] for v in series(timed["/main"], "nis")[1]]) == 9.0

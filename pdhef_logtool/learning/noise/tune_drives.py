@@ -5,12 +5,10 @@ What does not depend on a filter's noise (reading, alignment, truth) is done onc
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
-from multiprocessing import get_context
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from operator import attrgetter
 from types import TracebackType
 from typing import Any, Self
 
@@ -18,14 +16,14 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.drive.reading import MAX_BYTES, too_big
 from pdhef_logtool.drive.reading import Drive as ReadDrive
-from pdhef_logtool.estimators.table import SPECS, Options, former, spec_of
+from pdhef_logtool.estimators.table import FILTERS, SPECS, Options, former, spec_of
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.noise.search import DriveError, drive_error
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping as SignalMapping
-from pdhef_logtool.records.errors import EstimatorError, UsageError
-from pdhef_logtool.records.processes import follow_parent
+from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
 from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.supervisor import Crew, Tell
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 
@@ -125,24 +123,35 @@ class DriveBench:
         return errors
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """What a bench is to do: ``load`` with the arguments of that, or ``score`` tunings."""
+
+    place: int
+    load: tuple[int, LogInput, str | None, int] | None = None
+    score: Mapping[str, FilterNoise] = field(default_factory=dict)
+
+    def done_by(self, bench: DriveBench) -> Any:
+        return bench.load(*self.load) if self.load else bench.score(self.score)
+
+
 class Benches:
     """Drives dealt out to processes that live as long as the tuning does; one process is this one itself."""
 
     def __init__(self, setup: TuneSetup, jobs: int) -> None:
+        self._jobs = jobs
         self._local = DriveBench(setup) if jobs == 1 else None
-        self._pools = [
-            ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_open_bench, initargs=(setup,))
-            for _ in range(0 if jobs == 1 else jobs)
-        ]
+        preload = (__name__, *FILTERS)
+        self._crew = None if jobs == 1 else Crew[_Part, Any](partial(_do, setup), jobs=jobs, preload=preload)
 
     def __enter__(self) -> Self:
         """Return itself."""
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         """End the processes."""
-        for pool in self._pools:
-            pool.shutdown(wait=error is None, cancel_futures=True)
+        if self._crew is not None:
+            self._crew.__exit__(kind, error, at)
 
     def load(
         self, inputs: Sequence[LogInput], splits: Mapping[str, str], told: Callable[[DriveRecord], None]
@@ -156,60 +165,63 @@ class Benches:
         """
         loaded: list[DriveRecord] = []
         held = 0
-        under_way: deque[Future[DriveRecord]] = deque()
-        for index, log_input in enumerate(inputs):
-            what = (index, log_input, splits.get(log_input.stem), MAX_BYTES - held)
-            if self._local is not None:
-                under_way.append(_done(self._local.load(*what)))
-            else:
-                # No more than one a process ahead, so that the bound on the memory is kept.
-                under_way.append(self._pools[index % len(self._pools)].submit(_load, *what))
-            while len(under_way) > (len(self._pools) if index + 1 < len(inputs) else 0):
-                record = _result(under_way.popleft())
-                loaded.append(record)
-                held += record.bytes_held
-                if held > MAX_BYTES:
-                    raise too_big(record.name)
-                told(record)
+
+        def parts() -> Iterator[_Part]:
+            for index, log_input in enumerate(inputs):
+                # What is being read counts when it is: there is no more than one a process.
+                what = (index, log_input, splits.get(log_input.stem), MAX_BYTES - held)
+                yield _Part(index % self._jobs, load=what)
+
+        for record in self._in_order(parts()):
+            loaded.append(record)
+            held += record.bytes_held
+            if held > MAX_BYTES:
+                raise too_big(record.name)
+            told(record)
         return loaded
 
     def score(self, tunings: Mapping[str, FilterNoise]) -> dict[str, list[DriveError]]:
         """Return the errors of each estimator in the order of the drives."""
-        if self._local is not None:
-            parts = [self._local.score(tunings)]
-        else:
-            parts = [_result(f) for f in [pool.submit(_score, dict(tunings)) for pool in self._pools]]
+        parts = list(self._in_order(_Part(place, score=dict(tunings)) for place in range(self._jobs)))
         joined: dict[str, dict[int, DriveError]] = {n: {i: e for p in parts for i, e in p[n].items()} for n in tunings}
         return {n: [errors[i] for i in sorted(errors)] for n, errors in joined.items()}
 
+    def _in_order(self, parts: Iterable[_Part]) -> Iterator[Any]:
+        """Yield what comes of the parts, in their order; raise what a part raises."""
+        if self._local is not None:
+            for part in parts:
+                yield part.done_by(self._local)
+            return
+        assert self._crew is not None
+        early: dict[int, Any] = {}
+        count = 0
+        for ended in self._crew.each(parts, place=attrgetter("place")):
+            if ended.failure is not None:
+                raise _lost(ended.failure.reason)
+            early[ended.number] = ended.result
+            while count in early:
+                result = early.pop(count)
+                count += 1
+                if isinstance(result, PdhefError):
+                    raise result
+                yield result
 
-def _result(future: Future[Any]) -> Any:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        raise EstimatorError(
-            expected="processes that live", got="one that died (out of memory?)", where="--jobs", remedy="fewer --jobs"
-        ) from None
 
-
-def _done(record: DriveRecord) -> Future[DriveRecord]:
-    future: Future[DriveRecord] = Future()
-    future.set_result(record)
-    return future
+def _lost(reason: str) -> EstimatorError:
+    return EstimatorError(expected="a process that works", got=reason, where="--jobs", remedy="fewer --jobs")
 
 
 #: The bench of a process of :class:`Benches`, by key "bench".
 _here: dict[str, DriveBench] = {}
 
 
-def _open_bench(setup: TuneSetup) -> None:
-    follow_parent()
-    _here["bench"] = DriveBench(setup)
-
-
-def _load(index: int, log_input: LogInput, split: str | None, max_bytes: int) -> DriveRecord:
-    return _here["bench"].load(index, log_input, split, max_bytes)
-
-
-def _score(tunings: dict[str, FilterNoise]) -> dict[str, dict[int, DriveError]]:
-    return _here["bench"].score(tunings)
+def _do(setup: TuneSetup, part: _Part, _tell: Tell) -> Any:
+    """Do a part in a process of its own, where errors are results."""
+    if "bench" not in _here:
+        if part.load is None or part.load[0] != part.place:  # not its first one: it was held by a process that died
+            return _lost("one that died with its drives (out of memory?)")
+        _here["bench"] = DriveBench(setup)
+    try:
+        return part.done_by(_here["bench"])
+    except PdhefError as error:
+        return error

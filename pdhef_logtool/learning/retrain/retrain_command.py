@@ -52,7 +52,7 @@ from pdhef_logtool.results.comparing import compare_runs
 from pdhef_logtool.results.gate import Figure, Gate
 from pdhef_logtool.results.opened_run import open_run
 from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.pipeline import run_logs
+from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.report import json_bytes
 
 FORMAT, FORMAT_VERSION = "pdhef-retrain", 1
@@ -68,6 +68,8 @@ CALIBRATED = (HYBRID, "pd-hef-smoothed", "physics")
 #: Without a gate.toml: the error of the hybrid filter over the whole drive may grow by so much.
 DEFAULT_LIMIT = 0.02
 DEFAULT_GATE = Gate((Figure(estimator=HYBRID, limit=DEFAULT_LIMIT),))
+#: What is remembered of each log.
+_SEEN_KEYS = {"sha256", "signals_sha256", "left_out", "span_s"}
 #: Digits of a network's hash that name its folder.
 _NAME = 12
 
@@ -118,6 +120,7 @@ class _Retraining:
 
     settings: RetrainSettings
     car: Car
+    car_sha256: str | None
     drives: Mapping[str, tuple[LogInput, ...]]
     hashes: Mapping[str, str]
     work: Path
@@ -139,8 +142,13 @@ class _Retraining:
         config = self.settings.config
         mapping = None if config.mapping is None else digest(config.mapping.read_text(encoding="utf-8"))
         head = record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config, seed=self.settings.seed), self.car)
-        source = None if self.car.source is None else hash_log(self.car.source)
-        return [head, mapping, source, sorted(self.hashes[i.stem] for i in self.drives.get(role, ())), *rests_on]
+        return [
+            head,
+            mapping,
+            self.car_sha256,
+            sorted(self.hashes[i.stem] for i in self.drives.get(role, ())),
+            *rests_on,
+        ]
 
     def do(self, number: int, name: str, basis: list[Any], work: Callable[[Path], dict[str, Any]]) -> dict[str, Any]:
         return self.stages.do(number, name, basis, number / 8.0, work)
@@ -186,7 +194,9 @@ def retrain(
             work.mkdir(exist_ok=True)
         stages = Stages(work, lambda found: str(found["shown"]), say, progress)
         hashes = {i.stem: identity_of(i) for i in inputs}
-        records, signals = _look(inputs, hashes, car, settings, work, jobs, progress)
+        car_sha256 = None if car.source is None else hash_log(car.source)
+        basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), car_sha256])
+        records, signals = _look(inputs, hashes, car, config, work / SEEN_FILE, basis, jobs, progress)
         records, drives = _roles(inputs, records, signals, car, settings, work)
         told = set[str]()
 
@@ -198,7 +208,7 @@ def retrain(
         for record in records:
             tell_drive(record, once)
         _check_counts(drives)
-        this = _Retraining(settings, car, drives, hashes, work, stages, jobs, once)
+        this = _Retraining(settings, car, car_sha256, drives, hashes, work, stages, jobs, once)
         document = _stages(this)
         name = document["network_sha256"][:_NAME]
         judged = {p.name for group in (ACCEPTED, REJECTED) for p in (output / group).glob("*") if p.is_dir()} | {name}
@@ -250,23 +260,24 @@ def _unread(log_input: LogInput, reason: str) -> DriveRecord:
     return DriveRecord(log_input.stem, log_input.path.name, left_out=reason)
 
 
-def _look(
+def _look(  # positional: what reading takes, where it is remembered, and how it is done
     inputs: Sequence[LogInput],
     hashes: Mapping[str, str],
     car: Car,
-    settings: RetrainSettings,
-    work: Path,
+    config: RunConfig,
+    file: Path,
+    basis: str,
     jobs: int,
     progress: Progress,
 ) -> tuple[list[DriveRecord], list[str | None]]:
     """Return a record of every log and the hash of its signals; what earlier calls have read is not read again."""
-    config, mapping = settings.config, open_mapping(settings.config)
-    vehicle = None if car.source is None else hash_log(car.source)
-    basis = digest([record_head(FORMAT, FORMAT_VERSION, LearnSettings(config=config), car), vehicle, repr(mapping)])
+    mapping = open_mapping(config)
+    basis = digest([basis, repr(mapping)])
     known: dict[str, Any] = {}
-    with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
-        document = json.loads((work / SEEN_FILE).read_text(encoding="utf-8"))
-        known = document["logs"] if document["basis"] == basis else {}
+    with suppress(OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError):
+        document = json.loads(file.read_text(encoding="utf-8"))
+        logs = document["logs"] if document["basis"] == basis else {}
+        known = {key: found for key, found in logs.items() if set(found) == _SEEN_KEYS}
     new = [_Log(i, car, mapping, config) for i in inputs if hashes[i.stem] not in known]
 
     def tell(number: int, text: str, share: float) -> None:
@@ -286,7 +297,7 @@ def _look(
             "left_out": seen.record.left_out,
             "span_s": seen.record.span_s,
         }
-    write_bytes(work / SEEN_FILE, json_bytes({"basis": basis, "logs": known}))
+    write_bytes(file, json_bytes({"basis": basis, "logs": known}))
 
     def record(log_input: LogInput) -> DriveRecord:
         found = known[hashes[log_input.stem]]
@@ -325,8 +336,9 @@ def _roles(
             split = str(manifests(log_input.folder).get(log_input.path.name, {}).get("split") or "")
             candidates.append(Candidate(key, split, record.sha256 in taught))
     before: dict[str, str] = {}
-    with suppress(OSError, ValueError, RecursionError):
-        before = {str(k): str(v) for k, v in json.loads((work / ROLES_FILE).read_text(encoding="utf-8")).items()}
+    with suppress(OSError, ValueError, RecursionError, AttributeError, TypeError):
+        kept = json.loads((work / ROLES_FILE).read_text(encoding="utf-8"))
+        before = {key: role for key, role in kept.items() if role in SHARES}
     roles = deal(candidates, before, settings.seed)
     write_bytes(work / ROLES_FILE, json_bytes(dict(sorted(roles.items()))))
     told = list[DriveRecord]()
@@ -480,10 +492,15 @@ def _intervals(this: _Retraining, folder: Path) -> dict[str, Any]:
 
 
 def _run(this: _Retraining, number: int, folder: Path, car: Path | None, network: Path | None) -> dict[str, Any]:
-    config = replace(this.config_for(car, network), estimators=(HYBRID, *BESIDE), annotate="none")
+    config = replace(this.config_for(car, network), estimators=(HYBRID, *BESIDE), keep="metrics")
     logs = [str(i.path) for i in this.drives[GATE]]
     result = run_logs(
-        logs, folder / "run", config, report=False, progress=lambda text, share: this.step(number, text, share)
+        logs,
+        folder / "run",
+        config,
+        jobs=this.jobs,
+        report=False,
+        progress=lambda text, share: this.step(number, text, share),
     )
     return {"shown": f"{len(logs)} drives of the gate", "exit_code": result.exit_code}
 
@@ -494,7 +511,7 @@ def _judge(this: _Retraining, folder: Path, trusted: Mapping[str, Any]) -> dict[
     found = compare_runs(a, b, this.settings.gate, strict=this.settings.strict)
     reasons = list(found.failures)
     if not trusted["cap"]:
-        reasons.append(f"trust 0 on drives that it has not seen: {trusted['evidence']}")
+        reasons.append(f"{trusted['shown']} (on drives that it has not seen)")
     from pdhef_logtool.reports.comparison import comparison_page
 
     write_bytes(folder / PAGE_FILE, comparison_page(found))

@@ -1,4 +1,4 @@
-"""A web server of the tests: files with ranges and ETags, every request counted, faults on demand."""
+"""A web server on this machine: files with ranges and ETags, every request counted, faults on demand."""
 
 from __future__ import annotations
 
@@ -41,10 +41,12 @@ class CountingServer:
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def place(self, path: str) -> str:
+        """Return the URL of a file."""
         return f"{self.url}/{path}"
 
     @property
     def bytes_sent(self) -> int:
+        """Bytes of files that went out."""
         return sum(r.end - r.start for r in self.requests)
 
     def twice(self) -> int:
@@ -177,13 +179,44 @@ def cutting(after_bytes: int, times: int = 10**9) -> Fault:
     return fault
 
 
+def trickling() -> Fault:
+    """Send a byte now and then, without an end."""
+
+    def fault(handler: _Handler, _: int) -> bool:
+        path = handler.path.split("?")[0].lstrip("/")
+        data = handler.of.files[path]
+        handler.note(path, 0, 0)
+        handler.send_response(206)
+        handler.send_header("Content-Range", f"bytes 0-4095/{len(data)}")
+        handler.send_header("Content-Length", "4096")
+        handler.end_headers()
+        for at in range(40):
+            handler.wfile.write(data[at : at + 1])
+            handler.wfile.flush()
+            time.sleep(0.05)
+        handler.close_connection = True
+        return True
+
+    return fault
+
+
 def stalling(seconds: float) -> Fault:
     """Say nothing."""
 
-    def fault(handler: _Handler, n: int) -> bool:
+    def fault(handler: _Handler, _: int) -> bool:
         handler.note(handler.path.split("?")[0].lstrip("/"), 0, 0)
         time.sleep(seconds)
         handler.close_connection = True
         return True
+
+    return fault
+
+
+def slow(seconds: float) -> Fault:
+    """Answer late, and well."""
+
+    def fault(_: _Handler, __: int) -> bool:
+        time.sleep(seconds)
+        return False
 
     return fault

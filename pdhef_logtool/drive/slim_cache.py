@@ -1,0 +1,148 @@
+"""A cache of slim logs, in a folder or an object store: a log that was read once is only asked for what it is.
+
+An entry is known by the source's identity and by all that decides what of it is kept: mapping, truth, definitions,
+budget and version. It appears when it is complete, so that several processes may share a cache; one that is damaged is
+made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.drive.slim import slim_log
+from pdhef_logtool.logs.discovery import LogInput, hash_log, identity_of
+from pdhef_logtool.logs.open_log import open_log
+from pdhef_logtool.logs.slim_log import FORMAT, SlimLog, is_whole
+from pdhef_logtool.mapping import Mapping
+from pdhef_logtool.mapping.vendors import load_vendors
+from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
+from pdhef_logtool.records.files import scratch_folder
+from pdhef_logtool.records.processes import own_name
+from pdhef_logtool.records.version import __version__
+
+_DAMAGED = "its slim log in the cache is damaged and is made anew"
+
+
+@dataclass(frozen=True, slots=True)
+class SlimCache:
+    """Slim logs of logs that are read alike.
+
+    Attributes
+    ----------
+    place : folder, or URL of what fsspec can write to. mapping : None recognises types. options : as for a run.
+    """
+
+    place: str
+    mapping: Mapping | None
+    options: ReadOptions
+
+    @contextmanager
+    def standing_in(self, log: LogInput, warn: Callable[[str], None] = lambda _text: None) -> Iterator[LogInput]:
+        """Yield the slim log of a log with the log's name and slice, made if it is not there.
+
+        A log of which there can be none is yielded as it is, and so is each one when the cache cannot be written;
+        ``warn`` is told that, and which entry was damaged.
+        """
+        with scratch_folder() as scratch:
+            yield self._found(log, Path(scratch), warn) or log
+
+    def _found(self, log: LogInput, scratch: Path, warn: Callable[[str], None]) -> LogInput | None:
+        try:
+            identity = identity_of(log)
+        except (OSError, PdhefError):  # whoever reads it says what is wrong with it
+            return None
+        key = self._key(identity)
+        try:
+            path = self._fetched(key, scratch)
+            if path is not None and _is_sound(path):
+                return replace(log, path=path)
+            if path is not None:
+                warn(f"{log.stem}: {_DAMAGED}")
+            made = (Path(self.place) if self._is_folder else scratch) / key
+            try:
+                record = slim_log(log, made, self.mapping, self.options)
+            except OutputError:
+                raise
+            except PdhefError:
+                return None
+            if record.identity != identity:  # it changed meanwhile
+                made.unlink()
+                return None
+            if not self._is_folder:
+                self._put(key, made)
+        except (OSError, OutputError) as error:
+            warn(f"{log.stem}: the cache {self.place} is not used: {' '.join(str(error).split())}")
+            return None
+        return replace(log, path=made)
+
+    def _key(self, identity: str) -> str:
+        return f"{identity[:2]}/{identity}-{self._setting}.mcap"
+
+    @property
+    def _setting(self) -> str:
+        """Digest of all that decides what is kept of a log, as files are and not as they are called."""
+        mapping: dict[str, Any] = jsonable(self.mapping) or {}
+        if self.mapping is not None and self.mapping.can is not None:
+            mapping["can"]["dbc"] = [hash_log(path) for path in self.mapping.can.dbc]
+        vendors = repr(load_vendors()) if self.mapping is None or self.mapping.fill_recognised else ""
+        msgs = "" if self.options.msgs is None else hash_log(self.options.msgs)
+        said = (FORMAT, __version__, mapping, vendors, msgs, self.options.prefer_truth, self.options.budget)
+        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+
+    @property
+    def _is_folder(self) -> bool:
+        return "://" not in self.place
+
+    def _fetched(self, key: str, scratch: Path) -> Path | None:
+        """Return an entry as a file of this machine, None where there is none."""
+        if self._is_folder:
+            path = Path(self.place) / key
+            return path if path.is_file() else None
+        store, root = self._store()
+        path = scratch / "found.mcap"
+        try:
+            store.get_file(f"{root}/{key}", str(path))
+        except FileNotFoundError:
+            return None
+        return path
+
+    def _put(self, key: str, path: Path) -> None:
+        """Copy an entry to the store; it has its name when it is complete."""
+        store, root = self._store()
+        partial = f"{root}/{key}.{own_name()}.partial"
+        store.makedirs(partial.rpartition("/")[0], exist_ok=True)
+        store.put_file(str(path), partial)
+        store.mv(partial, f"{root}/{key}")
+
+    def _store(self) -> tuple[Any, str]:
+        import fsspec
+
+        try:
+            store, root = fsspec.core.url_to_fs(self.place, use_listings_cache=False)
+        except (ImportError, ValueError) as error:
+            raise UsageError(
+                expected="a folder, or a URL that fsspec can write to",
+                got=" ".join(str(error).split()),
+                where=f"--cache {self.place}",
+                remedy="pip install 'pdhef-logtool[s3]' for s3://",
+            ) from error
+        return store, root.rstrip("/")
+
+
+def _is_sound(path: Path) -> bool:
+    """Tell whether a file is a slim log that is as it was written."""
+    try:
+        if not is_whole(path):
+            return False
+        with closing(open_log(path)) as log:
+            return isinstance(log, SlimLog)
+    except (OSError, PdhefError):
+        return False

@@ -1,0 +1,49 @@
+"""The shift between two signals is the one that Pearson's coefficient at every shift gives, to the bit."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pdhef_logtool.drive.correlation import CommonGrid, Shift, _correlation, find_shift, parabolic_peak
+from pdhef_logtool.records.signals import FloatArray
+
+_UNKNOWN = Shift(float("nan"), float("nan"), False)
+
+
+def by_every_shift(grid: CommonGrid, reach: int) -> Shift:
+    """Find the shift as it is defined, without a shortcut."""
+    found = np.array([_correlation(grid.a, grid.b, k) for k in range(-reach, reach + 1)])
+    if grid.both < 2 or not np.isfinite(found).any():
+        return _UNKNOWN
+    best = int(np.nanargmax(found))
+    if best in (0, 2 * reach):
+        return Shift((best - reach) * grid.step_s, float(found[best]), False)
+    return Shift((best - reach + parabolic_peak(*found[best - 1 : best + 2])) * grid.step_s, float(found[best]), True)
+
+
+def pair(kind: str, rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
+    """Make two signals of which one follows the other."""
+    walk = np.cumsum(rng.standard_normal(n))
+    late = np.roll(walk, int(rng.integers(-40, 40))) + rng.uniform() * rng.standard_normal(n)
+    if kind == "holes":
+        walk[rng.random(n) < 0.3] = late[rng.random(n) < 0.3] = np.nan
+    made = {
+        "walk": (walk, late),
+        "holes": (walk, late),
+        "equal": (walk, walk.copy()),
+        "constant": (np.zeros(n), late),
+        "ties": (np.arange(n) % 2.0, np.arange(n) % 2.0),
+        "far from zero": (walk + 1e6, late),
+        "tiny and huge": (walk * 1e-200, late * 1e180),
+    }
+    return made[kind]
+
+
+@pytest.mark.parametrize("kind", ["walk", "holes", "equal", "constant", "ties", "far from zero", "tiny and huge"])
+@pytest.mark.filterwarnings("ignore:overflow", "ignore:invalid value")
+def test_the_shift_is_that_of_every_shift(kind: str) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        grid = CommonGrid(0.01, *pair(kind, rng, int(rng.integers(2, 200))))
+        assert repr(find_shift(grid, 0.3)) == repr(by_every_shift(grid, 30))
