@@ -8,6 +8,8 @@ the journal and the files of figures, ``metrics/run=…/car=…/part-….parquet
 from __future__ import annotations
 
 import itertools
+import os
+import platform
 import re
 import time
 from collections import Counter
@@ -15,9 +17,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.logs.discovery import (
     RUN_FILE,
     LogInput,
@@ -30,8 +34,10 @@ from pdhef_logtool.logs.discovery import (
 )
 from pdhef_logtool.mapping import Mapping, load_mapping
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
+from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.records.processes import own_name
+from pdhef_logtool.records.ray_supervisor import supervise_on_ray
 from pdhef_logtool.records.supervisor import Ended, Limits, Tell, supervise
 from pdhef_logtool.results.opened_run import (
     LOGS,
@@ -72,12 +78,14 @@ SILENCE_S = 600.0
 #: What each choice keeps includes what those before it keep.
 _KEPT = ("metrics", "estimates", "full")
 #: What the workers have loaded; polars starts threads at its first query, and none of these makes one.
-_PRELOAD = ("pdhef_logtool.runs.fleet", "pdhef_logtool.runs.guard")
+_PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.sinks.parquet", *FILTERS)
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
 _NO_SETTING = frozenset({"keep", "annotate", "cache", "window_s", "car", "cars", "network", "intervals"})
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"
+#: Begins the name of a file by which nodes know the output's folder.
+_MARK = ".nodes-"
 _NOT_IN_FOLDERS = re.compile(r"[^\w.-]+")
 
 
@@ -131,6 +139,7 @@ def run_logs(
     config: RunConfig,
     *,
     jobs: int = 1,
+    ray: str | None = None,
     resume: bool = False,
     retry: bool = False,
     only: Sequence[str] = (),
@@ -151,6 +160,8 @@ def run_logs(
     ----------
     arguments : logs, folders, glob patterns.
     jobs : processes at work; changes no number.
+    ray : address of a Ray cluster that does the work instead, one drive a processor at a time; ``output``, the logs
+        and what the configuration names lie where every node sees them under the same path.
     resume : what the folder's journal has of these logs and settings stays; ``retry`` : but for logs that failed.
     only : labels of logs that are run now, everything of them kept; the rest of the run in the folder stays.
     limits : of one log; None: none for a few logs and one job, else :data:`SILENCE_S`.
@@ -175,8 +186,8 @@ def run_logs(
     resume = resume or retry or bool(only)
     many = len(inputs) > FEW_LOGS
     if limits is None:
-        limits = Limits(SILENCE_S) if jobs > 1 or many else Limits()
-    if len(inputs) == 1 and jobs == 1 and limits == Limits() and not resume and work is None:
+        limits = Limits(SILENCE_S) if jobs > 1 or many or ray else Limits()
+    if len(inputs) == 1 and jobs == 1 and not ray and limits == Limits() and not resume and work is None:
         check_places(inputs, output, config, mapping, junit, cars.paths)
         return _run_alone(inputs[0], output, config, cars, mapping, thresholds, junit, report, progress, warn)
     if full_worst is None:
@@ -194,7 +205,7 @@ def run_logs(
     told = _setting(config, pools)
     fleet = _Fleet(
         output, config, cars, journal, planned, told, digest_of(told), thresholds, pools,
-        jobs, limits, report, work or run_drive, progress, warn, say,
+        jobs, ray, limits, report, work or run_drive, progress, warn, say,
     )  # fmt: skip
     if only:
         fleet.check_only(only)
@@ -215,8 +226,9 @@ def run_logs(
             with suppress(PdhefError):
                 fleet.collect()
             raise
-        if fleet.lost:
+        if fleet.lost or ray:  # a node that was lost has been made good and is not told of
             outputs.sweep()
+            _sweep_parts(output, {e.part for e in journal.entries.values()})
         results = fleet.collect()
         write_verdicts(junit, results)
         fleet.write_pages()
@@ -243,6 +255,20 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
         outcome = LogOutcome(log=task.log.stem, file=task.log.path.name, sha256=None, failed=reason)
         again = not own or isinstance(error, OutputError)
         return DriveEnd(outcome, _identity(task.log), warned=tuple(warned), again=again)
+
+
+def _on_node(work: Work, here: Path, mark: Path, task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
+    """Do a drive's work on a node of a cluster, in the folder that the run was begun in if the node has it."""
+    if not mark.is_file():
+        return OutputError(
+            expected="a folder that all nodes of the cluster see under this path",
+            got=f"another one, or none, on {platform.node()}",
+            where=str(mark.parent),
+            remedy="choose one on a shared file system with -o",
+        )
+    with suppress(OSError):
+        os.chdir(here)
+    return work(task, tell)
 
 
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
@@ -457,6 +483,7 @@ class _Fleet:
     thresholds: tuple[Threshold, ...] | None
     pools: dict[str, SelfCalibration | None]
     jobs: int
+    ray: str | None
     limits: Limits
     report: bool
     work: Work
@@ -499,12 +526,12 @@ class _Fleet:
         todo = [p for p in chosen if reasons[p.log.stem] is not None]
         if names is None and self.journal.entries:
             self._tell_of(chosen, [r for r in reasons.values() if r], retry)
+        if not todo:
+            return
         self._quiet = len(todo) > FEW_LOGS
         told = _Told(self.progress, len(todo))
         tasks = (self._task(p, keep) for p in todo)
-        for ended in supervise(
-            self.work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=told.hear
-        ):
+        for ended in self._supervised(tasks, told.hear):
             one = todo[ended.number]
             end = self._end(ended)
             if end.outcome.failed is not None and len(self.planned) > 1:
@@ -514,6 +541,25 @@ class _Fleet:
                 self._warn(line)
             self._note(one, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
             told.end(ended.number)
+
+    def _supervised(
+        self, tasks: Iterator[DriveTask], hear: Callable[[int, str, float], None]
+    ) -> Iterator[Ended[DriveTask, DriveEnd]]:
+        """Yield how the tasks end, here or on a cluster."""
+        if self.ray is None:
+            yield from supervise(self.work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear)
+            return
+        here, mark = Path.cwd(), self.output.resolve() / f"{_MARK}{self._run}"
+        work = partial(_on_node, self.work, here, mark)
+        with writing(mark):
+            mark.touch()
+        try:
+            for ended in supervise_on_ray(work, tasks, address=self.ray, limits=self.limits, preload=_PRELOAD):
+                if isinstance(ended.result, OutputError):
+                    raise ended.result
+                yield Ended(ended.number, ended.item, ended.result, ended.failure)
+        finally:
+            mark.unlink(missing_ok=True)
 
     def _task(self, one: _Planned, keep: Keep) -> DriveTask:
         full = keep == "full"
