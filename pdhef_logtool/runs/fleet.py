@@ -8,6 +8,7 @@ the journal and the files of figures, ``metrics/run=…/car=…/part-….parquet
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import platform
 import re
@@ -42,6 +43,7 @@ from pdhef_logtool.records.supervisor import Ended, Limits, Tell, supervise
 from pdhef_logtool.results.opened_run import (
     LOGS,
     METRICS_FILE,
+    PAGE_FILE,
     PARTS,
     REPORT_FILE,
     OpenedLog,
@@ -116,9 +118,8 @@ class DriveEnd:
 
     Attributes
     ----------
-    identity : what its log is known by. car : :func:`~.cars.car_record`. part : as in the journal.
+    identity : what its log is known by. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
     warned : lines for people. again : whether a failure may be none the next time.
-    error : that failure itself, where nobody else has a log to tell of.
     """
 
     outcome: LogOutcome
@@ -126,6 +127,7 @@ class DriveEnd:
     car: dict[str, Any] | None = None
     part: str | None = None
     failed_checks: int = 0
+    error_rad: float | None = None
     warned: tuple[str, ...] = ()
     again: bool = False
 
@@ -219,9 +221,10 @@ def run_logs(
         try:
             fleet.run(*((only, "full") if only else (None, config.kept)), retry=retry or bool(only))
             if full_worst and not only:
-                fleet.collect()
                 fleet.run(fleet.worst(full_worst), "full")
         except BaseException as stop:
+            if fleet.done:
+                stop.add_note("--resume goes on")
             stop.add_note(f"{fleet.done} of {len(planned)} logs are done")
             with suppress(PdhefError):
                 fleet.collect()
@@ -294,8 +297,16 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         {"digest": digest_of(record["parts"]), **record},
         part,
         result.failed_checks,
+        _error_of(result),
         tuple(warned),
     )
+
+
+def _error_of(result: LogResult) -> float | None:
+    """Return the RMSE of the answer's sideslip in rad, None where it is not scored against an independent truth."""
+    wanted = (result.outcome.main, "sideslip_rad", "all", "rmse")
+    rows = (r for r in result.rows if (r.estimator, r.signal, r.segment, r.metric) == wanted)
+    return next((r.value for r in rows if r.independent and math.isfinite(r.value)), None)
 
 
 def _page_of(output: Path, outcome: LogOutcome) -> list[str]:
@@ -528,7 +539,7 @@ class _Fleet:
             self._tell_of(chosen, [r for r in reasons.values() if r], retry)
         if not todo:
             return
-        self._quiet = len(todo) > FEW_LOGS
+        self._quiet = len(self.planned) > FEW_LOGS
         told = _Told(self.progress, len(todo))
         tasks = (self._task(p, keep) for p in todo)
         for ended in self._supervised(tasks, told.hear):
@@ -587,9 +598,10 @@ class _Fleet:
             self.journal.add_car(car, end.car)
             self._cars_now()[car] = end.car
         before = self.journal.entries.get(one.log.stem)
+        failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
             one.log.stem, one.place, end.identity or one.identity, self.setting, car, keep, end.part,
-            end.failed_checks, end.outcome.failed is not None and end.part is None, end.again, quarantined,
+            end.failed_checks, end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         self.journal.add(entry, end.outcome)
         if before is not None and before.part not in (None, end.part):
@@ -682,6 +694,8 @@ class _Fleet:
         network = None if only is None else {"name": only[0], "sha256": only[1]}
         run = build_run(tool_versions(), self.config.to_dict(), network, [r.outcome for r in results], remaining)
         write_json(self.output / RUN_FILE, run)
+        if remaining:
+            (self.output / PAGE_FILE).unlink(missing_ok=True)  # it is of other drives
         return results
 
     def _result(self, entry: Entry, folder: str) -> LogResult:
@@ -694,12 +708,8 @@ class _Fleet:
 
     def worst(self, count: int) -> list[str]:
         """Return the labels of the scored drives whose answers have the largest errors of sideslip."""
-        import polars as pl
-
-        from pdhef_logtool.results.summary import sideslip_errors
-
-        errors = sideslip_errors(open_run(self.output)).filter(pl.col("estimator") == pl.col("main"))
-        return errors.sort("value", "log", descending=[True, False])["log"].head(count).to_list()
+        entries = [e for p in self.planned if (e := self._entry(p)) is not None and e.error_rad is not None]
+        return [e.label for e in sorted(entries, key=lambda e: (-(e.error_rad or 0.0), e.label))[:count]]
 
     def write_pages(self) -> None:
         """Write the page of the run, and those of drives that no worker has written; or remove what there is."""

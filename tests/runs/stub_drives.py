@@ -31,7 +31,7 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     identity = identity_of(log)
     facts = CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, None)
     outcome = LogOutcome(log.stem, Path(str(log.path)).name, identity, car=facts, main="physics")
-    return DriveEnd(outcome, identity, {"digest": digest_of(record["parts"]), **record}, part)
+    return DriveEnd(outcome, identity, {"digest": digest_of(record["parts"]), **record}, part, error_rad=value)
 
 
 def waiting_drive(folder: Path, task: DriveTask, tell: Tell) -> DriveEnd:
