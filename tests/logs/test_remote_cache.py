@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from studies.counting_server import serving
-
 pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 
 from pdhef_logtool.car.car import Car
@@ -16,6 +14,7 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.slim_cache import SlimCache
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.remote_source import _forget, _spools
+from studies.counting_server import serving
 
 
 def _read(url: str, cache: SlimCache) -> tuple[object, ...]:
