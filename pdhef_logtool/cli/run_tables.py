@@ -19,10 +19,13 @@ from pdhef_logtool.sinks.answer import NEARLY_HOLDS, degrees
 from pdhef_logtool.sinks.report import diverged_line, reasons_line
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from rich.console import Console
 
     from pdhef_logtool.drive.slim import SlimResult
     from pdhef_logtool.evaluation.thresholds import Verdict
+    from pdhef_logtool.results.summary import RunSummary
     from pdhef_logtool.runs.pipeline import RunResult
     from pdhef_logtool.sinks.report import LogOutcome
 
@@ -58,6 +61,8 @@ _LEAVE_FIRST = (
 )
 #: Channels that are named where several share a loss, and checks where several are undecided.
 _MOST_PLACES, _MOST_UNDECIDED = 3, 4
+#: Logs that are named of those that failed alike.
+_MOST_FAILED = 5
 _TEXTS = {
     "result": "Result",
     "consistency": "Consistency",
@@ -90,9 +95,49 @@ def render_run(result: RunResult, console: Console) -> None:
         done = f"{len(result.results) - len(failed)} done, {len(failed)} failed, {len(lost)} with input lost"
         console.print(f"{len(result.results)} logs: {done}")
     if result.output is not None:
-        page = result.output / PAGE_FILE
-        shown = f"; open {page} in a browser" if page.is_file() else ""
-        console.print(f"outputs in {result.output}{shown}", soft_wrap=True)
+        _print_outputs(result.output, console)
+
+
+def render_fleet(summary: RunSummary, console: Console) -> None:
+    """Print a run of many logs: the errors over drives, the worst of them, what failed, and where the outputs are."""
+    if summary.errors:
+        spread = table("sideslip by", ">drives", ">median °", ">p90 °", ">largest °")
+        for of in summary.errors:
+            figures = (cell(x, DEGREES, 3) for x in (of.median_rad, of.p90_rad, of.max_rad))
+            spread.add_row(of.estimator, str(of.drives), *figures)
+        console.print(f"RMSE of sideslip over {summary.scored} drives with an independent truth")
+        console.print(spread)
+        console.print()
+    if summary.worst:
+        names = list(dict.fromkeys(n for d in summary.worst for n in d.errors_rad if n != d.main))
+        worst = table("worst drives", "by", ">RMSE °", *(f">{n} °" for n in names), fold=1)
+        for drive in summary.worst:
+            errors = (cell(drive.errors_rad.get(n), DEGREES, 3) for n in (drive.main, *names))
+            worst.add_row(drive.log, drive.main, *errors)
+        console.print(worst)
+        console.print()
+    for kind in summary.failed:
+        console.print(Text.assemble((f"{kind.count} failed: ", "bold"), kind.reason))
+        _print_some(kind.labels, kind.count, console)
+    if summary.checks_failed:
+        console.print(Text.assemble((f"{len(summary.checks_failed)} with failed checks", "bold"), ", see report.json:"))
+        _print_some(summary.checks_failed, len(summary.checks_failed), console)
+    left = f", {summary.remaining} not done" if summary.remaining else ""
+    failed = summary.logs - summary.done
+    console.print(f"{summary.logs} logs: {summary.done} done, {failed} failed, {summary.lost} with input lost{left}")
+    _print_outputs(summary.output, console)
+
+
+def _print_some(labels: Sequence[str], count: int, console: Console) -> None:
+    """Name the first of so many logs."""
+    more = f" and {count - _MOST_FAILED} more" if count > _MOST_FAILED else ""
+    _print_indented(", ".join(labels[:_MOST_FAILED]) + more, console)
+
+
+def _print_outputs(output: Path, console: Console) -> None:
+    page = output / PAGE_FILE
+    shown = f"; open {page} in a browser" if page.is_file() else ""
+    console.print(f"outputs in {output}{shown}", soft_wrap=True)
 
 
 def _render_verdicts(verdicts: Sequence[Verdict], console: Console) -> None:

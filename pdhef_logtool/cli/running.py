@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from pdhef_logtool.runs.pipeline import RunResult
 
 commands = typer.Typer()
+#: Thresholds that failed, of which each is told.
+_MOST_VERDICTS = 50
 
 
 @options.command(
@@ -34,6 +36,7 @@ commands = typer.Typer()
     "pdhef run fleet/ -o out --jobs 8 --keep metrics",
     "pdhef run fleet/ new/ -o out --jobs 8 --resume",
     "pdhef run fleet/ -o out --only drive_0312",
+    "pdhef run @list.txt -o /shared/out --ray auto --keep metrics",
     "pdhef run @list.txt -o out --jobs 8 --keep metrics --cache ~/slim",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
@@ -50,6 +53,10 @@ def run(
     junit: options.JunitFile = None,
     report: Annotated[bool, Option(help="Write pages for people: report.html of every log.")] = True,
     jobs: options.Jobs = 1,
+    ray: Annotated[
+        str | None,
+        Option(metavar="ADDRESS", help="Work on this Ray cluster (auto, HOST:PORT), with a shared OUTPUT."),
+    ] = None,
     resume: Annotated[
         bool, Option("--resume", help="Go on with the run in the folder: only what is new or has changed.")
     ] = False,
@@ -79,6 +86,7 @@ def run(
             output,
             config,
             jobs=jobs,
+            ray=ray,
             resume=resume,
             retry=retry,
             only=only or (),
@@ -190,17 +198,26 @@ def view(
 
 def _finish(result: RunResult, as_json: bool) -> NoReturn:
     """Print and leave; what closed the gate, and what the exit code then does not show, goes to stderr."""
-    from pdhef_logtool.cli.run_tables import render_run
+    from pdhef_logtool.cli.run_tables import render_fleet, render_run
 
-    console.show(result, render_run, as_json)
-    for one in result.results:
-        if one.outcome.failed is not None and one.report is not None:  # of the others the tables say it
-            console.say(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
+    if result.is_fleet and result.output is not None:
+        from pdhef_logtool.results.opened_run import open_run
+        from pdhef_logtool.results.summary import summarise
+
+        checks_failed = [r.outcome.log for r in result.results if r.failed_checks]
+        console.show(summarise(open_run(result.output), result.exit_code, checks_failed), render_fleet, as_json)
+    else:
+        console.show(result, render_run, as_json)
+        for one in result.results:
+            if one.outcome.failed is not None and one.report is not None:  # of the others the tables say it
+                console.say(f"pdhef: {one.outcome.log}: {one.outcome.failed}")
     failed = [v for v in result.verdicts if v.failed]
-    for verdict in failed:
+    for verdict in failed[:_MOST_VERDICTS]:
         where = f"{verdict.log}: {verdict.estimator}: {verdict.threshold.label}"
         console.say(f"pdhef: threshold failed: {where}: {verdict.reason}")
-    if failed:
+    if len(failed) > _MOST_VERDICTS:
+        console.say(f"pdhef: {len(failed) - _MOST_VERDICTS} more of {len(result.verdicts)} thresholds failed (--junit)")
+    if failed and not result.is_fleet:
         for one in result.results:
             if one.outcome.outcome != "ok":
                 console.say(f"pdhef: {one.outcome.log} besides {one.outcome.outcome}")
@@ -233,7 +250,7 @@ def find_recordings(output: Path, logs: Sequence[str]) -> list[Path]:
             expected=f"a log named {missing[0]}" if missing else RECORDING_FILE,
             got=", ".join(found) or "none",
             where=str(output),
-            remedy="" if found else "pdhef run LOG -o OUT writes one",
+            remedy="" if found else "pdhef run LOG -o OUT --keep full writes one",
         )
     return [found[name] for name in dict.fromkeys(logs)] if logs else list(found.values())
 

@@ -225,21 +225,9 @@ def read_fleet(run: OpenedRun, by: Sequence[str] = ()) -> Fleet:
         ranking=tuple(_ranking(scored, names)),
         breakdowns=tuple(_breakdowns(drives, by)),
         space=gathered.space(),
-        failed=_grouped(gathered.failed),
-        losses=_grouped(gathered.lost),
+        failed=grouped(gathered.failed),
+        losses=grouped(gathered.lost),
     )
-
-
-def answer_errors(run: OpenedRun) -> dict[str, float]:
-    """Return the RMSE of sideslip of each drive's answer in rad, where the truth is independent of it."""
-    figures = _figures(run)
-    found = {}
-    for log in run.logs:
-        main, own = log.entry.get("main") or "", figures.get(log.label, {})
-        error = own.get((main, JUDGED, "rmse"), math.nan)
-        if math.isfinite(error) and (main, JUDGED, "not_independent") not in own:
-            found[log.label] = error
-    return found
 
 
 def exact_median(values: FloatArray) -> Median:
@@ -333,12 +321,13 @@ def _figures(run: OpenedRun) -> dict[str, dict[tuple[str, str, str], float]]:
         .select("log", "estimator", "signal", "metric", "value")
     )
     found: dict[str, dict[tuple[str, str, str], float]] = {}
-    for log, estimator, signal, metric, value in _collected(rows, run).iter_rows():
+    for log, estimator, signal, metric, value in collected(rows, run).iter_rows():
         found.setdefault(log, {})[estimator, signal, metric] = math.nan if value is None else value
     return found
 
 
-def _collected(rows: pl.LazyFrame, run: OpenedRun) -> pl.DataFrame:
+def collected(rows: pl.LazyFrame, run: OpenedRun) -> pl.DataFrame:
+    """Return rows of a run's figures, read; raises OutputError where the file is damaged."""
     import polars as pl
 
     from pdhef_logtool.records.errors import OutputError
@@ -560,7 +549,7 @@ def _explained(groups: Sequence[FloatArray]) -> float:
     return 1.0 - (within / (n - k)) / (total / (n - 1)) if total > 0.0 else 0.0
 
 
-def _grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
+def grouped(found: Sequence[tuple[str, str]]) -> tuple[Failures, ...]:
     """Return reasons with their logs, the most frequent first; numbers and places do not tell reasons apart."""
     members: dict[str, tuple[str, dict[str, None]]] = {}
     for label, reason in found:

@@ -11,9 +11,11 @@ import pytest
 from rich.console import Console
 from run_report import MAIN, MODEL, SHA, errors_deg, figures, report
 
-from pdhef_logtool.cli.run_tables import render_run
+from pdhef_logtool.cli.run_tables import render_fleet, render_run
 from pdhef_logtool.estimators.table import SPECS
 from pdhef_logtool.records.signals import Loss
+from pdhef_logtool.results.fleet import Failures
+from pdhef_logtool.results.summary import ErrorsOf, RunSummary, WorstDrive
 from pdhef_logtool.runs.pipeline import LogResult, RunResult
 from pdhef_logtool.sinks.base import Event
 from pdhef_logtool.sinks.report import EstimatorFacts, FrictionFacts, LogFacts, LogOutcome, TruthFacts
@@ -164,3 +166,23 @@ def test_long_names_of_logs_stay_whole() -> None:
     name = "recording_of_a_long_day_" * 4
     text = shown(named(name), named("b"))
     assert name in "".join(line.split()[0] for line in text.splitlines() if line.strip())
+
+
+def test_a_fleet_is_told_in_a_few_lines_within_80_columns() -> None:
+    console = Console(width=80, record=True, file=io.StringIO(), highlight=False, markup=False)
+    errors = (ErrorsOf("answer", 290, 0.001, 0.003, 0.01), ErrorsOf("zero", 290, 0.01, 0.05, 0.2))
+    worst = tuple(
+        WorstDrive(f"a_day_in_may__drive_{i:05d}", "pd-hef", {"pd-hef": 0.01, "zero": 0.2}) for i in range(10)
+    )
+    failed = (Failures("expected a log, got a FIFO", 12, tuple(f"drive_{i}" for i in range(10))),)
+    summary = RunSummary(Path("out"), 3, 312, 300, 8, 290, 4, errors, worst, failed, ("drive_7",))
+    render_fleet(summary, console)
+    text = console.export_text()
+    assert all(len(line) <= 80 for line in text.splitlines())
+    assert rows(text, "answer")[0].split() == ["answer", "290", "0.057", "0.172", "0.573"]
+    assert rows(text, "a_day_in_may__drive_00000")[0].split()[1:] == ["pd-hef", "0.573", "11.459"]
+    assert "12 failed: expected a log, got a FIFO" in text
+    assert "drive_0, drive_1, drive_2, drive_3, drive_4 and 7 more" in text
+    assert "1 with failed checks, see report.json:" in text
+    assert "312 logs: 300 done, 12 failed, 8 with input lost, 4 not done" in text
+    assert len(text.splitlines()) < 30

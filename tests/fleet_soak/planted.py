@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from pdhef_logtool.records.supervisor import Tell
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_drive
+from tests.runs.stub_drives import stub_drive
+
+#: Where workers write what a drive cost; they have it from the process that started them.
+MEASURES = "PDHEF_SOAK_MEASURES"
 
 
 def planted_drive(task: DriveTask, tell: Tell, work: Callable[[DriveTask, Tell], DriveEnd] = run_drive) -> DriveEnd:
     """Hang, take 8 GB or be killed where the log's name says so, else do the work."""
-    name = task.log.stem
+    name = task.log.path.name.partition(".")[0]
     if name == "hangs":
         tell("before it hangs", 0.1)
         time.sleep(3600.0)
@@ -27,3 +33,25 @@ def planted_drive(task: DriveTask, tell: Tell, work: Callable[[DriveTask, Tell],
         tell("before it is killed", 0.1)
         os.kill(os.getpid(), signal.SIGKILL)
     return work(task, tell)
+
+
+def rss_bytes() -> int:
+    """Return the memory that this process has now."""
+    return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def measured_drive(task: DriveTask, tell: Tell) -> DriveEnd:
+    """Work on a drive and note process, processor seconds and memory."""
+    return _measured(planted_drive(task, tell), task)
+
+
+def measured_stub(task: DriveTask, tell: Tell) -> DriveEnd:
+    """Return a stub's end, as fast as it goes."""
+    return _measured(stub_drive(task, tell), task)
+
+
+def _measured(end: DriveEnd, task: DriveTask) -> DriveEnd:
+    line = json.dumps([os.getpid(), time.process_time(), rss_bytes(), task.log.path.name])
+    with Path(os.environ[MEASURES]).open("a") as file:
+        file.write(line + "\n")
+    return end

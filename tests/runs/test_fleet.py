@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.supervisor import Limits, Tell
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
+from pdhef_logtool.results.summary import summarise
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
 from pdhef_logtool.sinks.report import LogOutcome
@@ -259,3 +261,21 @@ def test_metrics_alone_leave_a_short_report_by_the_schema(sample_logs_dir: Path,
     assert (tmp_path / "logs" / worst / "report.html").is_file()
     assert (tmp_path / "report.html").is_file()
     assert {r.metric for r in result.results[0].rows} >= {"rmse", "nees", "lag_s"}
+    assert [(r.document, r.figures) for r in result.results] == [(None, None)] * 2  # nothing is held of a drive
+
+
+def test_a_fleets_summary_counts_what_the_figures_say(tmp_path: Path) -> None:
+    logs, out = named_logs(tmp_path / "logs", "a", "b", "c"), tmp_path / "out"
+
+    def failing(task: DriveTask, tell: Tell) -> DriveEnd:
+        if task.log.stem == "b":
+            return DriveEnd(LogOutcome("b", "b.mcap", None, failed="for a test"), None)
+        return stub_drive(task, tell)
+
+    result = run(logs, out, work=failing)
+    told = summarise(open_run(out), result.exit_code, ["c"]).to_dict()
+    values = {log: zlib.crc32(log.encode()) / 2**32 for log in "ac"}
+    assert (told["logs"], told["done"], told["scored"], told["exit_code"]) == (3, 2, 2, 3)
+    assert told["errors"][0]["median_rad"] == pytest.approx(sum(values.values()) / 2)
+    assert [w["log"] for w in told["worst"]] == sorted(values, key=lambda log: -values[log])
+    assert told["failed"][0]["labels"] == ("b",)

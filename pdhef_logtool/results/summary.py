@@ -1,0 +1,135 @@
+"""A run of many logs in a few lines: how large the errors are, which drives are worst, and what failed.
+
+Only the figures of sideslip are read, as columns: what a drive costs here is some bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pdhef_logtool.results.fleet import ANSWER, JUDGED, Failures, grouped
+from pdhef_logtool.results.opened_run import OpenedRun
+
+if TYPE_CHECKING:
+    import polars as pl
+
+#: Drives that are named as the worst, and estimators that are told beside the answer.
+WORST = 10
+_RIVALS = ("physics", "zero")
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorsOf:
+    """RMSE of sideslip in rad of one estimator over drives whose truth is independent of it."""
+
+    estimator: str
+    drives: int
+    median_rad: float
+    p90_rad: float
+    max_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class WorstDrive:
+    """A drive with a large error of the answer: RMSE of sideslip in rad by estimator, that of the answer first."""
+
+    log: str
+    main: str
+    errors_rad: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """What a run of many logs is told as.
+
+    Attributes
+    ----------
+    output : folder. exit_code : of the run. logs, done, lost : logs, those with figures, those with input lost.
+    scored : drives whose answer is scored. remaining : logs that are not done. checks_failed : logs with failed checks
+        that count.
+    """
+
+    output: Path
+    exit_code: int
+    logs: int
+    done: int
+    lost: int
+    scored: int
+    remaining: int
+    errors: tuple[ErrorsOf, ...]
+    worst: tuple[WorstDrive, ...]
+    failed: tuple[Failures, ...]
+    checks_failed: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the summary as one JSON-able document; its drives stand one by one in run.json."""
+        return {**asdict(self), "output": str(self.output)}
+
+
+def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> RunSummary:
+    """Return the summary of a run; raises OutputError where metrics.parquet is damaged."""
+    import polars as pl
+
+    errors = _sideslip_errors(run)
+    answers = errors.filter(pl.col("estimator") == pl.col("main"))
+    told = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
+    for name in _RIVALS:
+        own = errors.filter(pl.col("estimator") == name)
+        if own.height and set(answers["main"].unique()) != {name}:
+            told.append(ErrorsOf(name, *_spread(own)))
+    failed = [(log.label, log.outcome.partition(": ")[2]) for log in run.logs if log.outcome.startswith("failed")]
+    return RunSummary(
+        output=run.folder,
+        exit_code=exit_code,
+        logs=len(run.logs),
+        done=len(run.logs) - len(failed),
+        lost=sum(log.outcome.startswith("lost") for log in run.logs),
+        scored=answers.height,
+        remaining=int(run.document.get("remaining", 0)),
+        errors=tuple(told),
+        worst=tuple(_worst(errors, answers)),
+        failed=grouped(failed),
+        checks_failed=tuple(checks_failed),
+    )
+
+
+def _sideslip_errors(run: OpenedRun) -> pl.DataFrame:
+    """Return log, estimator, value (RMSE of sideslip in rad) and main (the answer), where the truth is independent."""
+    import polars as pl
+
+    from pdhef_logtool.results.fleet import collected
+
+    mains = pl.DataFrame(
+        {"log": [log.label for log in run.logs], "main": [str(log.entry.get("main") or "") for log in run.logs]},
+        schema={"log": pl.String, "main": pl.String},
+    )
+    rows = run.metrics().filter((pl.col("segment") == "all") & (pl.col("signal") == JUDGED))
+    dependent = rows.filter(pl.col("metric") == "not_independent").select("log", "estimator")
+    found = rows.filter((pl.col("metric") == "rmse") & pl.col("value").is_finite())
+    found = found.select("log", "estimator", "value").join(dependent, on=["log", "estimator"], how="anti")
+    return collected(found, run).join(mains, on="log").sort("log", "estimator")
+
+
+def _spread(errors: pl.DataFrame) -> tuple[int, float, float, float]:
+    values = errors["value"]
+    median, p90 = values.median(), values.quantile(0.9, "linear")
+    return errors.height, _number(median), _number(p90), _number(values.max())
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def _worst(errors: pl.DataFrame, answers: pl.DataFrame) -> list[WorstDrive]:
+    import polars as pl
+
+    found = []
+    for log, main in answers.sort("value", "log", descending=[True, False]).head(WORST).select("log", "main").rows():
+        own = dict(errors.filter(pl.col("log") == log).select("estimator", "value").rows())
+        names = dict.fromkeys((main, *(name for name in _RIVALS if name in own)))
+        found.append(WorstDrive(log, main, {name: own[name] for name in names}))
+    return found

@@ -1,0 +1,62 @@
+"""``python -m tests.fleet_soak.run_fleet LOGS OUT MEASURES``: a run with trouble planted, in a process of its own.
+
+It is what a person starts, but for its work on a drive, which plants trouble and writes down what a drive cost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import sys
+import time
+from pathlib import Path
+
+from pdhef_logtool.records.supervisor import Limits
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+from tests.fleet_soak.planted import MEASURES, measured_drive, measured_stub, rss_bytes
+
+
+def main() -> int:
+    """Run a fleet; print the parent's wall and processor seconds and its memory over the run."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("logs", nargs="+")
+    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument("--measures", type=Path, required=True)
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--stub", action="store_true")
+    parser.add_argument("--silence", type=float, default=60.0)
+    given = parser.parse_args()
+    os.environ[MEASURES] = str(given.measures)
+    memory: list[int] = []
+    said: list[str] = []
+    since = time.monotonic()
+    result = run_logs(
+        given.logs,
+        given.output,
+        RunConfig(car=Path("saloon")),
+        jobs=given.jobs,
+        resume=given.resume,
+        limits=Limits(given.silence, 3_000_000_000),
+        report=not given.stub,
+        work=measured_stub if given.stub else measured_drive,
+        progress=lambda _text, _share: memory.append(rss_bytes()),
+        say=said.append,
+    )
+    found = {
+        "exit_code": result.exit_code,
+        "wall_s": time.monotonic() - since,
+        "cpu_s": time.process_time(),
+        "rss_bytes": memory,
+        "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        "said": said,
+    }
+    print(json.dumps(found))
+    return result.exit_code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

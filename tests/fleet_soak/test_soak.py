@@ -1,0 +1,236 @@
+"""A fleet through all that befalls one: damage, no truth, planted trouble, kills, growth. ``make fleet`` runs it.
+
+What was measured stands in out/fleet/figures.json; docs/fleet.md tells of it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
+from tests.conftest import ROOT, SHARED
+
+pytestmark = [pytest.mark.fleet, pytest.mark.slow]
+
+#: Drives that were simulated once are kept for the next time.
+KEPT = ROOT / "out" / "fleet"
+DRIVES, DAMAGED, WITHOUT_TRUTH = int(os.environ.get("PDHEF_FLEET_DRIVES", "300")), 10, 10
+PLANTED = ("hangs", "takes_8_gb", "kills")
+
+
+@pytest.fixture(scope="session")
+def drives() -> Path:
+    """Simulated drives of 12.5 s."""
+    from truthsim.suite import write_suite
+
+    folder = KEPT / "drives"
+    write_suite(folder, count=DRIVES, seed=15, processes=2)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def logs(drives: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All that the fleet holds but the real drives."""
+    from truthsim.drive import simulate_drive, write_drive
+
+    root = tmp_path_factory.mktemp("logs")
+    (root / "drives").symlink_to(drives)
+    whole = sorted(drives.glob("*.mcap"))
+    damaged = root / "damaged"
+    damaged.mkdir()
+    for number, path in enumerate(whole[:DAMAGED]):
+        data = bytearray(path.read_bytes())
+        if number % 2:
+            del data[len(data) * number // DAMAGED :]
+        else:
+            data[len(data) // 3 : len(data) // 3 + 2000] = bytes(2000)
+        (damaged / f"damaged_{number}.mcap").write_bytes(data)
+    (root / "no_truth").mkdir()
+    for number in range(WITHOUT_TRUTH):
+        drive = simulate_drive("sine-sweep", seed=number, duration_s=12.5)
+        write_drive(drive, root / "no_truth" / f"no_truth_{number}.mcap", without=["rtk", "perfect"])
+    (root / "planted").mkdir()
+    for name in PLANTED:
+        shutil.copy(whole[0], root / "planted" / f"{name}.mcap")
+        with (root / "planted" / f"{name}.mcap").open("ab") as file:
+            file.write(name.encode())  # no two logs hold the same
+    return root
+
+
+def arguments(logs: Path) -> list[str]:
+    """Return what the fleet is named by."""
+    real = SHARED / "data" / "drives"
+    return [*(str(p) for p in sorted(logs.iterdir())), *([str(real)] if real.is_dir() else [])]
+
+
+def start(logs: Sequence[str], output: Path, *options: str) -> subprocess.Popen[str]:
+    measures = output.with_suffix(".jsonl")
+    command = [sys.executable, "-m", "tests.fleet_soak.run_fleet", *logs, "--output", str(output)]
+    return subprocess.Popen(
+        [*command, "--measures", str(measures), *options],
+        cwd=ROOT,
+        text=True,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+
+
+def finished(logs: Sequence[str], output: Path, *options: str) -> dict[str, Any]:
+    """Run to the end; return what the run found of itself."""
+    process = start(logs, output, *options)
+    said = process.communicate(timeout=7200.0)[0]
+    assert process.returncode in (0, 3), said
+    return dict(json.loads(said.splitlines()[-1]))
+
+
+def drives_of(output: Path) -> list[dict[str, Any]]:
+    path = output / JOURNAL_FILE
+    lines = path.read_text().splitlines() if path.is_file() else []
+    documents = [json.loads(line) for line in lines if line.endswith("}")]
+    return [d for d in documents if "outcome" in d]
+
+
+def contents(output: Path) -> dict[str, bytes]:
+    """Return what a run leaves, but for its journal and the recordings, which hold times."""
+    found = (p for p in output.rglob("*") if p.is_file() and p.name != JOURNAL_FILE and p.suffix != ".rrd")
+    return {p.relative_to(output).as_posix(): p.read_bytes() for p in found}
+
+
+def note(**figures: Any) -> None:
+    """Keep what was measured."""
+    path = KEPT / "figures.json"
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    path.write_text(json.dumps({**known, **figures}, indent=2, sort_keys=True) + "\n")
+
+
+@pytest.fixture(scope="session")
+def undisturbed(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    output = tmp_path_factory.mktemp("undisturbed") / "out"
+    return output, finished(arguments(logs), output)
+
+
+def measures(output: Path) -> list[tuple[int, float, int, str]]:
+    """Return process, processor seconds and memory behind each drive, in the order of ending."""
+    return [tuple(json.loads(line)) for line in output.with_suffix(".jsonl").read_text().splitlines()]
+
+
+def test_exactly_the_planted_ones_are_given_up(undisturbed: tuple[Path, dict[str, Any]]) -> None:
+    output, found = undisturbed
+    assert found["exit_code"] == 3
+    quarantined = [d["outcome"] for d in drives_of(output) if d["quarantined"]]
+    given_up = {o["file"].partition(".")[0]: o["failed"] for o in quarantined}
+    assert set(given_up) == set(PLANTED)
+    assert given_up["hangs"] == "nothing heard for 60 s, 2 tries; last heard: before it hangs"
+    assert "took more than 3000 MB" in given_up["takes_8_gb"]
+    assert given_up["kills"].startswith("the worker was killed (signal 9), 2 tries")
+    run = open_run(output)
+    ended = {log.entry["file"].partition(".")[0]: log.outcome for log in run.logs}
+    assert sum(outcome == "ok" for name, outcome in ended.items() if name.startswith("drive_")) == DRIVES
+    assert [ended[f"no_truth_{n}"] for n in range(WITHOUT_TRUTH)] == ["ok"] * WITHOUT_TRUTH
+    assert all(outcome != "ok" for name, outcome in ended.items() if name.startswith("damaged_"))
+    assert sum(log.file("recording.rrd") is not None for log in run.logs) == 5
+    sizes = [p.stat().st_size for log in run.logs if (p := log.file("report.json")) is not None]
+    assert "figures and a short report of each are kept" in found["said"][0]
+    largest = sorted(sizes)[-6]  # the five worst are kept in full
+    note(logs=len(run.logs), largest_short_report_bytes=largest)
+    assert largest <= 20_000
+
+
+def test_killed_twice_and_resumed_is_undisturbed(
+    undisturbed: tuple[Path, dict[str, Any]], logs: Path, tmp_path: Path
+) -> None:
+    output = tmp_path / "out"
+    total = len(open_run(undisturbed[0]).logs)
+    for share in (0.3, 0.7):
+        process = start(arguments(logs), output, "--resume")
+        while len(drives_of(output)) < share * total and process.poll() is None:
+            time.sleep(0.2)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+    before = len(drives_of(output))
+    finished(arguments(logs), output, "--resume")
+    assert len({d["label"] for d in drives_of(output)}) == total
+    assert len(drives_of(output)) <= total + 5 + 2 * 2  # the worst once more, and at most what was in flight
+    assert before < total
+    alike, killed = contents(undisturbed[0]), contents(output)
+    assert set(alike) == set(killed)
+    assert [name for name, data in alike.items() if killed[name] != data] == []
+
+
+def test_a_folder_added_later_computes_only_what_is_new(drives: Path, logs: Path, tmp_path: Path) -> None:
+    first, later = tmp_path / "first", tmp_path / "later"
+    for folder, part in ((first, slice(0, 6)), (later, slice(6, 9))):
+        folder.mkdir()
+        for path in sorted(drives.glob("*.mcap"))[part]:
+            shutil.copy(path, folder)
+    output = tmp_path / "out"
+    finished([str(first)], output)
+    finished([str(first), str(later)], output, "--resume")
+    names = [name for *_, name in measures(output)]
+    assert len(names) == len(set(names)) == 9
+    assert len(open_run(output).logs) == 9
+
+
+def test_two_jobs_are_nearly_twice_as_fast(drives: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for path in sorted(drives.glob("*.mcap"))[:100]:
+        shutil.copy(path, folder)
+    idle = os.getloadavg()[0] < 0.3 and (os.cpu_count() or 1) >= 2
+    found = {jobs: finished([str(folder)], tmp_path / f"out{jobs}", "--jobs", str(jobs)) for jobs in (1, 2)}
+    workers = {jobs: worker_seconds(tmp_path / f"out{jobs}") for jobs in (1, 2)}
+    # What no second job shortens is the parent's; the rest is halved if two take no more than one does.
+    alone = found[1]["cpu_s"] + workers[1]
+    shared = found[2]["cpu_s"] + workers[2] / 2.0
+    note(
+        jobs_cpu_ratio=alone / shared,
+        jobs_wall_ratio=found[1]["wall_s"] / found[2]["wall_s"],
+        cores_were_idle=idle,
+        drives_per_cpu_second=100 / alone,
+        parent_cpu_s=found[2]["cpu_s"],
+        workers_cpu_s=workers[2],
+    )
+    assert alone / shared >= 1.8
+    assert not idle or found[1]["wall_s"] / found[2]["wall_s"] >= 1.8
+
+
+def worker_seconds(output: Path) -> float:
+    """Return the processor seconds of all workers."""
+    last = {pid: seconds for pid, seconds, *_ in measures(output)}
+    return sum(last.values())
+
+
+def test_a_worker_takes_no_more_memory_after_300_drives_than_after_30(undisturbed: tuple[Path, dict[str, Any]]) -> None:
+    simulated = [m for m in measures(undisturbed[0]) if m[3].startswith("drive_")]
+    early = statistics.median(rss for _, _, rss, _ in simulated[20:40])
+    late = statistics.median(rss for _, _, rss, _ in simulated[-20:])
+    parent = undisturbed[1]["rss_bytes"]
+    note(worker_rss_30=early, worker_rss_300=late, parent_rss_30=parent[len(parent) // 10], parent_rss_300=parent[-1])
+    assert late < 1.15 * early
+    assert parent[-1] - parent[len(parent) // 10] < 100e6
+
+
+def test_the_parents_memory_is_flat_to_3000_logs(tmp_path: Path) -> None:
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for number in range(3000):
+        (folder / f"log_{number:05d}.mcap").write_text(f"this is {number}")
+    output = tmp_path / "out"
+    found = finished([str(folder)], output, "--stub")
+    memory = found["rss_bytes"]
+    note(stub_rss_300=memory[len(memory) // 10], stub_rss_3000=memory[-1], stub_peak=found["peak_bytes"])
+    assert len(open_run(output).logs) == 3000
+    assert memory[-1] - memory[len(memory) // 10] < 30e6
