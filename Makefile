@@ -153,7 +153,7 @@ switches: $(VENV)/installed-dev $(VENV)/compiled
 wheel: $(VENV)/installed-dev
 	rm -rf build/clone dist
 	git clone --quiet . build/clone
-	$(BIN)/python -m build --outdir dist build/clone >/dev/null
+	$(BIN)/python -m build --outdir dist build/clone >build/build.log 2>&1 || { tail -n 20 build/build.log >&2; exit 1; }
 	$(BIN)/python tests/release/check_dist.py dist
 
 # As a stranger installs and runs it, away from the source tree; the same steps as in the Dockerfile.

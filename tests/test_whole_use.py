@@ -44,7 +44,7 @@ def _said(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, A
     return found
 
 
-@pytest.mark.parametrize("kind", ["rosbag1", "rosbag2"])
+@pytest.mark.parametrize("kind", ["rosbag1", pytest.param("rosbag2", marks=pytest.mark.fleet)])
 def test_from_a_recording_to_a_network_and_back(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, before, after = _log(tmp_path, kind), tmp_path / "before", tmp_path / "after"
     _pdhef("run", log, "-o", before, *CAR, "-e", ",".join(ESTIMATORS))

@@ -190,6 +190,7 @@ def test_a_slim_log_of_a_slim_log_stands_for_the_same_source(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+@pytest.mark.fleet
 @pytest.mark.parametrize(
     ("name", "mapping"),
     [

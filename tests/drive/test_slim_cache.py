@@ -108,6 +108,7 @@ def _make(place: str, tell: Tell) -> bytes:
 
 
 @pytest.mark.slow
+@pytest.mark.fleet
 def test_several_processes_share_a_cache(tmp_path: Path) -> None:
     ended = list(supervise(_make, [str(tmp_path)] * 6, jobs=3))
     assert [one.failure for one in ended] == [None] * 6
