@@ -7,14 +7,11 @@ settings, and the sources of what computes. A row whose key is as it was is not 
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, lru_cache, partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +23,10 @@ from pdhef_logtool.car.parts import digest
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.table import Options, make_estimator, runnable
+from pdhef_logtool.estimators.table import FILTERS, Options, make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.files import PendingFile
+from pdhef_logtool.records.supervisor import Crew, Tell
 from pdhef_logtool.runs.estimating import calibrator
 from studies import error_budget, fixed_grid
 from studies.condition_drives import read_drive, rmse_row, score, sideslip_error, told
@@ -122,10 +120,10 @@ def run_rows(setup: Setup, rows: dict[str, list[Task]], folder: Path, *, jobs: i
     folder.mkdir(parents=True, exist_ok=True)
     done: dict[str, RowResult] = {}
     rows = {name: tasks for name, tasks in rows.items() if tasks}
-    with _workers(jobs) as work:
+    with _workers(setup, jobs) as work:
         for name, tasks in rows.items():
             path, key = folder / f"{name}.parquet", row_key(setup, tasks)
-            done[name] = _read(path, key) or _write(path, list(work(partial(_run, setup), tasks)), key)
+            done[name] = _read(path, key) or _write(path, list(work(tasks)), key)
             progress(f"\r{title}: {len(done)} of {len(rows)} rows   ")
     progress("\n")
     return done
@@ -153,15 +151,24 @@ def _write(path: Path, parts: list[_Done], key: str) -> RowResult:
 
 
 @contextmanager
-def _workers(jobs: int) -> Iterator[Callable[..., Iterator[_Done]]]:
-    """Yield what maps a function over tasks, here or in processes."""
+def _workers(setup: Setup, jobs: int) -> Iterator[Callable[[Sequence[Task]], Iterator[_Done]]]:
+    """Yield what runs tasks, here or in processes."""
     if jobs == 1:
-        yield map
+        yield lambda tasks: (_run(setup, task) for task in tasks)
         return
-    # Read by the fresh interpreters when they load the libraries: one thread each, parallel over drives.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        yield pool.map
+
+    def work(tasks: Sequence[Task]) -> Iterator[_Done]:
+        for ended in crew.each(tasks):
+            if ended.result is None:
+                raise RuntimeError(f"{ended.item.row}, {ended.item.log}: {ended.failure}")
+            yield ended.result
+
+    with Crew[Task, _Done](partial(_told, setup), jobs=jobs, preload=(__name__, *FILTERS)) as crew:
+        yield work
+
+
+def _told(setup: Setup, task: Task, _tell: Tell) -> _Done:
+    return _run(setup, task)
 
 
 def _run(setup: Setup, task: Task) -> _Done:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from email.utils import formatdate
+from functools import lru_cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
@@ -90,7 +91,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.note(path, 0, 0)
             self.plain(404)
             return
-        etag = f'"{hashlib.md5(data, usedforsecurity=False).hexdigest()}"'
+        etag = _etag(data)
         if self.headers.get("If-Match", etag) != etag:
             self.note(path, 0, 0)
             self.plain(412)
@@ -124,6 +125,11 @@ class _Handler(BaseHTTPRequestHandler):
         for name, value in {"Content-Length": "0", **(headers or {})}.items():
             self.send_header(name, value)
         self.end_headers()
+
+
+@lru_cache(maxsize=64)
+def _etag(data: bytes) -> str:
+    return f'"{hashlib.md5(data, usedforsecurity=False).hexdigest()}"'
 
 
 @contextmanager

@@ -58,20 +58,20 @@ def write_apart(path: Path, chunks: Iterable[list[Message]]) -> None:
         writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _with_camera(source: Path) -> Iterator[list[Message]]:
-    """Yield the messages of a log in chunks of 20 s, and after each as long a chunk of images."""
+def with_camera(source: Path, slice_ns: int = _SLICE_NS) -> Iterator[list[Message]]:
+    """Yield the messages of a log in chunks of 20 s (or other slices), and after each as long a chunk of images."""
     noise = random.Random(1)
     sensors: list[Message] = []
 
     def images(start_ns: int) -> list[Message]:
         head = b"\0\1\0\0" + _IMAGE_BYTES.to_bytes(4, "little")
-        stamps = range(start_ns, start_ns + _SLICE_NS, _IMAGE_NS)
+        stamps = range(start_ns, start_ns + slice_ns, _IMAGE_NS)
         return [("/camera", _CAMERA, at, head + noise.randbytes(_IMAGE_BYTES)) for at in stamps]
 
     with source.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
             assert schema is not None
-            if sensors and message.log_time - sensors[0][2] >= _SLICE_NS:
+            if sensors and message.log_time - sensors[0][2] >= slice_ns:
                 yield sensors
                 yield images(sensors[0][2])
                 sensors = []
@@ -101,7 +101,7 @@ def measure() -> str:
     """Return the table of all commands on all logs."""
     with tempfile.TemporaryDirectory() as folder:
         apart = Path(folder) / "apart.mcap"
-        write_apart(apart, _with_camera(SAMPLE))
+        write_apart(apart, with_camera(SAMPLE))
         files = {"mixed.mcap": SAMPLE.read_bytes(), "apart.mcap": apart.read_bytes()}
     files["apart.mcap.zst"] = zstandard.ZstdCompressor(1).compress(files["apart.mcap"])
     head = ["log", "MB", "chunks", "command", "requests", "MB fetched", "share", "bytes fetched twice"]

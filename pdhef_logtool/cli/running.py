@@ -36,6 +36,7 @@ _MOST_VERDICTS = 50
     "pdhef run fleet/ -o out --jobs 8 --keep metrics",
     "pdhef run fleet/ new/ -o out --jobs 8 --resume",
     "pdhef run fleet/ -o out --only drive_0312",
+    "pdhef run @list.txt -o /shared/out --ray auto --keep metrics",
     "pdhef run @list.txt -o out --jobs 8 --keep metrics --cache ~/slim",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
@@ -52,6 +53,10 @@ def run(
     junit: options.JunitFile = None,
     report: Annotated[bool, Option(help="Write pages for people: report.html of every log.")] = True,
     jobs: options.Jobs = 1,
+    ray: Annotated[
+        str | None,
+        Option(metavar="ADDRESS", help="Work on this Ray cluster (auto, HOST:PORT), with a shared OUTPUT."),
+    ] = None,
     resume: Annotated[
         bool, Option("--resume", help="Go on with the run in the folder: only what is new or has changed.")
     ] = False,
@@ -81,6 +86,7 @@ def run(
             output,
             config,
             jobs=jobs,
+            ray=ray,
             resume=resume,
             retry=retry,
             only=only or (),

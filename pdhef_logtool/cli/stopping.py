@@ -54,14 +54,4 @@ def _stop(number: int, _frame: Any) -> None:
     for other in _WORDS:
         signal.signal(other, signal.SIG_DFL)
     _came = Stopped(number)
-    _end_workers()
     raise _came
-
-
-def _end_workers() -> None:
-    """End our own processes, on which the command would wait."""
-    if "multiprocessing" in sys.modules:
-        from multiprocessing import active_children
-
-        for child in active_children():
-            child.terminate()

@@ -269,7 +269,9 @@ def _with_stems(paths: list[LogPlace]) -> list[LogInput]:
     for i in sorted(range(len(names)), key=lambda i: not _stays(names[i], counts)):
         stems[i] = names[i]
         if not _stays(names[i], counts):
-            digits = hashlib.sha256(os.fsencode("/".join(relative[i]))).hexdigest()
+            place = paths[i]
+            origin = place.identity if isinstance(place, RemotePlace) else "/".join(relative[i])
+            digits = hashlib.sha256(os.fsencode(origin)).hexdigest()
             made = (_portable(names[i], digits[:n]) for n in range(8, len(digits) + 1))
             stems[i] = next(stem for stem in made if as_taken(stem) not in taken)
         taken.add(as_taken(stems[i]))

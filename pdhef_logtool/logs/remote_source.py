@@ -230,10 +230,10 @@ class _Spool:
         async with self.remote.ask(0, head_bytes, None) as answer:
             written = await self._write(answer, answer.state.size)
         size = written if answer.state.size < 0 else answer.state.size
-        self.state = ObjectState(size, answer.state.etag, answer.state.modified)
         if written < min(size, head_bytes):
             raise TryAgainError("an answer that is cut")
         self.held = [(0, written)] if written else []
+        self.state = ObjectState(size, answer.state.etag, answer.state.modified)
 
     async def _ask_again(self) -> None:
         async with self.remote.ask(0, 1, self.state):

@@ -103,6 +103,8 @@ def serve(descriptor: int) -> None:
     finally:
         for pid in workers:
             os.kill(pid, signal.SIGKILL)  # not yet waited for: no other process can have its number
+        for pid in workers:
+            os.waitpid(pid, 0)  # so that what they took counts as the command's
 
 
 def _prepare(preload: Sequence[str]) -> str | None:

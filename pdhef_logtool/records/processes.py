@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-import signal
 from functools import cache
 from pathlib import Path
 
@@ -33,23 +32,6 @@ def is_alive(name: str) -> bool | None:
         pass
     # The number may have been given to another process since.
     return _start(int(pid)) in (None, int(start))
-
-
-def follow_parent() -> None:
-    """Begin a worker process: it ends without a word on Ctrl-C, and when its parent ends, however that ends."""
-    import multiprocessing
-    import threading
-
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    parent = multiprocessing.parent_process()
-
-    def follow() -> None:
-        assert parent is not None
-        parent.join()
-        os._exit(1)
-
-    if parent is not None:
-        threading.Thread(target=follow, daemon=True).start()
 
 
 @cache

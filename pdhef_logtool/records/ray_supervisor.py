@@ -14,7 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -124,6 +124,9 @@ def _connected(address: str) -> Iterator[Any]:
         ) from None
     if main:
         signal.signal(signal.SIGTERM, was)  # Ray has put its own in its place
+    with suppress(AttributeError):
+        # It prints on stdout, where results go, that a node was lost and that it goes on.
+        ray._private.worker.print_to_stdstream = lambda *_, **__: None
     try:
         yield ray
     finally:

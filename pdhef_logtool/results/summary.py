@@ -74,7 +74,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
     """Return the summary of a run; raises OutputError where metrics.parquet is damaged."""
     import polars as pl
 
-    errors = sideslip_errors(run)
+    errors = _sideslip_errors(run)
     answers = errors.filter(pl.col("estimator") == pl.col("main"))
     told = [ErrorsOf(ANSWER, *_spread(answers))] if answers.height else []
     for name in _RIVALS:
@@ -97,7 +97,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
     )
 
 
-def sideslip_errors(run: OpenedRun) -> pl.DataFrame:
+def _sideslip_errors(run: OpenedRun) -> pl.DataFrame:
     """Return log, estimator, value (RMSE of sideslip in rad) and main (the answer), where the truth is independent."""
     import polars as pl
 

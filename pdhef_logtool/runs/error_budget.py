@@ -123,6 +123,10 @@ def no_budget(reason: str) -> ErrorBudget:
     return ErrorBudget(reason, 0.0, float("nan"), ())
 
 
+def _too_short(seconds: float) -> str:
+    return f"{seconds:.0f} s of scored driving are too little, {LEAST_S:.0f} s are needed"
+
+
 def error_budget(estimator: Estimator, sample: DriveSample, low_speed_m_s: float) -> ErrorBudget:
     """Return what may have caused the error of ``physics`` on the blocks of a drive with truth.
 
@@ -133,6 +137,8 @@ def error_budget(estimator: Estimator, sample: DriveSample, low_speed_m_s: float
     bare, _ = bare_filter(estimator, sample.signals)
     if not isinstance(bare, AdaptivePhysics) or sample.truth is None:
         return no_budget(f"{estimator.name} is no physics filter on a car's model")
+    if np.unique(sample.block[sample.block >= 0] % 2).shape[0] < 2:
+        return no_budget(_too_short(sample.seconds))
     halves = []
     for part in (sample.half(0), sample.half(1)):
         assert part.truth is not None
@@ -142,7 +148,7 @@ def error_budget(estimator: Estimator, sample: DriveSample, low_speed_m_s: float
     scored = sum(h.scored for h in halves)
     seconds = sample.seconds * scored / max(1, int(np.count_nonzero(sample.block >= 0)))
     if seconds < LEAST_S or not all(h.scored for h in halves):
-        return no_budget(f"{seconds:.0f} s of scored driving are too little, {LEAST_S:.0f} s are needed")
+        return no_budget(_too_short(seconds))
     causes = tuple(_cause(name, parameters, halves, seconds) for name, parameters in _CAUSES.items())
     return ErrorBudget("", seconds, _rms(np.concatenate([h.error for h in halves])), causes)
 

@@ -8,6 +8,9 @@ the journal and the files of figures, ``metrics/run=…/car=…/part-….parquet
 from __future__ import annotations
 
 import itertools
+import math
+import os
+import platform
 import re
 import time
 from collections import Counter
@@ -15,9 +18,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.logs.discovery import (
     RUN_FILE,
     LogInput,
@@ -30,12 +35,15 @@ from pdhef_logtool.logs.discovery import (
 )
 from pdhef_logtool.mapping import Mapping, load_mapping
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
+from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.records.processes import own_name
+from pdhef_logtool.records.ray_supervisor import supervise_on_ray
 from pdhef_logtool.records.supervisor import Ended, Limits, Tell, supervise
 from pdhef_logtool.results.opened_run import (
     LOGS,
     METRICS_FILE,
+    PAGE_FILE,
     PARTS,
     REPORT_FILE,
     OpenedLog,
@@ -72,12 +80,14 @@ SILENCE_S = 600.0
 #: What each choice keeps includes what those before it keep.
 _KEPT = ("metrics", "estimates", "full")
 #: What the workers have loaded; polars starts threads at its first query, and none of these makes one.
-_PRELOAD = ("pdhef_logtool.runs.fleet", "pdhef_logtool.runs.guard")
+_PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.sinks.parquet", *FILTERS)
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
 _NO_SETTING = frozenset({"keep", "annotate", "cache", "window_s", "car", "cars", "network", "intervals"})
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"
+#: Begins the name of a file by which nodes know the output's folder.
+_MARK = ".nodes-"
 _NOT_IN_FOLDERS = re.compile(r"[^\w.-]+")
 
 
@@ -108,9 +118,8 @@ class DriveEnd:
 
     Attributes
     ----------
-    identity : what its log is known by. car : :func:`~.cars.car_record`. part : as in the journal.
+    identity : what its log is known by. car : :func:`~.cars.car_record`. part, error_rad : as in the journal.
     warned : lines for people. again : whether a failure may be none the next time.
-    error : that failure itself, where nobody else has a log to tell of.
     """
 
     outcome: LogOutcome
@@ -118,6 +127,7 @@ class DriveEnd:
     car: dict[str, Any] | None = None
     part: str | None = None
     failed_checks: int = 0
+    error_rad: float | None = None
     warned: tuple[str, ...] = ()
     again: bool = False
 
@@ -131,6 +141,7 @@ def run_logs(
     config: RunConfig,
     *,
     jobs: int = 1,
+    ray: str | None = None,
     resume: bool = False,
     retry: bool = False,
     only: Sequence[str] = (),
@@ -151,6 +162,8 @@ def run_logs(
     ----------
     arguments : logs, folders, glob patterns.
     jobs : processes at work; changes no number.
+    ray : address of a Ray cluster that does the work instead, one drive a processor at a time; ``output``, the logs
+        and what the configuration names lie where every node sees them under the same path.
     resume : what the folder's journal has of these logs and settings stays; ``retry`` : but for logs that failed.
     only : labels of logs that are run now, everything of them kept; the rest of the run in the folder stays.
     limits : of one log; None: none for a few logs and one job, else :data:`SILENCE_S`.
@@ -175,8 +188,8 @@ def run_logs(
     resume = resume or retry or bool(only)
     many = len(inputs) > FEW_LOGS
     if limits is None:
-        limits = Limits(SILENCE_S) if jobs > 1 or many else Limits()
-    if len(inputs) == 1 and jobs == 1 and limits == Limits() and not resume and work is None:
+        limits = Limits(SILENCE_S) if jobs > 1 or many or ray else Limits()
+    if len(inputs) == 1 and jobs == 1 and not ray and limits == Limits() and not resume and work is None:
         check_places(inputs, output, config, mapping, junit, cars.paths)
         return _run_alone(inputs[0], output, config, cars, mapping, thresholds, junit, report, progress, warn)
     if full_worst is None:
@@ -194,7 +207,7 @@ def run_logs(
     told = _setting(config, pools)
     fleet = _Fleet(
         output, config, cars, journal, planned, told, digest_of(told), thresholds, pools,
-        jobs, limits, report, work or run_drive, progress, warn, say,
+        jobs, ray, limits, report, work or run_drive, progress, warn, say,
     )  # fmt: skip
     if only:
         fleet.check_only(only)
@@ -208,15 +221,17 @@ def run_logs(
         try:
             fleet.run(*((only, "full") if only else (None, config.kept)), retry=retry or bool(only))
             if full_worst and not only:
-                fleet.collect()
                 fleet.run(fleet.worst(full_worst), "full")
         except BaseException as stop:
+            if fleet.done:
+                stop.add_note("--resume goes on")
             stop.add_note(f"{fleet.done} of {len(planned)} logs are done")
             with suppress(PdhefError):
                 fleet.collect()
             raise
-        if fleet.lost:
+        if fleet.lost or ray:  # a node that was lost has been made good and is not told of
             outputs.sweep()
+            _sweep_parts(output, {e.part for e in journal.entries.values()})
         results = fleet.collect()
         write_verdicts(junit, results)
         fleet.write_pages()
@@ -245,6 +260,20 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
         return DriveEnd(outcome, _identity(task.log), warned=tuple(warned), again=again)
 
 
+def _on_node(work: Work, here: Path, mark: Path, task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
+    """Do a drive's work on a node of a cluster, in the folder that the run was begun in if the node has it."""
+    if not mark.is_file():
+        return OutputError(
+            expected="a folder that all nodes of the cluster see under this path",
+            got=f"another one, or none, on {platform.node()}",
+            where=str(mark.parent),
+            remedy="choose one on a shared file system with -o",
+        )
+    with suppress(OSError):
+        os.chdir(here)
+    return work(task, tell)
+
+
 def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
     from pdhef_logtool.sinks.parquet import write_metrics
 
@@ -268,8 +297,16 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         {"digest": digest_of(record["parts"]), **record},
         part,
         result.failed_checks,
+        _error_of(result),
         tuple(warned),
     )
+
+
+def _error_of(result: LogResult) -> float | None:
+    """Return the RMSE of the answer's sideslip in rad, None where it is not scored against an independent truth."""
+    wanted = (result.outcome.main, "sideslip_rad", "all", "rmse")
+    rows = (r for r in result.rows if (r.estimator, r.signal, r.segment, r.metric) == wanted)
+    return next((r.value for r in rows if r.independent and math.isfinite(r.value)), None)
 
 
 def _page_of(output: Path, outcome: LogOutcome) -> list[str]:
@@ -457,6 +494,7 @@ class _Fleet:
     thresholds: tuple[Threshold, ...] | None
     pools: dict[str, SelfCalibration | None]
     jobs: int
+    ray: str | None
     limits: Limits
     report: bool
     work: Work
@@ -499,12 +537,12 @@ class _Fleet:
         todo = [p for p in chosen if reasons[p.log.stem] is not None]
         if names is None and self.journal.entries:
             self._tell_of(chosen, [r for r in reasons.values() if r], retry)
-        self._quiet = len(todo) > FEW_LOGS
+        if not todo:
+            return
+        self._quiet = len(self.planned) > FEW_LOGS
         told = _Told(self.progress, len(todo))
         tasks = (self._task(p, keep) for p in todo)
-        for ended in supervise(
-            self.work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=told.hear
-        ):
+        for ended in self._supervised(tasks, told.hear):
             one = todo[ended.number]
             end = self._end(ended)
             if end.outcome.failed is not None and len(self.planned) > 1:
@@ -514,6 +552,25 @@ class _Fleet:
                 self._warn(line)
             self._note(one, end, keep, quarantined=ended.failure is not None and ended.failure.tries > 1)
             told.end(ended.number)
+
+    def _supervised(
+        self, tasks: Iterator[DriveTask], hear: Callable[[int, str, float], None]
+    ) -> Iterator[Ended[DriveTask, DriveEnd]]:
+        """Yield how the tasks end, here or on a cluster."""
+        if self.ray is None:
+            yield from supervise(self.work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear)
+            return
+        here, mark = Path.cwd(), self.output.resolve() / f"{_MARK}{self._run}"
+        work = partial(_on_node, self.work, here, mark)
+        with writing(mark):
+            mark.touch()
+        try:
+            for ended in supervise_on_ray(work, tasks, address=self.ray, limits=self.limits, preload=_PRELOAD):
+                if isinstance(ended.result, OutputError):
+                    raise ended.result
+                yield Ended(ended.number, ended.item, ended.result, ended.failure)
+        finally:
+            mark.unlink(missing_ok=True)
 
     def _task(self, one: _Planned, keep: Keep) -> DriveTask:
         full = keep == "full"
@@ -541,9 +598,10 @@ class _Fleet:
             self.journal.add_car(car, end.car)
             self._cars_now()[car] = end.car
         before = self.journal.entries.get(one.log.stem)
+        failed = end.outcome.failed is not None and end.part is None
         entry = Entry(
             one.log.stem, one.place, end.identity or one.identity, self.setting, car, keep, end.part,
-            end.failed_checks, end.outcome.failed is not None and end.part is None, end.again, quarantined,
+            end.failed_checks, end.error_rad, failed, end.again, quarantined,
         )  # fmt: skip
         self.journal.add(entry, end.outcome)
         if before is not None and before.part not in (None, end.part):
@@ -636,6 +694,8 @@ class _Fleet:
         network = None if only is None else {"name": only[0], "sha256": only[1]}
         run = build_run(tool_versions(), self.config.to_dict(), network, [r.outcome for r in results], remaining)
         write_json(self.output / RUN_FILE, run)
+        if remaining:
+            (self.output / PAGE_FILE).unlink(missing_ok=True)  # it is of other drives
         return results
 
     def _result(self, entry: Entry, folder: str) -> LogResult:
@@ -648,12 +708,8 @@ class _Fleet:
 
     def worst(self, count: int) -> list[str]:
         """Return the labels of the scored drives whose answers have the largest errors of sideslip."""
-        import polars as pl
-
-        from pdhef_logtool.results.summary import sideslip_errors
-
-        errors = sideslip_errors(open_run(self.output)).filter(pl.col("estimator") == pl.col("main"))
-        return errors.sort("value", "log", descending=[True, False])["log"].head(count).to_list()
+        entries = [e for p in self.planned if (e := self._entry(p)) is not None and e.error_rad is not None]
+        return [e.label for e in sorted(entries, key=lambda e: (-(e.error_rad or 0.0), e.label))[:count]]
 
     def write_pages(self) -> None:
         """Write the page of the run, and those of drives that no worker has written; or remove what there is."""

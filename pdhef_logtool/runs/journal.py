@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.files import open_new, write_bytes, writing
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
@@ -42,9 +43,9 @@ class Place:
     @classmethod
     def of(cls, log: LogInput) -> Place:
         """Return the place of a log; of one that is not there no bytes."""
-        if log.local is None:
-            return cls(_key(str(log.path), log.span_s), _ELSEWHERE, 0)
-        path = Path(os.path.realpath(log.local))
+        if isinstance(log.path, RemotePlace):
+            return cls(_key(log.path.identity, log.span_s), _ELSEWHERE, 0)
+        path = Path(os.path.realpath(log.path))
         found = []
         with suppress(OSError):
             files = [p for p in path.rglob("*") if p.is_file()] if path.is_dir() else [path]
@@ -74,6 +75,7 @@ class Entry:
     identity : what the log is known by, None where nobody could read it. setting, car : digests of what it was run
         with; car None where it has none. keep : what was written.
     part : the file of its figures below the run's folder, None without. failed_checks : those that count.
+    error_rad : RMSE of the answer's sideslip, None where it is not scored against an independent truth.
     failed : whether nothing came out. again : whether that may be otherwise next time, as on a full disk.
     quarantined : whether it took its worker along.
     at : bytes into the journal.
@@ -87,6 +89,7 @@ class Entry:
     keep: str
     part: str | None = None
     failed_checks: int = 0
+    error_rad: float | None = None
     failed: bool = False
     again: bool = False
     quarantined: bool = False

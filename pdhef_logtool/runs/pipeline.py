@@ -165,7 +165,7 @@ class RunResult:
         return tuple(v for r in self.results for v in r.verdicts or ())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the result as one JSON-able document."""
+        """Return the result as one JSON-able document; of many logs without their reports."""
         return {
             "output": None if self.output is None else str(self.output),
             "exit_code": self.exit_code,
@@ -174,7 +174,7 @@ class RunResult:
                     "log": r.outcome.log,
                     "outcome": r.outcome.outcome,
                     "output": None if r.output is None else str(r.output),
-                    "report": r.report,
+                    "report": None if self.is_fleet else r.report,
                     **({} if r.verdicts is None else {"verdicts": [v.to_dict() for v in r.verdicts]}),
                 }
                 for r in self.results

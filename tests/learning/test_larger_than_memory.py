@@ -82,6 +82,6 @@ def test_validation_in_parts_is_that_at_once(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.fleet
-def test_twenty_hours_of_driving_are_trained_on_in_a_quarter_of_their_size(tmp_path: Path) -> None:
-    found = measured(tmp_path, 220.0, 64, 1)
+def test_ten_hours_of_driving_are_trained_on_in_a_quarter_of_their_size(tmp_path: Path) -> None:
+    found = measured(tmp_path, 110.0, 64, 1)
     assert found["limit_holds"] and found["ratio"] < 1.3

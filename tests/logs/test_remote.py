@@ -26,7 +26,7 @@ from pdhef_logtool.logs.remote_place import RemotePlace
 from pdhef_logtool.logs.remote_source import RemoteSource, join_ranges, without
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError, UsageError
 from studies.counting_server import CountingServer, cutting, serving, slow, stalling, status, trickling
-from studies.remote import write_apart
+from studies.remote import with_camera, write_apart
 
 pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 
@@ -200,6 +200,24 @@ def test_topics_apart_cost_three_requests_and_the_wanted_chunks(tmp_path: Path) 
         assert len(server.requests) <= 3 + chunks
         assert server.twice() == 0
         assert server.bytes_sent < 0.2 * file.stat().st_size + 2 * remote_source.JOINED_GAP_BYTES + (256 << 10)
+
+
+def test_a_drive_apart_from_its_camera_costs_its_chunks_alone(
+    tmp_path: Path, sample_logs_dir: Path, saloon: Car
+) -> None:
+    file = tmp_path / "apart.mcap"
+    write_apart(file, with_camera(sample_logs_dir / "dlc.mcap", 2_000_000_000))
+    with serving(**{file.name: file.read_bytes()}) as server:
+        hashes = []
+        for place in (_place(server, file.name), file):
+            with read_drive(place, saloon) as drive:
+                assert sum(len(w.signals) for w in drive.windows()) > 900
+                hashes.append((drive.signals_sha256, drive.truth_sha256, drive.losses))
+        sensors = 6
+        assert len(server.requests) <= 3 + sensors
+        assert server.twice() == 0
+        assert server.bytes_sent < 0.6 * file.stat().st_size
+        assert hashes[0] == hashes[1]
 
 
 def _stale_index(data: bytes) -> bytes:
@@ -419,6 +437,9 @@ def test_urls_lists_and_files_together(tmp_path: Path, monkeypatch: pytest.Monke
     assert len({i.stem for i in found}) == 3
     assert [i.stem for i in find_logs(["https://host/a/one.mcap", "https://host/b/one.mcap"])] == ["a__one", "b__one"]
     assert find_logs(["https://host/a/one.mcap?x=1"])[0].stem == "one"
+    asked = [f"https://host/get?id={i}&sig=x" for i in (1, 2)]
+    assert {i.stem for i in find_logs(asked)} == {i.stem for i in find_logs(asked[::-1])}
+    assert len(find_logs([*asked, "https://host/get?id=1&sig=y"])) == 2
     monkeypatch.chdir(tmp_path)
     (tmp_path / "@odd").mkdir()
     (tmp_path / "@odd" / "drive.mcap").write_bytes(dlc.read_bytes())

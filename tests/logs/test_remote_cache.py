@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from counting_server import serving
 
 pytest.importorskip("aiohttp", reason="reads http://: pip install 'pdhef-logtool[http]'")
 
@@ -15,6 +14,7 @@ from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.slim_cache import SlimCache
 from pdhef_logtool.logs.discovery import find_logs
 from pdhef_logtool.logs.remote_source import _forget, _spools
+from studies.counting_server import serving
 
 
 def _read(url: str, cache: SlimCache) -> tuple[object, ...]:

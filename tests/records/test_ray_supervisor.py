@@ -17,33 +17,17 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.ray_supervisor import supervise_on_ray
 from pdhef_logtool.records.supervisor import Failure, Limits
 from tests.records.planted_work import Item, planted
+from tests.records.ray_nodes import START_S, cluster_of_one, grow, processes_of
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
 pytestmark = pytest.mark.fleet
 PRELOAD = ["tests.records.planted_work"]
-NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
-#: What a node may take to start, on a machine that does other things too.
-START_S = 120.0
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    from ray.cluster_utils import Cluster
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        made = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
-        try:
-            yield made
-        finally:
-            made.shutdown()
-
-
-def grown(cluster: Any) -> list[Any]:
-    """Return two more nodes."""
-    nodes = [cluster.add_node(wait=False, **NODE) for _ in range(2)]
-    cluster.wait_for_nodes(timeout=START_S)
-    return nodes
+    with cluster_of_one() as made:
+        yield made
 
 
 def test_faults_end_on_a_node_as_they_do_here(cluster: Any) -> None:
@@ -59,23 +43,13 @@ def test_faults_end_on_a_node_as_they_do_here(cluster: Any) -> None:
     ]
 
 
-def below(pid: int) -> list[int]:
-    """Return a process and all that come from it."""
-    children = Path(f"/proc/{pid}/task/{pid}/children")
-    return [pid, *(p for c in (children.read_text().split() if children.exists() else ()) for p in below(int(c)))]
-
-
-def processes_of(node: Any) -> list[int]:
-    return [p for info in node.all_processes["raylet"] for p in below(info.process.pid)]
-
-
 def test_a_node_that_is_lost_while_its_task_runs_costs_no_item(cluster: Any, tmp_path: Path) -> None:
     """Every item notes where it begins, and waits; the node of one is killed, then the word is given to go on."""
-    nodes = grown(cluster)
+    nodes = grow(cluster)
     lost: list[Path] = []
 
     def kill_one() -> None:
-        ends = time.monotonic() + START_S
+        ends = time.monotonic() + 2 * START_S
         while not lost and time.monotonic() < ends:
             time.sleep(0.05)
             running = {int(p.read_text()): p for p in tmp_path.glob("*.begun") if p.read_text().endswith("\n")}

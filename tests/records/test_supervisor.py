@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -91,6 +92,13 @@ def test_workers_have_one_thread_and_live_as_long_as_the_run() -> None:
     assert set(omp) == {"1"}
     assert {len(c) for c in calls} == {1}, "the fork server called it, once for all"
     assert not called
+
+
+def test_what_workers_took_counts_as_the_commands() -> None:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    outcomes([("burn", "")] * 2, 2, Limits())
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime > 0.35
 
 
 def test_one_job_without_limits_runs_here() -> None:

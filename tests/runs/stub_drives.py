@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import time
 import zlib
 from pathlib import Path
 
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.logs.discovery import identity_of
+from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.supervisor import Tell
 from pdhef_logtool.runs.cars import RunCars, car_record
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, digest_of
@@ -28,4 +31,16 @@ def stub_drive(task: DriveTask, tell: Tell) -> DriveEnd:
     identity = identity_of(log)
     facts = CarFacts(car.file_name, car.vehicle.name, car.physics_sha256, None)
     outcome = LogOutcome(log.stem, Path(str(log.path)).name, identity, car=facts, main="physics")
-    return DriveEnd(outcome, identity, {"digest": digest_of(record["parts"]), **record}, part)
+    return DriveEnd(outcome, identity, {"digest": digest_of(record["parts"]), **record}, part, error_rad=value)
+
+
+def waiting_drive(folder: Path, task: DriveTask, tell: Tell) -> DriveEnd:
+    """Begin to write, wait until a file ``go`` appears in a folder, and only then do the work."""
+    (folder / f"{os.getpid()}.begun").touch()
+    pending = PendingFile(task.output / "logs" / task.log.stem / "report.json")
+    pending.path.write_text("half")
+    while not (folder / "go").exists():
+        tell("waits", 0.5)
+        time.sleep(0.01)
+    pending.discard()
+    return stub_drive(task, tell)

@@ -17,7 +17,7 @@ from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack, make_track
-from pdhef_logtool.runs.drive_sample import BLOCKS, SETTLE_S, sample_drive
+from pdhef_logtool.runs.drive_sample import BLOCKS, SETTLE_S, DriveSample, sample_drive
 from pdhef_logtool.runs.error_budget import ErrorBudget, error_budget
 
 #: Rolls not: the accelerometer of the reference car stands upright.
@@ -115,6 +115,8 @@ def test_what_cannot_be_told_has_a_reason(made: Drive) -> None:
     assert "too little" in error_budget(physics(VEHICLE), short, SLOW).reason
     assert "no physics filter" in error_budget(PassThrough("zero", claims_zero_sideslip=True), short, SLOW).reason
     assert sample_drive(made.signals, truth, np.full(len(made.signals), np.nan)) is None
+    one = DriveSample(short.signals, short.truth, np.where(short.block == 0, 0, -1))  # of a drive of a second
+    assert "too little" in error_budget(physics(VEHICLE), one, SLOW).reason
 
 
 def test_blocks_lie_where_the_weight_is_and_filters_settle_before_each(made: Drive) -> None:

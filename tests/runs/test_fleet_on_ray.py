@@ -1,0 +1,86 @@
+"""``pdhef run --ray``: three nodes here, one of which goes while it works on a drive. Part of ``make fleet``."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.supervisor import Limits
+from pdhef_logtool.results.opened_run import METRICS_FILE, open_run
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import _on_node, run_logs
+from tests.records.ray_nodes import START_S, cluster_of_one, grow, processes_of
+from tests.runs.stub_drives import stub_drive, waiting_drive
+from tests.runs.test_fleet import named_logs
+
+
+def files_of(output: Path) -> dict[str, bytes]:
+    """Return what a run has left, but for its times."""
+    return {
+        p.relative_to(output).as_posix(): p.read_bytes()
+        for p in sorted(output.rglob("*"))
+        if p.is_file() and p.name not in ("run.json", "journal.jsonl")
+    }
+
+
+@pytest.mark.fleet
+def test_a_fleet_on_three_nodes_one_of_which_goes_equals_one_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("ray", reason="Ray is not installed: pip install 'pdhef-logtool[ray]'")
+    named_logs(tmp_path / "logs", *(f"drive_{i}" for i in range(12)))
+    monkeypatch.chdir(tmp_path)
+    go, lost = tmp_path / "go", []
+    with cluster_of_one() as cluster:
+        nodes = grow(cluster)
+
+        def kill_one() -> None:
+            ends = time.monotonic() + 2 * START_S
+            while not lost and time.monotonic() < ends:
+                time.sleep(0.05)
+                for node in nodes:
+                    pids = processes_of(node)
+                    if here := [p for p in pids if (tmp_path / f"{p}.begun").exists()]:
+                        for pid in pids:
+                            os.kill(pid, signal.SIGKILL)
+                        cluster.remove_node(node, allow_graceful=False)
+                        lost.extend(here)
+                        break
+            go.touch()
+
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        work = partial(waiting_drive, tmp_path)
+        # Folders are named as from here: nodes work in the same one.
+        run = partial(run_logs, ["logs"], config=RunConfig(keep="metrics"), report=False)
+        result = run(output=Path("out"), ray=cluster.address, work=work)
+        killer.join()
+    assert lost, "a node went while its drive was worked on"
+    assert result.exit_code == 0
+    assert [log.label for log in open_run(Path("out")).logs] == sorted(f"drive_{i}" for i in range(12))
+    run(output=Path("here"), work=stub_drive)
+    assert files_of(Path("out")) == files_of(Path("here"))
+    assert METRICS_FILE in files_of(Path("out"))
+    again: dict[str, Any] = {"resume": True, "ray": "127.0.0.1:1", "work": work}
+    assert run(output=Path("out"), **again).exit_code == 0, "nothing is left to do: no cluster is asked for"
+
+
+def test_an_output_that_a_node_does_not_see_is_told(tmp_path: Path) -> None:
+    told = _on_node(stub_drive, tmp_path, tmp_path / ".nodes-x", None, lambda *_: None)  # type: ignore[arg-type]
+    assert isinstance(told, OutputError)
+    assert "a folder that all nodes of the cluster see" in str(told)
+
+
+def test_without_ray_or_a_cluster_there_is_one_line(tmp_path: Path) -> None:
+    logs = named_logs(tmp_path / "logs", "a", "b")
+    with pytest.raises(UsageError, match="--ray: expected"):
+        run_logs([str(logs)], tmp_path / "out", RunConfig(), ray="127.0.0.1:1", work=stub_drive, limits=Limits())
+    assert not list((tmp_path / "out").glob(".nodes-*"))
