@@ -16,7 +16,7 @@ from inspect import cleandoc
 
 from benchmarks.measuring import ROOT, Row, machine_facts
 
-NAMES = ("reading", "writing", "copying", "filtering")
+NAMES = ("reading", "writing", "copying", "filtering", "starting")
 DOCUMENT = ROOT / "docs" / "performance.md"
 _HEADINGS = ("work", "figure", "target", "", "against peers")
 _SECTION = "\n## "
