@@ -6,6 +6,7 @@ on a machine that others use too.
 
 from __future__ import annotations
 
+import json
 import os
 import platform
 import subprocess
@@ -20,6 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 #: Generated logs and outputs; ignored by git.
 CACHE = ROOT / "out" / "bench"
 ROUNDS = 3
+_RSS_UNIT = 1 if sys.platform == "darwin" else 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +80,32 @@ def peak_bytes(module: str, *arguments: str) -> int:
     )
     command = [sys.executable, "-c", code, module, *arguments]
     done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True)
-    return int(done.stdout.split()[-1]) * (1 if sys.platform == "darwin" else 1024)
+    return int(done.stdout.split()[-1]) * _RSS_UNIT
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Processor seconds and peak resident memory of a command, and the last line of what it says on stderr."""
+
+    seconds: float
+    peak_bytes: int
+    last_line: str
+
+
+def command_cost(*arguments: str | Path, module: str = "pdhef_logtool") -> Cost:
+    """Return what ``pdhef ARGUMENTS`` costs on one thread; it must end with 0 or, where input was lost, with 3."""
+    code = (
+        "import json, resource, subprocess, sys; done = subprocess.run(sys.argv[1:], capture_output=True, text=True);"
+        "used = resource.getrusage(resource.RUSAGE_CHILDREN); said = done.stderr.splitlines()[-1:];"
+        "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss, *said]))"
+    )
+    command = [sys.executable, "-c", code, sys.executable, "-m", module, *map(str, arguments)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True, env=environment)
+    code_of, seconds, peak, *said = json.loads(done.stdout)
+    if code_of not in (0, 3):
+        raise SystemExit(f"pdhef {' '.join(map(str, arguments))} ended with {code_of}")
+    return Cost(seconds, peak * _RSS_UNIT, said[0] if said else "")
 
 
 def machine_facts() -> dict[str, str]:

@@ -16,15 +16,16 @@ from inspect import cleandoc
 
 from benchmarks.measuring import ROOT, Row, machine_facts
 
-NAMES = ("reading", "writing", "copying", "filtering")
+NAMES = ("hour", "reading", "writing", "copying", "filtering", "fleet_drive")
 DOCUMENT = ROOT / "docs" / "performance.md"
 _HEADINGS = ("work", "figure", "target", "", "against peers")
 _SECTION = "\n## "
 _INTRODUCTION = """# Performance
 
 Written by `python -m benchmarks.performance --write-docs`; `make bench` prints the same tables. Seconds are processor
-seconds (user and system, with those of child processes), the best of several interleaved rounds; a ratio to a peer is
-measured in the same run. A section that is named on the command line is measured anew alone.
+seconds (user and system, with those of child processes), the best of several interleaved rounds unless a section says
+otherwise; a ratio to a peer is measured in the same run. A section that is named on the command line is measured anew
+alone.
 """
 
 

@@ -18,18 +18,20 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pdhef_logtool.car.car import WithoutTruth
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
-from pdhef_logtool.estimators.physics import FilterCarry
-from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, physics_filter
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.intervals import MAX_SIDESLIP_STD_RAD
+
+if TYPE_CHECKING:
+    from pdhef_logtool.estimators.physics import FilterCarry
+    from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 
 #: Names that run on ``physics``: they take the calibrated vehicle where there is one, the others the file as it stands.
 SELF_CALIBRATED = frozenset(
@@ -138,6 +140,8 @@ class SelfCalibrated:
     @cached_property
     def _filters(self) -> tuple[PhysicsFilter, ...]:
         """The physics filter on the vehicle and on those away from it; none where there are none of those."""
+        from pdhef_logtool.estimators.physics_ukf import physics_filter
+
         found = self.calibration
         vehicles = (found.vehicle, *found.varied) if found.varied else ()
         return tuple(replace(physics_filter(v, found.noise), read_with=self.read_with) for v in vehicles)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FORMER_FILTERS
@@ -16,7 +16,9 @@ from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, Compared, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
-from pdhef_logtool.residual_model.service import NetworkService
+
+if TYPE_CHECKING:
+    from pdhef_logtool.residual_model.service import NetworkService
 
 _ESP = frozenset({"steer_rad", "ay_m_s2", "yaw_rate_rad_s", "speed_m_s"})
 
@@ -41,6 +43,8 @@ class Options:
     def service(self, car: Car) -> NetworkService:
         """Return the car's network, ready to run."""
         assert car.network is not None, "the table lets no estimator run without the network that it needs"
+        from pdhef_logtool.residual_model.service import NetworkService
+
         return self.network or NetworkService(car.network)
 
 

@@ -131,15 +131,15 @@ class McapLogWriter:
     Parameters
     ----------
     path : file to write; its folder is made when it is missing.
-    profile : MCAP profile.
+    profile : MCAP profile. level : of zstd.
 
     Raises
     ------
     OutputError : the file cannot be written.
     """
 
-    def __init__(self, path: Path, *, profile: str = "ros2") -> None:
-        self._path = path
+    def __init__(self, path: Path, *, profile: str = "ros2", level: int = _LEVEL) -> None:
+        self._path, self._level = path, level
         self._schemas: dict[int, Schema] = {}
         self._schema_ids: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, Channel] = {}
@@ -369,7 +369,7 @@ class McapLogWriter:
         """Write message records as one chunk; channel, log time and offset [N] of each record in it."""
         import zstandard
 
-        stored = zstandard.ZstdCompressor(level=_LEVEL).compress(records)
+        stored = zstandard.ZstdCompressor(level=self._level).compress(records)
         self._emit_chunk(RawChunk("zstd", stored, len(records), zlib.crc32(records), channel, log_time_ns, offset))
 
     def _emit_chunk(self, chunk: RawChunk) -> None:

@@ -95,7 +95,7 @@ def paired_change(ratios: FloatArray, clusters: Sequence[object] | None = None) 
     order = np.argsort(ratios, kind="stable")
     ascending = ratios[order]
     median = float(_middle(ascending, np.ones((1, n), dtype=np.int32))[0])
-    votes = _sign_p(np.array([np.sum(np.sign(ratios[of_drive == g])) for g in range(groups)]) if clusters else ratios)
+    votes = sign_p(np.array([np.sum(np.sign(ratios[of_drive == g])) for g in range(groups)]) if clusters else ratios)
     if groups < LEAST_CLUSTERS:
         return PairedChange(n, groups, median, nan, nan, nan, nan, nan, votes)
     if ascending[0] == ascending[-1]:  # whatever is drawn
@@ -151,7 +151,7 @@ def _numbered(clusters: Sequence[object]) -> IntArray:
     return np.array([numbers.setdefault(c, len(numbers)) for c in clusters], dtype=np.int64)
 
 
-def _sign_p(votes: FloatArray) -> float:
+def sign_p(votes: FloatArray) -> float:
     """Return the two-sided p-value of the sign test; those without a sign do not vote."""
     up, down = int(np.count_nonzero(votes > 0)), int(np.count_nonzero(votes < 0))
     n = up + down

@@ -13,7 +13,6 @@ from pydantic.dataclasses import dataclass
 from pdhef_logtool.car.car import NO_INTERVALS, SHIPPED_CARS, UNSURE
 from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
-from pdhef_logtool.estimators.table import check_names
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
@@ -152,6 +151,8 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
     for where, entries in ((str(path), raw), ("options", {**raw, **given})):
         config = validated(RunConfig, entries, where, UsageError, expected="the entries of pdhef.toml")
     if config.estimators is not None:
+        from pdhef_logtool.estimators.table import check_names  # inspect takes none, and no compiler
+
         check_names(config.estimators)
     if config.cache is not None and config.annotate == "full":
         raise UsageError(

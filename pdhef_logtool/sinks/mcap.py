@@ -52,6 +52,8 @@ _STATE_FIELDS = (
 )
 #: Places of v_x, v_y and yaw rate among x, y, z and the rotations about x, y, z.
 _PLANAR = np.array([0, 1, 5])
+#: Of zstd: a third of the time of level 6, for 2 % more bytes of estimates.
+_LEVEL = 3
 #: Between two poses of a track that is not shown first.
 _POSE_STEP_NS = 50_000_000
 
@@ -102,7 +104,8 @@ class AnnotatedMcapSink(Sink):
         self._window: dict[str, list[TopicBatch]] = {}
         self._raws: Iterator[RawMessage | RawChunk] = iter(())
         self._next: RawMessage | RawChunk | None = None
-        self._writer = McapLogWriter(path, profile="ros2" if source is None else source_profile(source))
+        profile = "ros2" if source is None else source_profile(source)
+        self._writer = McapLogWriter(path, profile=profile, level=_LEVEL)
         if source is None:
             return
         try:

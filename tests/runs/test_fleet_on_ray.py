@@ -19,7 +19,7 @@ from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import _on_node, run_logs
 from tests.records.ray_nodes import START_S, cluster_of_one, grow, processes_of
 from tests.runs.stub_drives import stub_drive, waiting_drive
-from tests.runs.test_fleet import named_logs
+from tests.runs.test_fleet_runs import named_logs
 
 
 def files_of(output: Path) -> dict[str, bytes]:
