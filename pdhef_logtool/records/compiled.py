@@ -82,12 +82,13 @@ def njit(function: Any = None, *, cache: bool = False, **options: Any) -> Any:
 _kept: list[Any] = []
 
 
-def load_kept() -> None:
-    """Load all machine code that is kept for them; processes that are forked from this one have it then."""
+def load_kept() -> bool:
+    """Load all machine code that is kept for them, for the processes that are forked from this one; tell if any is."""
     for function in _kept:
         codegen = function.targetctx.codegen()
         for signature in function._cache.signatures(codegen):
             function.compile(signature)
+    return any(function.signatures for function in _kept)
 
 
 @functools.cache

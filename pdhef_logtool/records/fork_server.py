@@ -107,8 +107,12 @@ def serve(descriptor: int) -> None:
             os.waitpid(pid, 0)  # so that what they took counts as the command's
 
 
-def _prepare(preload: Sequence[str]) -> str | None:
-    """Import modules, with ``.*`` all of a package; call what stands after a colon; return what went wrong."""
+def _prepare(preload: Sequence[str]) -> tuple[str, bool]:
+    """Import modules, with ``.*`` all of a package, and call what stands after a colon.
+
+    Returns what went wrong, and whether all is warm: nothing that was called has returned False.
+    """
+    warm = True
     for name in preload:
         module, _, function = name.partition(":")
         try:
@@ -117,12 +121,12 @@ def _prepare(preload: Sequence[str]) -> str | None:
                 for inner in pkgutil.iter_modules(loaded.__path__, f"{loaded.__name__}."):
                     importlib.import_module(inner.name)
             if function:
-                getattr(loaded, function)()
+                warm &= getattr(loaded, function)() is not False
         except Exception as error:  # noqa: BLE001 (told by the parent, whatever it is)
-            return f"{name}: {told_error(error)}"
+            return f"{name}: {told_error(error)}", warm
     gc.collect()
     gc.freeze()  # so that collecting in a worker does not copy what all share
-    return None
+    return "", warm
 
 
 def _fork(control: socket.socket, channel: socket.socket, number: int) -> set[int]:

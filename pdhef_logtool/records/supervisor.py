@@ -202,8 +202,8 @@ class _Server:
         self._hears = True
         self._preload = list(preload)
 
-    def start(self) -> None:
-        """Wait until it has loaded what it is to load.
+    def start(self) -> bool:
+        """Wait until it has loaded what it is to load; return False if workers have something to compile.
 
         Raises
         ------
@@ -211,11 +211,12 @@ class _Server:
         """
         try:
             send(self._control, self._preload)
-            problem = receive(self._control)
+            problem, warm = receive(self._control)
         except (EOFError, OSError):
-            problem = f"the fork server ended with exit code {self._process.wait()}"
+            problem, warm = f"the fork server ended with exit code {self._process.wait()}", False
         if problem:
             raise RuntimeError(problem)
+        return bool(warm)
 
     def fork(self, number: int, channel: socket.socket) -> bool:
         """Begin a worker on its channel; False if the server is dead."""
@@ -262,6 +263,7 @@ class Crew(Generic[T, R]):
         self._server: _Server | None = None
         self._workers: list[_Worker[T]] = []
         self._started = 0
+        self._warm = True
         self._selector = selectors.DefaultSelector()
 
     def __enter__(self) -> Self:
@@ -319,7 +321,8 @@ class Crew(Generic[T, R]):
         since = time.monotonic()
         coming: _Attempt[T] | None = None
         while True:
-            while self._busy() < jobs:
+            # What the first item has compiled, the others find.
+            while self._busy() < (jobs if self._warm else 1):
                 coming = coming or next(attempts, None)
                 if coming is None or self._is_taken(coming):
                     break
@@ -362,7 +365,7 @@ class Crew(Generic[T, R]):
                 if self._server is not None:
                     self._server.end()
                 self._server = _Server(self._preload)
-                self._server.start()
+                self._warm = self._server.start()
                 self._server.fork(self._started, theirs)
         ours.settimeout(_SEND_S)
         worker = _Worker(ours, self._server, attempt, attempt.place)
@@ -409,7 +412,7 @@ class Crew(Generic[T, R]):
                 yield from self._lose(worker, self._too_big())
                 return
             else:
-                worker.attempt = None
+                worker.attempt, self._warm = None, True
                 yield attempt, _opened(attempt, said[0]) if kind == "done" else _failed(attempt, said[0])
 
     def _watch(self) -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
@@ -427,7 +430,7 @@ class Crew(Generic[T, R]):
 
     def _lose(self, worker: _Worker[T], reason: str = "") -> Iterator[tuple[_Attempt[T], Ended[T, R] | None]]:
         """End a worker; its item, if it has one, is lost for a reason, or for how the process ended."""
-        attempt = worker.attempt
+        attempt, self._warm = worker.attempt, True
         how = self._end(worker)
         if attempt is not None:
             yield attempt, _failed(attempt, reason or how) if attempt.tries >= _TRIES else None

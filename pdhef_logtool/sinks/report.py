@@ -35,9 +35,8 @@ if TYPE_CHECKING:
 
 #: Columns of a figure in the report.
 _METRIC_COLUMNS = ("log", "estimator", "signal", "segment", "metric", "value", "unit", "n")
-#: Metrics of whole drives that tables show, and entries that a brief report keeps of a list.
-_SHOWN_METRICS = frozenset({"rmse", "coverage95", "nis", "nis_dof", "d2"})
-_MOST_LISTED = 20
+#: Entries that a brief report keeps of a list.
+_MOST_LISTED = 5
 #: Distributions whose version decides what a run computes or writes.
 VERSIONED = ("pdhef-logtool", "mcap", "numba", "numpy", "polars", "pyarrow", "rerun-sdk", "rosbags", "scipy", "torch")
 
@@ -315,12 +314,14 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     answer = report["answer"]
     told = {answer["main"], answer["naive"], PHYSICS} if answer else set()
     first = {key: report[key][:_MOST_LISTED] for key in ("losses", "warnings", "remarks")}
+    if space := report.get("operating_space"):
+        first["operating_space"] = {**space, "cells": [*map(_rounded, space["cells"])]}
     return {
         **{key: value for key, value in report.items() if key not in ("innovations", "error_budget")},
         **first,
         "log": {**report["log"], "topics": [t for t in report["log"]["topics"] if t["mapped"]]},
         "estimators": [_brief_estimator(e, told) for e in report["estimators"]],
-        "metrics": [m for m in report["metrics"] if m["estimator"] in told and _is_shown(m)],
+        "metrics": [m for m in report["metrics"] if m["estimator"] in told and _is_shown(m, answer["main"])],
         "segments": [s for s in report["segments"] if s["name"] in {f"{n} diverged" for n in told}][:_MOST_LISTED],
         "ledger": {"bytes": report["ledger"]["bytes"][:_MOST_LISTED], "samples": _with_drops(report)},
         "checks": [c for c in report["checks"] if c["verdict"] != "passed"],
@@ -334,10 +335,17 @@ def _brief_estimator(estimator: Mapping[str, Any], told: Container[str | None]) 
     return {**estimator, "algorithm": digest, "notes": kept, "reasons": estimator["reasons"] if own else None}
 
 
-def _is_shown(metric: Mapping[str, Any]) -> bool:
-    whole = metric["segment"] == "all"
-    judged = metric["signal"] == "sideslip_rad" and metric["segment"] in ("linear", "nonlinear")
-    return (whole and metric["metric"] in _SHOWN_METRICS) or (judged and metric["metric"] == "rmse")
+def _is_shown(metric: Mapping[str, Any], main: str) -> bool:
+    """Whether a brief report keeps a figure: errors of sideslip, of the answer in other signals too; d2 and NIS."""
+    signal, name = metric["signal"], metric["metric"]
+    if metric["segment"] != "all":
+        return signal == "sideslip_rad" and name == "rmse" and metric["segment"] in ("linear", "nonlinear")
+    own = name == "rmse" and (signal == "sideslip_rad" or metric["estimator"] == main)
+    return own or (name == "coverage95" and signal == "sideslip_rad") or name in ("nis", "nis_dof", "d2")
+
+
+def _rounded(cell: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in cell.items()}
 
 
 def _with_drops(report: Mapping[str, Any]) -> list[Any]:

@@ -35,6 +35,11 @@ def planted_drive(task: DriveTask, tell: Tell, work: Callable[[DriveTask, Tell],
     return work(task, tell)
 
 
+def planted_stub(task: DriveTask, tell: Tell) -> DriveEnd:
+    """Do the same with a stub's work."""
+    return planted_drive(task, tell, stub_drive)
+
+
 def rss_bytes() -> int:
     """Return the memory that this process has now."""
     return int(Path("/proc/self/statm").read_bytes().split()[1]) * os.sysconf("SC_PAGE_SIZE")

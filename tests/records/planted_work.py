@@ -22,6 +22,11 @@ def note_call() -> None:
     called.append(os.getpid())
 
 
+def cold() -> bool:
+    """Tell the fork server that there is no compiled code yet."""
+    return False
+
+
 class Odd:
     """A result that does not travel."""
 

@@ -188,13 +188,14 @@ def test_kept_code_is_loaded_before_it_is_called(
     monkeypatch.setattr(compiled, "_announced", [])
     monkeypatch.setattr(compiled, "_kept", [])
     again = _load(module_file)
-    compiled.load_kept()
+    assert compiled.load_kept()
     assert set(again.more.signatures) == set(first.more.signatures)
     assert capsys.readouterr().err == ""
     for file in _code_files(module_file.parent):
         file.write_bytes(b"cut")
     cut = _load(module_file)
-    compiled.load_kept()
+    monkeypatch.setattr(compiled, "_kept", [cut.more])
+    assert not compiled.load_kept()
     assert cut.more.signatures == []
 
 

@@ -144,6 +144,18 @@ def test_items_of_a_place_go_to_its_worker_as_long_as_it_lives() -> None:
         assert [len(e.result[1]) for e in ended] == [1, 5, 5]  # type: ignore[index]
 
 
+def test_the_first_item_compiles_alone() -> None:
+    items = [("slowly", "a"), ("well", "b"), ("well", "c")]
+    told: list[int] = []
+    found = supervise(
+        planted, items, jobs=3, preload=["tests.records.planted_work:cold"], progress=lambda n, *_: told.append(n)
+    )
+    first = next(found)
+    assert first.number == 0
+    assert set(told) == {0}
+    assert {e.number for e in found} == {1, 2}
+
+
 def test_what_cannot_be_loaded_is_told_at_once() -> None:
     with pytest.raises(RuntimeError, match="no_such_module: ModuleNotFoundError"):
         list(supervise(planted, [("well", "")], jobs=2, preload=["no_such_module"]))

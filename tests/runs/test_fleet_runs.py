@@ -20,7 +20,7 @@ from pdhef_logtool.results.summary import summarise
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
 from pdhef_logtool.sinks.report import LogOutcome
-from tests.fleet_soak.planted import planted_drive
+from tests.fleet_soak.planted import planted_stub
 from tests.runs.stub_drives import stub_drive
 
 
@@ -141,15 +141,19 @@ def test_more_is_kept_when_it_is_asked_for_and_never_less(tmp_path: Path) -> Non
         run(logs, out, RunConfig(keep="metrics", friction=0.4), only=["a"])
 
 
-def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(tmp_path: Path) -> None:
-    logs = named_logs(tmp_path / "logs", *(f"drive{i:02d}" for i in range(51)))
+def test_many_logs_keep_metrics_and_the_worst_in_full_and_say_so_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("fleet", "pipeline"):
+        monkeypatch.setattr(f"pdhef_logtool.runs.{module}.FEW_LOGS", 7)
+    logs = named_logs(tmp_path / "logs", *(f"drive{i:02d}" for i in range(8)))
     work, said = Counted(), list[str]()
     result = run(logs, tmp_path / "out", work=work, say=said.append, full_worst=2)
     assert result.is_fleet
-    assert said[0].startswith("51 logs: figures and a short report of each are kept, no tracks")
+    assert said[0].startswith("8 logs: figures and a short report of each are kept, no tracks")
     errors = pl.read_parquet(tmp_path / "out/metrics.parquet").filter(pl.col("metric") == "rmse")
     worst = errors.sort("value", "log", descending=[True, False])["log"][:2].to_list()
-    assert work.asked[51:] == sorted(worst)
+    assert work.asked[8:] == sorted(worst)
     entries = [json.loads(line) for line in (tmp_path / "out" / JOURNAL_FILE).read_text().splitlines()]
     assert [e["keep"] for e in entries if e.get("label") in worst] == ["metrics"] * 2 + ["full"] * 2
     again = Counted()
@@ -206,21 +210,17 @@ def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: 
 @pytest.mark.slow
 def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(tmp_path: Path) -> None:
     logs, out = named_logs(tmp_path / "logs", "a", "hangs", "b", "kills"), tmp_path / "out"
-    result = run(logs, out, work=planted_stub, jobs=2, limits=Limits(3.0))
+    result = run(logs, out, work=planted_stub, jobs=2, limits=Limits(2.0))
     assert result.exit_code == 3
     outcomes = {r.outcome.log: r.outcome.outcome for r in result.results}
     assert outcomes["a"] == outcomes["b"] == "ok"
-    assert outcomes["hangs"] == "failed: nothing heard for 3 s, 2 tries; last heard: before it hangs"
+    assert outcomes["hangs"] == "failed: nothing heard for 2 s, 2 tries; last heard: before it hangs"
     assert outcomes["kills"].startswith("failed: the worker was killed (signal 9), 2 tries")
     work = Counted()
     assert run(logs, out, work=work, resume=True).exit_code == 3
     assert work.asked == []
     assert run(logs, out, work=work, retry=True).exit_code == 0
     assert work.asked == ["hangs", "kills"]
-
-
-def planted_stub(task: DriveTask, tell: Tell) -> DriveEnd:
-    return planted_drive(task, tell, stub_drive)
 
 
 @pytest.mark.slow
