@@ -15,8 +15,7 @@ RUN pip install ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} /tmp/dist/*.whl
 
 # Compiles the filters, once, into the installation. On a processor of another kind they are compiled anew at first use,
 # into the cache of whoever runs them.
-RUN --mount=type=bind,source=sample_logs,target=/sample_logs \
-    pdhef run /sample_logs/dlc.mcap --car saloon --estimators all --annotate none -o /tmp/out && rm -r /tmp/out
+RUN pdhef compile
 
 # Nobody in particular: --user makes outputs belong to whoever runs it, who then has no home of his own here.
 RUN useradd --create-home --uid 1000 pdhef && mkdir -m 1777 /work

@@ -65,6 +65,7 @@ demo: $(VENV)/installed $(VENV)/compiled
 # of our sources all of it goes.
 $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/*/*.py pdhef_logtool/*/*/*.py truthsim/*.py)
 	@find pdhef_logtool truthsim -name '*.nb[ic]' -delete
+	$(BIN)/pdhef compile
 	@touch $@
 
 test: $(VENV)/installed-dev $(VENV)/compiled

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from pdhef_logtool.cli import comparing, inspecting, learning, reporting, running, simulating, stopping
+from pdhef_logtool.cli import comparing, compiling, inspecting, learning, reporting, running, simulating, stopping
 from pdhef_logtool.cli.console import say
 from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, PdhefError
 from pdhef_logtool.records.files import OF_WRITING, cannot_write
@@ -36,7 +36,7 @@ app = typer.Typer(
     "4 a threshold or regression gate failed, 130 interrupted (Ctrl-C), 141 nobody read the output to its end, "
     "143 terminated.",
 )
-for _group in (inspecting, running, reporting, comparing, simulating, learning):
+for _group in (inspecting, running, reporting, comparing, simulating, learning, compiling):
     app.registered_commands += _group.commands.registered_commands
 
 

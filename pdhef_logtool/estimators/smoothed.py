@@ -27,7 +27,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -135,6 +135,10 @@ def _smooth(forward, links, span, smoothed):  # type: ignore[no-untyped-def]
             out_P[k] = Ps
 
 
+#: Smoothed states [K, n] and covariances [K, n, n].
+Smoothed: TypeAlias = tuple[FloatArray, FloatArray]
+
+
 def spans(steps: PosteriorSteps, count: int, origin_ns: int, block_ns: int) -> Iterator[tuple[int, int, int]]:
     """Yield of each block that begins in the first ``count`` steps its first and last step there, and the last it sees.
 
@@ -150,11 +154,33 @@ def smooth_steps(
     steps: PosteriorSteps, links: StepLinks, count: int, origin_ns: int, block_ns: int
 ) -> tuple[FloatArray, FloatArray]:
     """Return smoothed states [count, n] and covariances [count, n, n] of the first ``count`` steps (see `spans`)."""
-    n = steps.x.shape[1]
-    x, P = np.empty((count, n)), np.empty((count, n, n))
+    x, P = smooth_blocks(steps, links, count, origin_ns, block_ns)
+    return x[:count], P[:count]
+
+
+# positional: those of `smooth_steps`, and what is known already.
+def smooth_blocks(
+    steps: PosteriorSteps,
+    links: StepLinks,
+    count: int,
+    origin_ns: int,
+    block_ns: int,
+    known: Smoothed | None = None,
+) -> Smoothed:
+    """Return what `smooth_steps` does of all steps of the blocks that the first ``count`` steps lie in, [M ≥ count].
+
+    ``known`` [D] is what this has returned of the first steps before, up to the end of a block: it is not done again.
+    """
+    n, done = steps.x.shape[1], 0 if known is None else len(known[0])
+    block = (steps.stamps_ns - origin_ns) // block_ns
+    end = max(done, int(np.searchsorted(block, block[count - 1], side="right")) if count else 0)
+    x, P = np.empty((end, n)), np.empty((end, n, n))
+    if known is not None:
+        x[:done], P[:done] = known
     forward, tied = (steps.x, steps.P, steps.prior), (links.kind, links.predicted_P, links.cross)
-    for span in spans(steps, count, origin_ns, block_ns):
-        _smooth(forward, tied, span, (x, P))
+    for first, last, seen in spans(steps, end, origin_ns, block_ns):
+        if first >= done:
+            _smooth(forward, tied, (first, last, seen), (x, P))
     return x, P
 
 
@@ -199,7 +225,8 @@ class SharedSteps(StepColumns):
 class SmoothedCarry:
     """State of the inputs, the forward filters [H] and their evidence behind all steps that are taken; those ahead.
 
-    ``inputs`` is None where all inputs are known beforehand. ``origin_ns`` is where the blocks begin.
+    ``inputs`` is None where all inputs are known beforehand. ``origin_ns`` is where the blocks begin; ``smoothed`` what
+    is done already of the steps ahead, by filter.
     """
 
     inputs: InputCarry | None
@@ -208,6 +235,7 @@ class SmoothedCarry:
     ahead: tuple[ForwardSteps, ...]
     shared: SharedSteps
     origin_ns: int | None
+    smoothed: tuple[Smoothed, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,10 +298,12 @@ class SmoothedPhysics:
             origin_ns = carry.origin_ns if carry else None
             if origin_ns is None and len(given):
                 origin_ns = int(given.stamps_ns[0])
-            parts.append(self._smoothed(given.rows(first, end), steps, shared, forward, origin_ns or 0))
+            done = None if carry is None else carry.smoothed
+            part, done = self._smoothed(given.rows(first, end), steps, shared, forward, origin_ns or 0, done)
+            parts.append(part)
             passed = end - first
             ahead_of = tuple(one.since(passed) for one in steps)
-            carry = SmoothedCarry(inputs, forward, evidence, ahead_of, shared.since(passed), origin_ns)
+            carry = SmoothedCarry(inputs, forward, evidence, ahead_of, shared.since(passed), origin_ns, done)
         assert carry is not None
         return concatenate(parts), carry
 
@@ -300,14 +330,21 @@ class SmoothedPhysics:
         shared: SharedSteps,
         after: Sequence[FilterCarry],
         origin_ns: int,
-    ) -> StateTrack:
-        """Smooth the steps of ``signals``, which are the first of ``steps``, with all of them."""
+        done: tuple[Smoothed, ...] | None,
+    ) -> tuple[StateTrack, tuple[Smoothed, ...]]:
+        """Smooth the steps of ``signals``, which are the first of ``steps``, with all of them.
+
+        ``done`` by filter are the first of them that are smoothed already; beside the track it returns those that are
+        smoothed now of the steps that follow.
+        """
         count, block_ns = len(signals), round(self.block_s * 1e9)
         physics = self.filtered.physics
-        tracks, valid = [], []
-        for one, forward, carry in zip(self.filtered.filters, steps, after, strict=True):
-            x, P = smooth_steps(forward.posterior, forward.links, count, origin_ns, block_ns)
-            here = replace(forward.posterior.until(count), x=x, P=P, ready_ns=signals.stamps_ns)
+        tracks, valid, following = [], [], []
+        for i, (one, forward, carry) in enumerate(zip(self.filtered.filters, steps, after, strict=True)):
+            before = None if done is None else done[i]
+            x, P = smooth_blocks(forward.posterior, forward.links, count, origin_ns, block_ns, before)
+            following.append((x[count:].copy(), P[count:].copy()))
+            here = replace(forward.posterior.until(count), x=x[:count], P=P[:count], ready_ns=signals.stamps_ns)
             # Known at its own stamp, a step is not predicted: what comes back is the step itself.
             track, _ = one.outputs(signals, None, here, carry)
             tracks.append(track)
@@ -319,7 +356,7 @@ class SmoothedPhysics:
             weights = weigh(evidence, np.stack(valid, axis=1))
             track = mix(weights, tracks)
             told["mixture_weight"] = np.where(track.valid, 1.0 - weights[:, 0], np.nan)
-        return replace(
+        whole = replace(
             track,
             name=self.name,
             network_trust=np.where(track.valid, self.filtered.trust, np.nan),
@@ -329,6 +366,7 @@ class SmoothedPhysics:
             reason=shared.reason[:count],
             **told,
         )
+        return whole, tuple(following)
 
     def _two_sided(
         self, steps: Sequence[PosteriorSteps], evidence: FloatArray, count: int, origin_ns: int
