@@ -162,7 +162,7 @@ release: wheel
 	rm -rf build/fresh
 	$(PYTHON) -m venv build/fresh
 	build/fresh/bin/python -m pip install --quiet dist/*.whl
-	cd build/fresh && bin/pdhef --version && bin/pdhef --help >/dev/null
+	cd build/fresh && bin/pdhef --version && bin/pdhef --help >/dev/null && bin/pdhef compile
 	cd build/fresh && bin/pdhef run ../../sample_logs/dlc.mcap --car saloon --estimators all --annotate none -o out
 
 clean:
