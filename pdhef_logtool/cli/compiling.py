@@ -17,7 +17,7 @@ commands = typer.Typer()
     name="compile",
 )
 def compile_(as_json: options.JsonFlag = False) -> None:
-    """Compile the filters now, once, instead of in the first run: for the end of an installation."""
+    """Compile the filters now, so that no run waits. For installations."""
     import time
     from pathlib import Path
     from tempfile import TemporaryDirectory

@@ -46,7 +46,7 @@ _MOST_VERDICTS = 50
     "waived model calibration",
     car="Your car (default: a sedan)",
 )
-def run(
+def run(  # positional: one an option of the command line
     logs: options.Logs,
     output: Annotated[Path, Option("--output", "-o", help="Folder for everything that the run writes.")],
     config: RunConfig,

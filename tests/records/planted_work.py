@@ -52,7 +52,7 @@ def planted(item: Item, tell: Tell) -> object:
     if what in _FAULTS:
         return _FAULTS[what](value, tell)
     if what == "where":
-        return os.getpid(), called, threading.active_count(), os.environ["OMP_NUM_THREADS"]
+        return os.getpid(), called, threading.active_count(), os.environ.get("OMP_NUM_THREADS")
     return value
 
 

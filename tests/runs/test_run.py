@@ -116,7 +116,9 @@ def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> No
         error = (both["sideslip_rad"] - both["sideslip_rad_truth"]).to_numpy()
         error = error[np.isfinite(error)]
         rmse = float(np.sqrt(np.mean(error**2)))
-        assert _value(metrics, name, "sideslip_rad", "rmse") == pytest.approx(rmse, rel=1e-9)
+        assert _value(metrics, name, "sideslip_rad", "rmse") == pytest.approx(
+            rmse, rel=1e-6
+        )  # the file is in single precision
 
 
 def test_physics_filter_beats_its_trivial_rivals_on_the_lane_change(dlc_run: Path) -> None:

@@ -97,7 +97,7 @@ def test_what_several_estimators_say_stands_once(stuck_run: tuple[RunResult, Pat
     one_of_them, other = report["estimators"]
     one_of_them["reasons"] = other["reasons"]
     out = io.StringIO()
-    render_run(replace(stuck_run[0], results=(replace(one, report=report),)), Console(file=out, width=200))
+    render_run(replace(stuck_run[0], results=(replace(one, document=report),)), Console(file=out, width=200))
     lines = [line.strip() for line in out.getvalue().splitlines()]
     assert sum("gyro stuck" in line for line in lines) == 1
     assert any(line.startswith("phy-ukf, pd-hef: ") for line in lines)
