@@ -336,11 +336,8 @@ class SmoothedPhysics:
         parts = []
         for first in range(0, max(len(signals), 1), STEPS_AT_ONCE):
             end = min(first + STEPS_AT_ONCE, len(signals))
-            seen = len(given)
-            if end < len(signals):
-                horizon_ns = given.stamps_ns[end - 1] + round(self.look_ahead_s * 1e9)
-                seen = int(np.searchsorted(given.stamps_ns, horizon_ns, side="right"))
             taken = first + (0 if carry.shared is None else len(carry.shared))
+            seen = max(taken, self._seen(given.stamps_ns, end, carry.origin_ns))
             if known is None:
                 checked, after = self.filtered.inputs(given.rows(taken, seen), carry.inputs)
                 carry = replace(carry, inputs=after)
@@ -351,6 +348,14 @@ class SmoothedPhysics:
             parts.append(part)
             carry = _without(carry, end - first, done)
         return concatenate(parts), carry
+
+    def _seen(self, stamps_ns: IntArray, end: int, origin_ns: int | None) -> int:
+        """Return how many steps there are up to the end of the block behind that of the last of the first ``end``."""
+        if end == 0 or origin_ns is None:
+            return 0
+        block_ns = round(self.block_s * 1e9)
+        block = (int(stamps_ns[end - 1]) - origin_ns) // block_ns
+        return int(np.searchsorted(stamps_ns, origin_ns + (block + 2) * block_ns))
 
     def _filtered(self, checked: CheckedInputs, carry: SmoothedCarry) -> SmoothedCarry:
         """Run the filters forward over steps that they have not taken yet; they follow those ahead."""
