@@ -144,6 +144,7 @@ def test_items_of_a_place_go_to_its_worker_as_long_as_it_lives() -> None:
         assert [len(e.result[1]) for e in ended] == [1, 5, 5]  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_the_first_item_compiles_alone() -> None:
     items = [("slowly", "a"), ("well", "b"), ("well", "c")]
     told: list[int] = []
@@ -180,6 +181,7 @@ def test_items_are_pulled_as_workers_become_free() -> None:
             assert pulled <= count + 1 + 2
 
 
+@pytest.mark.slow
 def test_a_busy_caller_is_no_silence_of_the_workers() -> None:
     items = [("well", ""), ("slowly", "")]
     for ended in supervise(planted, items, jobs=2, limits=Limits(silence_s=0.6), preload=PRELOAD):

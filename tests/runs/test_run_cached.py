@@ -32,6 +32,7 @@ def _cars(folder: Path, sample_logs_dir: Path) -> Path:
     return folder / "cars.toml"
 
 
+@pytest.mark.slow
 def test_the_figures_are_those_of_the_logs_which_are_read_once(
     sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
