@@ -8,6 +8,10 @@ OUT ?= out/demo
 CAR := saloon
 # Test processes; the suite is bound by the processor.
 JOBS ?= 2
+# What Python has compiled stays: each process would compile all tests and sources again.
+unexport PYTHONDONTWRITEBYTECODE
+# A thread a process: threads that wait for each other are no faster than the processors, and they wait by counting.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 .PHONY: help demo test quick fleet pages mutants check lint format bench train-default samples conditions real switches torture \
   retrain docs docs-truthsim paper strangers wheel release clean
@@ -69,19 +73,19 @@ $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/
 	@touch $@
 
 test: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+	$(PYTEST) -n $(JOBS) --dist loadfile
 
 quick: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m "not slow"
+	$(PYTEST) -n $(JOBS) --dist loadfile -m "not slow"
 
 pages: $(VENV)/installed-dev $(VENV)/compiled
-	$(BIN)/python -m pytest tests/reports tests/results
+	$(PYTEST) tests/reports tests/results
 	OMP_NUM_THREADS=1 $(BIN)/python -m studies.comparing
 	OMP_NUM_THREADS=1 $(BIN)/python tests/reports/screenshots.py
 
 # What takes too long for `make test`, or needs extras: Ray, S3.
 fleet: $(VENV)/installed-dev $(VENV)/compiled
-	PDHEF_FLEET=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m fleet
+	PDHEF_FLEET=1 $(PYTEST) -m fleet
 
 # Faults in the code that the tests should notice; each runs the tests until one fails. Hours for many that survive.
 SEED ?= 1

@@ -100,7 +100,8 @@ def command_cost(*arguments: str | Path, module: str = "pdhef_logtool") -> Cost:
         "print(json.dumps([done.returncode, used.ru_utime + used.ru_stime, used.ru_maxrss, *said]))"
     )
     command = [sys.executable, "-c", code, sys.executable, "-m", module, *map(str, arguments)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    # As where it is installed: its modules are not compiled anew by every command.
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | {"OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, cwd=ROOT, check=True, capture_output=True, text=True, env=environment)
     code_of, seconds, peak, *said = json.loads(done.stdout)
     if code_of not in (0, 3):

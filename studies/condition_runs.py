@@ -19,12 +19,12 @@ import polars as pl
 import pyarrow.parquet as pq
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import digest
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.table import FILTERS, Options, make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.files import PendingFile
 from pdhef_logtool.records.supervisor import Crew, Tell
 from pdhef_logtool.runs.estimating import calibrator

@@ -24,7 +24,7 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 from studies.condition_drives import ConditionDrive, read_drive, root_mean_square, sideslip_error
-from studies.pages import DOCS, fill, options, table, write
+from studies.pages import DOCS, measured, table
 from truthsim.drive import simulate_drive, write_drive
 
 FIRST_SEED = 6100
@@ -141,18 +141,11 @@ def tables(outcomes: Sequence[Outcome]) -> str:
     return "\n\n".join([drives, estimate, told, sideslip])
 
 
-def main() -> None:
-    """Measure, print, and write if asked for."""
-    parser = options("friction", __doc__)
-    parser.add_argument("--write-docs", action="store_true", help=f"put the tables into {DOCUMENT.name}")
-    arguments = parser.parse_args()
+def all_tables() -> str:
+    """Return the tables of the page."""
     with tempfile.TemporaryDirectory() as folder:
-        text = tables(measure_all(Path(folder)))
-    print(text)
-    if arguments.write_docs:
-        page = DOCUMENT.read_text(encoding="utf-8")
-        write(DOCUMENT, fill(page, {"measured": text}, DOCUMENT.name))
+        return tables(measure_all(Path(folder)))
 
 
 if __name__ == "__main__":
-    main()
+    measured("friction", __doc__, DOCUMENT, all_tables)

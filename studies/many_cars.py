@@ -2,8 +2,10 @@
 
 Saloons and SUVs of all loads, heights, tyres and wear, with sensors of all qualities; the hatchback is kept for cars
 that no network ever saw. A car's file is fitted to a ramp steer of it (``error_budget.fit_vehicle``), as somebody who
-has measured his car would have it; ``physics`` of it is identified by the tool on its first drives, and residuals are
-taken from the others: the network is trained as it is served. Drives are split by car.
+has measured his car would have it; ``physics`` of it is identified by the tool on its first drives, with the truth of
+an INS that is mounted a little askew: the network is trained for filters as it will meet them. Residuals are taken from
+the other drives, with perfect truth: from those of the INS the network learnt its noise (the validation loss rose from
+the second epoch on). Drives are split by car.
 """
 
 from __future__ import annotations
@@ -20,10 +22,13 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.flat import flat_toml, load_vehicle, vehicle_toml
 from pdhef_logtool.car.parts import PHYSICS, FittedPhysics, FittedValues, physics_sha256
 from pdhef_logtool.car.vehicle import PhysicsParts, VehicleParameters
-from pdhef_logtool.learning.car.fit_data import FitDrive
+from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.learning.car.fit_data import load_fit_drive
 from pdhef_logtool.learning.car.physics_fit import fit_physics
+from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.mapping.mapping_file import load_mapping
 from pdhef_logtool.records.errors import SimulationError
-from studies.condition_drives import read_drive
+from studies.defaults.train_default import MAPPING as TRAINING_MAPPING
 from studies.error_budget import fit_vehicle
 from truthsim.batch import DriveSpec, Job, run_jobs
 from truthsim.linear_theory import understeer_gradient_rad_per_m_s2
@@ -40,6 +45,8 @@ FIT_DRIVES, FIT_ITERATIONS = 3, 4
 #: With so little driving the parts are not chosen: those that a bare car cannot do without, and none that adapts.
 PARTS = PhysicsParts(lag=True, load_transfer=True, braking=True, roll=True, biases=True)
 DRIVE_S = 12.5
+#: Of a set, beside its drives.
+MAPPING_FILE = "mapping.toml"
 BASE = Path("sample_logs/vehicle.toml")
 KINDS = ("sedan", "suv")
 #: Share of the cars that get the tyres of the other kind.
@@ -61,8 +68,19 @@ SENSOR_FACTORS = {
 }
 DELAY_S = (0.0, 0.040)
 STEER_GAIN = 0.01
-#: Where the IMU may be from where the car's file has it, forward and to the left.
-LEVER_M = 0.15
+#: Free play of the steering at the road wheels: up to 2.5 degrees at a steering wheel of ratio 15.
+STEER_PLAY_RAD = (0.0, 0.003)
+#: Where the IMU may be from where the car's file has it, forward and to the left; the same of the INS, and its heading.
+LEVER_M, TRUTH_LEVER_M, TRUTH_HEADING_RAD = 0.15, 0.1, np.radians(0.3)
+#: What a car is identified with: recognised types, the friction that was driven on, a proving ground's truth.
+MAPPING = TRAINING_MAPPING + "".join(
+    f"""
+[truth.{name}]
+topic = "/rtk/odometry"
+field = "twist.twist.{field}"
+"""
+    for name, field in (("vx_m_s", "linear.x"), ("vy_m_s", "linear.y"), ("yaw_rate_rad_s", "angular.z"))
+)
 #: Less understeer than this no maker sells: 0.5 degrees per g.
 LEAST_UNDERSTEER = np.radians(0.5) / GRAVITY_M_S2
 #: A ramp steer at this friction shows the axles' curves.
@@ -108,7 +126,10 @@ def _sensors(rng: np.random.Generator) -> tuple[tuple[str, float], ...]:
     }
     values["can_delay_s"] = float(rng.uniform(*DELAY_S))
     values["steer_gain"] = STEER_GAIN
-    values |= {name: float(rng.uniform(-LEVER_M, LEVER_M)) for name in ("imu_x_m", "imu_y_m")}
+    values["steer_play_rad"] = float(rng.uniform(*STEER_PLAY_RAD))
+    values["rtk_heading_offset_rad"] = float(rng.uniform(-TRUTH_HEADING_RAD, TRUTH_HEADING_RAD))
+    for reach, names in ((LEVER_M, ("imu_x_m", "imu_y_m")), (TRUTH_LEVER_M, ("rtk_x_m", "rtk_y_m"))):
+        values |= {name: float(rng.uniform(-reach, reach)) for name in names}
     return tuple((name, round(value, 6)) for name, value in sorted(values.items()))
 
 
@@ -157,14 +178,15 @@ def identify_cars(folder: Path) -> list[str]:
     for entry in manifest["drives"]:
         if "sha256" in entry:
             by_car.setdefault(entry["car"], []).append(entry)
-    others = folder / "residuals"
+    others, mapping = folder / "residuals", folder / MAPPING_FILE
     others.mkdir(exist_ok=True)
+    mapping.write_text(MAPPING, encoding="utf-8")
     kept = []
     for index, entries in by_car.items():
         name = f"car_{index:04d}.toml"
         if not (others / name).is_file():
-            own = folder / entries[0]["vehicle_file"]
-            (others / name).write_text(identified(own, [folder / e["file"] for e in entries[:FIT_DRIVES]]), "utf-8")
+            own, logs = folder / entries[0]["vehicle_file"], [folder / e["file"] for e in entries[:FIT_DRIVES]]
+            (others / name).write_text(identified(own, logs, mapping), encoding="utf-8")
         for entry in entries[FIT_DRIVES:]:
             link = others / entry["file"]
             if not link.exists():
@@ -174,14 +196,11 @@ def identify_cars(folder: Path) -> list[str]:
     return [str(others / e["file"]) for e in kept]
 
 
-def identified(file: Path, logs: Sequence[Path]) -> str:
-    """Return a car's file with its ``physics`` as the tool identifies it on drives with perfect truth."""
-    own = load_vehicle(file)
-    drives = []
-    for log in logs:
-        read = read_drive(log, Car.of(own))
-        start_ns = int(read.signals.stamps_ns[0])
-        drives.append(FitDrive(read.name, read.signals, read.truth, independent_yaw_rate=True, log_start_ns=start_ns))
+def identified(file: Path, logs: Sequence[Path], mapping: Path) -> str:
+    """Return a car's file with its ``physics`` as the tool identifies it on drives."""
+    own, given = load_vehicle(file), load_mapping(mapping)
+    read = (load_fit_drive(LogInput(log, log.stem), Car.of(own), given, ReadOptions())[1] for log in logs)
+    drives = [drive for drive in read if drive is not None]
     found = fit_physics(drives, own, PARTS, starts=({},), iterations=FIT_ITERATIONS)
     values = FittedValues.of(found.vehicle)
     noise = found.noise.model_copy(update={"physics_sha256": physics_sha256(values.applied_to(own))})

@@ -69,7 +69,7 @@ def train_networks() -> None:
     """Simulate, extract and train; what is there already as it should be is kept."""
     many_cars.write_cars(CARS, cars=many_cars.CARS, drives=many_cars.DRIVES_PER_CAR, seed=many_cars.SEED, jobs=2)
     logs = many_cars.identify_cars(CARS)
-    mapping = CARS / "mapping.toml"
+    mapping = CARS / "extract.toml"
     mapping.write_text(MAPPING, encoding="utf-8")
     pdhef("extract", *logs, "-o", DATA, "--mapping", mapping, "--jobs", 2, "--resume")
     recipe = Recipe(seed=0, epochs=EPOCHS, feature_names=FEATURES)

@@ -29,7 +29,7 @@ import polars as pl
 from scipy.signal import butter, sosfilt
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import Trust, digest
+from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
@@ -47,6 +47,7 @@ from pdhef_logtool.learning.network.fine_tune import train_on_parts
 from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import load_mapping
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.records.files import PendingFile, write_bytes
 from pdhef_logtool.records.release import released_steps

@@ -21,7 +21,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from studies.counting_server import CountingServer, serving
-from studies.pages import DOCS, ROOT, fill, options, table, write
+from studies.pages import DOCS, ROOT, measured, table
 
 DOCUMENT = DOCS / "remote.md"
 SAMPLE = ROOT / "sample_logs" / "road.mcap"
@@ -125,17 +125,5 @@ def _chunks(data: bytes) -> str:
     return f"{len(summary.chunk_indexes)}" + (f", {others} of the camera" if others else "")
 
 
-def main() -> None:
-    """Measure, print, and write if asked for."""
-    parser = options("remote", __doc__)
-    parser.add_argument("--write-docs", action="store_true", help=f"put the table into {DOCUMENT.name}")
-    arguments = parser.parse_args()
-    text = measure()
-    print(text)
-    if arguments.write_docs:
-        page = DOCUMENT.read_text(encoding="utf-8")
-        write(DOCUMENT, fill(page, {"measured": text}, DOCUMENT.name))
-
-
 if __name__ == "__main__":
-    main()
+    measured("remote", __doc__, DOCUMENT, measure)

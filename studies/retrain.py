@@ -26,6 +26,7 @@ from pdhef_logtool.learning.network.dataset import MANIFEST, TARGETS
 from pdhef_logtool.learning.network.extract_command import extract
 from pdhef_logtool.learning.retrain import retrain_command
 from pdhef_logtool.learning.retrain.retrain_command import RetrainResult, RetrainSettings, retrain
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.sinks.report import write_json
 from studies.pages import options
@@ -99,7 +100,7 @@ def corrupt_labels(dataset: Path, corrupt: Corrupt) -> dict[str, Any]:
         pq.write_table(table, path)
         drive["file_sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
     files = [d["file_sha256"] for d in document["drives"]]
-    document["sha256"] = hashlib.sha256(json.dumps(files).encode()).hexdigest()
+    document["sha256"] = digest(files)
     write_json(dataset / MANIFEST, document)
     return document
 

@@ -166,7 +166,7 @@ def errors_of(
             car = car.with_noise("physics", found.noise.model_copy(update={"r_std": {}}))
         used = "open-loop" if name == OPEN_LOOP and car.self_calibrated is None else name
         track, _ = run_window(make_estimator(used, car), drive.signals, None, None)
-        rows = d2_rows(track, drive.signals, whole, log="", low_speed_m_s=low, sensors=sensors)
+        rows = d2_rows([track], drive.signals, whole, log="", low_speed_m_s=low, sensors=sensors)
         rmse = float(np.degrees(np.sqrt(np.nanmean(signal_error(track, truth, SIDESLIP, low) ** 2))))
         errors[name] = rmse, rows[0].value if rows else float("nan")
     return errors

@@ -85,7 +85,7 @@ class Verdict:
 class _Finder(ast.NodeVisitor):
     """Collects every possible fault in the functions of one file."""
 
-    def __init__(self, package: str, file: str, source: bytes, run_at_import: set[str]) -> None:
+    def __init__(self, package: str, file: str, source: bytes, run_at_import: frozenset[str]) -> None:
         self.found: list[Mutant] = []
         self._package, self._file, self._source, self._run_at_import = package, file, source, run_at_import
         self._lines = [0]
@@ -210,8 +210,7 @@ def _flip(operator: ast.AST) -> Any:
 @functools.cache
 def possible(package: str, root: Path = ROOT) -> tuple[Mutant, ...]:
     """Return every fault that can be put into a package, in order of files and lines."""
-    trees = {p: ast.parse(p.read_bytes()) for p in sorted((root / SOURCES).rglob("*.py"))}
-    at_import = {name for tree in trees.values() for name in _called_at_import(tree)}
+    trees, at_import = _parsed(root / SOURCES)
     found: list[Mutant] = []
     for path, tree in trees.items():
         if path.is_relative_to(root / SOURCES / package):
@@ -219,6 +218,13 @@ def possible(package: str, root: Path = ROOT) -> tuple[Mutant, ...]:
             finder.visit(tree)
             found += finder.found
     return tuple(found)
+
+
+@functools.cache
+def _parsed(sources: Path) -> tuple[dict[Path, ast.Module], frozenset[str]]:
+    """Return all modules, and what they call when they are imported."""
+    trees = {p: ast.parse(p.read_bytes()) for p in sorted(sources.rglob("*.py"))}
+    return trees, frozenset(name for tree in trees.values() for name in _called_at_import(tree))
 
 
 def _called_at_import(tree: ast.Module) -> Iterator[str]:

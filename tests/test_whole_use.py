@@ -6,7 +6,6 @@ import json
 import shutil
 from collections import Counter
 from pathlib import Path
-from typing import Any
 
 import polars as pl
 import pytest
@@ -15,7 +14,7 @@ from rerun.chunk import RrdReader
 from rosbags.convert.converter import convert
 from rosbags.typesys import Stores, get_typestore
 
-from pdhef_logtool.cli.app import app
+from tests.command_line import pdhef, said
 
 pytestmark = pytest.mark.slow
 
@@ -33,21 +32,10 @@ def _log(folder: Path, kind: str) -> Path:
     return folder / "drive.bag"
 
 
-def _pdhef(*arguments: object) -> None:
-    assert not app([str(a) for a in arguments], prog_name="pdhef", standalone_mode=False)
-
-
-def _said(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    capsys.readouterr()
-    _pdhef(*arguments, "--json")
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
-
-
 @pytest.mark.parametrize("kind", ["rosbag1", pytest.param("rosbag2", marks=pytest.mark.fleet)])
 def test_from_a_recording_to_a_network_and_back(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, before, after = _log(tmp_path, kind), tmp_path / "before", tmp_path / "after"
-    _pdhef("run", log, "-o", before, *CAR, "-e", ",".join(ESTIMATORS))
+    pdhef("run", log, "-o", before, *CAR, "-e", ",".join(ESTIMATORS))
     run = json.loads((before / "run.json").read_text())
     assert [(one["log"], one["outcome"]) for one in run["logs"]] == [("drive", "ok")]
     drive = before / "logs/drive"
@@ -56,9 +44,9 @@ def test_from_a_recording_to_a_network_and_back(kind: str, tmp_path: Path, capsy
     _look_at_recordings(drive, stamps)
 
     (drive / "report.html").unlink()
-    _pdhef("report", before)
+    pdhef("report", before)
     assert "drive" in (drive / "report.html").read_text()
-    events = _said(capsys, "events", before, "--where", "abs(ay_m_s2) > 2 for 0.5s", "--clip")
+    events = said(capsys, "events", before, "--where", "abs(ay_m_s2) > 2 for 0.5s", "--clip")
     assert len(events["events"]) == 1
     (clip,) = before.rglob("*clip*/*.mcap")
     with clip.open("rb") as file:
@@ -66,10 +54,10 @@ def test_from_a_recording_to_a_network_and_back(kind: str, tmp_path: Path, capsy
 
     dataset, network = tmp_path / "dataset", tmp_path / "network"
     for split, start, end in (("train", 0, 3.5), ("validation", 3.5, 6)):
-        _pdhef("extract", log, *CAR, "-o", dataset, "--split", split, "--start", start, "--end", end)
-    _pdhef("train", dataset, "-o", network, "--epochs", 1)
-    _pdhef("run", log, "-o", after, *CAR, "-e", ",".join(ESTIMATORS), "--network", network, "--annotate", "none")
-    compared = _said(capsys, "compare", before, after, "--html", tmp_path / "compared.html")
+        pdhef("extract", log, *CAR, "-o", dataset, "--split", split, "--start", start, "--end", end)
+    pdhef("train", dataset, "-o", network, "--epochs", 1)
+    pdhef("run", log, "-o", after, *CAR, "-e", ",".join(ESTIMATORS), "--network", network, "--annotate", "none")
+    compared = said(capsys, "compare", before, after, "--html", tmp_path / "compared.html")
     assert compared["pairs"] == {"signals": 1}
     assert (tmp_path / "compared.html").stat().st_size > 10_000
 

@@ -23,7 +23,7 @@ from pdhef_logtool.records.version import __version__
 from truthsim.drive import DEFAULT_VEHICLE, Drive, simulate_drive, write_drive
 from truthsim.faults import parse_fault
 from truthsim.manoeuvres import GRAVITY_M_S2
-from truthsim.sensors import SensorNoise
+from truthsim.sensors import SIGNED, SensorNoise
 from truthsim.vehicle_choice import choose_vehicle
 
 MANIFEST = "manifest.json"
@@ -101,9 +101,7 @@ def sensor_noise(values: Mapping[str, float]) -> SensorNoise:
         raise UsageError(
             expected=f"values of {', '.join(SensorNoise._fields)}", got=", ".join(unknown), where="--sensor"
         )
-    wrong = [
-        n for n, v in values.items() if not np.isfinite(v) or (v < 0.0 and n not in ("imu_x_m", "imu_y_m", "imu_z_m"))
-    ]
+    wrong = [n for n, v in values.items() if not np.isfinite(v) or (v < 0.0 and n not in SIGNED)]
     if wrong:
         raise UsageError(expected="finite numbers of at least 0", got=", ".join(wrong), where="--sensor")
     return SensorNoise(**values)

@@ -52,6 +52,10 @@ class SensorNoise(NamedTuple):
     #: Time constant of the INS's own error; white noise of a third of each sigma comes on top.
     rtk_time_s: float = 2.0
     rtk_delay_s: float = 0.020
+    #: What nobody has told of the INS: its heading's offset, and how far its place is from the CG, forward and left.
+    rtk_heading_offset_rad: float = 0.0
+    rtk_x_m: float = 0.0
+    rtk_y_m: float = 0.0
     #: A toothed wheel with 48 teeth gives no pulse in time below this speed, and the sensor reads zero.
     wheel_dead_m_s: float = 0.15
     #: Full scale of the 16-bit accelerometers and gyros; beyond it they read full scale.
@@ -64,6 +68,8 @@ class SensorNoise(NamedTuple):
     #: The angle is measured at the steering wheel in steps of 0.1 degrees; the ratio is known to this share.
     steering_wheel_step_rad: float = 0.1 * np.pi / 180.0
     steer_gain: float = 0.0
+    #: Free play between steering wheel and road wheels, all of it, as an angle of the road wheels.
+    steer_play_rad: float = 0.0
     #: Share of the messages of IMU, steering and wheel speeds that the bus loses.
     message_loss: float = 0.0
     #: Outages of the RTK fix: how often, and how long on average (exponential); half of them leave a float solution.
@@ -71,6 +77,8 @@ class SensorNoise(NamedTuple):
     rtk_outage_s: float = 8.0
 
 
+#: Values that may be below 0: places and an offset.
+SIGNED = frozenset({"imu_x_m", "imu_y_m", "imu_z_m", "rtk_heading_offset_rad", "rtk_x_m", "rtk_y_m"})
 #: Sensors that err in nothing but delay, tilt, wheel slip and quantisation.
 NO_NOISE = SensorNoise(
     acceleration_m_s2=0.0,
@@ -242,6 +250,7 @@ def _steering(
     """The sensor sits at the steering wheel; noise and bias are those of the road-wheel angle, times the ratio."""
     rng = streams["steer"]
     clean = motion.column("steer_rad", 1)
+    clean = clean + ahead_by_play(clean, noise.steer_play_rad)
     offset = noise.steer_bias_rad * rng.standard_normal()
     gain = 1.0 + noise.steer_gain * streams["gain"].standard_normal()
     read = gain * clean + offset + student_t(rng, noise.steer_rad, clean.shape[0])
@@ -253,6 +262,20 @@ def _steering(
         times + noise.can_delay_s,
         {"steer_rad": wheel / vehicle.steering_ratio, "steering_wheel_rad": wheel},
     )
+
+
+def ahead_by_play(steer_rad: FloatArray, play_rad: float) -> FloatArray:
+    """Return by how much the steering wheel is ahead of the road wheels [N], within half of the play to both sides.
+
+    Behind a reversal it turns twice as far as they do until it has gone through the play: a spring with dry friction
+    (Prandtl's stop element), as a steering column is.
+    """
+    ahead, half = np.zeros_like(steer_rad), 0.5 * play_rad
+    value = 0.0
+    for k, turned in enumerate(np.diff(steer_rad).tolist(), start=1):
+        value = min(half, max(-half, value + turned))
+        ahead[k] = value
+    return ahead
 
 
 def _wheels(
@@ -296,7 +319,7 @@ def _rtk(
     every: int,
     outages: Sequence[Outage],
 ) -> SensorChannel:
-    """GNSS/INS at the CG: ENU position and velocity, attitude, and the body velocity that follows from them."""
+    """GNSS/INS at the CG, or at the place taken for it: ENU position and velocity, attitude, body velocity of these."""
     rng = streams["rtk"]
     rows = slice(None, None, every)
     times = motion.times_s[rows]
@@ -317,23 +340,32 @@ def _rtk(
         return np.asarray((slow + sigma / 3.0 * rng.standard_normal(n)) * np.where(loose, in_float, 1.0))
 
     yaw = motion.column("yaw_rad")[rows]
-    v_x, v_y = motion.column("vx_m_s")[rows], motion.column("vy_m_s")[rows]
+    turning = motion.column("yaw_rate_rad_s")[rows]
+    v_x = motion.column("vx_m_s")[rows] - turning * noise.rtk_y_m
+    v_y = motion.column("vy_m_s")[rows] + turning * noise.rtk_x_m
+    x_m = motion.column("x_m")[rows] + noise.rtk_x_m * np.cos(yaw) - noise.rtk_y_m * np.sin(yaw)
+    y_m = motion.column("y_m")[rows] + noise.rtk_x_m * np.sin(yaw) + noise.rtk_y_m * np.cos(yaw)
     speed_drift, place_drift = _COAST_M_S2 * coast_s, 0.5 * _COAST_M_S2 * coast_s**2
     east = v_x * np.cos(yaw) - v_y * np.sin(yaw) + error(noise.rtk_velocity_m_s, _FLOAT_VELOCITY)
     north = v_x * np.sin(yaw) + v_y * np.cos(yaw) + error(noise.rtk_velocity_m_s, _FLOAT_VELOCITY)
     east, north = east + speed_drift * drift[:, 0], north + speed_drift * drift[:, 1]
-    heading = yaw + error(noise.rtk_heading_rad, _FLOAT_ANGLE) + _COAST_RAD_S * coast_s * drift[:, 3]
+    heading = (
+        yaw
+        + noise.rtk_heading_offset_rad
+        + error(noise.rtk_heading_rad, _FLOAT_ANGLE)
+        + _COAST_RAD_S * coast_s * drift[:, 3]
+    )
     place = noise.rtk_position_m
     fields = {
-        "x_m": motion.column("x_m")[rows] + error(place, _FLOAT_POSITION) + place_drift * drift[:, 0],
-        "y_m": motion.column("y_m")[rows] + error(place, _FLOAT_POSITION) + place_drift * drift[:, 1],
+        "x_m": x_m + error(place, _FLOAT_POSITION) + place_drift * drift[:, 0],
+        "y_m": y_m + error(place, _FLOAT_POSITION) + place_drift * drift[:, 1],
         "z_m": motion.column("z_m")[rows] + error(2.0 * place, _FLOAT_POSITION) + place_drift * drift[:, 2],
         "roll_rad": motion.column("roll_rad")[rows] + error(noise.rtk_tilt_rad, 1.0),
         "pitch_rad": motion.column("pitch_rad")[rows] + error(noise.rtk_tilt_rad, 1.0),
         "yaw_rad": heading,
         "vx_m_s": east * np.cos(heading) + north * np.sin(heading),
         "vy_m_s": -east * np.sin(heading) + north * np.cos(heading),
-        "yaw_rate_rad_s": motion.column("yaw_rate_rad_s")[rows] + noise.rtk_yaw_rate_rad_s * rng.standard_normal(n),
+        "yaw_rate_rad_s": turning + noise.rtk_yaw_rate_rad_s * rng.standard_normal(n),
         "quality": quality,
         "position_std_m": np.where(loose, _FLOAT_POSITION, 1.0) * place + place_drift,
     }

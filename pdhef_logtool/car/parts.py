@@ -6,8 +6,7 @@ stale and is not taken, however the files came together.
 
 from __future__ import annotations
 
-import hashlib
-import json
+import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -23,7 +22,7 @@ from pdhef_logtool.car.vehicle import (
     Tyres,
     VehicleParameters,
 )
-from pdhef_logtool.records.documents import one_of
+from pdhef_logtool.records.documents import digest, one_of
 
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
@@ -46,17 +45,17 @@ MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 _NOT_PHYSICS = {"name", "truth_position_m"}
 
 
-def digest(document: Any) -> str:
-    """Return the sha256 of a JSON-able value, whatever the order of its keys."""
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
-
-
 def physics_sha256(vehicle: VehicleParameters) -> str:
     """Return the digest of what a vehicle file says of physics and sensors, whatever its name, layout and comments.
 
     Entries at their defaults count as absent: one that a later version adds makes no car stale.
     """
     return digest(vehicle.model_dump(mode="json", exclude=_NOT_PHYSICS, exclude_defaults=True))
+
+
+def car_folder(name: str, physics_sha256: str) -> str:
+    """Return the name of the folder of a car's drives in files by ``car=``: short, portable, another one a physics."""
+    return f"car={re.sub(r'[^A-Za-z0-9._]+', '-', name)[:24]}-{physics_sha256[:8]}"
 
 
 class LearntOn(Record):

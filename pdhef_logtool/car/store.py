@@ -24,7 +24,8 @@ from pdhef_logtool.car.car import (
     Car,
 )
 from pdhef_logtool.car.flat import flat_toml, vehicle_toml
-from pdhef_logtool.car.parts import HistoryLine, LearntOn, digest
+from pdhef_logtool.car.parts import HistoryLine, LearntOn
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.outputs import LOCK_FILE, FolderLock, FolderTransaction

@@ -30,8 +30,8 @@ _PAD_S, _CLIP_PAD_S = 0.25, 5.0
     "gate; 4 the gate is closed, or cannot tell with --strict. Without a gate a change alone closes nothing.",
 )
 def compare(
-    a: Annotated[Path, Argument(metavar="A", help="Outputs of the run that is the yardstick.")],
-    b: Annotated[Path, Argument(metavar="B", help="Outputs of the run that is held against it.")],
+    a: Annotated[str, Argument(metavar="A", help="Outputs of the run that is the yardstick: folder or URL.")],
+    b: Annotated[str, Argument(metavar="B", help="Outputs of the run that is held against it.")],
     *,
     gate: Annotated[Path | None, Option(metavar="FILE", help="gate.toml: figures with their limits.")] = None,
     max_regression: Annotated[
@@ -54,11 +54,14 @@ def compare(
 ) -> None:
     """Say whether run B is better or worse than run A. Drives are paired; nobody can tell is an answer."""
     from pdhef_logtool.cli.compare_tables import render_comparison, write_comparison_junit
+    from pdhef_logtool.records.object_store import is_url
     from pdhef_logtool.records.outputs import check_no_input
     from pdhef_logtool.results.comparing import compare_runs
     from pdhef_logtool.results.opened_run import open_run
 
-    check_no_input([a, b, gate], [file for file in (html, junit) if file is not None])
+    check_no_input(
+        [*(Path(x) for x in (a, b) if not is_url(x)), gate], [file for file in (html, junit) if file is not None]
+    )
     asked = _gate(gate, max_regression, estimator, metric, allow_unpaired=allow_unpaired)
     found = compare_runs(open_run(a), open_run(b), asked, cluster=cluster, strict=strict)
     if junit is not None:
@@ -107,7 +110,7 @@ def _gate(
     "at least.",
 )
 def events(
-    output: Annotated[Path, Argument(metavar="OUTPUT", help="Folder of a run.")],
+    output: Annotated[str, Argument(metavar="OUTPUT", help="Folder or URL of a run.")],
     *,
     where: Annotated[str, Option(metavar="EXPR", help="What is to hold; docs/compare.md.")],
     pad: Annotated[
@@ -126,6 +129,7 @@ def events(
 ) -> None:
     """Find where in the drives of a run something holds. Each event can be cut out as a clip."""
     from pdhef_logtool.cli.event_tables import render_events
+    from pdhef_logtool.records.object_store import is_url
     from pdhef_logtool.records.outputs import check_no_input
     from pdhef_logtool.results.events import find_events, write_events
     from pdhef_logtool.results.expression import parse_condition
@@ -135,7 +139,9 @@ def events(
     pad_s = (_CLIP_PAD_S if clip else _PAD_S) if pad is None else _seconds(pad)
     if source is not None and not clip:
         raise UsageError(expected="--clip", got="--source alone", where="--source")
-    check_no_input([output], [] if parquet is None else [parquet])
+    if is_url(output) and clip:
+        options.local_folder(output)
+    check_no_input([] if is_url(output) else [Path(output)], [] if parquet is None else [parquet])
     run = open_run(output)
     found = find_events(run, condition, estimator=estimator, pad_s=pad_s)
     if clip:

@@ -24,6 +24,7 @@ commands = typer.Typer()
     "pdhef inspect drive.bag --json | jq .signals",
     "pdhef inspect drive.mcap --write-mapping mapping.toml",
     "pdhef inspect drive.mcap --fields /imu/data",
+    "pdhef inspect https://host/drive.mcap --all",
 )
 def inspect(
     log: options.Log,
@@ -31,9 +32,13 @@ def inspect(
     write_mapping: Annotated[Path | None, Option(help="Write a ready-to-edit mapping.toml (never overwrites).")] = None,
     fields: Annotated[bool, Option("--fields", help="Instead: every number of TOPIC, or of all topics.")] = False,
     topic: Annotated[str | None, Argument(metavar="[TOPIC]", help="Topic of --fields.", show_default=False)] = None,
+    whole: Annotated[bool, Option("--all", help="Read all of a large log, and find damage within its chunks.")] = False,
     as_json: options.JsonFlag = False,
 ) -> None:
-    """Show what a log holds and what maps to what. Rates, gaps and jitter are shown too, and what is missing."""
+    """Show what a log holds and what maps to what. Rates, gaps and jitter are shown too, and what is missing.
+
+    Of a long MCAP above 32 MB whose index is sound a part of the chunks is read, and how many is said.
+    """
     from pdhef_logtool.inspection import fields_of_log, inspect_log, render_fields, render_inspection
     from pdhef_logtool.inspection import write_mapping as write_mapping_file
     from pdhef_logtool.logs.discovery import one_place
@@ -47,7 +52,12 @@ def inspect(
         found = fields_of_log(one_place(log), topic, budget=reading.limits, msgs=reading.msgs)
         console.finish(found, render_fields, as_json, exit_code=EXIT_OK)
     inspection = inspect_log(
-        one_place(log), chosen, prefer_truth=reading.prefer_truth, budget=reading.limits, msgs=reading.msgs
+        one_place(log),
+        chosen,
+        prefer_truth=reading.prefer_truth,
+        budget=reading.limits,
+        msgs=reading.msgs,
+        whole=whole,
     )
     if write_mapping is not None:
         write_mapping_file(inspection, write_mapping)

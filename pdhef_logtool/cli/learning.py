@@ -22,6 +22,7 @@ commands = typer.Typer()
     "pdhef identify drives/ --car guess.toml -o mycar",
     "pdhef identify drive.mcap --car guess.toml -o mycar --end 150 --holdout 0",
     "pdhef identify logs/ --car guess.toml -o mycar --without-truth",
+    shared="cache",
     car="Where the fit starts (mass, geometry, sensor noise, priors)",
 )
 def identify(
@@ -63,7 +64,7 @@ def identify(
     "beside them has a split, or --split puts all of them into one. Of drives with the same signals one is taken. "
     "Columns of --where: the features, truth_vx_m_s, truth_vy_m_s; _deg and _km_h in place of _rad and _m_s "
     "(docs/retrain.md).",
-    shared="sensors friction",
+    shared="cache sensors friction",
     car="The nominal car (default: what a set's manifest names)",
 )
 def extract(
@@ -149,7 +150,7 @@ def train(
     "pdhef tune logs/ --split validation --car mycar -o mycar --trials 256",
     notes="Every estimator gets the same search space, drives and number of trials. All trials and a plot of them "
     "are kept with the car. Drives that a set's manifest marks test or extrapolation are refused (docs/tune.md).",
-    shared="sensors friction network model signal_map",
+    shared="cache sensors friction network model signal_map",
     car="The car whose filter noise is tuned",
 )
 def tune(
@@ -191,7 +192,7 @@ def tune(
     notes="Give driving that neither the network nor the car was fitted to; drives that a manifest marks train or "
     "validation are refused. The filter runs at trust 0, 0.25, 0.5, 0.75 and 1. The cap is 1 only if a bootstrap of "
     "blocks confirms the gain, at most 0.5 on a mean gain, else 0 (docs/trust.md). All figures are kept with the car.",
-    shared="sensors friction network model",
+    shared="cache sensors friction network model",
     car="The car of the drives",
 )
 def trust(
@@ -219,7 +220,7 @@ def trust(
     "pdhef calibrate logs/ --car mycar --vary 0 -o mycar",
     notes="Give drives of many kinds that neither network nor filter noise was fitted to; drives that a set's "
     "manifest marks test or extrapolation are refused (docs/calibrate.md).",
-    shared="estimators sensors friction network model",
+    shared="estimators cache sensors friction network model",
     car="The car that the estimators run with",
 )
 def calibrate(
@@ -250,7 +251,7 @@ def calibrate(
     "learnt one after the other; a step that makes the error on held-out driving worse is undone. The end of a drive "
     "(or some drives of many) is scored once, against all baselines: learn.md in the car's folder (docs/learn.md). The "
     "same command again goes on where it was interrupted.",
-    shared="sensors friction network",
+    shared="cache sensors friction network",
     car="Where it starts (mass, geometry, sensor noise, priors)",
 )
 def learn(
@@ -288,7 +289,7 @@ def learn(
     "whether the candidate is worse: then it is kept under rejected/ with the reason, else under accepted/ "
     "(docs/retrain.md). The same command again does what is new and nothing else. Exit codes: 0 accepted, 3 accepted "
     "with drives left out, 4 rejected.",
-    shared="sensors friction",
+    shared="cache sensors friction",
     car="The car whose network is trained on",
 )
 def retrain(

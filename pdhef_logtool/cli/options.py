@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 from collections.abc import Callable
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -35,7 +36,35 @@ Split = Annotated[str | None, Option(help="Only drives of this split, by the man
 AnySplit = Annotated[bool, Option("--any-split", help="Take drives of every split, even of those refused otherwise.")]
 Jobs = Annotated[int, Option("--jobs", "-j", help="Processes at work; changes no number.")]
 
+
+def _check_local(output: object) -> None:
+    """Raise UsageError for a URL where only a folder or file can be; as a path it has lost a slash."""
+    if isinstance(output, Path) and (found := _URL.match(str(output))) and not Path(found[1]).exists():
+        raise UsageError(
+            expected="a place on this machine",
+            got=str(output).replace(":/", "://", 1),
+            where="--output",
+            remedy="pdhef run alone writes to a URL",
+        )
+
+
+def local_folder(argument: str) -> Path:
+    """Return the folder that an argument names; raises UsageError for a URL, as the command writes there."""
+    from pdhef_logtool.records.object_store import ObjectFolder, is_url
+
+    if is_url(argument):
+        shown = ObjectFolder(argument).shown
+        raise UsageError(
+            expected="a folder of this machine",
+            got=shown,
+            where="OUTPUT",
+            remedy=f"copy it first: aws s3 cp --recursive {shown} DIR",
+        )
+    return Path(argument)
+
+
 _Text = str | None
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+:)/.")
 _File = Path | None
 #: The shared options by the name of the configuration's entry, in the order of the help.
 _OPTIONS: dict[str, Any] = {
@@ -61,6 +90,10 @@ _OPTIONS: dict[str, Any] = {
     "cache": Annotated[
         _Text,
         Option(metavar="DIR|URL", help="Keep a slim log of each log there and read that the next time: docs/slim.md."),
+    ],
+    "cache_max_gb": Annotated[
+        float | None,
+        Option("--cache-max", metavar="GB", help="What --cache DIR may hold; what was not used for longest goes."),
     ],
     "sensors": Annotated[_Text, Option(help="full, or esp: no wheel speeds in the filters after the start.")],
     "friction": Annotated[
@@ -104,6 +137,7 @@ def command(
     car : what --car means to the command, which then has --start and --end too; empty = it has no car.
     """
     wanted = f"mapping prefer_truth budget msgs {shared} {'car vehicle start end' if car else ''}".split()
+    wanted += ["cache_max_gb"] * ("cache" in wanted)
     taken = {key: option for key, option in _OPTIONS.items() if key in wanted}
     if car:
         taken["car"] = Annotated[_File, Option(help=f"{car}: a folder, or a bare vehicle.toml.")]
@@ -115,6 +149,7 @@ def command(
 
         @functools.wraps(function)
         def run_command(**values: Any) -> None:
+            _check_local(values.get("output"))
             if "config" in given:
                 values["config"] = run_config({key: values.pop(key) for key in taken})
             function(**values)

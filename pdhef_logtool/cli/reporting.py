@@ -28,7 +28,7 @@ commands = typer.Typer()
     "pdhef report out --png --json",
 )
 def report(
-    output: Annotated[Path, Argument(metavar="OUT", help="Folder of a run.")],
+    output: Annotated[Path, Argument(parser=options.local_folder, metavar="OUT", help="Folder of a run.")],
     show: Annotated[bool, Option("--open", help="Open the page in the browser.")] = False,
     by: Annotated[
         list[str] | None,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from rich.measure import Measurement
@@ -19,8 +20,6 @@ from pdhef_logtool.sinks.answer import NEARLY_HOLDS, degrees
 from pdhef_logtool.sinks.report import diverged_line, reasons_line
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from rich.console import Console
 
     from pdhef_logtool.drive.slim import SlimResult
@@ -94,8 +93,8 @@ def render_run(result: RunResult, console: Console) -> None:
     if len(result.results) > 1 or failed:
         done = f"{len(result.results) - len(failed)} done, {len(failed)} failed, {len(lost)} with input lost"
         console.print(f"{len(result.results)} logs: {done}")
-    if result.output is not None:
-        _print_outputs(result.output, console)
+    if result.place is not None:
+        _print_outputs(result.place, console)
 
 
 def render_fleet(summary: RunSummary, console: Console) -> None:
@@ -134,8 +133,8 @@ def _print_some(labels: Sequence[str], count: int, console: Console) -> None:
     _print_indented(", ".join(labels[:_MOST_FAILED]) + more, console)
 
 
-def _print_outputs(output: Path, console: Console) -> None:
-    page = output / PAGE_FILE
+def _print_outputs(output: Path | str, console: Console) -> None:
+    page = Path(output) / PAGE_FILE
     shown = f"; open {page} in a browser" if page.is_file() else ""
     console.print(f"outputs in {output}{shown}", soft_wrap=True)
 

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
@@ -37,6 +38,7 @@ _MOST_VERDICTS = 50
     "pdhef run fleet/ new/ -o out --jobs 8 --resume",
     "pdhef run fleet/ -o out --only drive_0312",
     "pdhef run @list.txt -o /shared/out --ray auto --keep metrics",
+    "pdhef run @list.txt -o s3://bucket/out --jobs 8 --keep metrics --resume",
     "pdhef run @list.txt -o out --jobs 8 --keep metrics --cache ~/slim",
     notes="Times: seconds from the log's start (12.5, +10s), before its end (end-5s), nanoseconds (an integer of "
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
@@ -48,14 +50,16 @@ _MOST_VERDICTS = 50
 )
 def run(  # positional: one an option of the command line
     logs: options.Logs,
-    output: Annotated[Path, Option("--output", "-o", help="Folder for everything that the run writes.")],
+    output: Annotated[
+        str, Option("--output", "-o", metavar="DIR|URL", help="Folder, or s3:// URL, for all that the run writes.")
+    ],
     config: RunConfig,
     junit: options.JunitFile = None,
     report: Annotated[bool, Option(help="Write pages for people: report.html of every log.")] = True,
     jobs: options.Jobs = 1,
     ray: Annotated[
         str | None,
-        Option(metavar="ADDRESS", help="Work on this Ray cluster (auto, HOST:PORT), with a shared OUTPUT."),
+        Option(metavar="ADDRESS", help="Work on this Ray cluster (auto, HOST:PORT), with a shared OUTPUT or a URL."),
     ] = None,
     resume: Annotated[
         bool, Option("--resume", help="Go on with the run in the folder: only what is new or has changed.")
@@ -177,7 +181,12 @@ def slim(
 
 @options.command(commands, "pdhef view out", "pdhef view out --log drive", "pdhef view out --web")
 def view(
-    output: Annotated[Path, Argument(metavar="OUTPUT", help="Folder of a run or of one of its logs, or a .rrd file.")],
+    output: Annotated[
+        Path,
+        Argument(
+            parser=options.local_folder, metavar="OUTPUT", help="Folder of a run or of a log in it, or a .rrd file."
+        ),
+    ],
     log: Annotated[
         list[str] | None, Option(metavar="NAME", help="Which logs of the run, repeatable; default: all.")
     ] = None,
@@ -205,7 +214,8 @@ def _finish(result: RunResult, as_json: bool) -> NoReturn:
         from pdhef_logtool.results.summary import summarise
 
         checks_failed = [r.outcome.log for r in result.results if r.failed_checks]
-        console.show(summarise(open_run(result.output), result.exit_code, checks_failed), render_fleet, as_json)
+        summary = summarise(open_run(result.output), result.exit_code, checks_failed)
+        console.show(replace(summary, output=result.place or summary.output), render_fleet, as_json)
     else:
         console.show(result, render_run, as_json)
         for one in result.results:

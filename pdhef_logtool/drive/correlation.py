@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pdhef_logtool.drive.interpolation import Bracket
-from pdhef_logtool.records.signals import FloatArray, IntArray
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 
 #: A step of more than this many median periods is a gap.
 GAP_PERIODS = 3.0
 #: The common grid's step is kept within these bounds: finer gains nothing, coarser loses the peak.
 MIN_STEP_S, MAX_STEP_S = 0.005, 0.05
-#: Far above what rounding does to a rough correlation of signals that vary by more than the least share of their power.
-_ROUGH_ERROR, _LEAST_POWER = 1e-8, 1e-4
+#: Far above what rounding does to a rough correlation of signals that vary by all of their power; of such as vary by
+#: less of it than the least share nothing rough is told.
+_ROUGH_ERROR, _LEAST_POWER = 1e-10, 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,18 +42,66 @@ class Shift:
     inside: bool
 
 
+class EvenGrid:
+    """One even grid where the stamps of two signals, at least two each, overlap; found once for all of their columns.
+
+    Parameters
+    ----------
+    stamps_a_ns, stamps_b_ns : int64 [N], [M], ascending; may be one and the same array.
+    """
+
+    def __init__(self, stamps_a_ns: IntArray, stamps_b_ns: IntArray) -> None:
+        both = [stamps_a_ns] if stamps_a_ns is stamps_b_ns else [stamps_a_ns, stamps_b_ns]
+        periods = [float(np.median(np.diff(stamps))) for stamps in both]
+        step_ns = round(float(np.clip(min(periods), MIN_STEP_S * 1e9, MAX_STEP_S * 1e9)))
+        start, end = max(int(s[0]) for s in both), min(int(s[-1]) for s in both)
+        grid = np.arange(start, end + 1, step_ns, dtype=np.int64)
+        self.step_s = step_ns * 1e-9
+        brackets = [Bracket(s, grid, round(GAP_PERIODS * p)) for s, p in zip(both, periods, strict=True)]
+        self._a, self._b = brackets[0], brackets[-1]
+        self._line: _Line | None = None
+
+    def of_a(self, values: FloatArray) -> FloatArray:
+        """Return a column [N] of the first signal on the grid, its linear trend removed; NaN in gaps."""
+        return self._without_trend(self._a.linear(values))
+
+    def of_b(self, values: FloatArray) -> FloatArray:
+        """Return a column [M] of the second signal as :meth:`of_a` does."""
+        return self._without_trend(self._b.linear(values))
+
+    def _without_trend(self, values: FloatArray) -> FloatArray:
+        known = np.isfinite(values)
+        if np.count_nonzero(known) < 2:
+            return values
+        if self._line is None or not np.array_equal(self._line.known, known):
+            self._line = _Line(known)
+        return self._line.removed_from(values)
+
+
+class _Line:
+    """Fits a line to values on a grid [N] of which the same ones are known; the bits are those of ``np.polyfit``."""
+
+    def __init__(self, known: BoolArray) -> None:
+        n = known.shape[0]
+        self.known = known
+        self._powers = np.vander((np.arange(n) / n)[known], 2)
+        self._scale = np.sqrt((self._powers * self._powers).sum(axis=0))
+        self._powers /= self._scale
+
+    def removed_from(self, values: FloatArray) -> FloatArray:
+        known = values if self.known.all() else values[self.known]
+        precision = known.shape[0] * np.finfo(np.float64).eps
+        slope, offset = np.linalg.lstsq(self._powers, known, precision)[0] / self._scale
+        n = values.shape[0]
+        return np.asarray(values - offset - slope * (np.arange(n) / n), dtype=np.float64)
+
+
 def on_common_grid(
     stamps_a_ns: IntArray, values_a: FloatArray, stamps_b_ns: IntArray, values_b: FloatArray
 ) -> CommonGrid:
     """Sample two signals of at least two samples each on one even grid where they overlap, linear trends removed."""
-    periods = [float(np.median(np.diff(stamps))) for stamps in (stamps_a_ns, stamps_b_ns)]
-    step_ns = round(float(np.clip(min(periods), MIN_STEP_S * 1e9, MAX_STEP_S * 1e9)))
-    start = max(int(stamps_a_ns[0]), int(stamps_b_ns[0]))
-    end = min(int(stamps_a_ns[-1]), int(stamps_b_ns[-1]))
-    grid = np.arange(start, end + 1, step_ns, dtype=np.int64)
-    a = Bracket(stamps_a_ns, grid, round(GAP_PERIODS * periods[0])).linear(values_a)
-    b = Bracket(stamps_b_ns, grid, round(GAP_PERIODS * periods[1])).linear(values_b)
-    return CommonGrid(step_s=step_ns * 1e-9, a=_detrend(a), b=_detrend(b))
+    grid = EvenGrid(stamps_a_ns, stamps_b_ns)
+    return CommonGrid(step_s=grid.step_s, a=grid.of_a(values_a), b=grid.of_b(values_b))
 
 
 def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
@@ -61,11 +111,11 @@ def find_shift(grid: CommonGrid, max_shift_s: float) -> Shift:
     neighbours refines it below the grid's step. NaN when a signal does not vary.
     """
     reach = round(max_shift_s / grid.step_s)
-    if grid.both < 2:
+    if grid.both < 2 or not all(np.nan_to_num(values, nan=0.0).any() for values in (grid.a, grid.b)):
         return Shift(float("nan"), float("nan"), False)
-    rough = _rough_correlations(grid.a, grid.b, reach)
+    rough, error = _rough_correlations(grid.a, grid.b, reach)
     # Candidates: all that rounding may have put behind the largest, and what cannot be told without the exact sums.
-    near = ~(rough < np.nanmax(rough, initial=-np.inf) - _ROUGH_ERROR)
+    near = ~(rough + error < np.nanmax(rough - error, initial=-np.inf))
     exact = {k: _correlation(grid.a, grid.b, k) for k in (np.flatnonzero(near) - reach).tolist()}
     known = [k for k, value in exact.items() if np.isfinite(value)]
     if not known:
@@ -91,41 +141,68 @@ def parabolic_peak(before: float, at: float, after: float) -> float:
     return float(0.5 * (before - after) / curvature) if curvature < 0 else 0.0
 
 
-def _detrend(values: FloatArray) -> FloatArray:
-    known = np.flatnonzero(np.isfinite(values))
-    if known.size < 2:
-        return values
-    slope, offset = np.polyfit(known / values.shape[0], values[known], 1)
-    return np.asarray(values - offset - slope * (np.arange(values.shape[0]) / values.shape[0]), dtype=np.float64)
-
-
 def _around(shift: int) -> tuple[int, int, int]:
     return shift - 1, shift, shift + 1
 
 
-def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> FloatArray:
-    """Return :func:`_correlation` at all shifts within ± ``reach``, to :data:`_ROUGH_ERROR`; NaN where it is unsure.
+def _rough_correlations(a: FloatArray, b: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
+    """Return :func:`_correlation` at all shifts within ± ``reach`` and how far it may be off; NaN where it is unsure.
 
-    From sums of products, which a library of linear algebra forms ten times as fast as means are taken off.
+    From sums: those of products a library of linear algebra forms ten times as fast as means are taken off.
     """
-    a, b = _unit_power(a), _unit_power(b)
-    knows_a, knows_b = (np.isfinite(values).astype(np.float64) for values in (a, b))
-    a, b = np.nan_to_num(a, nan=0.0), np.nan_to_num(b, nan=0.0)
-    pairs = ((knows_a, knows_b), (a, knows_b), (knows_a, b), (a * a, knows_b), (knows_a, b * b), (a, b))
-    found = np.full(2 * reach + 1, np.nan)
+    of_a, of_b = _Sums(_unit_power(a)), _Sums(_unit_power(b))
+    found, error = np.full((2, 2 * reach + 1), np.nan)
     n = a.shape[0]
     for k in range(max(-reach, 1 - n), min(reach, n - 1) + 1):
-        x, y = slice(max(0, -k), n - max(0, k)), slice(max(0, k), n - max(0, -k))
-        count, sum_a, sum_b, aa, bb, ab = (float(np.dot(u[x], v[y])) for u, v in pairs)
+        x, y = _overlap(n, k)
+        count, sum_a, aa = of_a.sums_beside(of_b, x, y)
+        _, sum_b, bb = of_b.sums_beside(of_a, y, x)
+        ab = float(np.dot(of_a.values[x], of_b.values[y]))
         if count >= 2:
             power_a, power_b = aa - sum_a * sum_a / count, bb - sum_b * sum_b / count
-            if min(power_a, power_b) > _LEAST_POWER * count:
+            least = min(power_a, power_b)
+            if least > _LEAST_POWER * count:
                 found[reach + k] = (ab - sum_a * sum_b / count) / (power_a * power_b) ** 0.5
-    return found
+                error[reach + k] = _ROUGH_ERROR * count / least
+    return found, error
+
+
+class _Sums:
+    """Sums of parts of a signal [N]; ``values`` are 0 where it is not known."""
+
+    def __init__(self, values: FloatArray) -> None:
+        known = np.isfinite(values)
+        self._whole = bool(known.all())
+        self.values = values if self._whole else np.where(known, values, 0.0)
+        self._columns = known, self.values, self.values * self.values
+        self._totals = [float(c.sum()) for c in self._columns]
+
+    def sums_beside(self, other: _Sums, own: slice, others: slice) -> list[float]:
+        """Return count, sum and sum of squares of a part, where the part of the other signal upon it is known."""
+        if other._whole:
+            ends = zip(self._totals, self._columns, strict=True)
+            return [total - float(c[: own.start].sum()) - float(c[own.stop :].sum()) for total, c in ends]
+        first, end = (np.clip(other._runs, others.start, others.stop) + own.start - others.start).T
+        return [float((c[end] - c[first]).sum()) for c in self._running]
+
+    @cached_property
+    def _runs(self) -> IntArray:
+        """From where to where it is known, [R, 2]."""
+        return np.flatnonzero(np.diff(self._columns[0], prepend=False, append=False)).reshape(-1, 2)
+
+    @cached_property
+    def _running(self) -> list[FloatArray]:
+        return [np.concatenate([[0.0], np.cumsum(c)]) for c in self._columns]
+
+
+def _overlap(n: int, shift: int) -> tuple[slice, slice]:
+    """Return the parts of ``a`` and ``b`` [N] that a shift puts upon one another."""
+    return slice(max(0, -shift), n - max(0, shift)), slice(max(0, shift), n - max(0, -shift))
 
 
 def _unit_power(values: FloatArray) -> FloatArray:
-    known = values[np.isfinite(values)]
+    finite = np.isfinite(values)
+    known = values if finite.all() else values[finite]
     with np.errstate(over="ignore"):
         size = float(np.sqrt(np.mean(np.square(known)))) if known.size else 0.0
     return values / size if size > 0 and np.isfinite(size) else values
@@ -135,12 +212,12 @@ def _correlation(a: FloatArray, b: FloatArray, shift: int) -> float:
     n = a.shape[0]
     if abs(shift) >= n:
         return float("nan")
-    x = a[max(0, -shift) : n - max(0, shift)]
-    y = b[max(0, shift) : n - max(0, -shift)]
+    x, y = (values[part] for values, part in zip((a, b), _overlap(n, shift), strict=True))
     both = np.isfinite(x) & np.isfinite(y)
     if np.count_nonzero(both) < 2:
         return float("nan")
-    x, y = x[both], y[both]
+    if not both.all():
+        x, y = x[both], y[both]
     x, y = x - x.mean(), y - y.mean()
     power = float((x * x).sum()) * float((y * y).sum())
     # A constant leaves rounding noise after detrending, which must not correlate.

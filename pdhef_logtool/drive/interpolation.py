@@ -23,20 +23,30 @@ class Bracket:
     """
 
     def __init__(self, stamps_ns: IntArray, at_ns: IntArray, max_gap_ns: int) -> None:
+        self._left: IntArray | slice
+        self._right: IntArray | slice
         n = int(stamps_ns.shape[0])
         if n == 0:
             self.inside: BoolArray = np.zeros(at_ns.shape[0], dtype=np.bool_)
-            self._left = self._right = np.zeros(at_ns.shape[0], dtype=np.int64)
-            self._share = np.zeros(at_ns.shape[0])
+            self._left = self._right = np.empty(0, dtype=np.int64)
+            self._share = np.empty(0)
+            return
+        if np.array_equal(stamps_ns, at_ns) and (stamps_ns[1:] > stamps_ns[:-1]).all():
+            self.inside = np.ones(n, dtype=np.bool_)
+            self._left = self._right = slice(None)
+            self._share = np.zeros(1)
             return
         right = np.searchsorted(stamps_ns, at_ns, side="left")
         hit = stamps_ns[np.minimum(right, n - 1)] == at_ns
         left = np.where(hit, right, right - 1)
         bracketed = (left >= 0) & (right < n)
-        self._left, self._right = np.clip(left, 0, n - 1), np.minimum(right, n - 1)
-        step = stamps_ns[self._right] - stamps_ns[self._left]
+        left, right = np.clip(left, 0, n - 1), np.minimum(right, n - 1)
+        step = stamps_ns[right] - stamps_ns[left]
         self.inside = bracketed & (step <= max_gap_ns)
-        self._share = np.where(self.inside, (at_ns - stamps_ns[self._left]) / np.maximum(step, 1), 0.0)
+        if not self.inside.all():
+            at_ns, left, right, step = (c[self.inside] for c in (at_ns, left, right, step))
+        self._left, self._right = left, right
+        self._share = (at_ns - stamps_ns[left]) / np.maximum(step, 1)
 
     def linear(self, values: FloatArray) -> FloatArray:
         """Return [M] or [M, k] of a column [N] or [N, k]; NaN outside."""
@@ -51,8 +61,11 @@ class Bracket:
         return self._between(values, lambda a, b: np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b) - a)
 
     def _between(self, values: FloatArray, difference: Callable[[FloatArray, FloatArray], FloatArray]) -> FloatArray:
+        a, b = values[self._left], values[self._right]
+        share = self._share.reshape(-1, *([1] * (values.ndim - 1)))
+        found: FloatArray = a + share * difference(a, b)
+        if len(found) == len(self.inside):
+            return found
         out = np.full((self.inside.shape[0], *values.shape[1:]), np.nan)
-        a, b = values[self._left[self.inside]], values[self._right[self.inside]]
-        share = self._share[self.inside].reshape(-1, *([1] * (values.ndim - 1)))
-        out[self.inside] = a + share * difference(a, b)
+        out[self.inside] = found
         return out

@@ -31,6 +31,8 @@ class ReadOptions:
     budget : factor on what reading a log may cost.
     waived : names of checks that do not count.
     msgs : folder with definitions of message types that a log does not define.
+    cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
+    cache_max_gb : what the cache may hold, in GB, if it is a folder; None = any.
     """
 
     start: str | None = None
@@ -42,6 +44,8 @@ class ReadOptions:
     budget: float = 1.0
     waived: tuple[str, ...] = ()
     msgs: Path | None = None
+    cache: str | None = None
+    cache_max_gb: float | None = None
 
     @property
     def use_speed(self) -> bool:

@@ -7,10 +7,9 @@ made anew.
 
 from __future__ import annotations
 
-import hashlib
-import json
+import os
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,16 @@ from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.slim_log import FORMAT, SlimLog, is_whole
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.mapping.vendors import load_vendors
-from pdhef_logtool.records.documents import jsonable
-from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
+from pdhef_logtool.records.documents import digest, jsonable
+from pdhef_logtool.records.errors import OutputError, PdhefError
 from pdhef_logtool.records.files import scratch_folder
-from pdhef_logtool.records.processes import own_name
+from pdhef_logtool.records.object_store import ObjectFolder, is_url
 from pdhef_logtool.records.version import __version__
 
+#: A process looks at what a cache holds each time that it has added this share of what it may hold.
+_LOOK_SHARE = 0.05
+#: Bytes that this process adds to a cache before it looks again.
+_left_bytes: dict[str, float] = {}
 _DAMAGED = "its slim log in the cache is damaged and is made anew"
 
 
@@ -63,6 +66,8 @@ class SlimCache:
         try:
             path = self._fetched(key, scratch)
             if path is not None and _is_sound(path):
+                with suppress(OSError):
+                    os.utime(path)  # it is used: others go first
                 return replace(log, path=path)
             if path is not None:
                 warn(f"{log.stem}: {_DAMAGED}")
@@ -76,8 +81,10 @@ class SlimCache:
             if record.identity != identity:  # it changed meanwhile
                 made.unlink()
                 return None
-            if not self._is_folder:
-                self._put(key, made)
+            if self._is_folder:
+                self._make_room(made)
+            else:
+                ObjectFolder(self.place).put(key, made)
         except (OSError, OutputError) as error:
             warn(f"{log.stem}: the cache {self.place} is not used: {' '.join(str(error).split())}")
             return None
@@ -95,46 +102,44 @@ class SlimCache:
         vendors = repr(load_vendors()) if self.mapping is None or self.mapping.fill_recognised else ""
         msgs = "" if self.options.msgs is None else hash_log(self.options.msgs)
         said = (FORMAT, __version__, mapping, vendors, msgs, self.options.prefer_truth, self.options.budget)
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:16]
+        return digest(said)[:16]
 
     @property
     def _is_folder(self) -> bool:
-        return "://" not in self.place
+        return not is_url(self.place)
+
+    def _make_room(self, made: Path) -> None:
+        """Remove what was not used for longest where there is more than there may be, but for what was just made."""
+        if self.options.cache_max_gb is None:
+            return
+        most = self.options.cache_max_gb * 1e9
+        left = _left_bytes.get(self.place, 0.0) - made.stat().st_size
+        if left < 0.0:
+            left = _LOOK_SHARE * most
+            found = [(state.st_mtime_ns, state.st_size, path) for path, state in _entries(Path(self.place))]
+            size = sum(one[1] for one in found)
+            for _, size_bytes, path in sorted(found):
+                if size <= most:
+                    break
+                if path != made:
+                    path.unlink(missing_ok=True)
+                    size -= size_bytes
+        _left_bytes[self.place] = left
 
     def _fetched(self, key: str, scratch: Path) -> Path | None:
         """Return an entry as a file of this machine, None where there is none."""
         if self._is_folder:
             path = Path(self.place) / key
             return path if path.is_file() else None
-        store, root = self._store()
         path = scratch / "found.mcap"
-        try:
-            store.get_file(f"{root}/{key}", str(path))
-        except FileNotFoundError:
-            return None
-        return path
+        return path if ObjectFolder(self.place).get(key, path) else None
 
-    def _put(self, key: str, path: Path) -> None:
-        """Copy an entry to the store; it has its name when it is complete."""
-        store, root = self._store()
-        partial = f"{root}/{key}.{own_name()}.partial"
-        store.makedirs(partial.rpartition("/")[0], exist_ok=True)
-        store.put_file(str(path), partial)
-        store.mv(partial, f"{root}/{key}")
 
-    def _store(self) -> tuple[Any, str]:
-        import fsspec
-
-        try:
-            store, root = fsspec.core.url_to_fs(self.place, use_listings_cache=False)
-        except (ImportError, ValueError) as error:
-            raise UsageError(
-                expected="a folder, or a URL that fsspec can write to",
-                got=" ".join(str(error).split()),
-                where=f"--cache {self.place}",
-                remedy="pip install 'pdhef-logtool[s3]' for s3://",
-            ) from error
-        return store, root.rstrip("/")
+def _entries(place: Path) -> Iterator[tuple[Path, os.stat_result]]:
+    """Yield the entries of a folder; those that another process removes are left out."""
+    for path in place.glob("??/*.mcap"):
+        with suppress(OSError):
+            yield path, path.stat()
 
 
 def _is_sound(path: Path) -> bool:

@@ -76,13 +76,14 @@ class AdaptiveCarry:
 def _gather(dt, likelihood, starts, evidence, out):  # type: ignore[no-untyped-def]
     """Write Λ [K, H] of each step; ``evidence`` [H] is that of the step before the first, and updated in place."""
     for k in range(dt.shape[0]):
-        if starts[k] or not dt[k] <= RESTART_GAP_S:
-            evidence[:] = 0.0
-        else:
-            evidence *= math.exp(-dt[k] / FORGET_S)
-            if np.isfinite(likelihood[k]).all():
-                evidence += likelihood[k]
-        out[k] = evidence
+        forgets = starts[k] or not dt[k] <= RESTART_GAP_S
+        kept = 0.0 if forgets else math.exp(-dt[k] / FORGET_S)
+        heeds = not forgets
+        for h in range(evidence.shape[0]):
+            heeds = heeds and math.isfinite(likelihood[k, h])
+        for h in range(evidence.shape[0]):
+            evidence[h] = kept * evidence[h] + (likelihood[k, h] if heeds else 0.0)
+            out[k, h] = evidence[h]
 
 
 def gather_evidence(
@@ -103,31 +104,63 @@ def gather_evidence(
 
 def weigh(evidence: FloatArray, usable: FloatArray) -> FloatArray:
     """Return weights [K, H] that go with exp(evidence), 0 where ``usable`` [K, H] is not; a row of zeros for none."""
-    best = np.max(evidence, axis=1, keepdims=True, where=usable > 0, initial=-np.inf)
-    weights = np.where(usable > 0, np.exp(np.minimum(evidence - np.where(np.isfinite(best), best, 0.0), 0.0)), 0.0)
-    weights[weights < LEAST_WEIGHT * weights.sum(axis=1, keepdims=True)] = 0.0
-    return _shares(weights)
-
-
-def _shares(weights: FloatArray) -> FloatArray:
-    total = weights.sum(axis=1, keepdims=True)
-    shares: FloatArray = np.divide(weights, total, out=np.zeros_like(weights), where=total > 0.0)
-    return shares
+    weights = np.empty_like(evidence)
+    _weigh(evidence, usable, weights)
+    return weights
 
 
 @njit(cache=True)
-def _mix(w, states, covariances, x, P):  # type: ignore[no-untyped-def]
-    """Write the mixtures of states [H, N, 4] and covariances [H, N, 3, 3]; the first three states have a covariance."""
+def _weigh(evidence, usable, out):  # type: ignore[no-untyped-def]
+    for k in range(evidence.shape[0]):
+        best, total = -math.inf, 0.0
+        for h in range(evidence.shape[1]):
+            if usable[k, h]:
+                best = max(best, evidence[k, h])
+        for h in range(evidence.shape[1]):
+            out[k, h] = math.exp(evidence[k, h] - best) if usable[k, h] else 0.0
+            total += out[k, h]
+        for h in range(evidence.shape[1]):
+            if out[k, h] < LEAST_WEIGHT * total:
+                out[k, h] = 0.0
+    _share(out)
+
+
+@njit(cache=True)
+def _share(weights):  # type: ignore[no-untyped-def]
+    """Divide weights [K, H] by their sums, in place; a row of zeros stays."""
+    for k in range(weights.shape[0]):
+        total = 0.0
+        for h in range(weights.shape[1]):
+            total += weights[k, h]
+        for h in range(weights.shape[1]):
+            weights[k, h] = weights[k, h] / total if total > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _mix(weights, valid, states, covariances, w, x, P):  # type: ignore[no-untyped-def]
+    """Write the mixtures of states [H, N, 4] and covariances [H, N, 3, 3]; the first three states have a covariance.
+
+    ``w`` [N, H] becomes the weights of what is valid; where all weight is lost so, what is valid has equal ones.
+    """
+    for k in range(w.shape[0]):
+        total = 0.0
+        for h in range(w.shape[1]):
+            w[k, h] = weights[k, h] if valid[k, h] else 0.0
+            total += w[k, h]
+        for h in range(w.shape[1]):
+            if not total > 0.0:
+                w[k, h] = 1.0 if valid[k, h] else 0.0
+    _share(w)
     for k in range(w.shape[0]):
         x[k, :] = 0.0
         P[k, :, :] = 0.0
         for h in range(w.shape[1]):
-            if w[k, h] == 1.0:
-                x[k] = states[h, k]
-                P[k] = covariances[h, k]
-            elif w[k, h] > 0.0:
-                x[k] += w[k, h] * states[h, k]
-                P[k] += w[k, h] * covariances[h, k]
+            if w[k, h] > 0.0:
+                for i in range(4):
+                    x[k, i] += w[k, h] * states[h, k, i]
+                for i in range(3):
+                    for j in range(3):
+                        P[k, i, j] += w[k, h] * covariances[h, k, i, j]
         for h in range(w.shape[1]):
             if 0.0 < w[k, h] < 1.0:
                 for i in range(3):
@@ -142,12 +175,10 @@ def mix(weights: FloatArray, tracks: Sequence[StateTrack]) -> StateTrack:
     What is not valid has no weight; where all weight is lost so, what is valid has equal ones.
     """
     valid = np.stack([t.valid for t in tracks], axis=1)
-    w = np.where(valid, weights, 0.0)
-    w = _shares(np.where(w.sum(axis=1, keepdims=True) > 0.0, w, valid))
-    count = len(w)
-    x, P = np.empty((count, 4)), np.empty((count, 3, 3))
+    count = len(valid)
+    w, x, P = np.empty(valid.shape), np.empty((count, 4)), np.empty((count, 3, 3))
     states = np.stack([np.stack([t.vx_m_s, t.vy_m_s, t.yaw_rate_rad_s, t.ay_m_s2], axis=1) for t in tracks])
-    _mix(w, states, np.stack([t.covariance for t in tracks]), x, P)
+    _mix(weights, valid, states, np.stack([t.covariance for t in tracks]), w, x, P)
     any_valid: BoolArray = valid.any(axis=1)  # type: ignore[assignment]
     x[~any_valid], P[~any_valid] = np.nan, np.nan
     likeliest = np.argmax(w, axis=1)
@@ -226,16 +257,16 @@ class AdaptivePhysics:
         faults, rate = checked.faults, self.trust * checked.rate
         filters = self.filters
         before: Sequence[FilterCarry | None] = c.filters if c else [None] * len(filters)
-        runs = [f.filter_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
-        gathered, evidence = gather_evidence(
-            [steps for steps, _ in runs], c.filters if c else None, c.evidence if c else None
-        )
-        weights = weigh(gathered, np.stack([steps.valid for steps, _ in runs], axis=1))
+        runs = [
+            f.predicted_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)
+        ]
+        steps_of = [steps for steps, _, _ in runs]
+        gathered, evidence = gather_evidence(steps_of, c.filters if c else None, c.evidence if c else None)
+        weights = weigh(gathered, np.stack([steps.valid for steps in steps_of], axis=1))
         tracks, after = [], []
-        for h, (one, b, (steps, moved)) in enumerate(zip(filters, before, runs, strict=True)):
-            # Only what the mixture takes is predicted to the stamps.
-            taken = replace(steps, valid=steps.valid & (weights[:, h] > 0.0))
-            track, on = one.outputs(signals, b, taken, moved)
+        for h, (one, b, (steps, moved, predicted)) in enumerate(zip(filters, before, runs, strict=True)):
+            taken = replace(steps, valid=steps.valid & (weights[:, h] > 0.0))  # what the mixture takes
+            track, on = one.outputs(signals, b, taken, moved, predicted)
             tracks.append(track)
             after.append(on)
         raised = r_scale(faults.extra_r, self.physics.measurement_std)

@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from types import MappingProxyType
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -43,6 +43,7 @@ VX, VY, YAW_RATE, AX_BIAS = 0, 1, 2, 3
 STATES = 4
 Z_AY, Z_YAW_RATE, Z_SPEED = 0, 1, 2
 MEASUREMENTS = 3
+MOTION = 3  # entries of the state that an output has a covariance of
 # Inputs of a step; a_x is 0 where U_AX_KNOWN is 0. U_SPEED is the last speed sample that was believed, 0 before any.
 U_STEER, U_AX, U_FRICTION, U_AX_KNOWN, U_SPEED = 0, 1, 2, 3, 4
 INPUTS = 5
@@ -229,7 +230,7 @@ class Due(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """Where predictions are written: state [M, n], covariance [M, n, n], planar a_y [M]."""
+    """What becomes of steps: state [M, n], covariance of the motion [M, 3, 3], planar a_y [M]; NaN for none."""
 
     x: FloatArray
     P: FloatArray
@@ -449,8 +450,23 @@ def finish_step(k, now, residual_rate, rules, memory, inputs):  # type: ignore[n
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class StepOutline(StepColumns):
+    """What an output takes of posterior steps beside what is predicted from them."""
+
+    stamps_ns: IntArray
+    ready_ns: IntArray
+    inputs: FloatArray
+    nis: FloatArray
+    nis_dof: FloatArray
+    valid: BoolArray
+    diverged: BoolArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSteps(StepColumns):
     """Filter posteriors on measurement time: [K] each, state [K, n], covariance [K, n, n], inputs [K, 5].
+
+    Where nobody asks for more, the covariance is that of the last steps only, [≤K, n, n].
 
     ``prior`` [K, n] is the state before the update, NaN where the filter starts. ``residual_rate``
     [K, 2] is what is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
@@ -469,6 +485,18 @@ class PosteriorSteps(StepColumns):
     diverged: BoolArray
     prior: FloatArray
     residual_rate: FloatArray
+
+    @property
+    def outline(self) -> StepOutline:
+        """What an output takes of them."""
+        return StepOutline(**{f.name: getattr(self, f.name) for f in fields(StepOutline)})
+
+    def _cut(self, part: slice) -> Self:
+        forgotten = len(self.x) - len(self.P)
+        start, stop, _ = part.indices(len(self.x))
+        columns = {f.name: getattr(self, f.name)[part] for f in fields(self)}
+        columns["P"] = self.P[max(start - forgotten, 0) : max(stop - forgotten, 0)]
+        return type(self)(**columns)
 
 
 Steps = TypeVar("Steps", bound=PosteriorSteps)
@@ -542,11 +570,11 @@ def resume(carry: ShellCarry[Any] | None, n: int, memory_size: int = MEMORY) -> 
     return Belief(*(part.copy() for part in carry.belief))
 
 
-def no_posterior(count: int, n: int) -> Posterior:
-    """Return what a kernel writes to: ``count`` steps without an estimate."""
+def no_posterior(count: int, n: int, kept: int | None = None) -> Posterior:
+    """Return what a kernel writes to: ``count`` steps without an estimate, with room for ``kept`` covariances."""
     return Posterior(
         x=np.empty((count, n)),
-        P=np.empty((count, n, n)),
+        P=np.empty((count if kept is None else kept, n, n)),
         inputs=np.empty((count, INPUTS)),
         nis=np.full(count, np.nan),
         nis_dof=np.zeros(count),
@@ -556,6 +584,11 @@ def no_posterior(count: int, n: int) -> Posterior:
         diverged=np.zeros(count, dtype=np.bool_),
         prior=np.full((count, n), np.nan),
     )
+
+
+def no_prediction(count: int, n: int) -> Predicted:
+    """Return what predictions of ``n`` states are written to, with none in it."""
+    return Predicted(*(np.full((count, *shape), np.nan) for shape in ((n,), (MOTION, MOTION), ())))
 
 
 def carry_on(
@@ -569,20 +602,19 @@ def carry_on(
 def released_track(
     name: str,
     stamps_ns: IntArray,
-    steps: PosteriorSteps,
-    predict: Callable[[Due, Predicted], None],
+    steps: StepOutline,
+    predict: Callable[[Due], Predicted],
     named: Mapping[str, int] = MappingProxyType({}),
 ) -> tuple[StateTrack, Release]:
     """Predict to each scored stamp the newest step that had arrived by then.
 
-    ``predict`` writes what becomes of the steps in the time ahead, with their inputs held. ``named`` are the entries of
-    the state that have a column of the track.
+    ``predict`` returns what becomes of the steps in the time ahead, with their inputs held. ``named`` are the entries
+    of the state that have a column of the track.
     """
     released, horizon_s, usable = predictable(steps.stamps_ns, steps.ready_ns, steps.valid, stamps_ns)
-    at, count, n = released.at, len(stamps_ns), steps.x.shape[1]
-    predicted = Predicted(np.empty((count, n)), np.empty((count, n, n)), np.empty(count))
-    predict(Due(np.where(usable, at, -1), horizon_s), predicted)
-    x, covariance = predicted.x, predicted.P[:, :3, :3]
+    at, count = released.at, len(stamps_ns)
+    predicted = predict(Due(np.where(usable, at, -1), horizon_s))
+    x, covariance = predicted.x, predicted.P
     usable &= np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[at, U_SPEED])
     track = make_track(
         name,

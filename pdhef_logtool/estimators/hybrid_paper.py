@@ -28,14 +28,20 @@ from pdhef_logtool.car.nominal_model import (
     measured_lateral_acceleration,
     model_parameters,
     planar_lateral_acceleration,
-    rk4_step,
     substeps,
 )
+from pdhef_logtool.car.nominal_points import AT_VX, AT_VY, AT_YAW_RATE, advance_points, place, work_size
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators.fuzzy_trust import NOMINAL_TRUST, fuzzy_trust
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
-from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, FilterCarry
+from pdhef_logtool.estimators.physics import (
+    PHY_UKF_Q_STD,
+    FilterCarry,
+    StateLayout,
+    measure_sigma_points,
+    set_points,
+)
 from pdhef_logtool.estimators.unscented import (
     draw_sigma_points,
     innovation_moments,
@@ -93,36 +99,25 @@ class Parallel(NamedTuple):
     valid: BoolArray
 
 
+#: This filter has no state beside those that all have.
+_LAYOUT = StateLayout(-1, -1)
+
+
 @njit(cache=True)
-def _propagate(chi, over, rate, dt, p):  # type: ignore[no-untyped-def]
+def _propagate(chi, over, rate, dt, p, points):  # type: ignore[no-untyped-def]
     """Move sigma points [s, 4] by ``dt`` and add the increment of the residual ``rate`` whole at the end (Eq 19).
 
-    A residual counts where the model is dynamic: it knows nothing of the kinematic range.
+    A residual counts where the model is dynamic: it knows nothing of the kinematic range. ``points`` is work space.
     """
     rate_vy, rate_r = rate
     share = dynamic_share(chi[0, shell.VX], p) * dt
-    n = substeps(chi[0, shell.VX], dt, over.friction, p)
+    set_points(chi, over.steer, over.ax, (0.0, 0.0), _LAYOUT, points)
+    advance_points(points, over.friction, dt, substeps(chi[0, shell.VX], dt, over.friction, p), p)
     for i in range(chi.shape[0]):
-        ax = over.ax - chi[i, shell.AX_BIAS]
-        vx, vy, r = rk4_step(
-            chi[i, shell.VX], chi[i, shell.VY], chi[i, shell.YAW_RATE], over.steer, ax, over.friction, dt, n, p
-        )  # fmt: skip
-        chi[i, shell.VX] = vx
-        chi[i, shell.VY] = vy + share * rate_vy
-        chi[i, shell.YAW_RATE] = r + share * rate_r
-
-
-@njit(cache=True)
-def _measure(chi, steer, friction, rate_vy, p, zeta):  # type: ignore[no-untyped-def]
-    """Write what the sensors would read at sigma points chi [s, 4] to zeta [s, 3]."""
-    residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, shell.VX], p) * rate_vy
-    for i in range(chi.shape[0]):
-        ay = measured_lateral_acceleration(
-            chi[i, shell.VX], chi[i, shell.VY], chi[i, shell.YAW_RATE], steer, friction, p
-        )
-        zeta[i, shell.Z_AY] = ay + residual
-        zeta[i, shell.Z_YAW_RATE] = chi[i, shell.YAW_RATE]
-        zeta[i, shell.Z_SPEED] = chi[i, shell.VX]
+        at = place(i)
+        chi[i, shell.VX] = points[at + AT_VX]
+        chi[i, shell.VY] = points[at + AT_VY] + share * rate_vy
+        chi[i, shell.YAW_RATE] = points[at + AT_YAW_RATE] + share * rate_r
 
 
 @njit(cache=True)
@@ -155,6 +150,7 @@ def _filter(window, tuning, r0, p, parallel, belief, out, adapted):  # type: ign
     out_trust, out_r_scale = adapted
     n = shell.STATES
     chi, L, zeta, z_hat, S, Pxz, nu, _, _, use = shell.make_work(n)
+    points = np.empty(work_size(2 * n + 1))
     for k in range(dt.shape[0]):
         steer, friction, has_ax, ok = (
             inputs[k, shell.U_STEER],
@@ -190,14 +186,14 @@ def _filter(window, tuning, r0, p, parallel, belief, out, adapted):  # type: ign
             rate_vy, rate_r = trust * memory[shell.M_RATE_VY], trust * memory[shell.M_RATE_R]
             draw_sigma_points(x, P, scale, L, chi)
             over = shell.meanwhile(now, memory)
-            _propagate(chi, over, (rate_vy, rate_r), dt[k], p)
+            _propagate(chi, over, (rate_vy, rate_r), dt[k], p, points)
             mean_and_covariance(chi, wm, wc, x, P)
             shell.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust) * dt[k])  # Eq 26
             alive = shell.all_finite(x, P)
             out_prior[k] = x
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
-                _measure(chi, steer, friction, rate_vy, p, zeta)
+                measure_sigma_points(chi, steer, friction, rate_vy, _LAYOUT, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 nu[shell.Z_AY] = now.ay - z_hat[shell.Z_AY]
                 nu[shell.Z_YAW_RATE] = now.yaw_rate - z_hat[shell.Z_YAW_RATE]
@@ -237,7 +233,7 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
     out_x, out_P, out_ay = predicted
     q_std, _, _, _, wm, wc, scale, _ = tuning
     n = shell.STATES
-    chi = np.empty((2 * n + 1, n))
+    chi, points = np.empty((2 * n + 1, n)), np.empty(work_size(2 * n + 1))
     L = np.empty((n, n))
     x = np.empty(n)
     P = np.empty((n, n))
@@ -253,7 +249,7 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
             rate_vy, rate_r = trust[k] * rate[k, 0], trust[k] * rate[k, 1]
             if horizon_s[m] > 0.0:
                 draw_sigma_points(x, P, scale, L, chi)
-                _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], p)
+                _propagate(chi, over, (rate_vy, rate_r), horizon_s[m], p, points)
                 mean_and_covariance(chi, wm, wc, x, P)
                 shell.add_process_noise(P, q_std, over.ax_known, (1.0 + PROCESS_NOISE_GAIN * trust[k]) * horizon_s[m])
             if shell.all_finite(x, P):
@@ -265,7 +261,7 @@ def _predict_outputs(due, held, trust, tuning, p, predicted):  # type: ignore[no
                 x[:] = math.nan
                 P[:, :] = math.nan
         out_x[m] = x
-        out_P[m] = P
+        out_P[m] = P[:3, :3]
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,10 +323,12 @@ class PaperHybridUkf:
             steps = carry.own.steps.joined(steps)
         held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
 
-        def predict(due: shell.Due, predicted: shell.Predicted) -> None:
+        def predict(due: shell.Due) -> shell.Predicted:
+            predicted = shell.no_prediction(len(due.step), steps.x.shape[1])
             _predict_outputs(due, held, steps.trust, self._tuning, self._parameters, predicted)
+            return predicted
 
-        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict)
+        track, released = shell.released_track(self.name, signals.stamps_ns, steps.outline, predict)
         track = replace(
             track,
             network_trust=np.where(track.valid, steps.trust[released.at], np.nan),

@@ -114,7 +114,7 @@ def _propagate(chi, over, rate, dt, layout, p, points):  # type: ignore[no-untyp
     """
     rate_vy, rate_r = rate
     share = 0.5 * dynamic_share(chi[0, 0], p) * dt
-    _set_points(chi, over.steer, over.ax, (share * rate_vy, share * rate_r), layout, points)
+    set_points(chi, over.steer, over.ax, (share * rate_vy, share * rate_r), layout, points)
     advance_points(points, over.friction, dt, substeps(chi[0, 0], dt, over.friction, p), p)
     keep = math.exp(-dt / FORCE_SCALE_TIME_S) if layout.force_scale >= 0 else 1.0
     for i in range(chi.shape[0]):
@@ -128,7 +128,7 @@ def _propagate(chi, over, rate, dt, layout, p, points):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def _set_points(chi, steer, ax, more, layout, points):  # type: ignore[no-untyped-def]
+def set_points(chi, steer, ax, more, layout, points):  # type: ignore[no-untyped-def]
     """Write sigma points [s, n] to ``points``, with the increments of v_y and r times their force; the rest is filled.
 
     What is left of the last block is the first point again: numbers that cannot overflow.
@@ -148,10 +148,10 @@ def _set_points(chi, steer, ax, more, layout, points):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _measure(chi, steer, friction, rate_vy, layout, p, points, zeta):  # type: ignore[no-untyped-def]
+def measure_sigma_points(chi, steer, friction, rate_vy, layout, p, points, zeta):  # type: ignore[no-untyped-def]
     """Write what the sensors would read at sigma points chi [s, n] to zeta [s, 3]; the residual belongs to a_y too."""
     residual = (1.0 + p.ay_roll_gain) * dynamic_share(chi[0, 0], p) * rate_vy
-    _set_points(chi, steer, 0.0, (0.0, 0.0), layout, points)
+    set_points(chi, steer, 0.0, (0.0, 0.0), layout, points)
     measure_points(points, friction, p)
     for i in range(chi.shape[0]):
         at = place(i)
@@ -223,7 +223,7 @@ def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-u
                 out_prior[k, i] = x[i]
             if alive:
                 draw_sigma_points(x, P, scale, L, chi)
-                _measure(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
+                measure_sigma_points(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
                 innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                 shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
                 verdict = shell.gate(now, memory, nu, S, at_gate, given, use)
@@ -239,7 +239,7 @@ def _filter(window, tuning, layout, p, belief, out, links):  # type: ignore[no-u
                     if linked:  # to a smoother the inflation is process noise of the step that led here
                         out_predicted_P[k] = P
                     draw_sigma_points(x, P, scale, L, chi)
-                    _measure(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
+                    measure_sigma_points(chi, now.steer, now.friction, rate_vy, layout, p, points, zeta)
                     innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz)
                     shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
                     shell.open_gate(use, memory)
@@ -280,9 +280,6 @@ def _predict_outputs(due, held, tuning, layout, p, predicted):  # type: ignore[n
     for m in range(step.shape[0]):
         k = step[m]
         if k < 0:
-            out_x[m, :] = math.nan
-            out_P[m, :, :] = math.nan
-            out_ay[m] = math.nan
             continue
         x[:] = held_x[k]
         P[:, :] = held_P[k]
@@ -297,7 +294,7 @@ def _predict_outputs(due, held, tuning, layout, p, predicted):  # type: ignore[n
                 x[:] = math.nan
                 P[:, :] = math.nan
         out_x[m] = x
-        out_P[m] = P
+        out_P[m] = P[:3, :3]
         angle = over.steer if layout.bias < 0 else over.steer - x[layout.bias + 2]
         force = 1.0 if layout.force_scale < 0 else max(0.1, 1.0 + x[layout.force_scale])
         ay = planar_lateral_acceleration(x[shell.VX], x[shell.VY], x[shell.YAW_RATE], angle, over.friction, p, force)
@@ -428,10 +425,12 @@ class PhysicsUkf:
             steps = carry.steps.joined(steps)
         held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
 
-        def predict(due: shell.Due, predicted: shell.Predicted) -> None:
+        def predict(due: shell.Due) -> shell.Predicted:
+            predicted = shell.no_prediction(len(due.step), steps.x.shape[1])
             _predict_outputs(due, held, self._tuning, self.layout, self._parameters, predicted)
+            return predicted
 
-        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict)
+        track, released = shell.released_track(self.name, signals.stamps_ns, steps.outline, predict)
         return track, replace(after, steps=steps.since(released.needed))
 
 

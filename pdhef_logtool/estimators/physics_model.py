@@ -17,17 +17,20 @@ part, [φ, φ̇], [bank], [s], [b_δ], [b_ay, b_r]. f = F_y / m is an axle's lat
 - **Bank**: −g · bank in v̇_y and nowhere else, an Ornstein-Uhlenbeck process.
 - **Force scale**: 1 + s on the tyres' forces, an Ornstein-Uhlenbeck process.
 
-A step moves all points at once in inner loops without branches, as :mod:`~pdhef_logtool.car.nominal_points` does. One
-evaluation of the tyres a step: the exponential kernel of the lag weighs what they were asked over the step, and stands
-for one instant of it, t*; the state there is that at the start, moved by its derivative. Velocities take the mean of
-the forces at both ends. Second order in the step but for what changes slowly over one (speed in the lag, bank, force
-scale, and the load transfer where nothing rolls), and stable for any lag.
+A step moves eight points at once in an inner loop without branches, as :mod:`~pdhef_logtool.car.nominal_points` does:
+each part has its place there, and what a car lacks is 0 (:func:`spread_layout`). One evaluation of the tyres a step:
+the exponential kernel of the lag weighs what they were asked over the step, and stands for one instant of it, t*; the
+state there is that at the start, moved by its derivative. Velocities take the mean of the forces at both ends. Second
+order in the step but for what changes slowly over one (speed in the lag, bank, force scale, and the load transfer where
+nothing rolls), and stable for any lag.
 """
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
+
+import numpy as np
 
 from pdhef_logtool.car.nominal_model import KINEMATIC_TIME_CONSTANT_S, MAX_SUBSTEPS, dynamic_share, substeps
 from pdhef_logtool.car.nominal_points import arctangent, sine
@@ -38,6 +41,13 @@ from pdhef_logtool.records.compiled import njit
 #: Entries of the state that every car has, and how many of the others its parts add.
 VX, VY, YAW_RATE, AX_BIAS, FRONT, REAR = range(6)
 CORE = 6
+#: Entries of the others, where every part has its place whether or not the car has it (:func:`spread_layout`), and how
+#: many entries such a state has.
+ROLL, ROLL_RATE, BANK, FORCE_SCALE, STEER_BIAS, AY_BIAS, RATE_BIAS = range(CORE, CORE + 7)
+PLACES = 13
+#: Points that an inner loop takes, and for how many a block of points has room: a multiple of it.
+LANES = 8
+WIDTH = 3 * LANES
 
 #: Time constant with which the bank returns to 0 (METHOD §16).
 BANK_TIME_S = 5.0
@@ -74,6 +84,36 @@ class Layout(NamedTuple):
             "yaw_rate_bias_rad_s": self.sensor_bias + 1 if self.sensor_bias >= 0 else -1,
         }
         return {name: at for name, at in places.items() if at >= 0}
+
+
+@njit(cache=True)
+def spread_layout(layout):  # type: ignore[no-untyped-def]
+    """Return the layout of a state in which every part has its place: still −1 for a part that the car lacks."""
+    return Layout(
+        PLACES,
+        ROLL if layout.roll >= 0 else -1,
+        BANK if layout.bank >= 0 else -1,
+        FORCE_SCALE if layout.force_scale >= 0 else -1,
+        STEER_BIAS if layout.steer_bias >= 0 else -1,
+        AY_BIAS if layout.sensor_bias >= 0 else -1,
+    )
+
+
+@njit(cache=True)
+def places_of(layout):  # type: ignore[no-untyped-def]
+    """Return where each entry of a state [n] stands in one in which every part has its place, [n]."""
+    places = np.arange(layout.size)
+    for at, place, width in (
+        (layout.roll, ROLL, 2),
+        (layout.bank, BANK, 1),
+        (layout.force_scale, FORCE_SCALE, 1),
+        (layout.steer_bias, STEER_BIAS, 1),
+        (layout.sensor_bias, AY_BIAS, 2),
+    ):
+        for i in range(width):
+            if at >= 0:
+                places[at + i] = place + i
+    return places
 
 
 class PhysicsParameters(NamedTuple):
@@ -141,6 +181,8 @@ class _Step(NamedTuple):
     kept: float  # share of an axle's force at the start that is left at the end of the step
     tyre_s: float  # t*: the time from the step's start at which the tyres are asked
     inertia: float  # m / I_z
+    front_held: float  # s_z where the front axle's formula holds the transfer of steady cornering already, else 0
+    rear_held: float
 
 
 @njit(cache=True)
@@ -182,14 +224,16 @@ def _prepare(vx, h, steer, ax, friction, p, f):  # type: ignore[no-untyped-def]
         kept,
         tyre_s,
         p.mass_kg / p.yaw_inertia_kg_m2,
+        f.load_sensitivity if f.front_holds_transfer else 0.0,
+        f.load_sensitivity if f.rear_holds_transfer else 0.0,
     )
 
 
 @_inline
-def _transfer_factor(ay, f):  # type: ignore[no-untyped-def]
+def _transfer_factor(ay, sensitivity, f):  # type: ignore[no-untyped-def]
     """Return 1 − s_z x² of an axle at lateral acceleration ``ay``; x ends at 1, the inner wheel off the road."""
     x = min(1.0, abs(f.transfer_per_ay * ay))
-    return 1.0 - f.load_sensitivity * x * x
+    return 1.0 - sensitivity * x * x
 
 
 # positional: numbers of one point in an inner loop that is to become vector instructions.
@@ -202,84 +246,105 @@ def _tyre_forces(v, vy, r, angle, ay, force, c, p, f):  # type: ignore[no-untype
     rear = arctangent(rear - p.rear_E * (rear - arctangent(rear, 1.0)), 1.0)
     ff = c.peak_front * sine(p.front_C * front)
     fr = c.peak_rear * sine(p.rear_C * rear)
-    factor = _transfer_factor(ay, f)
-    ff *= force * factor / (_transfer_factor(ff / f.front_share, f) if f.front_holds_transfer else 1.0)
-    fr *= force * factor / (_transfer_factor(fr / f.rear_share, f) if f.rear_holds_transfer else 1.0)
+    factor = _transfer_factor(ay, f.load_sensitivity, f)
+    ff *= force * factor / _transfer_factor(ff / f.front_share, c.front_held, f)
+    fr *= force * factor / _transfer_factor(fr / f.rear_share, c.rear_held, f)
     return ff, fr
 
 
+# positional: numbers and records of numbers, which a compiled function takes at no cost.
 @_compiled
-def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
-    """Advance points [state, WIDTH], of which ``count`` are used, by ``dt`` s in ``n`` steps with constant inputs.
+def advance_block(points, count, vx, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
+    """Advance a block of points [PLACES · WIDTH], an entry after the other, by ``dt`` s in ``n`` steps.
 
-    ``over`` are steering angle, accelerometer's a_x and friction. The rows of sensors' biases are not looked at.
+    As :func:`advance`, but every part has its place; of the points the first ``count`` move, and those that fill the
+    last ``LANES``: all of them must be numbers. ``vx`` is the speed that they all go by.
     """
     h = dt / n
-    c = _prepare(points[VX, 0], h, over.steer, over.ax, over.friction, p, f)
+    c = _prepare(vx, h, over.steer, over.ax, over.friction, p, f)
     per_blend = 1.0 / (p.blend_high_m_s - p.blend_low_m_s)
     per_kinematic = 1.0 / KINEMATIC_TIME_CONSTANT_S
-    rolls, banks, scales, steers = layout.roll >= 0, layout.bank >= 0, layout.force_scale >= 0, layout.steer_bias >= 0
-    # Rows that a car has not stand for another one, whose value is then not used.
-    roll, bank = max(layout.roll, 0), max(layout.bank, 0)
-    scale, steer_bias = max(layout.force_scale, 0), max(layout.steer_bias, 0)
-    stiffness, damping = f.roll_frequency_rad_s**2, 2.0 * f.roll_damping * f.roll_frequency_rad_s
+    rolls = layout.roll >= 0
+    stiffness = f.roll_frequency_rad_s**2 if rolls else 0.0
+    damping = 2.0 * f.roll_damping * f.roll_frequency_rad_s if rolls else 0.0
     leans = rolls and abs(f.roll_gradient) > LEAST_ROLL_GRADIENT
-    per_gradient = 1.0 / f.roll_gradient if leans else 0.0
-    bank_kept, scale_kept = math.exp(-h / BANK_TIME_S), math.exp(-h / FORCE_SCALE_TIME_S)
-    t = c.tyre_s
+    per_gradient, follows = (1.0 / f.roll_gradient, 0.0) if leans else (0.0, 1.0)
+    bank_kept = math.exp(-h / BANK_TIME_S) if layout.bank >= 0 else 1.0
+    scale_kept = math.exp(-h / FORCE_SCALE_TIME_S) if layout.force_scale >= 0 else 1.0
+    t, half = c.tyre_s, 0.5 * h
     for _ in range(n):
-        for j in range(count):
-            vx, vy, r = points[VX, j], points[VY, j], points[YAW_RATE, j]
-            ff, fr = points[FRONT, j], points[REAR, j]
-            angle = c.angle - (points[steer_bias, j] if steers else 0.0)
-            slope = GRAVITY_M_S2 * points[bank, j] if banks else 0.0
-            force = max(0.1, 1.0 + points[scale, j]) if scales else 1.0
-            phi = points[roll, j] if rolls else 0.0
-            phi_dot = points[roll + 1, j] if rolls else 0.0
-            ax = c.ax - points[AX_BIAS, j]
-            w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * per_blend))
-            follow = (1.0 - w) * per_kinematic
-            # at the start
-            ffc = ff * c.cos
-            r_kin = vx * c.r_kin_per_vx
-            vx_dot = ax + r * r * p.imu_x_m + vy * r
-            vy_dot = w * (ffc + fr - slope - vx * r) + (follow * (p.rear_m * r_kin - vy) if w < 1.0 else 0.0)
-            r_dot = w * c.inertia * (p.front_m * ffc - p.rear_m * fr) + (follow * (r_kin - r) if w < 1.0 else 0.0)
-            vx_dot += r_dot * p.imu_y_m
-            ay = w * (ffc + fr) + (1.0 - w) * vx * r
-            roll_acc = stiffness * (f.roll_gradient * ay - phi) - damping * phi_dot if rolls else 0.0
-            # the tyres, at t*
-            sway = f.swing_m * (phi_dot + t * roll_acc) if rolls else 0.0
-            lean = (phi + t * phi_dot) * per_gradient if leans else ay
-            v = max(vx + t * vx_dot, p.blend_low_m_s)
-            sf, sr = _tyre_forces(v, vy + t * vy_dot + sway, r + t * r_dot, angle, lean, force, c, p, f)
-            ff1 = sf + (ff - sf) * c.kept
-            fr1 = sr + (fr - sr) * c.kept
-            # the mean over the step
-            half = 0.5 * h
-            mf = 0.5 * (ff + ff1)
-            mr = 0.5 * (fr + fr1)
-            mfc = mf * c.cos
-            mx, my, mrate = vx + half * vx_dot, vy + half * vy_dot, r + half * r_dot
-            r_kin = mx * c.r_kin_per_vx
-            r_dot = w * c.inertia * (p.front_m * mfc - p.rear_m * mr) + (follow * (r_kin - mrate) if w < 1.0 else 0.0)
-            mrate = r + half * r_dot
-            vy_dot = w * (mfc + mr - slope - mx * mrate) + (follow * (p.rear_m * r_kin - my) if w < 1.0 else 0.0)
-            my = vy + half * vy_dot
-            points[VX, j] = vx + h * (ax + r_dot * p.imu_y_m + mrate * mrate * p.imu_x_m + my * mrate)
-            points[VY, j] = vy + h * vy_dot
-            points[YAW_RATE, j] = r + h * r_dot
-            points[FRONT, j] = ff1
-            points[REAR, j] = fr1
-            if rolls:
+        for first in range(0, count, LANES):
+            block = points[first:]
+            for j in range(LANES):
+                vx, vy, r = block[VX * WIDTH + j], block[VY * WIDTH + j], block[YAW_RATE * WIDTH + j]
+                ff, fr = block[FRONT * WIDTH + j], block[REAR * WIDTH + j]
+                phi, phi_dot = block[ROLL * WIDTH + j], block[ROLL_RATE * WIDTH + j]
+                angle = c.angle - block[STEER_BIAS * WIDTH + j]
+                slope = GRAVITY_M_S2 * block[BANK * WIDTH + j]
+                force = max(0.1, 1.0 + block[FORCE_SCALE * WIDTH + j])
+                ax = c.ax - block[AX_BIAS * WIDTH + j]
+                w = min(1.0, max(0.0, (vx - p.blend_low_m_s) * per_blend))
+                follow = (1.0 - w) * per_kinematic
+                # at the start
+                ffc = ff * c.cos
+                r_kin = vx * c.r_kin_per_vx
+                vx_dot = ax + r * r * p.imu_x_m + vy * r
+                vy_dot = w * (ffc + fr - slope - vx * r) + follow * (p.rear_m * r_kin - vy)
+                r_dot = w * c.inertia * (p.front_m * ffc - p.rear_m * fr) + follow * (r_kin - r)
+                vx_dot += r_dot * p.imu_y_m
+                ay = w * (ffc + fr) + (1.0 - w) * vx * r
+                roll_acc = stiffness * (f.roll_gradient * ay - phi) - damping * phi_dot
+                # the tyres, at t*
+                sway = f.swing_m * (phi_dot + t * roll_acc)
+                lean = (phi + t * phi_dot) * per_gradient + follows * ay
+                v = max(vx + t * vx_dot, p.blend_low_m_s)
+                sf, sr = _tyre_forces(v, vy + t * vy_dot + sway, r + t * r_dot, angle, lean, force, c, p, f)
+                ff1 = sf + (ff - sf) * c.kept
+                fr1 = sr + (fr - sr) * c.kept
+                # the mean over the step
+                mf = 0.5 * (ff + ff1)
+                mr = 0.5 * (fr + fr1)
+                mfc = mf * c.cos
+                mx, my, mrate = vx + half * vx_dot, vy + half * vy_dot, r + half * r_dot
+                r_kin = mx * c.r_kin_per_vx
+                r_dot = w * c.inertia * (p.front_m * mfc - p.rear_m * mr) + follow * (r_kin - mrate)
+                mrate = r + half * r_dot
+                vy_dot = w * (mfc + mr - slope - mx * mrate) + follow * (p.rear_m * r_kin - my)
+                my = vy + half * vy_dot
                 ay = w * (mfc + mr) + (1.0 - w) * mx * mrate
                 middle, speed = phi + half * phi_dot, phi_dot + half * roll_acc
-                points[roll, j] = phi + h * speed
-                points[roll + 1, j] = phi_dot + h * (stiffness * (f.roll_gradient * ay - middle) - damping * speed)
-            if banks:
-                points[bank, j] *= bank_kept
-            if scales:
-                points[scale, j] *= scale_kept
+                block[VX * WIDTH + j] = vx + h * (ax + r_dot * p.imu_y_m + mrate * mrate * p.imu_x_m + my * mrate)
+                block[VY * WIDTH + j] = vy + h * vy_dot
+                block[YAW_RATE * WIDTH + j] = r + h * r_dot
+                block[FRONT * WIDTH + j] = ff1
+                block[REAR * WIDTH + j] = fr1
+                block[ROLL * WIDTH + j] = phi + h * speed
+                block[ROLL_RATE * WIDTH + j] = phi_dot + h * (
+                    stiffness * (f.roll_gradient * ay - middle) - damping * speed
+                )
+                block[BANK * WIDTH + j] *= bank_kept
+                block[FORCE_SCALE * WIDTH + j] *= scale_kept
+
+
+@njit(cache=True)
+def advance(points, count, over, dt, n, layout, p, f):  # type: ignore[no-untyped-def]
+    """Advance the first ``count`` of points [state, S] by ``dt`` s in ``n`` steps with constant inputs.
+
+    ``over`` are steering angle, accelerometer's a_x and friction. The rows of sensors' biases are not looked at. All
+    points go by the speed of the first.
+    """
+    places, block, vx = places_of(layout), np.empty(PLACES * WIDTH), points[VX, 0]
+    for first in range(0, count, WIDTH):
+        here = min(count - first, WIDTH)
+        block[:] = 0.0
+        for i in range(layout.size):
+            at = places[i] * WIDTH
+            block[at : at + WIDTH] = points[i, first]
+            block[at : at + here] = points[i, first : first + here]
+        advance_block(block, here, vx, over, dt, n, spread_layout(layout), p, f)
+        for i in range(layout.size):
+            at = places[i] * WIDTH
+            points[i, first : first + here] = block[at : at + here]
 
 
 @njit(cache=True)

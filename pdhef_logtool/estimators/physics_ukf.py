@@ -3,7 +3,7 @@
 An unscented filter on the model of :mod:`~.physics_model` (METHOD §6, §16). As the axles' forces and the roll are
 states, what the sensors read is linear in the state but for a lever arm's r²: the update takes the derivative, which
 for a linear function is what the sigma points give. Points that differ in the sensors' biases alone move with their
-centre. With ``jacobian`` the time update takes derivatives too, by differences of the model, and is an extended filter.
+centre.
 
 A residual rate of v̇_y and ṙ enters as in ``phy-ukf``: half before and half after the model's step, and in the
 predicted a_y, times the force scale where that is a state. Zeros change no bit.
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -26,36 +26,55 @@ from pdhef_logtool.estimators import filter_shell as shell
 from pdhef_logtool.estimators.physics import (
     BIAS_WALK_STD,
     FORCE_SCALE_STD,
+    FORCE_SCALE_TIME_S,
     LINK_NONE,
     LINK_WHOLE,
     FilterCarry,
     LinkColumns,
     StepLinks,
-    add_process_noise,
 )
 from pdhef_logtool.estimators.physics_model import (
     AX_BIAS,
+    AY_BIAS,
+    BANK,
     BANK_TIME_S,
     CORE,
+    FORCE_SCALE,
     FRONT,
+    PLACES,
+    RATE_BIAS,
     REAR,
     VX,
     VY,
+    WIDTH,
     YAW_RATE,
     Layout,
     PhysicsParameters,
-    advance,
+    advance_block,
     layout_of,
     physics_parameters,
+    places_of,
     planar_ay,
     sensed_ay,
     settle_forces,
+    spread_layout,
     step_count,
 )
-from pdhef_logtool.estimators.unscented import cholesky_lower, kalman_update, repair_covariance
+from pdhef_logtool.estimators.unscented import ROOM, whiten, wide_root
 from pdhef_logtool.records.compiled import njit
+from pdhef_logtool.records.release import predictable
 from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.vectors import (
+    LANES,
+    aligned,
+    first_half_twice,
+    inner_products,
+    load,
+    spread,
+    store,
+    total,
+)
 from pdhef_logtool.watches.speed_slip import believable
 
 if TYPE_CHECKING:
@@ -72,181 +91,347 @@ _ROLL_STD, _STANDSTILL_ROLL_STD, _ROLL_WALK = (0.01, 0.03), (0.005, 0.01), 0.02
 #: Spread of the bank, rad: a crowned road has 0.02-0.03, motorway bends to 0.07.
 _BANK_STD = 0.02
 
+#: The column of a block of points that holds the centre.
+_CENTRE = AY_BIAS
+#: How many places there are behind the first whole vector.
+_REST = PLACES - LANES
+
 # No check of divisors, and sums in any order, so that the compiler can take several terms at a time.
 _compiled = njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc"})
+# To hand arrays on costs as much as a part of a step computes.
+_inlined = njit(forceinline=True, error_model="numpy", fastmath={"contract", "reassoc"})
+
+# In the compiled code every part has its place in the state, whether or not a car has it (``spread_layout``); what it
+# lacks is 0 and has no variance. x has ROOM entries, P and the factor ROOM rows of ROOM.
 
 
-@_compiled
-def _draw(x, P, scale, layout, L, points):  # type: ignore[no-untyped-def]
-    """Write the sigma points of (x, P) to the columns of points [n, 2n+1] and return how many of them move.
+class _Constants(NamedTuple):
+    """Vectors that stay what they are: read as a whole, they need not wait for numbers that were just written."""
 
-    The first is the centre; those that differ from it in the sensors' biases alone are last. P is repaired if needed.
+    signs: FloatArray  # which of the columns 8 to 15 lie before and behind the centre
+    centre: FloatArray  # 1 where the centre stands there, else 0
+    biases: FloatArray  # 1 for the sensors' biases among the entries 8 to 15, else 0
+    others: FloatArray  # the reverse
+    unit: FloatArray  # a single 1, ROOM numbers before and behind it
+
+
+@njit(cache=True)
+def _make_constants():  # type: ignore[no-untyped-def]
+    signs, centre, biases, others, unit = aligned(8), aligned(8), aligned(8), aligned(8), aligned(2 * ROOM + 1)
+    signs[:3], signs[4:7] = 1.0, -1.0
+    centre[_CENTRE - LANES] = 1.0
+    others[:] = 1.0
+    for i in (AY_BIAS, RATE_BIAS):
+        biases[i - LANES], others[i - LANES] = 1.0, 0.0
+    unit[ROOM] = 1.0
+    return _Constants(signs, centre, biases, others, unit)
+
+
+@_inlined
+def _draw(x, L, scale, constants, points):  # type: ignore[no-untyped-def]
+    """Write a block of sigma points about x to points [PLACES · WIDTH]; L as of :func:`~.unscented.wide_root`.
+
+    Columns i and 16 + i, of the entries 8 to 10 columns i and 4 + i, differ from the centre along column i of the
+    factor; the rest are the centre. Points that differ in the sensors' biases alone move with their centre and are left
+    out; the rows of these biases hold what the other points differ from their centre.
     """
-    n = x.shape[0]
-    if not cholesky_lower(P, L):
-        repair_covariance(P)
-        cholesky_lower(P, L)
-    moving = n if layout.sensor_bias < 0 else layout.sensor_bias
-    root = math.sqrt(scale)
-    for j in range(n):
-        points[j, 0] = x[j]
-        for i in range(n):
-            d = root * L[j, i]
-            up = 1 + i if i < moving else 1 + i + moving
-            points[j, up] = x[j] + d
-            points[j, up + (moving if i < moving else n - moving)] = x[j] - d
-    return 1 + 2 * moving
+    root = spread(math.sqrt(scale))
+    for j in range(PLACES):
+        centre = spread(x[j] if j < AY_BIAS else 0.0)
+        low, high = root * load(L, j * ROOM), root * load(L, j * ROOM + LANES)
+        store(points, j * WIDTH, centre + low)
+        store(points, j * WIDTH + LANES, centre + load(constants.signs, 0) * first_half_twice(high))
+        store(points, j * WIDTH + 2 * LANES, centre - low)
+
+
+@_inlined
+def _moments(points, scale, q, constants, x, P, whole):  # type: ignore[no-untyped-def]
+    """Write mean and covariance of points that :func:`_draw` drew, with ``q`` [ROOM] added to the variances.
+
+    Of the covariance only that of the motion, unless the ``whole`` is wanted. In place of the points stands what they
+    differ from their centre, e. With δ the mean of e, the moments about the mean, the weight of the centre among them,
+    are Σ w e eᵀ + δ δᵀ: in the centre's place stands δ / √w.
+    """
+    weight = 0.5 / scale
+    per_weight = 1.0 / math.sqrt(weight)
+    for j in range(AY_BIAS):
+        at = j * WIDTH
+        centre = points[at + _CENTRE]
+        about = spread(centre)
+        a, b, c = load(points, at) - about, load(points, at + LANES) - about, load(points, at + 2 * LANES) - about
+        moved = weight * total(a + b + c)
+        store(points, at, a)
+        store(points, at + LANES, b + spread(per_weight * moved) * load(constants.centre, 0))
+        store(points, at + 2 * LANES, c)
+        x[j] = centre + moved
+    share = spread(weight)
+    for i in range(PLACES if whole else shell.MOTION):
+        at = i * ROOM
+        product = share * inner_products(points, WIDTH, i * WIDTH, 0, LANES)
+        store(P, at, product + spread(q[i]) * load(constants.unit, ROOM - i))
+        if whole:
+            product = share * inner_products(points, WIDTH, i * WIDTH, LANES * WIDTH, _REST)
+            if i >= AY_BIAS:  # no point shows the covariance of the sensors' biases with each other, and it stays
+                kept = load(constants.biases, 0) * load(P, at + LANES)
+                product = load(constants.others, 0) * product + kept
+            store(P, at + LANES, product + spread(q[i]) * load(constants.unit, ROOM - i + LANES))
+
+
+@_inlined
+def _keep_before(points, x, P, places, before, cross):  # type: ignore[no-untyped-def]
+    """Write what drawn points differ from their centre x, and of the cross covariance [n, n] the sensors' biases."""
+    for j in range(PLACES):
+        centre = spread(x[j] if j < AY_BIAS else 0.0)
+        for at in range(j * WIDTH, (j + 1) * WIDTH, LANES):
+            store(before, at, load(points, at) - centre)
+    for a in range(places.shape[0]):
+        for b in range(places.shape[0]):
+            cross[a, b] = P[places[a], places[b]]
+
+
+@_inlined
+def _cross(before, points, scale, places, cross):  # type: ignore[no-untyped-def]
+    """Write the covariance [n, n] of points before a step, as :func:`_keep_before`, and after it, as :func:`_moments`.
+
+    That of the sensors' biases with each other, which no point that is left shows, stays.
+    """
+    weight = 0.5 / scale
+    for i in range(places.shape[0]):
+        at = places[i] * WIDTH
+        a, b, c = load(before, at), load(before, at + LANES), load(before, at + 2 * LANES)
+        for j in range(places.shape[0]):
+            to = places[j] * WIDTH
+            if places[i] < AY_BIAS or places[j] < AY_BIAS:
+                product = a * load(points, to) + b * load(points, to + LANES) + c * load(points, to + 2 * LANES)
+                cross[i, j] = weight * total(product)
 
 
 @_compiled
-def _moments(points, x, P, deviation):  # type: ignore[no-untyped-def]
-    """Write mean [n], covariance [n, n] and deviations of points [n, 2n+1] that :func:`_draw` drew."""
-    n, s = points.shape
-    weight = 0.5 / n
-    for j in range(n):
-        total = 0.0
-        for i in range(1, s):
-            total += points[j, i]
-        x[j] = weight * total
-        for i in range(s):
-            deviation[j, i] = points[j, i] - x[j]
-    for a in range(n):
-        for b in range(a + 1):
-            total = 0.0
-            for i in range(1, s):
-                total += deviation[a, i] * deviation[b, i]
-            P[a, b] = weight * total + 2.0 * deviation[a, 0] * deviation[b, 0]
-            P[b, a] = P[a, b]
+def _force(x):  # type: ignore[no-untyped-def]
+    """Return the factor on forces and residual in state x."""
+    return max(0.1, 1.0 + x[FORCE_SCALE])
 
 
 @_compiled
-def _cross(before, deviation, out):  # type: ignore[no-untyped-def]
-    """Write the covariance [n, n] of points before a step [n, 2n+1], in pairs about their first, and after it."""
-    n, s = before.shape
-    weight = 0.5 / n
-    for a in range(n):
-        for b in range(n):
-            total = 0.0
-            for i in range(1, s):
-                total += (before[a, i] - before[a, 0]) * deviation[b, i]
-            out[a, b] = weight * total
-
-
-@_compiled
-def _force(x, layout):  # type: ignore[no-untyped-def]
-    """Return the factor on forces and residual in state x [n]."""
-    return max(0.1, 1.0 + x[layout.force_scale]) if layout.force_scale >= 0 else 1.0
-
-
-@_compiled
-def _push(points, count, half, layout):  # type: ignore[no-untyped-def]
-    """Add half of the residual's increments of v_y and r to points that move, times their force scale."""
+def _push(points, half):  # type: ignore[no-untyped-def]
+    """Add half of the residual's increments of v_y and r to points, times their force scale."""
     half_vy, half_rate = half
-    for j in range(count):
-        force = max(0.1, 1.0 + points[layout.force_scale, j]) if layout.force_scale >= 0 else 1.0
-        points[VY, j] += force * half_vy
-        points[YAW_RATE, j] += force * half_rate
+    for j in range(WIDTH):
+        force = max(0.1, 1.0 + points[FORCE_SCALE * WIDTH + j])
+        points[VY * WIDTH + j] += force * half_vy
+        points[YAW_RATE * WIDTH + j] += force * half_rate
+
+
+@_compiled
+def _process_noise(q_std, ax_known, dt, layout, q):  # type: ignore[no-untyped-def]
+    """Write the variance that ``dt`` s add to each entry, as ``phy-ukf`` does; the bank returns to 0."""
+    for i in range(ROOM):
+        q[i] = q_std[i] * q_std[i] * dt
+    if not ax_known:
+        q[VX] = shell.NO_AX_Q_STD**2 * dt
+    if layout.force_scale >= 0:
+        q[FORCE_SCALE] += FORCE_SCALE_STD**2 * (1.0 - math.exp(-2.0 * dt / FORCE_SCALE_TIME_S))
+    if layout.bank >= 0:
+        q[BANK] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
 
 
 # positional: to hand structures of arrays on at every step would cost as much as the step.
-@_compiled
-def _predict(x, P, over, rate, dt, noise, layout, p, f, work):  # type: ignore[no-untyped-def]
-    """Move state and covariance by ``dt`` s in place; the deviations of the sigma points are left in ``work``.
+@_inlined
+def _predict(x, P, over, rate, dt, noise, layout, p, f, constants, points, whole):  # type: ignore[no-untyped-def]
+    """Move state and covariance, the ``whole`` or that of the motion, by ``dt`` s with drawn points.
 
     ``rate`` is the residual of v̇_y and ṙ; it counts where the model is dynamic.
     """
-    q_std, scale = noise
-    points, deviation, L = work
-    count = _draw(x, P, scale, layout, L, points)
+    q_std, q, scale = noise
     n = step_count(x[VX], dt, over.friction, layout, p, f)
     given = rate[0] != 0.0 or rate[1] != 0.0
     share = 0.5 * dynamic_share(x[VX], p) * dt
     half = (share * rate[0], share * rate[1])
     if given:
-        _push(points, count, half, layout)
-    advance(points, count, over, dt, n, layout, p, f)
+        _push(points, half)
+    advance_block(points, WIDTH, x[VX], over, dt, n, layout, p, f)
     if given:
-        _push(points, count, half, layout)
-    for j in range(x.shape[0]):
-        if layout.sensor_bias < 0 or j < layout.sensor_bias:
-            for i in range(count, points.shape[1]):
-                points[j, i] = points[j, 0]
-    _moments(points, x, P, deviation)
-    add_process_noise(P, q_std, over.ax_known, dt, layout)
-    if layout.bank >= 0:
-        P[layout.bank, layout.bank] += _BANK_STD**2 * (1.0 - math.exp(-2.0 * dt / BANK_TIME_S))
+        _push(points, half)
+    _process_noise(q_std, over.ax_known, dt, layout, q)
+    _moments(points, scale, q, constants, x, P, whole)
+
+
+# positional: as _predict.
+@_inlined
+def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
+    """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [3, ROOM].
+
+    ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
+    """
+    z_hat[shell.Z_AY] = sensed_ay(x, steer, layout, p, f, row)
+    if rate_vy != 0.0:
+        felt = (1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient) * dynamic_share(x[VX], p) * rate_vy
+        z_hat[shell.Z_AY] += _force(x) * felt
+        if layout.force_scale >= 0:
+            row[FORCE_SCALE] = felt
+    z_hat[shell.Z_YAW_RATE] = x[YAW_RATE] + x[RATE_BIAS]
+    z_hat[shell.Z_SPEED] = x[VX]
+    low, high = spread(0.0), spread(0.0)
+    for b in range(PLACES):
+        if row[b] != 0.0:
+            low = low + spread(row[b]) * load(P, b * ROOM)
+            high = high + spread(row[b]) * load(P, b * ROOM + LANES)
+    store(Pxz, shell.Z_AY * ROOM, low)
+    store(Pxz, shell.Z_AY * ROOM + LANES, high)
+    for at in (0, LANES):
+        rate = load(P, YAW_RATE * ROOM + at) + load(P, RATE_BIAS * ROOM + at)
+        store(Pxz, shell.Z_YAW_RATE * ROOM + at, rate)
+        store(Pxz, shell.Z_SPEED * ROOM + at, load(P, VX * ROOM + at))
+    of_ay, of_rate, of_speed = 0.0, 0.0, 0.0
+    for b in range(PLACES):
+        if row[b] != 0.0:
+            of_ay += row[b] * Pxz[shell.Z_AY, b]
+            of_rate += row[b] * Pxz[shell.Z_YAW_RATE, b]
+            of_speed += row[b] * Pxz[shell.Z_SPEED, b]
+    S[shell.Z_AY, shell.Z_AY] = of_ay
+    S[shell.Z_AY, shell.Z_YAW_RATE] = S[shell.Z_YAW_RATE, shell.Z_AY] = of_rate
+    S[shell.Z_AY, shell.Z_SPEED] = S[shell.Z_SPEED, shell.Z_AY] = of_speed
+    for k in (shell.Z_YAW_RATE, shell.Z_SPEED):
+        S[shell.Z_YAW_RATE, k] = Pxz[k, YAW_RATE] + Pxz[k, RATE_BIAS]
+        S[shell.Z_SPEED, k] = Pxz[k, VX]
+
+
+# positional: as _predict.
+@_inlined
+def _update(x, P, nu, S, Pxz, use, index, root, w, gain):  # type: ignore[no-untyped-def]
+    """Do what :func:`~.unscented.kalman_update` does, but for the check of P; ``gain`` [3, ROOM] is work space."""
+    nis, used, log_likelihood = whiten(nu, S, use, index, root, w)
+    if used == 0:
+        return nis, used, log_likelihood
+    gain[:, :] = 0.0
+    w[used:] = 0.0
+    for i in range(used):
+        for at in (0, LANES):
+            of = load(Pxz, index[i] * ROOM + at)
+            for j in range(i):
+                of = of - spread(root[i, j]) * load(gain, j * ROOM + at)
+            store(gain, i * ROOM + at, spread(1.0 / root[i, i]) * of)
+    for at in (0, LANES):
+        a, b, c = load(gain, at), load(gain, ROOM + at), load(gain, 2 * ROOM + at)
+        store(x, at, load(x, at) + spread(w[0]) * a + spread(w[1]) * b + spread(w[2]) * c)
+        for i in range(PLACES):
+            to = i * ROOM + at
+            left = load(P, to) - spread(gain[0, i]) * a - spread(gain[1, i]) * b - spread(gain[2, i]) * c
+            store(P, to, left)
+    return nis, used, log_likelihood
+
+
+@_compiled
+def _finite(x, P):  # type: ignore[no-untyped-def]
+    """Return whether state and variances are numbers; so are all covariances then."""
+    found = 0.0
+    for i in range(PLACES):
+        found += x[i] + P[i, i]
+    return math.isfinite(found)
+
+
+@_compiled
+def _in_places(values, places, rest):  # type: ignore[no-untyped-def]
+    """Return values [n] where their entries have their places, [ROOM]."""
+    out = aligned(ROOM)
+    out[:] = rest
+    for i in range(places.shape[0]):
+        out[places[i]] = values[i]
+    return out
+
+
+@_compiled
+def _matrix_in_places(P, places, out):  # type: ignore[no-untyped-def]
+    """Write P [n, n] where its entries have their places, [ROOM, ROOM]; the rest is left."""
+    for i in range(places.shape[0]):
+        for j in range(places.shape[0]):
+            out[places[i], places[j]] = P[i, j]
+
+
+@_inlined
+def _take(x, places, out):  # type: ignore[no-untyped-def]
+    """Write a state [n] from where its entries have their places."""
+    for i in range(places.shape[0]):
+        out[i] = x[places[i]]
+
+
+@_inlined
+def _take_matrix(P, places, out):  # type: ignore[no-untyped-def]
+    """Write a covariance [n, n] from where its entries have their places."""
+    for i in range(places.shape[0]):
+        for j in range(places.shape[0]):
+            out[i, j] = P[places[i], places[j]]
 
 
 # positional: as _predict.
 @_compiled
-def _measure(x, P, steer, rate_vy, layout, p, f, row, z_hat, S, Pxz):  # type: ignore[no-untyped-def]
-    """Write what the sensors should read [3], its covariance without R [3, 3] and the cross covariance [n, 3].
-
-    ``rate_vy`` is the residual of v̇_y, which the accelerometer feels as it does the tyres' forces.
-    """
-    n = x.shape[0]
-    z_hat[shell.Z_AY] = sensed_ay(x, steer, layout, p, f, row)
+def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: ignore[no-untyped-def]
+    """Write state, covariance of the motion and planar a_y to row m, if they are numbers."""
+    out_x, out_P, out_ay = predicted
+    if not _finite(x, P):
+        return
+    _take(x, places, out_x[m])
+    for i in range(shell.MOTION):
+        for j in range(shell.MOTION):
+            out_P[m, i, j] = P[i, j]
+    out_ay[m] = planar_ay(x, steer, p)
     if rate_vy != 0.0:
-        felt = (1.0 if layout.roll >= 0 else 1.0 + GRAVITY_M_S2 * f.roll_gradient) * dynamic_share(x[VX], p) * rate_vy
-        z_hat[shell.Z_AY] += _force(x, layout) * felt
-        if layout.force_scale >= 0:
-            row[layout.force_scale] = felt
-    z_hat[shell.Z_YAW_RATE] = x[YAW_RATE]
-    z_hat[shell.Z_SPEED] = x[VX]
-    biased = layout.sensor_bias >= 0
-    rate_bias = layout.sensor_bias + 1
-    if biased:
-        z_hat[shell.Z_YAW_RATE] += x[rate_bias]
-    for a in range(n):
-        total = 0.0
-        for b in range(n):
-            total += P[a, b] * row[b]
-        Pxz[a, shell.Z_AY] = total
-        Pxz[a, shell.Z_YAW_RATE] = P[a, YAW_RATE] + (P[a, rate_bias] if biased else 0.0)
-        Pxz[a, shell.Z_SPEED] = P[a, VX]
-    for k in range(shell.MEASUREMENTS):
-        total = 0.0
-        for b in range(n):
-            total += row[b] * Pxz[b, k]
-        S[shell.Z_AY, k] = total
-        S[k, shell.Z_AY] = total
-        S[shell.Z_YAW_RATE, k] = Pxz[YAW_RATE, k] + (Pxz[rate_bias, k] if biased else 0.0)
-        S[shell.Z_SPEED, k] = Pxz[VX, k]
+        out_ay[m] += _force(x) * dynamic_share(x[VX], p) * rate_vy
 
 
+# positional: as _predict.
 @njit(cache=True)
-def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[no-untyped-def]
-    """Run over one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
+def _filter(window, tuning, layout, p, f, belief, out, links, due, predicted):  # type: ignore[no-untyped-def]
+    """Run over one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them.
+
+    The covariance is kept of the last steps only, as many as there is room for. ``due`` are predictions of the window's
+    steps, in their order, for what is written to ``predicted``.
+    """
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
-    x, P, memory = belief
+    belief_x, belief_P, memory = belief
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_link, out_predicted_P, out_cross = links
+    due_step, horizon_s = due
     linked = out_link.shape[0] > 0
-    n = x.shape[0]
-    _, L, _, z_hat, S, Pxz, nu, at_gate, given, use = shell.make_work(n)
-    points, deviation = np.zeros((n, 2 * n + 1)), np.zeros((n, 2 * n + 1))
-    before = np.zeros((n, 2 * n + 1))
-    row = np.empty(n)
-    noise, work = (q_std, scale), (points, deviation, L)
+    places = places_of(layout)
+    layout = spread_layout(layout)
+    x, there = _in_places(belief_x, places, 0.0), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
+    ahead, ahead_P = _in_places(belief_x, places, 0.0), np.zeros((ROOM, ROOM))
+    P, L = aligned(ROOM * ROOM).reshape((ROOM, ROOM)), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
+    _matrix_in_places(belief_P, places, P)
+    q_std, initial_std = _in_places(q_std, places, 0.0), _in_places(initial_std, places, 0.0)
+    standstill_std = _in_places(standstill_std, places, math.nan)
+    points, before, row = aligned(PLACES * WIDTH), aligned(PLACES * WIDTH), aligned(ROOM)
+    Pxz, gain = aligned(3 * ROOM).reshape((3, ROOM)), aligned(3 * ROOM).reshape((3, ROOM))
+    _, _, _, z_hat, S, _, nu, at_gate, given, use = shell.make_work(shell.MEASUREMENTS)
+    index, root, w = np.empty(shell.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
+    noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
+    factored = False  # whether L is the factor of P
+    m, forgotten = 0, dt.shape[0] - out_P.shape[0]
     for k in range(dt.shape[0]):
         sample = shell.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
         now = shell.begin_step(sample, rules, memory)
         if memory[shell.M_INITIALISED] == 0.0:
+            factored = False
             out_valid[k] = shell.starts(now, p.rear_m, initial_std, x, P, memory)
             if out_valid[k]:
                 settle_forces(x, now.steer, now.ax, now.friction, layout, p, f)
         else:
             over = shell.meanwhile(now, memory)
             rate = (memory[shell.M_RATE_VY], memory[shell.M_RATE_R])
+            if not factored:
+                wide_root(P, places, there, L)
+            factored = False
+            _draw(x, L, scale, constants, points)
             if linked:
-                _draw(x, P, scale, layout, L, before)
-            _predict(x, P, over, rate, now.dt, noise, layout, p, f, work)
-            alive = shell.all_finite(x, P)
+                _keep_before(points, x, P, places, before, out_cross[k])
+            _predict(x, P, over, rate, now.dt, noise, layout, p, f, constants, points, True)
+            alive = _finite(x, P)
             if linked:
-                _cross(before, deviation, out_cross[k])
-                out_predicted_P[k] = P
-            out_prior[k] = x
+                _cross(before, points, scale, places, out_cross[k])
+                _take_matrix(P, places, out_predicted_P[k])
+            _take(x, places, out_prior[k])
             if alive:
                 _measure(x, P, now.steer, rate[0], layout, p, f, row, z_hat, S, Pxz)
                 shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
@@ -255,22 +440,26 @@ def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[n
                     if given[i]:
                         out_nu[k, i] = nu[i]
                 if verdict.outside:  # a sample counts in the likelihood even if rejected, as if it stood at the gate
-                    _, _, out_likelihood[k] = kalman_update(x.copy(), P.copy(), at_gate, S, Pxz, given)
+                    _, _, out_likelihood[k] = whiten(at_gate, S, given, index, root, w)
                 if verdict.opens:
                     P *= shell.GATE_INFLATION
                     if linked:  # to a smoother the inflation is process noise of the step that led here
-                        out_predicted_P[k] = P
+                        _take_matrix(P, places, out_predicted_P[k])
                     _measure(x, P, now.steer, rate[0], layout, p, f, row, z_hat, S, Pxz)
                     shell.innovate(k, now, r_std, extra_r, z_hat, S, nu)
                     shell.open_gate(use, memory)
-                nis, dof, likelihood = kalman_update(x, P, nu, S, Pxz, use)
+                nis, dof, likelihood = _update(x, P, nu, S, Pxz, use, index, root, w, gain)
                 if dof > 0:
+                    wide_root(P, places, there, L)
+                    factored = True
                     out_nis[k] = nis
                     out_dof[k] = dof
                     if not verdict.outside:
                         out_likelihood[k] = likelihood
                 shell.settle(now, verdict, rules, standstill_std, x, P, memory)
-                alive = shell.all_finite(x, P)
+                if memory[shell.M_STILL] >= rules.still_after_s:
+                    factored = False
+                alive = _finite(x, P)
             out_valid[k] = alive and now.steer_ok
             out_diverged[k] = not alive or shell.diverges(rules, x, memory)
             if not alive:
@@ -278,41 +467,52 @@ def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[n
             elif linked and memory[shell.M_STILL] < rules.still_after_s:
                 out_link[k] = LINK_WHOLE
         shell.finish_step(k, now, residual_rate, rules, memory, out_inputs)
-        out_x[k] = x
-        out_P[k] = P
+        _take(x, places, out_x[k])
+        if k >= forgotten:
+            _take_matrix(P, places, out_P[k - forgotten])
+        while m < due_step.shape[0] and due_step[m] <= k:
+            if due_step[m] == k and out_valid[k]:
+                if not factored:
+                    wide_root(P, places, there, L)
+                    factored = True
+                over, rate = shell.held_inputs(out_inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
+                ahead[:] = x
+                if horizon_s[m] > 0.0:
+                    _draw(x, L, scale, constants, points)
+                    _predict(ahead, ahead_P, over, rate, horizon_s[m], noise, layout, p, f, constants, points, False)
+                else:
+                    ahead_P[:, :] = P
+                _write_prediction(m, ahead, ahead_P, over.steer, rate[0], places, p, predicted)
+            m += 1
+    _take(x, places, belief_x)
+    _take_matrix(P, places, belief_P)
 
 
 @njit(cache=True)
 def _predict_outputs(due, held, tuning, layout, p, f, predicted):  # type: ignore[no-untyped-def]
-    """Predict the steps that are due with their inputs held; writes state, covariance and planar a_y."""
+    """Predict the steps that are due with their inputs held; the rows of no step (−1) are left."""
     step, horizon_s = due
     held_x, held_P, inputs, residual_rate = held
-    out_x, out_P, out_ay = predicted
     q_std, _, _, _, _, _, scale, _ = tuning
-    n = held_x.shape[1]
-    points, deviation, L = np.zeros((n, 2 * n + 1)), np.zeros((n, 2 * n + 1)), np.empty((n, n))
-    x, P = np.empty(n), np.empty((n, n))
+    places = places_of(layout)
+    layout = spread_layout(layout)
+    x, there = aligned(ROOM), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
+    P, L = aligned(ROOM * ROOM).reshape((ROOM, ROOM)), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
+    noise, constants = (_in_places(q_std, places, 0.0), aligned(ROOM), scale), _make_constants()
+    points = aligned(PLACES * WIDTH)
     for m in range(step.shape[0]):
         k = step[m]
         if k < 0:
-            out_x[m, :] = math.nan
-            out_P[m, :, :] = math.nan
-            out_ay[m] = math.nan
             continue
-        x[:] = held_x[k]
-        P[:, :] = held_P[k]
-        over = shell.held_inputs(inputs, k)
-        rate = (residual_rate[k, 0], residual_rate[k, 1])
+        for i in range(places.shape[0]):
+            x[places[i]] = held_x[k, i]
+        _matrix_in_places(held_P[k], places, P)
+        over, rate = shell.held_inputs(inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
         if horizon_s[m] > 0.0:
-            _predict(x, P, over, rate, horizon_s[m], (q_std, scale), layout, p, f, (points, deviation, L))
-            if not shell.all_finite(x, P):
-                x[:] = math.nan
-                P[:, :] = math.nan
-        out_x[m] = x
-        out_P[m] = P
-        out_ay[m] = planar_ay(x, over.steer, p)
-        if rate[0] != 0.0:
-            out_ay[m] += _force(x, layout) * dynamic_share(x[VX], p) * rate[0]
+            wide_root(P, places, there, L)
+            _draw(x, L, scale, constants, points)
+            _predict(x, P, over, rate, horizon_s[m], noise, layout, p, f, constants, points, False)
+        _write_prediction(m, x, P, over.steer, rate[0], places, p, predicted)
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,7 +602,7 @@ class PhysicsFilter:
         ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
         """
-        steps, after, _ = self._steps(signals, carry, residual_rate, extra_r, linked=False)
+        steps, after, _ = self._steps(signals, carry, residual_rate, extra_r)
         return steps, after
 
     def linked_steps(
@@ -415,6 +615,38 @@ class PhysicsFilter:
         """Return what :meth:`filter_steps` does, bit for bit, and what ties the steps together."""
         return self._steps(signals, carry, residual_rate, extra_r, linked=True)
 
+    def predicted_steps(
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        residual_rate: FloatArray | None = None,
+        extra_r: FloatArray | None = None,
+    ) -> tuple[shell.PosteriorSteps, FilterCarry, shell.Predicted]:
+        """Return what :meth:`filter_steps` does, and of each stamp what its newest step then becomes.
+
+        A prediction begins with what the filter has at hand of its step. Covariances are those of the steps that a
+        coming stamp may ask for.
+        """
+        stamps_ns, ready_ns, waiting = signals.stamps_ns, signals.ready_ns, 0
+        if carry is not None:
+            waiting = len(carry.steps.stamps_ns)
+            stamps_ns = np.concatenate([carry.steps.stamps_ns, stamps_ns])
+            ready_ns = np.concatenate([carry.steps.ready_ns, ready_ns])
+        known = np.ones(len(stamps_ns), dtype=np.bool_)
+        released, horizon_s, near = predictable(stamps_ns, ready_ns, known, signals.stamps_ns)
+        step, predicted = np.where(near, released.at, -1), shell.no_prediction(len(signals), self.layout.size)
+        before = int(np.searchsorted(released.at, waiting))
+        if carry is not None:
+            self._predict(carry.steps, shell.Due(step[:before], horizon_s[:before]), _rows(predicted, slice(before)))
+        steps, after, _ = self._steps(
+            signals, carry, residual_rate, extra_r,
+            kept=len(signals) - max(released.needed - waiting, 0),
+            due=shell.Due(step[before:] - waiting, horizon_s[before:]),
+            predicted=_rows(predicted, slice(before, None)),
+        )  # fmt: skip
+        return steps, after, predicted
+
+    # positional: what all of them take.
     def _steps(
         self,
         signals: Signals,
@@ -422,19 +654,29 @@ class PhysicsFilter:
         residual_rate: FloatArray | None,
         extra_r: FloatArray | None,
         *,
-        linked: bool,
+        linked: bool = False,
+        kept: int | None = None,
+        due: shell.Due | None = None,
+        predicted: shell.Predicted | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
         signals = self.corrected(signals)
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
         window, tuning = shell.make_window(signals, carry, residual_rate, extra_r), self._tuning
         count, n = len(signals), self.layout.size
-        belief, out = shell.resume(carry, n), shell.no_posterior(count, n)
+        belief, out = shell.resume(carry, n), shell.no_posterior(count, n, kept)
         tied = count if linked else 0
         links = LinkColumns(np.full(tied, LINK_NONE), np.zeros((tied, n, n)), np.zeros((tied, n, n)))
-        _filter(window, tuning, *self.parameters, belief, out, links)
+        due = due or shell.Due(np.zeros(0, dtype=np.int64), np.zeros(0))
+        predicted = predicted or shell.no_prediction(0, n)
+        _filter(window, tuning, *self.parameters, belief, out, links, due, predicted)
         steps = shell.PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
         return steps, shell.carry_on(belief, steps, carry, slip), StepLinks(*links)
+
+    def _predict(self, steps: shell.PosteriorSteps, due: shell.Due, predicted: shell.Predicted) -> None:
+        """Write what becomes of steps, all of which have a covariance."""
+        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
+        _predict_outputs(due, held, self._tuning, *self.parameters, predicted)
 
     def run(
         self,
@@ -444,22 +686,42 @@ class PhysicsFilter:
         extra_r: FloatArray | None = None,
     ) -> tuple[StateTrack, FilterCarry]:
         """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
-        steps, after = self.filter_steps(signals, carry, residual_rate, extra_r)
-        return self.outputs(signals, carry, steps, after)
+        steps, after, predicted = self.predicted_steps(signals, carry, residual_rate, extra_r)
+        return self.outputs(signals, carry, steps, after, predicted)
 
     def outputs(
-        self, signals: Signals, carry: FilterCarry | None, steps: shell.PosteriorSteps, after: FilterCarry
+        self,
+        signals: Signals,
+        carry: FilterCarry | None,
+        steps: shell.PosteriorSteps,
+        after: FilterCarry,
+        predicted: shell.Predicted | None = None,
     ) -> tuple[StateTrack, FilterCarry]:
-        """Predict to the window's stamps what :meth:`filter_steps` returned for it; the carry keeps waiting steps."""
+        """Predict a window's steps to its stamps; the carry keeps waiting steps.
+
+        ``predicted`` is what :meth:`predicted_steps` returned with them; without it all steps need their covariance.
+        """
+        outline, waiting = steps.outline, 0
         if carry is not None:
-            steps = carry.steps.joined(steps)
-        held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
+            outline, waiting = carry.steps.outline.joined(outline), len(carry.steps.stamps_ns)
 
-        def predict(due: shell.Due, predicted: shell.Predicted) -> None:
-            _predict_outputs(due, held, self._tuning, *self.parameters, predicted)
+        def predict(due: shell.Due) -> shell.Predicted:
+            if predicted is not None:
+                for column in predicted:
+                    column[due.step < 0] = np.nan
+                return predicted
+            found = shell.no_prediction(len(due.step), self.layout.size)
+            self._predict(steps if carry is None else carry.steps.joined(steps), due, found)
+            return found
 
-        track, released = shell.released_track(self.name, signals.stamps_ns, steps, predict, self.layout.named)
-        return track, replace(after, steps=steps.since(released.needed))
+        track, released = shell.released_track(self.name, signals.stamps_ns, outline, predict, self.layout.named)
+        if carry is not None and released.needed < waiting:
+            return track, replace(after, steps=carry.steps.since(released.needed).joined(steps))
+        return track, replace(after, steps=steps.since(released.needed - waiting))
+
+
+def _rows(predicted: shell.Predicted, part: slice) -> shell.Predicted:
+    return shell.Predicted(*(column[part] for column in predicted))
 
 
 def physics_filter(

@@ -41,11 +41,12 @@ from pdhef_logtool.estimators.adaptive_physics import (
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, r_scale
 from pdhef_logtool.estimators.filter_shell import AX_BIAS, VX, PosteriorSteps
 from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, StepLinks
-from pdhef_logtool.estimators.unscented import cholesky_lower, repair_covariance
+from pdhef_logtool.estimators.unscented import ROOM, wide_root
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.vectors import LANES, aligned, load, spread, store
 
 #: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
 #: smoother that sees all of a drive of 300 s this changed v_y by less than 5e-5 m/s (60 s: 5e-4 m/s).
@@ -56,94 +57,137 @@ STEPS_AT_ONCE = 8192
 NOT_CAUSAL = "not causal: an estimate uses what was measured later; to be ranked apart from causal ones"
 
 
-# Inner loops run over independent entries, so that the compiler takes several at a time; each sum keeps its order.
+# Matrices have ROOM for the entries of a state, rows of whole vectors, with zeros where there is no entry.
+_compiled = njit(cache=True, error_model="numpy", fastmath={"contract"})
 
 
-@njit(cache=True)
-def _smoother_gain(cross, predicted, first, L, gain):  # type: ignore[no-untyped-def]
-    """Write (C P⁻¹)ᵀ to gain [n, n] over the entries from ``first`` on of the later state; the rows before are 0."""
-    n = cross.shape[0]
-    size = n - first
-    A = np.empty((size, size))
-    for i in range(size):
-        for j in range(size):
-            A[i, j] = predicted[first + i, first + j]
-    if not cholesky_lower(A, L[:size, :size]):
-        repair_covariance(A)
-        cholesky_lower(A, L[:size, :size])
-    gain[:, :] = 0.0
-    for i in range(size):  # forward, then backward substitution with A = L Lᵀ
-        for a in range(n):
-            gain[first + i, a] = cross[a, first + i]
-        for j in range(i):
-            for a in range(n):
-                gain[first + i, a] -= L[i, j] * gain[first + j, a]
-        for a in range(n):
-            gain[first + i, a] /= L[i, i]
-    for i in range(size - 1, -1, -1):
-        for j in range(i + 1, size):
-            for a in range(n):
-                gain[first + i, a] -= L[j, i] * gain[first + j, a]
-        for a in range(n):
-            gain[first + i, a] /= L[i, i]
+@_compiled
+def _make_work(n):  # type: ignore[no-untyped-def]
+    """Return the entries of a state [n], which of them count [ROOM], and four matrices [ROOM, ROOM]."""
+    a, b, c, d = aligned(ROOM * ROOM), aligned(ROOM * ROOM), aligned(ROOM * ROOM), aligned(ROOM * ROOM)
+    shape = (ROOM, ROOM)
+    return (
+        np.arange(n),
+        np.zeros(ROOM, np.bool_),
+        a.reshape(shape),
+        b.reshape(shape),
+        c.reshape(shape),
+        d.reshape(shape),
+    )
 
 
-@njit(cache=True)
-def _step_back(x, P, link, xs, Ps):  # type: ignore[no-untyped-def]
-    """Take the smoothed state [n] and covariance [n, n] from the step behind to the one with the posterior x, P.
-
-    ``link`` is what ties the two: its kind, predicted covariance, cross covariance and prior state.
-    """
-    kind, predicted_P, cross, prior = link
-    n = x.shape[0]
-    if kind == LINK_NONE:
-        xs[:] = x
-        Ps[:, :] = P
-        return
-    overwritten = AX_BIAS if kind == LINK_BIASES else 0
-    work = np.empty((5, n, n))  # to allocate takes longer than to compute
-    L, gain, change, half, check = work[0], work[1], work[2], work[3], work[4]
-    _smoother_gain(cross, predicted_P, overwritten, L, gain)
-    move = check[0]
+@_compiled
+def _gain(cross, predicted_P, k, first, work):  # type: ignore[no-untyped-def]
+    """Write (C P⁻¹)ᵀ of step k to the third matrix of ``work``, over the later state's entries from ``first`` on."""
+    every, counts, A, L, gain, _ = work
+    n = every.shape[0]
     for i in range(n):
-        move[i] = xs[i] - prior[i]
+        counts[i] = i >= first
         for j in range(n):
-            change[i, j] = Ps[i, j] - predicted_P[i, j]
-    xs[:] = x
-    half[:, :] = 0.0
-    for i in range(overwritten, n):
-        for a in range(n):
-            xs[a] += gain[i, a] * move[i]
-        for j in range(n):
-            for a in range(n):
-                half[j, a] += gain[i, a] * change[i, j]
-    for a in range(n):
-        for b in range(n):
-            Ps[a, b] = 0.5 * (P[a, b] + P[b, a])
-        for j in range(overwritten, n):
-            of_half, of_gain = half[j, a], gain[j, a]
-            for b in range(n):
-                Ps[a, b] += 0.5 * (of_half * gain[j, b] + half[j, b] * of_gain)
-    if not cholesky_lower(Ps, check):
-        repair_covariance(Ps)
+            A[i, j] = predicted_P[k, i, j] if i >= first and j >= first else 0.0
+            gain[i, j] = cross[k, j, i] if i >= first else 0.0
+    wide_root(A, every[first:], counts, L)
+    for i in range(first, n):  # forward, then backward substitution with P = L Lᵀ
+        at = i * ROOM
+        low, high = load(gain, at), load(gain, at + LANES)
+        for j in range(first, i):
+            share = spread(L[i, j])
+            low, high = low - share * load(gain, j * ROOM), high - share * load(gain, j * ROOM + LANES)
+        per = spread(1.0 / L[i, i])
+        store(gain, at, per * low)
+        store(gain, at + LANES, per * high)
+    for i in range(n - 1, first - 1, -1):
+        at = i * ROOM
+        low, high = load(gain, at), load(gain, at + LANES)
+        for j in range(i + 1, n):
+            share = spread(L[j, i])
+            low, high = low - share * load(gain, j * ROOM), high - share * load(gain, j * ROOM + LANES)
+        per = spread(1.0 / L[i, i])
+        store(gain, at, per * low)
+        store(gain, at + LANES, per * high)
 
 
-@njit(cache=True)
-def _smooth(forward, links, span, xs, Ps, out_x, out_P):  # type: ignore[no-untyped-def]
-    """Smooth steps of a piece from the last of a span, where ``xs`` and ``Ps`` stand, to its first; they are moved.
+# positional: arrays of steps with a place in them: a view for each would cost as much as the sums.
+@_compiled
+def _step_back(forward, k, links, following, xs, Ps, work):  # type: ignore[no-untyped-def]
+    """Take the smoothed state [ROOM] and covariance [ROOM, ROOM] from the step behind to step k of ``forward``.
 
-    ``forward`` are posterior state, covariance and prior state, ``links`` the columns of :class:`~.physics.StepLinks`,
-    ``span`` the first step, the last one that is written and the last one, inclusive.
+    ``links`` are by step the kind of link, predicted covariance, cross covariance and prior state; ``following`` is the
+    step behind in them.
     """
-    x, P, prior = forward
-    kind, predicted_P, cross = links
+    x, P, _ = forward
+    kind, predicted_P, cross, prior = links
+    every, counts, change, L, gain, half = work
+    n = every.shape[0]
+    if kind[following] == LINK_NONE:
+        for i in range(n):
+            xs[i] = x[k, i]
+            for j in range(n):
+                Ps[i, j] = P[k, i, j]
+        return
+    overwritten = AX_BIAS if kind[following] == LINK_BIASES else 0
+    _gain(cross, predicted_P, following, overwritten, work)
+    for i in range(n):
+        for j in range(n):
+            change[i, j] = Ps[i, j] - predicted_P[following, i, j]
+            Ps[i, j] = P[k, i, j]
+    low, high = spread(0.0), spread(0.0)
+    for i in range(n):
+        move = spread(xs[i] - prior[following, i])
+        low, high = low + move * load(gain, i * ROOM), high + move * load(gain, i * ROOM + LANES)
+        xs[i] = x[k, i]
+    store(xs, 0, load(xs, 0) + low)
+    store(xs, LANES, load(xs, LANES) + high)
+    for j in range(n):
+        low, high = spread(0.0), spread(0.0)
+        for i in range(n):
+            of = spread(change[i, j])
+            low, high = low + of * load(gain, i * ROOM), high + of * load(gain, i * ROOM + LANES)
+        store(half, j * ROOM, low)
+        store(half, j * ROOM + LANES, high)
+    for a in range(n):
+        at = a * ROOM
+        low, high = load(Ps, at), load(Ps, at + LANES)
+        for j in range(n):
+            of = spread(gain[j, a])
+            low, high = low + of * load(half, j * ROOM), high + of * load(half, j * ROOM + LANES)
+        store(Ps, at, low)
+        store(Ps, at + LANES, high)
+    for a in range(n):
+        counts[a] = True
+        for b in range(a):
+            Ps[a, b] = 0.5 * (Ps[a, b] + Ps[b, a])
+            Ps[b, a] = Ps[a, b]
+    wide_root(Ps, every, counts, L)
+
+
+@_compiled
+def _smooth(forward, links, tie, span, xs, Ps, out_x, out_P):  # type: ignore[no-untyped-def]
+    """Smooth steps of a piece from the last of a span to its first; ``xs`` [n] and ``Ps`` [n, n] are moved.
+
+    ``forward`` are posterior state, covariance and prior state, ``links`` kind, predicted covariance, cross covariance
+    and prior, and ``tie`` those of the step behind the span, where xs and Ps stand; without one they are not looked at.
+    ``span`` is the first step, the last one that is written and the last one, inclusive.
+    """
+    x, P, _ = forward
     first, last, end = span
+    work = _make_work(x.shape[1])
+    n = x.shape[1]
+    wide_x, wide_P = aligned(ROOM), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
+    wide_x[:n], wide_P[:n, :n] = xs, Ps
     for k in range(end, first - 1, -1):
         if k < end:
-            _step_back(x[k], P[k], (kind[k + 1], predicted_P[k + 1], cross[k + 1], prior[k + 1]), xs, Ps)
+            _step_back(forward, k, links, k + 1, wide_x, wide_P, work)
+        elif tie[0].shape[0] > 0:
+            _step_back(forward, k, tie, 0, wide_x, wide_P, work)
+        else:
+            wide_x[:n], wide_P[:n, :n] = x[k], P[k]
         if k <= last:
-            out_x[k] = xs
-            out_P[k] = Ps
+            for i in range(n):
+                out_x[k, i] = wide_x[i]
+                for j in range(n):
+                    out_P[k, i, j] = wide_P[i, j]
+    xs[:], Ps[:, :] = wide_x[:n], wide_P[:n, :n]
 
 
 #: Smoothed states [K, n] and covariances [K, n, n].
@@ -212,23 +256,23 @@ def _smooth_pieces(
 ) -> None:
     """Smooth a span of `spans` from its last piece to its first."""
     first, last, end = span
-    behind: ForwardSteps | None = None
+    n = pieces[0].posterior.x.shape[1]
+    tie, xs, Ps = _tie(pieces[0].until(0)), np.empty(n), np.empty((n, n))
     start = sum(map(len, pieces))
     for piece in reversed(pieces):
         start -= len(piece)
         begin, stop = max(first - start, 0), min(end - start, len(piece) - 1)
         if begin > stop:
             continue
-        steps, links = piece.posterior, piece.links
-        if behind is None:
-            xs, Ps = steps.x[stop].copy(), steps.P[stop].copy()
-        else:
-            tie = behind.links
-            link = (tie.kind[0], tie.predicted_P[0], tie.cross[0], behind.posterior.prior[0])
-            _step_back(steps.x[stop], steps.P[stop], link, xs, Ps)
-        behind = piece
-        forward, tied = (steps.x, steps.P, steps.prior), (links.kind, links.predicted_P, links.cross)
-        _smooth(forward, tied, (begin, last - start, stop), xs, Ps, out_x[start:], out_P[start:])
+        steps = piece.posterior
+        forward = (steps.x, steps.P, steps.prior)
+        _smooth(forward, _tie(piece), tie, (begin, last - start, stop), xs, Ps, out_x[start:], out_P[start:])
+        tie = _tie(piece)
+
+
+def _tie(piece: ForwardSteps) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return what ties each step to the one before: kind, predicted covariance, cross covariance and prior state."""
+    return piece.links.kind, piece.links.predicted_P, piece.links.cross, piece.posterior.prior
 
 
 @njit(cache=True)

@@ -6,12 +6,20 @@ All functions work on small float64 arrays in place of allocation where it matte
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.signals import FloatArray
+from pdhef_logtool.records.vectors import LANES, chosen, transposed, vectors_at
 
+#: Room for the entries of a wide state, whole vectors, and how many entries it may have.
+ROOM, MOST = 2 * LANES, 13
 #: Smallest variance that a repaired covariance keeps on its diagonal.
 COVARIANCE_FLOOR = 1e-12
 
@@ -50,6 +58,62 @@ def cholesky_lower(P, L):  # type: ignore[no-untyped-def]
     return True
 
 
+@intrinsic
+def wide_factor(_typing, P, there, L):  # type: ignore[no-untyped-def]
+    """Write the lower Cholesky factor of P [ROOM, ROOM] to L; False if P is not positive definite.
+
+    Entries of the first MOST that are not ``there`` [ROOM] have zeros in P, and get zeros. All of it stays in
+    registers: a loop would wait for its own numbers to be written.
+    """
+
+    def generate(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        P, L = (vectors_at(context, builder, signature.args[i], args[i]) for i in (0, 2))
+        is_there = context.make_array(signature.args[1])(context, builder, args[1]).data
+        number, lane = ir.DoubleType(), ir.IntType(32)
+        vector = ir.VectorType(number, LANES)
+        one, nothing, unknown = number(1.0), number(0.0), ir.Constant(vector, ir.Undefined)
+        root = cgutils.get_or_insert_function(builder.module, ir.FunctionType(number, (number,)), "llvm.sqrt.f64")
+
+        def spread(of: Any, at: int) -> Any:
+            return builder.shuffle_vector(of, unknown, ir.Constant(ir.VectorType(lane, LANES), [at] * LANES))
+
+        def everywhere(value: Any) -> Any:
+            return spread(builder.insert_element(unknown, value, lane(0)), 0)
+
+        zeros = ir.Constant(vector, [0.0] * LANES)
+        rows = {(i, half): P.load(i * ROOM + half * LANES) for i in range(MOST) for half in range(i // LANES, 2)}
+        good = ir.IntType(1)(1)
+        for k in range(MOST):
+            own = range(k // LANES, 2)
+            pivot = builder.extract_element(rows[k, k // LANES], lane(k % LANES))
+            positive = builder.fcmp_ordered(">", pivot, nothing)
+            lacks = builder.icmp_unsigned(
+                "==", builder.load(builder.gep(is_there, [ir.IntType(64)(k)])), ir.IntType(8)(0)
+            )
+            good = builder.and_(good, builder.or_(positive, lacks))
+            per_pivot = builder.select(positive, builder.fdiv(one, pivot), nothing)
+            per_root = builder.select(positive, builder.fdiv(one, builder.call(root, (pivot,))), nothing)
+            shares = {half: builder.fmul(rows[k, half], everywhere(per_pivot)) for half in own}
+            for i in range(k + 1, MOST):  # what the pivot's row leaves of those behind it
+                share = spread(shares[i // LANES], i % LANES)
+                for half in range(i // LANES, 2):
+                    taken = builder.fmul(share, rows[k, half], flags=("contract",))
+                    rows[i, half] = builder.fsub(rows[i, half], taken, flags=("contract",))
+            for half in own:
+                rows[k, half] = builder.fmul(rows[k, half], everywhere(per_root))
+            before = k % LANES  # what stands before the diagonal is no part of the column
+            lanes = [LANES + i if i < before else i for i in range(LANES)]
+            rows[k, k // LANES] = chosen(builder, rows[k, k // LANES], zeros, lanes)
+        for columns, half in ((0, 0), (0, 1), (1, 1)):
+            block = [rows.get((columns * LANES + i, half), zeros) for i in range(LANES)]
+            for i, row in enumerate(transposed(builder, block)):
+                if half * LANES + i < MOST:
+                    L.store((half * LANES + i) * ROOM + columns * LANES, row)
+        return good
+
+    return types.boolean(P, there, L), generate
+
+
 @njit(cache=True)
 def repair_covariance(P):  # type: ignore[no-untyped-def]
     """Make P [n, n] symmetric positive definite in place: eigenvalues below the floor are raised to it."""
@@ -67,6 +131,23 @@ def repair_covariance(P):  # type: ignore[no-untyped-def]
             for k in range(n):
                 s += v[i, k] * max(w[k], floor) * v[j, k]
             P[i, j] = s
+
+
+@njit(cache=True)
+def wide_root(P, places, there, L):  # type: ignore[no-untyped-def]
+    """Write the factor of P as :func:`wide_factor`, ``places`` being what is there; P is repaired if needed."""
+    if wide_factor(P, there, L):
+        return
+    n = places.shape[0]
+    dense = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
+            dense[i, j] = P[places[i], places[j]]
+    repair_covariance(dense)
+    for i in range(n):
+        for j in range(n):
+            P[places[i], places[j]] = dense[i, j]
+    wide_factor(P, there, L)
 
 
 @njit(cache=True)
@@ -122,6 +203,55 @@ def innovation_moments(chi, x, zeta, wm, wc, z_hat, S, Pxz):  # type: ignore[no-
 
 
 @njit(cache=True)
+def _factor_used(S, index, used, L):  # type: ignore[no-untyped-def]
+    """Do what :func:`cholesky_lower` does with the first ``used`` rows and columns of S that ``index`` names."""
+    for i in range(used):
+        for j in range(i + 1):
+            s = S[index[i], index[j]]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                if not s > 0.0:
+                    return False
+                L[i, i] = math.sqrt(s)
+            else:
+                L[i, j] = s / L[j, j]
+    return True
+
+
+@njit(cache=True)
+def whiten(nu, S, use, index, L, w):  # type: ignore[no-untyped-def]
+    """Whiten the innovation nu [m], of covariance S [m, m], in the channels of ``use`` (bool [m]).
+
+    Writes which channels are used to ``index`` [m], and in their order the factor of their covariance to L [m, m] and
+    w = L⁻¹ν [m]. Returns what :func:`kalman_update` does.
+    """
+    used = 0
+    for k in range(nu.shape[0]):
+        if use[k]:
+            index[used] = k
+            used += 1
+    if used == 0:
+        return 0.0, 0, 0.0
+    if not _factor_used(S, index, used, L):
+        A = np.empty((used, used))
+        for i in range(used):
+            for j in range(used):
+                A[i, j] = S[index[i], index[j]]
+        repair_covariance(A)
+        _factor_used(A, np.arange(used), used, L)
+    det, nis = 1.0, 0.0
+    for i in range(used):
+        s = nu[index[i]]
+        for j in range(i):
+            s -= L[i, j] * w[j]
+        w[i] = s / L[i, i]
+        nis += w[i] * w[i]
+        det *= L[i, i]
+    return nis, used, -0.5 * (nis + used * math.log(2.0 * math.pi)) - math.log(det)
+
+
+@njit(cache=True)
 def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     """Update x [n], P [n, n] in place with the channels of ``use`` (bool [m]).
 
@@ -132,37 +262,14 @@ def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     -------
     nis : νᵀ S⁻¹ ν over the used channels. dof : how many. log_likelihood : of the innovation, Gaussian.
     """
-    n = x.shape[0]
-    m = nu.shape[0]
+    n, m = Pxz.shape
+    work = np.empty((n + m + 1, m))  # to allocate takes longer than to compute
+    G, L, w = work[:n], work[n : n + m], work[n + m]
     index = np.empty(m, dtype=np.int64)
-    d = 0
-    for k in range(m):
-        if use[k]:
-            index[d] = k
-            d += 1
+    nis, d, log_likelihood = whiten(nu, S, use, index, L, w)
     if d == 0:
-        return 0.0, 0, 0.0
-    both = np.empty((2, d, d))  # to allocate takes longer than to compute
-    A, L = both[0], both[1]
-    for i in range(d):
-        for j in range(d):
-            A[i, j] = S[index[i], index[j]]
-    if not cholesky_lower(A, L):
-        repair_covariance(A)
-        cholesky_lower(A, L)
-    # w = L⁻¹ ν and G = P_xz L⁻ᵀ, by forward substitution
-    gain = np.empty((n + 1, d))
-    G, w = gain[:n], gain[n]
-    log_det = 0.0
-    nis = 0.0
-    for i in range(d):
-        s = nu[index[i]]
-        for j in range(i):
-            s -= L[i, j] * w[j]
-        w[i] = s / L[i, i]
-        nis += w[i] * w[i]
-        log_det += 2.0 * math.log(L[i, i])
-    for a in range(n):
+        return nis, d, log_likelihood
+    for a in range(n):  # G = P_xz L⁻ᵀ, by forward substitution
         for i in range(d):
             s = Pxz[a, index[i]]
             for j in range(i):
@@ -180,4 +287,4 @@ def kalman_update(x, P, nu, S, Pxz, use):  # type: ignore[no-untyped-def]
     check = np.empty((n, n))
     if not cholesky_lower(P, check):
         repair_covariance(P)
-    return nis, d, -0.5 * (nis + log_det + d * math.log(2.0 * math.pi))
+    return nis, d, log_likelihood

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,6 +52,28 @@ def median_step_ns(stamped: Signals | StateTrack) -> float:
     return float(np.median(steps, overwrite_input=True)) if steps.size else 1.0
 
 
+class HeldRows(StateTrack):
+    """Rows of a track of which each column is read once: on disk it would be read each time that it is asked for."""
+
+    __slots__ = ("_rows",)
+    _rows: StateTrack
+
+    def __init__(self, rows: StateTrack) -> None:
+        object.__setattr__(self, "_rows", rows)
+
+    def __getattr__(self, name: str) -> Any:
+        """Fill the field of a column, which is empty until it is asked for."""
+        if name == "_rows":
+            raise AttributeError(name)
+        value = getattr(self._rows, name)
+        object.__setattr__(self, name, value)
+        return value
+
+    def __len__(self) -> int:
+        """Return the number of stamps."""
+        return len(self._rows)
+
+
 class SegmentMasks(Mapping[str, BoolArray]):
     """Masks [N] by segment, a bit a row each: of ten hours at 100 Hz ten segments take 7 MB, as booleans 36 MB."""
 
@@ -86,15 +109,6 @@ def packed(masks: Mapping[str, BoolArray], n: int) -> SegmentMasks:
     return masks
 
 
-def known_by_segment(values: FloatArray, masks: Mapping[str, BoolArray]) -> Iterator[tuple[str, FloatArray]]:
-    """Yield the finite ones of values [N] of each segment that has any."""
-    known = np.isfinite(values)
-    for segment, mask in masks.items():
-        inside = values[mask & known]
-        if inside.size:
-            yield segment, inside
-
-
 class SegmentSums:
     """Counts and sums of columns by segment."""
 
@@ -104,9 +118,11 @@ class SegmentSums:
     def add(self, masks: Mapping[str, BoolArray], *columns: NDArray[np.generic]) -> None:
         """Take a block of columns [M], of which the stamps count at which the first column is finite."""
         known = np.isfinite(columns[0])
+        if not known.any():
+            return
         for segment, mask in masks.items():
             use = mask & known
-            self.add_to(segment, *(c[use] for c in columns))
+            self.add_to(segment, *(columns if use.all() else (c[use] for c in columns)))
 
     def add_to(self, segment: str, *columns: NDArray[np.generic]) -> None:
         """Take columns [M] that lie in a segment."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -98,7 +99,13 @@ def _interval(
     value = float(statistic(sums.sum(axis=1), counts.sum()))
     if blocks < 2:
         return Interval(value, nan, nan, blocks)
-    draws = np.random.default_rng(seed).multinomial(blocks, np.full(blocks, 1.0 / blocks), size=n)
+    draws = _draws(blocks, n, seed)
     resampled = statistic(sums @ draws.T, draws @ counts)
     low, high = np.percentile(resampled, [50.0 * (1.0 - level), 50.0 * (1.0 + level)])
     return Interval(value, float(low), float(high), blocks)
+
+
+@lru_cache(maxsize=2)
+def _draws(blocks: int, n: int, seed: int) -> IntArray:
+    """Return how often each block is in each resample, [n, blocks]: the same for all figures of a drive."""
+    return np.random.default_rng(seed).multinomial(blocks, np.full(blocks, 1.0 / blocks), size=n)

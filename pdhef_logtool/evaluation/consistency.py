@@ -131,7 +131,7 @@ def disagreement_rows(
 
 
 def d2_rows(
-    track: StateTrack,
+    tracks: Sequence[StateTrack],
     signals: Signals,
     masks: Mapping[str, BoolArray],
     *,
@@ -139,15 +139,18 @@ def d2_rows(
     low_speed_m_s: float,
     sensors: LogSensors,
 ) -> list[MetricRow]:
-    """Return ``d2`` of one estimator at the same stamps as the signals [N], a row a segment; none where v_y is not."""
-    masks = packed(masks, len(track))
-    sums = SegmentSums()
+    """Return ``d2`` of estimators at the same stamps as the signals [N], a row a segment; none where v_y is not."""
+    masks = packed(masks, len(signals))
+    found = [SegmentSums() for _ in tracks]
     for first, a, b, end in blocks_with_halo(signals, D2_SPAN_S + MAX_STEP_S, 1):
-        part, estimate, core = signals.rows(first, end), track.rows(first, end), slice(a - first, b - first)
-        residual = _lateral_change_residual(part, estimate, low_speed_m_s, sensors)[core]
-        sums.add(masks.rows(a, b), residual, residual**2)
+        core, inside = slice(a - first, b - first), dict(masks.rows(a, b))
+        driven = _Driven(signals.rows(first, end), low_speed_m_s, sensors)
+        for track, sums in zip(tracks, found, strict=True):
+            residual = driven.residual(track.rows(first, end))[core]
+            sums.add(inside, residual, residual**2)
     return [
         MetricRow(log, track.name, "vy_m_s", segment, "d2", float(np.sqrt(squares / n)), "m/s", n)
+        for track, sums in zip(tracks, found, strict=True)
         for segment, (n, (_, squares)) in sums.totals().items()
     ]
 
@@ -159,8 +162,9 @@ def driving_products(
 
     They are of the products of the changes over 2 s of v_y, v_x r and a_y, and of the residual that d2 squares.
     """
-    residual, changes = _lateral_changes(signals, track, low_speed_m_s, sensors)
-    rows = np.concatenate([changes, residual[None]])
+    driven = _Driven(signals, low_speed_m_s, sensors)
+    vy = driven.carried_vy(track)
+    rows = np.stack([*map(driven.change, (vy, driven.turn, signals.ay_m_s2)), driven.residual(track)])
     step_s = np.minimum(np.diff(signals.stamps_ns, prepend=signals.stamps_ns[:1]) * 1e-9, MAX_STEP_S)
     known = np.isfinite(rows).all(axis=0)
     rows, step_s = rows[:, known], step_s[known]
@@ -183,35 +187,42 @@ def driven_d2(products: FloatArray, seconds: float) -> float:
     return float(np.sqrt(believed / seconds))
 
 
-def _lateral_change_residual(
-    signals: Signals, track: StateTrack, low_speed_m_s: float, sensors: LogSensors
-) -> FloatArray:
-    """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN where it cannot be told."""
-    return _lateral_changes(signals, track, low_speed_m_s, sensors)[0]
+class _Driven:
+    """What d2 needs of the signals [N] of a part of a drive, whichever estimate is held against them.
 
+    Attributes
+    ----------
+    turn : v_x r as far as no bank carries it, [N] in m/s².
+    """
 
-def _lateral_changes(
-    signals: Signals, track: StateTrack, low_speed_m_s: float, sensors: LogSensors
-) -> tuple[FloatArray, FloatArray]:
-    """Return that residual [N], and the changes over the same 2 s of v_y, v_x r and a_y [3, N]."""
-    t = signals.stamps_ns
-    speed = _carried_speed(signals)
-    rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
-    turn = (1.0 - sensors.superelevation) * speed * rate
-    rising = (signals.ay_m_s2 - sensors.ay_bias_m_s2) / sensors.ay_gain - turn
-    vy = np.where(track.valid & (speed > low_speed_m_s), track.vy_m_s, np.nan)
-    vy = vy + sensors.lever_m / sensors.ay_gain * rate  # the lever's share of ∫ a_y
-    gained, breaks, steps = np.zeros(len(t)), np.zeros(len(t)), np.diff(t) * 1e-9
-    broken = ~np.isfinite(rising[1:] + rising[:-1]) | (steps > MAX_STEP_S)
-    gained[1:] = np.cumsum(np.where(broken, 0.0, 0.5 * (rising[1:] + rising[:-1]) * steps))
-    breaks[1:] = np.cumsum(broken)
-    earlier = np.searchsorted(t, t - round(D2_SPAN_S * 1e9), side="right") - 1
-    i = np.maximum(earlier, 0)
-    whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((D2_SPAN_S + MAX_STEP_S) * 1e9))
-    followed = np.stack([vy, turn, signals.ay_m_s2])
-    return np.where(whole, vy - vy[i] - (gained - gained[i]), np.nan), np.where(
-        whole, followed - followed[:, i], np.nan
-    )
+    def __init__(self, signals: Signals, low_speed_m_s: float, sensors: LogSensors) -> None:
+        t = signals.stamps_ns
+        speed = _carried_speed(signals)
+        rate = signals.yaw_rate_rad_s - sensors.yaw_rate_bias_rad_s
+        self.turn = (1.0 - sensors.superelevation) * speed * rate
+        rising = (signals.ay_m_s2 - sensors.ay_bias_m_s2) / sensors.ay_gain - self.turn
+        self._fast = speed > low_speed_m_s
+        self._of_lever = sensors.lever_m / sensors.ay_gain * rate
+        gained, breaks, steps = np.zeros(len(t)), np.zeros(len(t)), np.diff(t) * 1e-9
+        broken = ~np.isfinite(rising[1:] + rising[:-1]) | (steps > MAX_STEP_S)
+        gained[1:] = np.cumsum(np.where(broken, 0.0, 0.5 * (rising[1:] + rising[:-1]) * steps))
+        breaks[1:] = np.cumsum(broken)
+        earlier = np.searchsorted(t, t - round(D2_SPAN_S * 1e9), side="right") - 1
+        self._before = i = np.maximum(earlier, 0)
+        self._whole = (earlier >= 0) & (breaks[i] == breaks) & (t - t[i] <= round((D2_SPAN_S + MAX_STEP_S) * 1e9))
+        self._gained = gained - gained[i]
+
+    def carried_vy(self, track: StateTrack) -> FloatArray:
+        """Return v_y [N] of an estimate with the lever's share of ∫ a_y; NaN where it does not count."""
+        return np.where(track.valid & self._fast, track.vy_m_s, np.nan) + self._of_lever
+
+    def change(self, values: FloatArray) -> FloatArray:
+        """Return by how much values [N] changed in 2 s, [N]; NaN where that cannot be told."""
+        return np.where(self._whole, values - values[self._before], np.nan)
+
+    def residual(self, track: StateTrack) -> FloatArray:
+        """Return v_y(t) − v_y(t − 2 s) − ∫ (a_y − v_x r) dt, [N]; NaN where it cannot be told."""
+        return self.change(self.carried_vy(track)) - self._gained
 
 
 def sensor_rows(signals: Signals, masks: Mapping[str, BoolArray], *, log: str, low_speed_m_s: float) -> list[MetricRow]:

@@ -53,6 +53,8 @@ STRAIGHT_M_S2, STRAIGHT_S = 0.5, 2.0
 CORNERING_M_S2, CORNERING_S = 1.0, 1.5
 SWING_M_S2, SLALOM_M_S2, SLALOM_PEAKS, SLALOM_SPACING_S = 0.5, 1.5, 3, 2.5
 BRAKING_M_S2, ACCELERATING_M_S2, PEDAL_S = -1.5, 1.0, 0.5
+#: Rows that are smoothed at once: they stay near the processor.
+_NEAR_ROWS = 1 << 12
 #: What is further away than this decides nothing: three swings of a slalom, and a corner after it, take 16 s.
 HALO_S = 20.0
 
@@ -209,10 +211,13 @@ def smooth(stamps_ns: IntArray, values: FloatArray, cutoff_hz: float, step_ns: f
     sigma = _sigma_rows(float(np.median(np.diff(stamps_ns))) if step_ns is None else step_ns, cutoff_hz)
     known = np.isfinite(values)
     for a, b in _runs(stamps_ns, np.ones(values.shape[0], dtype=np.bool_)):
-        weight = _gaussian(known[a:b].astype(np.float64), sigma)
-        total = _gaussian(np.where(known[a:b], values[a:b], 0.0), sigma)
         here = known[a:b]
-        out[a:b][here] = total[here] / weight[here]
+        if here.all():
+            out[a:b] = _gaussian(values[a:b], sigma) / _gaussian_of_ones(b - a, sigma)
+        else:
+            weight = _gaussian(here.astype(np.float64), sigma)
+            total = _gaussian(np.where(here, values[a:b], 0.0), sigma)
+            out[a:b][here] = total[here] / weight[here]
     return out
 
 
@@ -227,10 +232,24 @@ def _gaussian(values: FloatArray, sigma_rows: float) -> FloatArray:
     n = len(values)
     padded = np.concatenate([np.zeros(reach), values, np.zeros(reach)])
     out: FloatArray = values * weights[reach]
-    for first in range(reach):
-        before, behind = padded[first : first + n], padded[2 * reach - first : 2 * reach - first + n]
-        out += (before + behind) * weights[first]
+    for a in range(0, n, _NEAR_ROWS):
+        b = min(a + _NEAR_ROWS, n)
+        part, beside = out[a:b], np.empty(b - a)
+        for first in range(reach):
+            last = 2 * reach - first
+            np.add(padded[a + first : b + first], padded[a + last : b + last], out=beside)
+            beside *= weights[first]
+            part += beside
     return out
+
+
+def _gaussian_of_ones(n: int, sigma_rows: float) -> FloatArray:
+    """Return :func:`_gaussian` of n ones, which is the same everywhere but near the ends."""
+    reach = int(4.0 * sigma_rows + 0.5)
+    if n <= 2 * reach:
+        return _gaussian(np.ones(n), sigma_rows)
+    ends = _gaussian(np.ones(2 * reach + 1), sigma_rows)
+    return np.concatenate([ends[:reach], np.full(n - 2 * reach, ends[reach]), ends[reach + 1 :]])
 
 
 def _last_known(stamps_ns: IntArray, values: FloatArray) -> FloatArray:

@@ -14,6 +14,7 @@ from rich.text import Text
 from pdhef_logtool.inspection.rendering import empty_table, number_text
 from pdhef_logtool.inspection.report import COVARIANCE, INDEX, collapsed
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, TopicInfo
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -75,7 +76,7 @@ def fields_of_log(
     LogError : The file is no log.
     UsageError : It has no such topic.
     """
-    with closing(open_log(path, budget, msgs)) as log:
+    with closing(open_log(path, budget, msgs, Wanted(frozenset()))) as log:
         topics = [t for t in log.topics if topic in (None, t.name)]
         if topic is not None and not topics:
             names = ", ".join(t.name for t in log.topics) or "none"

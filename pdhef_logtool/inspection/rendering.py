@@ -29,6 +29,8 @@ def render_inspection(inspection: Inspection, console: Console) -> None:
         f"{inspection.kind}, {inspection.duration_s:.1f} s from {shown_time(inspection.start_ns)}, {messages} messages "
         f"on {len(inspection.topics)} topics"
     )
+    if inspection.sample is not None:
+        console.print(Text(str(inspection.sample), "cyan"))
     if inspection.topics:
         console.print(_topics_table(inspection.topics))
     if inspection.signals or inspection.truth:

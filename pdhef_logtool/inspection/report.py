@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from collections.abc import Mapping as MappingABC
 from contextlib import closing
 from dataclasses import dataclass
@@ -19,6 +19,8 @@ from pdhef_logtool.drive.proposals import Proposal, apply_proposals, mapping_pro
 from pdhef_logtool.inspection.step_statistics import DelayStatistics, StepStatistics, ValueStatistics
 from pdhef_logtool.inspection.uses import uses_of
 from pdhef_logtool.logs.budget import DEFAULT_BUDGET, Budget
+from pdhef_logtool.logs.columnar_log import ColumnarLog
+from pdhef_logtool.logs.container import Wanted
 from pdhef_logtool.logs.drive_log import DriveLog, FieldInfo, TopicInfo, windows
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -39,7 +41,7 @@ from pdhef_logtool.mapping import (
     resolve_mapping,
 )
 from pdhef_logtool.mapping.candidates import Candidate
-from pdhef_logtool.mapping.clocks import sources_by_clock
+from pdhef_logtool.mapping.clocks import sources_by_clock, survey_windows
 from pdhef_logtool.mapping.mapping_file import missing_signals
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.documents import jsonable
@@ -48,6 +50,10 @@ from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.signals import SIGNAL_UNITS, TRUTH_UNITS, Loss
 
 WINDOW_NS = 600_000_000_000
+#: Of a larger log with a sound index values are looked at in a part: its first ten minutes, and windows over the rest.
+WHOLE_BYTES = 32 << 20
+#: Where that is a larger share of the chunks, the rest is read too.
+MOST_SAMPLED = 0.75
 #: Kinds of loss that are counted by topic and concern all its signals.
 TOPIC_DROPS = frozenset({"bad-stamp", "duplicate-stamp"})
 #: Topics with more number fields than this are listed in part.
@@ -63,6 +69,7 @@ CLOCK_RESIDUAL_S = 0.02
 class TopicReport:
     """One topic. Times in s; ``largest_gap_at_s`` is since the log's start; NaN where nothing can be said.
 
+    ``rate_hz`` is by the median step; of a topic of which no time was looked at, by its messages and the log's length.
     ``delay_*`` are of log time − publish time, which equals zero where a recorder knows one time only.
     """
 
@@ -121,6 +128,27 @@ class SignalReport:
 
 
 @dataclass(frozen=True, slots=True)
+class Sample:
+    """What was looked at of a log that was not read whole.
+
+    ``times`` says what rates, jitter and gaps of topics come from: the ``index``, or the chunks that were read
+    (``sample``), as do delays, signals and truth in any case. Counts are the index's.
+    """
+
+    chunks: int
+    of_chunks: int
+    times: Literal["index", "sample"]
+
+    def __str__(self) -> str:
+        """Say it in a line."""
+        what, index = ("values", "counts and rates") if self.times == "index" else ("values and rates", "counts")
+        return (
+            f"{what} from {self.chunks} of {self.of_chunks} chunks, {index} from the index; "
+            "--all reads everything and finds damage within chunks"
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Inspection:
     """All that :func:`inspect_log` found.
 
@@ -130,7 +158,7 @@ class Inspection:
     signals, truth : reports by name. missing : signals an estimator looks for and no topic provides.
     ambiguities, notes : of the mapping. candidates : fields that were weighed for it.
     checks : what physics says of signals and truth. proposals : corrections of the mapping that are certain.
-    lost : every loss and note of reading.
+    lost : every loss and note of reading. sample : what was looked at; None: everything.
     """
 
     path: str
@@ -149,6 +177,7 @@ class Inspection:
     proposals: tuple[Proposal, ...]
     lost: tuple[Loss, ...]
     candidates: tuple[Candidate, ...] = ()
+    sample: Sample | None = None
 
     @property
     def uses(self) -> MappingABC[str, str]:
@@ -173,6 +202,7 @@ class Inspection:
             "start_ns": self.start_ns,
             "end_ns": self.end_ns,
             "duration_s": self.duration_s,
+            "sample": self.sample,
             "topics": self.topics,
             "clocks": self.clocks,
             "mapping_origin": self.mapping.origin,
@@ -198,26 +228,41 @@ def inspect_log(
     prefer_truth: Literal["perfect", "rtk"] = "perfect",
     budget: Budget = DEFAULT_BUDGET,
     msgs: Path | None = None,
+    whole: bool = False,
 ) -> Inspection:
-    """Read a log once through and report on it; without a mapping the well-known types are recognised.
+    """Look a log through and report on it; without a mapping the well-known types are recognised.
 
-    Memory is bounded by windows of ten minutes, whatever the log's length. ``prefer_truth`` is the choice of
-    :func:`pdhef_logtool.mapping.recognise`; ``budget`` is what reading may cost, ``msgs`` a folder with
-    definitions of types that the log does not define.
+    Of a large MCAP whose index agrees with itself values are looked at in a part of the chunks (``sample``), unless
+    ``whole``; if anything is wrong in them, or little is left, all of it is read. Memory is bounded by windows of ten
+    minutes, whatever the log's length. ``prefer_truth`` is the choice of :func:`pdhef_logtool.mapping.recognise`;
+    ``budget`` is what reading may cost, ``msgs`` a folder with definitions of types that the log does not define.
 
     Raises
     ------
     LogError : The file is no log.
     MappingError : The mapping names what the log does not hold.
     """
+    if not whole:
+        with closing(open_log(path, budget, msgs, Wanted(frozenset(), above_bytes=WHOLE_BYTES))) as log:
+            assert isinstance(log, ColumnarLog)
+            long = log.far or log.end_ns - log.start_ns > 2 * WINDOW_NS  # a shorter one is mostly read anyway
+            by_index = long and log.by_index and log.size > WHOLE_BYTES
+            found = inspect_drive_log(log, mapping, prefer_truth=prefer_truth, by_index=by_index)
+            damaged = any(loss.severity == "lost" for loss in log.lost)
+            if found.sample is None or not (damaged or found.sample.chunks > MOST_SAMPLED * found.sample.of_chunks):
+                return found
     with closing(open_log(path, budget, msgs)) as log:
         return inspect_drive_log(log, mapping, prefer_truth=prefer_truth)
 
 
 def inspect_drive_log(
-    log: DriveLog, given: Mapping | None = None, *, prefer_truth: Literal["perfect", "rtk"] = "perfect"
+    log: DriveLog,
+    given: Mapping | None = None,
+    *,
+    prefer_truth: Literal["perfect", "rtk"] = "perfect",
+    by_index: bool = False,
 ) -> Inspection:
-    """Do what :func:`inspect_log` does with a log that is open already."""
+    """Do what :func:`inspect_log` does with a log that is open already; ``by_index`` looks at a sample of it."""
     ambiguities: tuple[Ambiguity, ...] = ()
     candidates: tuple[Candidate, ...] = ()
     if given is None:
@@ -227,17 +272,27 @@ def inspect_drive_log(
         check_mapping(given, log)
         mapping = given
     mapping = resolve_mapping(log, mapping)
+    head = (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS))
+    look = _sample_look(log, mapping, head) if by_index and isinstance(log, ColumnarLog) else _whole_look(log)
     clocks = fit_clocks(log, mapping, log.start_ns, log.end_ns)
-    looked_at = survey_log(log, mapping, clocks, (log.start_ns, min(log.end_ns, log.start_ns + WINDOW_NS)))
+    looked_at = survey_log(log, mapping, clocks, head)
     mapping = looked_at.mapping
     steps = {t.name: StepStatistics() for t in log.topics}
     delays = {t.name: DelayStatistics() for t in log.topics}
     gathered: dict[tuple[str, str], _Gathered] = {}
     losses: list[tuple[Loss, ...]] = []
-    for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
-        channels = read_signals(log, mapping, clocks, start, end, stamps=tuple(steps))
+    if look.by_index is not None:
+        for start, end in windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied):
+            for name, times in look.by_index.index_times(start, end).items():
+                steps[name].add(times)
+    for start, end in look.windows:
+        if look.sample is not None:  # nothing is known of what lies between two windows
+            for one in (*(steps.values() if look.by_index is None else ()), *(g.steps for g in gathered.values())):
+                one.last_ns = None
+        channels = read_signals(log, mapping, clocks, start, end, stamps=look.stamps)
         for name, columns in channels.stamps.items():
-            steps[name].add(columns.log_time_ns)
+            if look.by_index is None:
+                steps[name].add(columns.log_time_ns)
             delays[name].add(columns.log_time_ns, columns.publish_time_ns)
         losses.append(channels.losses)
         _gather(channels, gathered)
@@ -264,7 +319,44 @@ def inspect_drive_log(
         # Last, since a log knows all its losses only after it was read through.
         lost=merge_losses([log.lost, reading]),
         candidates=candidates,
+        sample=None if look.sample is None else look.sample(),
     )
+
+
+# ------------------------------------------------------------------------------------------------ what is read
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """What of a log is read.
+
+    Attributes
+    ----------
+    windows : [start, end) that are read. stamps : topics whose times are read there.
+    by_index : the log whose indexes tell the times of all topics; None: what is read tells them.
+    sample : says what was looked at in the end; None: all of the log is.
+    """
+
+    windows: Iterable[tuple[int, int]]
+    stamps: tuple[str, ...]
+    by_index: ColumnarLog | None = None
+    sample: Callable[[], Sample] | None = None
+
+
+def _whole_look(log: DriveLog) -> _Look:
+    return _Look(windows(log.start_ns, log.end_ns, WINDOW_NS, log.occupied), tuple(t.name for t in log.topics))
+
+
+def _sample_look(log: ColumnarLog, mapping: Mapping, head: tuple[int, int]) -> _Look:
+    """Look at what the clocks are fitted to, evenly over the log. With the head, which is checked, it is expected."""
+    mapped = {source.topic for source in mapping.sources()}
+    spread = survey_windows(log.start_ns, log.end_ns) if log.end_ns > head[1] else [head]
+    log.expect(mapped, [head, *spread])
+
+    def sample() -> Sample:
+        return Sample(*log.looked_at, times="sample" if log.far else "index")
+
+    return _Look(spread, tuple(sorted(log.beside(mapped))), None if log.far else log, sample)
 
 
 # ---------------------------------------------------------------------------------------------- gathering
@@ -306,13 +398,14 @@ def collapsed(fields: Sequence[FieldInfo]) -> list[tuple[str, str, list[str]]]:
 
 def _topic_report(topic: TopicInfo, steps: StepStatistics, delays: DelayStatistics, log: DriveLog) -> TopicReport:
     largest = steps.largest
+    log_s = (log.end_ns - log.start_ns) * 1e-9
     numbers = tuple(name for name, _, _ in collapsed(log.fields(topic.name)))
     return TopicReport(
         name=topic.name,
         type=topic.type_name,
         encoding=topic.encoding,
         messages=topic.messages,
-        rate_hz=_inverse(steps.median_s),
+        rate_hz=_inverse(steps.median_s) if steps.count else topic.messages / log_s if log_s > 0.0 else float("nan"),
         jitter_p95_s=steps.jitter_p95_s,
         largest_gap_s=largest[0] if largest else float("nan"),
         largest_gap_at_s=(largest[1] - log.start_ns) * 1e-9 if largest else float("nan"),

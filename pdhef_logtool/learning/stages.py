@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pdhef_logtool.car.parts import digest
 from pdhef_logtool.drive.reading import Tell
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.outputs import FolderTransaction
 from pdhef_logtool.sinks.report import json_bytes

@@ -82,6 +82,7 @@ class ColumnarLog:
         self._schemas_s = 0.0  # processor time that parsing took
         self._plans: dict[tuple[str, tuple[str, ...]], _Plan] = {}
         self._kept: dict[tuple[int, int, frozenset[int] | None], Block] = {}
+        self._kept_bytes = 0
         self._occupied: OccupiedTime | None = None
 
     @property
@@ -89,12 +90,11 @@ class ColumnarLog:
         """All topics by name; ``messages`` leaves out those of spans found damaged so far."""
         counts: Counter[str] = Counter()
         for c, container in enumerate(self.containers):
-            by_id: Counter[int] = Counter()
+            names = {id_: channel.topic for id_, channel in container.channels.items()}
             for span in container.spans:
                 if (c, span.index) not in self._damaged:
-                    by_id.update(span.counts)
-            for id_, n in by_id.items():
-                counts[container.channels[id_].topic] += n
+                    for id_, n in span.counts.items():
+                        counts[names[id_]] += n
         firsts = ((name, channels[0][1]) for name, channels in sorted(self._by_topic.items()))
         return tuple(TopicInfo(name, first.type_name, first.encoding, counts[name]) for name, first in firsts)
 
@@ -122,6 +122,8 @@ class ColumnarLog:
             container.meter.check()
             with container.meter.running():
                 channel, log_time = container.times(span)
+            if container.by_index:
+                return channel, log_time
             known = np.isin(channel, list(container.channels))
             return channel[known], log_time[known]
         except SourceError:
@@ -161,6 +163,57 @@ class ColumnarLog:
         for channel, n in sorted(counts.items()):
             what = f"{n} messages do not fit the type of their topic"
             yield Loss("undecodable", what, container.channels[channel].topic, count=n)
+
+    @property
+    def by_index(self) -> bool:
+        """Whether everything but the content of chunks is known, and nothing of it is odd."""
+        return all(container.by_index for container in self.containers) and not self.lost
+
+    @property
+    def far(self) -> bool:
+        """Whether each read costs a journey."""
+        return any(container.far for container in self.containers)
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+        return sum(container.account.size for container in self.containers)
+
+    @property
+    def looked_at(self) -> tuple[int, int]:
+        """How many spans were read, and how many there are."""
+        return len({(c, index) for c, index, _ in self._seen}), sum(len(c.spans) for c in self.containers)
+
+    def index_times(self, start_ns: int, end_ns: int) -> dict[str, IntArray]:
+        """Return each topic's log times in [start, end), ascending, as the indexes have them."""
+        parts: dict[str, list[IntArray]] = {topic: [] for topic in self._by_topic}
+        for c, container in enumerate(self.containers):
+            for span in container.spans:
+                found = self._times(c, span) if span.end_ns > start_ns and span.start_ns < end_ns else None
+                if found is None:
+                    continue
+                channel, times = found
+                keep = in_window(times, start_ns, end_ns)
+                channel, times = (channel, times) if keep is None else (channel[keep], times[keep])
+                for id_ in span.counts:
+                    parts[container.channels[id_].topic].append(times[channel == id_])
+        return {topic: np.sort(np.concatenate(part)) for topic, part in parts.items() if part}
+
+    def beside(self, topics: Collection[str]) -> frozenset[str]:
+        """Return the topics whose messages all lie in spans that hold one of these: they cost no further read."""
+        held, apart = set(topics), set[str]()
+        for container in self.containers:
+            names = {id_: channel.topic for id_, channel in container.channels.items()}
+            for span in container.spans:
+                inside = {names[id_] for id_ in span.counts}
+                (apart if inside.isdisjoint(topics) else held).update(inside)
+        return frozenset(held - apart)
+
+    def expect(self, topics: Collection[str], spans_ns: Sequence[tuple[int, int]]) -> None:
+        """Take note of what will be read soon: these topics in [start, end) of each."""
+        for container in self.containers:
+            found = (s for start, end in spans_ns for s in self._to_read(topics, container, start, end))
+            container.expect({span.index: span for span in found}.values())
 
     def fields(self, topic: str, *, quiet: bool = False) -> tuple[FieldInfo, ...]:
         """Return the scalar leaves of a topic's schema; empty when the encoding carries none.
@@ -247,6 +300,7 @@ class ColumnarLog:
     def close(self) -> None:
         """Release the files."""
         self._kept.clear()
+        self._kept_bytes = 0
         for container in self.containers:
             container.close()
 
@@ -286,8 +340,9 @@ class ColumnarLog:
             container.account.decode(*extent)
             self._hold_against(c, span, block, want)
         self._kept[(*key, want)] = block
-        while len(self._kept) > _KEPT_SPANS and sum(b.nbytes for b in self._kept.values()) > _KEPT_BYTES:
-            self._kept.pop(next(iter(self._kept)))
+        self._kept_bytes += block.nbytes
+        while len(self._kept) > _KEPT_SPANS and self._kept_bytes > _KEPT_BYTES:
+            self._kept_bytes -= self._kept.pop(next(iter(self._kept))).nbytes
         return block
 
     def _hold_against(self, c: int, span: Span, block: Block, want: frozenset[int] | None) -> None:
@@ -422,12 +477,12 @@ class ColumnarLog:
 
     @staticmethod
     def _to_read(
-        plans: Mapping[str, _Plan], container: Container, start_ns: int | None, end_ns: int | None
+        topics: Collection[str], container: Container, start_ns: int | None, end_ns: int | None
     ) -> Iterator[Span]:
         """Yield the spans of a window that hold any of the topics asked for."""
         for span in container.spans:
             inside = (start_ns is None or span.end_ns > start_ns) and (end_ns is None or span.start_ns < end_ns)
-            if inside and any(container.channels[id_].topic in plans for id_ in span.counts):
+            if inside and any(container.channels[id_].topic in topics for id_ in span.counts):
                 yield span
 
     def _collect_span(

@@ -167,12 +167,14 @@ class MetadataRecord:
 class Wanted:
     """Of which topics messages will be read, and of which log times [start, end); None: of all.
 
-    A hint that changes no byte of what is read: where reading is far, an index is believed for all else.
+    A hint that changes no byte of what is read: where reading is far, an index is believed for all else, if the file
+    has more than ``above_bytes``.
     """
 
     topics: frozenset[str] | None = None
     start_ns: int | None = None
     end_ns: int | None = None
+    above_bytes: int = 0
 
     def has(self, topics: Iterable[str], first_ns: int, last_ns: int) -> bool:
         """Tell whether something that holds messages of these topics and log times is wanted."""
@@ -214,10 +216,13 @@ class Container(ABC):
     selective : whether a load can leave out the payloads of unwanted channels.
     profile : MCAP profile that a copy should carry. distro : ROS distribution that the file names; empty if none.
     remedy : what to do about a file that is none of this format.
+    far : whether reading costs a journey. by_index : whether a sound index names all messages.
     """
 
     form = ""
     selective = False
+    far = False
+    by_index = False
     profile = "ros2"
     distro = ""
     remedy = ""

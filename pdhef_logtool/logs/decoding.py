@@ -113,14 +113,14 @@ class ChannelDecoder:
         """Decode the messages ``rows`` of a block: float64 [N] or [N, k], or int64 nanoseconds [N], by path."""
         self.undecodable = []
         partial: list[tuple[IntArray, dict[str, NDArray[Any]]]] = []
-        left = np.arange(len(rows))
+        left = every = np.arange(len(rows))
         if self.schema.wire in ("cdr", "ros1"):
             left = self._read_records(block, rows, left, partial)
         if left.size or not partial:
             partial.append((left, self._read_singly(block, rows[left])))
         if len(partial) == 1 and len(partial[0][0]) == len(rows):
             order, columns = partial[0]
-            if np.all(order[1:] >= order[:-1]):
+            if order is every or np.all(order[1:] >= order[:-1]):
                 return columns
             back = np.argsort(order)
             return {path: column[back] for path, column in columns.items()}

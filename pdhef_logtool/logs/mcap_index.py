@@ -22,8 +22,8 @@ from pdhef_logtool.logs.occupied_time import SILENCE_NS, STEP_BACK_NS
 #: One request brings the summary of a drive of several minutes; what is missing of a longer one comes with a second.
 TAIL_BYTES = 256 << 10
 _MOST_SUMMARY_BYTES = 64 << 20
-_RECORD = struct.Struct("<BQ")
-_FOOTER = struct.Struct("<BQQQI")
+RECORD = struct.Struct("<BQ")  # opcode, size of what follows
+FOOTER = struct.Struct("<BQQQI")  # the same, then: start of summary and of its offsets, CRC of the summary
 _CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last time, offset, length, bytes of the message indexes' offsets
 _STATISTICS = struct.Struct("<QHIIIIQQI")
 _EXTENT = struct.Struct("<QQ")
@@ -66,20 +66,20 @@ def read_index(source: ByteSource) -> McapIndex | None:
 def _summary(source: ByteSource) -> tuple[bytes, int] | None:
     """Return the bytes of the summary section and where it begins."""
     size = source.size
-    foot = size - len(MCAP_MAGIC) - _FOOTER.size
+    foot = size - len(MCAP_MAGIC) - FOOTER.size
     if foot <= len(MCAP_MAGIC):
         return None
     tail = max(0, size - TAIL_BYTES)
     source.expect([(tail, size)])
     end = source.read(foot, size - foot)
-    opcode, length, start, _, crc = _FOOTER.unpack_from(end)
-    if opcode != Opcode.FOOTER or length != _FOOTER.size - 9 or end[_FOOTER.size :] != MCAP_MAGIC:
+    opcode, length, start, _, crc = FOOTER.unpack_from(end)
+    if opcode != Opcode.FOOTER or length != FOOTER.size - 9 or end[FOOTER.size :] != MCAP_MAGIC:
         return None
     if not 0 < start < foot or foot - start > _MOST_SUMMARY_BYTES:
         return None
     source.expect([(start, size)])
     summary = source.read(start, foot - start)
-    if crc and zlib.crc32(end[: _FOOTER.size - 4], zlib.crc32(summary)) != crc:
+    if crc and zlib.crc32(end[: FOOTER.size - 4], zlib.crc32(summary)) != crc:
         return None
     return summary, start
 
@@ -87,7 +87,7 @@ def _summary(source: ByteSource) -> tuple[bytes, int] | None:
 def _records(summary: bytes) -> Iterator[tuple[int, bytes]]:
     at = 0
     while at < len(summary):
-        opcode, length = _RECORD.unpack_from(summary, at)
+        opcode, length = RECORD.unpack_from(summary, at)
         if at + 9 + length > len(summary):
             raise ValueError("a cut record")
         yield opcode, summary[at + 9 : at + 9 + length]

@@ -46,18 +46,18 @@ from pdhef_logtool.logs.container import (
     block_from_lists,
     told,
 )
-from pdhef_logtool.logs.mcap_index import IndexedChunk, read_index
+from pdhef_logtool.logs.mcap_index import RECORD, IndexedChunk, read_index
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.logs.type_names import ros2_type_name
 from pdhef_logtool.records.signals import IntArray
 
 UintArray: TypeAlias = NDArray[np.uint64]
 
-_RECORD = struct.Struct("<BQ")
 _MESSAGE_RECORD = struct.Struct("<BQHIQ")
 _CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
 _INDEX_HEAD = struct.Struct("<9sHI")  # head of the record, channel, bytes of the pairs
-_U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
+_INDEX_RECORD = struct.Struct("<BQHI")  # the same, with opcode and size
+_U32, _U64 = struct.Struct("<I"), struct.Struct("<Q")
 _FOOTER_BYTES = 9 + 20
 _UNCHUNKED_RUN_BYTES = 4 << 20  # unchunked messages are read in runs of this size
 _CRC_BLOCK_BYTES = 4 << 20
@@ -119,6 +119,8 @@ class McapContainer(FileContainer):
         self._extents: list[_Extent] = []
         self._attachment_at: list[tuple[int, int]] = []
         self._metadata_at: list[tuple[int, int]] = []
+        self._index_believed = False
+        self._misled = False  # whether an index named other messages than are there
         self._indexed: list[int] | None = None  # where the chunks lie that the summary names
         self._walked = _Walk(self)
         super().__init__(path, shown_path, meter)
@@ -135,7 +137,7 @@ class McapContainer(FileContainer):
                 self.account.decode(at, size)
                 walk.closed = True
                 return
-            opcode, length = _RECORD.unpack(source.read(at, 9)) if at + 9 <= size else (0, 0)
+            opcode, length = RECORD.unpack(source.read(at, 9)) if at + 9 <= size else (0, 0)
             end = at + 9 + length
             if end > size or opcode == 0:
                 if not header_seen:
@@ -165,10 +167,15 @@ class McapContainer(FileContainer):
 
     def _finish(self) -> None:
         self._walked.finish()
+        self.far = self.source.far
+        chunked = bool(self._extents) and all(extent.is_chunk for extent in self._extents)
+        known = self._index_believed if self.far else self._walked.statistics is not None
+        self.by_index = chunked and known and not self._misled and not self.lost
 
     def _believed(self) -> dict[int, IndexedChunk | tuple[int, int]]:
         """Return the chunks and attachments that are not wanted by their place, and have all else fetched."""
-        index = None if self._wanted == EVERYTHING else read_index(self.source)
+        everything = self._wanted == EVERYTHING or self.source.size <= self._wanted.above_bytes
+        index = None if everything else read_index(self.source)
         found: dict[int, IndexedChunk | tuple[int, int]] = {}
         try:
             for schema in index.schemas if index else ():
@@ -181,6 +188,7 @@ class McapContainer(FileContainer):
             self._raw_channels.clear()
             index = None
         if index is not None:
+            self._index_believed = True
             topics = {id_: channel.topic for id_, channel in self._raw_channels.items()}
             for chunk in index.chunks:
                 if not self._wanted.has([topics[id_] for id_ in chunk.counts], chunk.first_ns, chunk.last_ns):
@@ -219,7 +227,7 @@ class McapContainer(FileContainer):
         (at,) = _U64.unpack(read(foot + 9, 8))
         found: list[int] = []
         while at > 0 and at + 9 <= foot:
-            opcode, length = _RECORD.unpack(read(at, 9))
+            opcode, length = RECORD.unpack(read(at, 9))
             if opcode == Opcode.CHUNK_INDEX and length >= 24 and at + 9 + length <= foot:
                 (offset,) = _U64.unpack(read(at + 9 + 16, 8))
                 if offset < foot and read(offset, 1)[0] == Opcode.CHUNK:
@@ -301,7 +309,7 @@ class McapContainer(FileContainer):
         while at < size:
             if at + 9 > size:
                 raise SpanDamageError("its last record is cut")
-            opcode, length = _RECORD.unpack_from(content, at)
+            opcode, length = RECORD.unpack_from(content, at)
             end = at + 9 + length
             if end > size:
                 raise SpanDamageError("its last record is cut")
@@ -486,6 +494,7 @@ class McapContainer(FileContainer):
             self.account.decode(extent.at, extent.end)
             return
         first, last = int(block.log_time_ns.min()), int(block.log_time_ns.max())
+        self._misled |= (claimed.start_ns, claimed.end_ns, claimed.counts) != (first, last + 1, held)
         self.add_span(extent, Span(0, first, last + 1, held, block.ordered))
 
     def add_span(self, extent: _Extent, span: Span) -> None:
@@ -504,6 +513,7 @@ class McapContainer(FileContainer):
             found.update(span.counts)
         if self.lost or (found.total() == total and (not by_channel or found == Counter(by_channel))):
             return
+        self._misled = True
         spans, extents = self.spans[:], self._extents[:]
         self.spans.clear()
         self._extents.clear()
@@ -624,7 +634,7 @@ class _Walk:
             if base + place - start >= _UNCHUNKED_RUN_BYTES:
                 break
         if place == first:  # not even the first one is a message
-            end = at + 9 + int(_RECORD.unpack(of.source.read(at, 9))[1])
+            end = at + 9 + int(RECORD.unpack(of.source.read(at, 9))[1])
             self._end_run()
             of.lose_record(at, end, SpanDamageError("a message record is too short"))
             return end
@@ -777,8 +787,7 @@ def _message_indexes(record: bytes, at: int) -> list[tuple[int, UintArray, UintA
     """Return channel, log times [N] and offsets [N] of each message index from a byte on; None if one is malformed."""
     found: list[tuple[int, UintArray, UintArray]] = []
     while at < len(record):
-        opcode, length = _RECORD.unpack_from(record, at)
-        (channel,), (n,) = _U16.unpack_from(record, at + 9), _U32.unpack_from(record, at + 11)
+        opcode, length, channel, n = _INDEX_RECORD.unpack_from(record, at)
         if opcode != _OP_MESSAGE_INDEX or n % 16 or n + 6 > length:
             return None
         pairs = np.frombuffer(record, dtype="<u8", count=n // 8, offset=at + 15)
@@ -793,7 +802,7 @@ def _indexed_messages(content: bytes, record: bytes, at: int) -> Block | None:
     if not indexes:
         return None
     # Each channel's offsets ascend already, which the stable sort makes use of.
-    offset = np.sort(np.concatenate([offsets.astype(np.int64) for _, _, offsets in indexes]), kind="stable")
+    offset = np.sort(np.concatenate([offsets for _, _, offsets in indexes]).view(np.int64), kind="stable")
     return _gather_messages(content, offset) if offset.size else None
 
 
@@ -806,28 +815,32 @@ def _gather_messages(content: bytes, offset: IntArray) -> Block | None:
     plain = np.dtype((np.void, MESSAGE_HEAD.itemsize))
     heads = np.ndarray((n - plain.itemsize + 1,), dtype=plain, buffer=content, strides=(1,))[offset]
     heads = heads.view(MESSAGE_HEAD)
-    if (heads["op"] != _OP_MESSAGE).any() or (heads["size"] > n).any():
+    size = heads["size"].astype(np.int64)  # what does not fit is below 0
+    if (heads["op"] != _OP_MESSAGE).any() or size.min() < 22 or size.max() > n:
         return None
-    size = heads["size"].astype(np.int64)
     ends = offset + (9 + size)
-    if (size < 22).any() or (ends > n).any():
+    if ends.max() > n:
         return None
-    starts = np.append(offset, n)
-    ends = np.append(0, ends)
-    if (starts != ends).any():
-        others = _records_between(content, ends, starts)
+    if offset[0] != 0 or ends[-1] != n or (offset[1:] != ends[:-1]).any():
+        others = _records_between(content, np.append(0, ends), np.append(offset, n))
         if others is None or any(opcode < _FIRST_PRIVATE and opcode not in _DECLARATIONS for opcode, _, _ in others):
             return None
-    latest = np.uint64(MAX_TIME_NS)
     return Block(
         buffer=content,
         channel=heads["channel"].astype(np.int64),
-        log_time_ns=np.minimum(heads["log"], latest).view(np.int64),
-        publish_time_ns=np.minimum(heads["publish"], latest).view(np.int64),
+        log_time_ns=_held_times(heads["log"]),
+        publish_time_ns=_held_times(heads["publish"]),
         sequence=heads["sequence"].astype(np.int64),
         offset=offset + 31,
         length=size - 22,
     )
+
+
+def _held_times(times: UintArray) -> IntArray:
+    """Return times [N] as int64, those above ``MAX_TIME_NS`` as that."""
+    held = times.astype(np.int64)
+    fit = held.min() >= 0 and held.max() <= MAX_TIME_NS
+    return held if fit else np.minimum(times, np.uint64(MAX_TIME_NS)).astype(np.int64)
 
 
 def _records_between(content: bytes, starts: IntArray, ends: IntArray) -> list[tuple[int, int, int]] | None:
@@ -838,7 +851,7 @@ def _records_between(content: bytes, starts: IntArray, ends: IntArray) -> list[t
         while at < end:
             if at + 9 > end:
                 return None
-            opcode, length = _RECORD.unpack_from(content, at)
+            opcode, length = RECORD.unpack_from(content, at)
             found.append((opcode, at + 9, at + 9 + length))
             at += 9 + length
         if at != end:

@@ -321,6 +321,7 @@ class _Wrapped(Container):
         self.channels, self.spans, self.lost = container.channels, container.spans, container.lost
         self.undeclared = container.undeclared
         self.meter, self.account, self.selective = container.meter, container.account, container.selective
+        self.far, self.by_index = container.far, container.by_index
 
     def load(self, span: Span, want: frozenset[int] | None = None) -> Block:
         return self.container.load(span, want)

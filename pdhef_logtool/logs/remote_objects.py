@@ -79,13 +79,15 @@ class Answer:
 class RemoteObject(ABC):
     """An object that gives ranges of its bytes."""
 
-    def __init__(self, place: RemotePlace) -> None:
+    def __init__(self, place: RemotePlace, system: Any) -> None:
         self.place = place
+        self._system = system  # of fsspec
 
     @property
-    @abstractmethod
     def loop(self) -> asyncio.AbstractEventLoop:
         """The loop that its requests run on, in another thread."""
+        loop: asyncio.AbstractEventLoop = self._system.loop
+        return loop
 
     @abstractmethod
     def ask(self, start: int, end: int, pinned: ObjectState | None) -> AbstractAsyncContextManager[Answer]:
@@ -150,19 +152,12 @@ class HttpObject(RemoteObject):
     """An object of a web server. Proxies and ``netrc`` are the environment's."""
 
     def __init__(self, place: RemotePlace) -> None:
-        super().__init__(place)
         aiohttp = _imported("aiohttp", "http", place)
         import fsspec
 
         timeout = aiohttp.ClientTimeout(total=None, sock_connect=PATIENCE.connect_s, sock_read=PATIENCE.silence_s)
         client = {"trust_env": True, "auto_decompress": False, "timeout": timeout}
-        self._system = fsspec.filesystem("http", client_kwargs=client)
-
-    @property
-    def loop(self) -> asyncio.AbstractEventLoop:
-        """See :class:`RemoteObject`."""
-        loop: asyncio.AbstractEventLoop = self._system.loop
-        return loop
+        super().__init__(place, fsspec.filesystem("http", client_kwargs=client))
 
     @asynccontextmanager
     async def ask(self, start: int, end: int, pinned: ObjectState | None) -> AsyncIterator[Answer]:
@@ -219,14 +214,7 @@ class S3Object(RemoteObject):
     """An object of an S3 store. Credentials, region and endpoint are what the environment gives to any AWS tool."""
 
     def __init__(self, place: RemotePlace) -> None:
-        super().__init__(place)
-        self._system = s3_system(place)
-
-    @property
-    def loop(self) -> asyncio.AbstractEventLoop:
-        """See :class:`RemoteObject`."""
-        loop: asyncio.AbstractEventLoop = self._system.loop
-        return loop
+        super().__init__(place, s3_system(place))
 
     @asynccontextmanager
     async def ask(self, start: int, end: int, pinned: ObjectState | None) -> AsyncIterator[Answer]:

@@ -125,11 +125,4 @@ def _add_channel(writer: McapLogWriter, log: ColumnarLog, c: int, channel: Chann
         with parsing(f"the definition of {channel.type_name}"):
             text = schema.store.generate_msgdef(schema.type_name, ros_version=ros)[0]
         channel = replace(channel, schema_encoding=f"ros{ros}msg", schema_data=text.encode())
-    return writer.add_raw_channel(
-        channel.topic,
-        schema_name=channel.schema_name,
-        schema_encoding=channel.schema_encoding,
-        schema_data=channel.schema_data,
-        message_encoding=channel.encoding,
-        metadata=channel.metadata,
-    )
+    return writer.add_channel(channel)

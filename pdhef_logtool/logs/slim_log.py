@@ -20,6 +20,7 @@ from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.logs.columnar_log import ColumnarLog
 from pdhef_logtool.logs.container import MAX_TIME_NS, MCAP_MAGIC, Container
 from pdhef_logtool.logs.drive_log import TopicInfo
+from pdhef_logtool.logs.mcap_index import FOOTER
 from pdhef_logtool.logs.mcap_log import McapContainer
 from pdhef_logtool.logs.occupied_time import OccupiedTime
 from pdhef_logtool.logs.remote_place import LogPlace
@@ -32,8 +33,8 @@ from pdhef_logtool.records.version import LIBRARY
 FORMAT = 1
 #: Name of the MCAP metadata record, and of its one entry.
 RECORD_NAME, RECORD_ENTRY = "pdhef_slim", "json"
-#: Opcode, size, then: start of summary and of its offsets, CRC of the summary; CRC of all before it.
-_FOOTER, _DATA_END = struct.Struct("<BQQQI"), struct.Struct("<BQI")
+#: Opcode, size; CRC of all before it.
+_DATA_END = struct.Struct("<BQI")
 _LONGEST_NS = 366 * 86_400_000_000_000
 #: Losses that come up again when the kept messages are read.
 _FOUND_AGAIN = frozenset({"undecodable", "bad-schema"})
@@ -85,6 +86,11 @@ class SlimLog(ColumnarLog):
         self.record = record
         self._occupied = OccupiedTime(record.intervals, left_out=record.left_out)
         self._extracted: tempfile.TemporaryDirectory[str] | None = None
+
+    @property
+    def by_index(self) -> bool:
+        """False: it is small, and its index is not that of its source."""
+        return False
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
@@ -151,13 +157,13 @@ def slim_record(container: Container) -> SlimRecord | None:
 def is_whole(path: Path) -> bool:
     """Tell by its checksums whether a file that our writer wrote is as it was written."""
     data = path.read_bytes()
-    foot = len(data) - _FOOTER.size - len(MCAP_MAGIC)
+    foot = len(data) - FOOTER.size - len(MCAP_MAGIC)
     if foot < _DATA_END.size or not data.endswith(MCAP_MAGIC):
         return False
-    opcode, _, summary, _, summary_crc = _FOOTER.unpack_from(data, foot)
+    opcode, _, summary, _, summary_crc = FOOTER.unpack_from(data, foot)
     if opcode != Opcode.FOOTER or not _DATA_END.size <= summary <= foot:
         return False
     end, _, data_crc = _DATA_END.unpack_from(data, summary - _DATA_END.size)
     view = memoryview(data)
-    checked = zlib.crc32(view[: summary - _DATA_END.size]), zlib.crc32(view[summary : foot + _FOOTER.size - 4])
+    checked = zlib.crc32(view[: summary - _DATA_END.size]), zlib.crc32(view[summary : foot + FOOTER.size - 4])
     return bool(end == Opcode.DATA_END and checked == (data_crc, summary_crc))

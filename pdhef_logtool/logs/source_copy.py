@@ -104,17 +104,7 @@ def register_channels(
             )
             id_ = known.get(identity)
             if id_ is None or id_ in same_file:  # two publishers of one file stay two channels
-                channel_id, schema_id = places.of(c, target)
-                id_ = writer.add_raw_channel(
-                    target.topic,
-                    schema_name=target.schema_name,
-                    schema_encoding=target.schema_encoding,
-                    schema_data=target.schema_data,
-                    message_encoding=target.encoding,
-                    metadata=target.metadata,
-                    channel_id=channel_id,
-                    schema_id=schema_id,
-                )
+                id_ = writer.add_channel(target, *places.of(c, target))
                 known[identity] = id_
             same_file.add(id_)
             ids[(c, channel.id)] = id_

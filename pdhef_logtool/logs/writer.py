@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 from mcap.data_stream import RecordBuilder
@@ -35,7 +35,7 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from pdhef_logtool.logs.container import MCAP_MAGIC, RawChunk
+from pdhef_logtool.logs.container import MCAP_MAGIC, ChannelRecord, RawChunk
 from pdhef_logtool.logs.encoding import CdrEncoder
 from pdhef_logtool.logs.mcap_log import MESSAGE_HEAD
 from pdhef_logtool.logs.schema_files import message_definition
@@ -43,6 +43,9 @@ from pdhef_logtool.records.errors import MappingError, OutputError
 from pdhef_logtool.records.files import PendingFile, open_new, writing
 from pdhef_logtool.records.signals import IntArray
 from pdhef_logtool.records.version import LIBRARY
+
+if TYPE_CHECKING:
+    from zstandard import ZstdCompressor
 
 #: Of message records, as far as they come together; in a chunk.
 CHUNK_BYTES = 1 << 20
@@ -153,6 +156,7 @@ class McapLogWriter:
         self._last_ns = 0
         self._crc = 0
         self._at = 0
+        self._compressor: ZstdCompressor | None = None
         self._pending = PendingFile(path)
         with writing(path):
             self._file: IO[bytes] = open_new(self._pending.path)
@@ -213,6 +217,19 @@ class McapLogWriter:
             metadata={},
         )
         self._encoders[topic] = (channel, encoder)
+
+    def add_channel(self, record: ChannelRecord, channel_id: int | None = None, schema_id: int | None = None) -> int:
+        """Add a channel as a file has it, otherwise as :meth:`add_raw_channel`."""
+        return self.add_raw_channel(
+            record.topic,
+            schema_name=record.schema_name,
+            schema_encoding=record.schema_encoding,
+            schema_data=record.schema_data,
+            message_encoding=record.encoding,
+            metadata=record.metadata,
+            channel_id=channel_id,
+            schema_id=schema_id,
+        )
 
     def add_raw_channel(
         self,
@@ -316,18 +333,16 @@ class McapLogWriter:
             raise MappingError(expected="a topic of this file", got="an unknown one", where=batch.topic)
         channel, encoder = self._encoders[batch.topic]
         n = len(batch.log_time_ns)
-        payload = encoder.encode(n, batch.fields)
+        rows = encoder.encode(n, batch.fields, head=MESSAGE_HEAD.itemsize)
         head = np.zeros(n, dtype=MESSAGE_HEAD)
         head["op"] = Opcode.MESSAGE
-        head["size"] = 22 + payload.shape[1]
+        head["size"] = 22 + rows.shape[1] - MESSAGE_HEAD.itemsize
         head["channel"] = channel
         head["sequence"] = self._sequences[channel] + np.arange(n)
         head["log"] = batch.log_time_ns
         head["publish"] = batch.publish_time_ns
         self._sequences[channel] += n
-        rows = np.empty((n, MESSAGE_HEAD.itemsize + payload.shape[1]), dtype=np.uint8)
         rows[:, : MESSAGE_HEAD.itemsize] = head.view(np.uint8).reshape(n, MESSAGE_HEAD.itemsize)
-        rows[:, MESSAGE_HEAD.itemsize :] = payload
         return _Records(channel, batch.log_time_ns.astype(np.int64), rows)
 
     def _write_merged(self, raws: Sequence[RawMessage], merged: _Merged, part: slice) -> None:
@@ -362,14 +377,18 @@ class McapLogWriter:
             for i in np.unique(part_source).tolist():
                 mine = part_source == i
                 scatter(content, at[mine], part_row[mine], raw_bytes if i < 0 else merged.rows[i])
-            self.write_chunk(content.tobytes(), channel[first:last], log_time[first:last], at)
+            self.write_chunk(content.data, channel[first:last], log_time[first:last], at)
             first = last
 
-    def write_chunk(self, records: bytes, channel: IntArray, log_time_ns: IntArray, offset: IntArray) -> None:
+    def write_chunk(
+        self, records: bytes | memoryview, channel: IntArray, log_time_ns: IntArray, offset: IntArray
+    ) -> None:
         """Write message records as one chunk; channel, log time and offset [N] of each record in it."""
-        import zstandard
+        if self._compressor is None:
+            import zstandard
 
-        stored = zstandard.ZstdCompressor(level=self._level).compress(records)
+            self._compressor = zstandard.ZstdCompressor(level=self._level)
+        stored = self._compressor.compress(records)
         self._emit_chunk(RawChunk("zstd", stored, len(records), zlib.crc32(records), channel, log_time_ns, offset))
 
     def _emit_chunk(self, chunk: RawChunk) -> None:
@@ -388,14 +407,17 @@ class McapLogWriter:
         chunk_length = self._at - chunk_at
         index_at = self._at
         offsets: dict[int, int] = {}
-        for id_ in np.unique(channel).tolist():
-            mine = channel == id_
-            pairs = np.empty((int(mine.sum()), 2), dtype="<u8")
-            pairs[:, 0], pairs[:, 1] = log_time[mine], offset[mine]
-            offsets[id_] = self._at
-            data = pairs.tobytes()
-            self._emit(struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(data), id_, len(data)) + data)
-            self._counts[id_] += len(pairs)
+        index = bytearray()
+        order = np.argsort(channel, kind="stable")
+        pairs = np.empty((len(order), 2), dtype="<u8")
+        pairs[:, 0], pairs[:, 1] = log_time[order], offset[order]
+        ids, firsts = np.unique(channel[order], return_index=True)
+        for id_, mine in zip(ids.tolist(), np.split(pairs, firsts[1:]), strict=True):
+            offsets[id_] = index_at + len(index)
+            data = mine.tobytes()
+            index += struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6 + len(data), id_, len(data)) + data
+            self._counts[id_] += len(mine)
+        self._emit(bytes(index))
         self._chunk_indexes.append(
             ChunkIndex(
                 chunk_start_offset=chunk_at,

@@ -158,7 +158,7 @@ def fit_clocks(log: DriveLog, mapping: Mapping, start_ns: int, end_ns: int) -> d
     for source in wanted.values():
         paths = requests.setdefault(source.read_topic, [])
         paths += [p for p in stamp_request(log, source) if p not in paths]
-    parts = _survey(log, wanted, requests, _survey_windows(start_ns, end_ns))
+    parts = _survey(log, wanted, requests, survey_windows(start_ns, end_ns))
     # Between the parts of a survey a clock may have stepped: then all of its stamps are looked at.
     doubtful = {key: source for key, source in wanted.items() if _offset_changes(parts[key])}
     whole: dict[str, list[_Stamps]] = {}
@@ -305,7 +305,8 @@ def _to_nanoseconds(parts: list[NDArray[np.generic]], units: tuple[str, ...]) ->
     return total, usable & (total > 0)
 
 
-def _survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+def survey_windows(start_ns: int, end_ns: int) -> list[tuple[int, int]]:
+    """Return what :func:`fit_clocks` looks at: all of a short log, windows of 10 s spread over a longer one."""
     if end_ns - start_ns <= SURVEY_WHOLE_NS:
         return [(start_ns, end_ns)] if start_ns < end_ns else []
     starts = np.linspace(start_ns, end_ns - SURVEY_WINDOW_NS, SURVEY_WINDOWS).astype(np.int64)

@@ -118,7 +118,7 @@ def _vectors(topic: TopicInfo, fields: tuple[FieldInfo, ...], stamp: str) -> lis
             scale = (factor, factor, factor if vertical == "u" else -factor)
             found.append(SignalSource("enu_velocity_m_s", topic.name, paths, stamp, scale))
             break
-    elements = {f.path for f in fields}
+    elements = dict.fromkeys(f.path for f in fields)  # in order, which the report follows
     for base in dict.fromkeys(p.removesuffix("[0]") for p in elements if p.endswith("[0]") and "ecef" in p.lower()):
         if f"{base}[2]" not in elements or f"{base}[3]" in elements:
             continue

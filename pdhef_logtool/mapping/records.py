@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
 
 from pdhef_logtool.records.checks import Check
-from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.documents import digest, jsonable
 
 #: Number of columns of the truth channels that are vectors; all other signals are scalars.
 VECTOR_COLUMNS: dict[str, int] = {
@@ -193,8 +191,7 @@ class Mapping:
     @property
     def sha256(self) -> str:
         """Hash of what is read and how: sources, scales, stamps, latencies, limits and the truth's gate."""
-        said = jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality})
-        return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()
+        return digest(jsonable({"signals": self.signals, "truth": self.truth, "quality": self.quality}))
 
     def sources(self) -> Iterator[SignalSource]:
         """Yield every source: signals, truth, the gate."""

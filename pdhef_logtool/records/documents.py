@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import tomllib
@@ -245,3 +246,8 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         return jsonable(value.tolist())
     raise TypeError(f"no JSON form of {type(value).__name__}")
+
+
+def digest(document: Any) -> str:
+    """Return the sha256 of a JSON-able value, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()

@@ -15,7 +15,10 @@ WGS84_E2 = 6.69437999014e-3
 
 def wrap_angle(angle_rad: FloatArray) -> FloatArray:
     """Wrap angles to [−π, π); any shape, rad."""
-    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi, dtype=np.float64)
+    turned = angle_rad + np.pi
+    if ((turned < 0.0) | (turned >= 2.0 * np.pi)).any():  # the remainder is slow, and none within a turn
+        turned = turned % (2.0 * np.pi)
+    return np.asarray(turned - np.pi, dtype=np.float64)
 
 
 def rotation_from_quat(quat_wxyz: FloatArray) -> FloatArray:
@@ -115,11 +118,12 @@ def dead_reckon(
         return empty, empty.copy(), empty.copy()
     dt = np.diff(stamps_ns) * 1e-9
     ok = np.isfinite(vx_m_s + vy_m_s + yaw_rate_rad_s)
-    use = ok[1:] & ok[:-1]
-    dt = np.where(use, dt, 0.0)
+    whole = bool(ok.all())
+    if not whole:
+        dt = np.where(ok[1:] & ok[:-1], dt, 0.0)
 
     def mid(a: FloatArray) -> FloatArray:
-        a = np.where(ok, a, 0.0)
+        a = a if whole else np.where(ok, a, 0.0)
         return 0.5 * (a[1:] + a[:-1])
 
     def accumulate(first: float, steps: FloatArray) -> FloatArray:
@@ -128,9 +132,10 @@ def dead_reckon(
 
     yaw = accumulate(start[2], mid(yaw_rate_rad_s) * dt)
     heading = 0.5 * (yaw[1:] + yaw[:-1])
+    cos, sin = np.cos(heading), np.sin(heading)
     vx, vy = mid(vx_m_s), mid(vy_m_s)
-    x = accumulate(start[0], (vx * np.cos(heading) - vy * np.sin(heading)) * dt)
-    y = accumulate(start[1], (vx * np.sin(heading) + vy * np.cos(heading)) * dt)
+    x = accumulate(start[0], (vx * cos - vy * sin) * dt)
+    y = accumulate(start[1], (vx * sin + vy * cos) * dt)
     return x, y, yaw
 
 

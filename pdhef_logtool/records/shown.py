@@ -35,8 +35,14 @@ def all_shown(value: _T) -> _T:
 
 
 def _all_shown(value: Any) -> Any:
+    if value is None or type(value) in (float, int, bool):  # in order of how many there are in a report
+        return value
     if type(value) is str:
         return shown(value)
+    if type(value) is dict:
+        return {_all_shown(k): _all_shown(v) for k, v in value.items()}
+    if type(value) is list:
+        return [_all_shown(v) for v in value]
     if isinstance(value, PurePath):
         return type(value)(shown(value))
     if isinstance(value, Mapping):

@@ -117,7 +117,8 @@ def drive_figures(path: Path, report: Mapping[str, Any], roles: Roles, low_speed
     for name in dict.fromkeys([TRUTH, *roles.names]):
         if name in tracks.names:
             against = reference if scored else None if name == roles.main else Reference(answer, False, tracks)
-            series[name] = gather(name, tracks, grid, None if name == TRUTH else against, dof)
+            error_of = None if name == TRUTH else against
+            series[name] = gather(name, tracks, grid, error_of, dof, whole=name in (TRUTH, roles.main))
     charts = Charts(grid, origin_ns)
     peaks = () if reference is None else _peaks(answer, reference, report["segments"], origin_ns)
     moves = bool(np.isfinite(series[roles.main].sideslip.values).any())

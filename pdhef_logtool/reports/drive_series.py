@@ -21,10 +21,9 @@ from pdhef_logtool.sinks.parquet import list_estimators, read_blocks
 
 #: NIS is shown as its mean over so long.
 _NIS_S = 1.0
-_COLUMNS = (
-    "vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2", "x_m", "y_m",
-    "sideslip_std_rad", "network_trust", "r_scale", "nis", "valid", "reason",
-)  # fmt: skip
+#: What is drawn of every track, and beside it of the truth and of the answer.
+_COLUMNS = ("vx_m_s", "vy_m_s", "sideslip_rad", "network_trust", "r_scale", "nis", "valid", "reason")
+_MORE_COLUMNS = ("yaw_rate_rad_s", "ay_m_s2", "x_m", "y_m", "sideslip_std_rad")
 _BLOCK_ROWS = 1 << 15
 #: What errors and gaps of sideslip are told from.
 _OF_SIDESLIP = ("vx_m_s", "vy_m_s", "sideslip_rad", "valid")
@@ -100,7 +99,10 @@ class Points:
 
 
 class DriveSeries:
-    """What is drawn of one track; angles in degrees. ``error``: absolute, against what the page compares with."""
+    """What is drawn of one track; angles in degrees. ``error``: absolute, against what the page compares with.
+
+    Band, speed, a_y and the planes are empty but for the truth and the answer.
+    """
 
     def __init__(self, name: str, grid: Grid) -> None:
         self.name = name
@@ -143,35 +145,49 @@ class Reference:
 
 
 def gather(
-    name: str, tracks: Tracks, grid: Grid, reference: Reference | None, nis_dof: Mapping[str, float]
+    name: str,
+    tracks: Tracks,
+    grid: Grid,
+    reference: Reference | None,
+    nis_dof: Mapping[str, float],
+    *,
+    whole: bool,
 ) -> DriveSeries:
     """Return the series of one track, read block by block.
 
     Parameters
     ----------
     reference : what its errors are told against; None: none are. nis_dof : mean degrees of freedom by estimator.
+    whole : whether band, motion and planes are drawn of it too.
     """
     made = DriveSeries(name, grid)
-    for track in tracks.blocks(name):
+    for track in tracks.blocks(name, (*_COLUMNS, *_MORE_COLUMNS) if whole else _COLUMNS):
         drawn, stamps = tracks.drawn(track), track.stamps_ns
-        beta, half = drawn.sideslip_rad * DEGREES, NORMAL_95 * drawn.sideslip_std_rad * DEGREES
+        beta = drawn.sideslip_rad * DEGREES
         made.sideslip.add(stamps, beta)
-        made.band_low.add(stamps, beta - half)
-        made.band_high.add(stamps, beta + half)
         if reference is not None:
             made.error.add(stamps, np.abs(reference.error(track)) * DEGREES)
         made.trust.add(stamps, track.network_trust)
         made.r_scale.add(stamps, track.r_scale)
         made.nis.add(stamps, track.nis / nis_dof.get(name, np.nan))
-        made.speed.add(stamps, track.vx_m_s)
-        made.ay.add(stamps, track.ay_m_s2)
-        made.path.add(stamps, track.x_m, track.y_m)
-        made.ay_sideslip.add(stamps, np.abs(track.ay_m_s2), beta)
-        made.phase.add(stamps, beta, np.where(np.isfinite(beta), sideslip_rate(track), np.nan) * DEGREES)
         made.invalid.append(~track.valid)
         if len(track.reason) == len(track):
             made.reason.append(track.reason)
+        if whole:
+            _add_whole(made, track, drawn)
     return made
+
+
+def _add_whole(made: DriveSeries, track: StateTrack, drawn: StateTrack) -> None:
+    stamps, beta = track.stamps_ns, drawn.sideslip_rad * DEGREES
+    half = NORMAL_95 * drawn.sideslip_std_rad * DEGREES
+    made.band_low.add(stamps, beta - half)
+    made.band_high.add(stamps, beta + half)
+    made.speed.add(stamps, track.vx_m_s)
+    made.ay.add(stamps, track.ay_m_s2)
+    made.path.add(stamps, track.x_m, track.y_m)
+    made.ay_sideslip.add(stamps, np.abs(track.ay_m_s2), beta)
+    made.phase.add(stamps, beta, np.where(np.isfinite(beta), sideslip_rate(track), np.nan) * DEGREES)
 
 
 def sideslip_rate(track: StateTrack) -> FloatArray:

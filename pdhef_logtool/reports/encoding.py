@@ -167,7 +167,7 @@ def encode(values: FloatArray, resolution: float = 0.0) -> Encoded:
     steps = np.diff(q, prepend=np.uint16(0)).view(np.int16)
     folded = ((steps << 1) ^ (steps >> 15)).view(np.uint16)
     planes = (folded & 0xFF).astype(np.uint8).tobytes() + (folded >> 8).astype(np.uint8).tobytes()
-    return Encoded(low, step, len(flat), base64.b64encode(zlib.compress(planes, 9)).decode("ascii"))
+    return Encoded(low, step, len(flat), base64.b64encode(zlib.compress(planes, 7)).decode("ascii"))
 
 
 def decode(encoded: Encoded) -> FloatArray:

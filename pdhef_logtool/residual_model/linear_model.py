@@ -6,7 +6,6 @@ sees low-passed features: the coefficients then make up for what the low-pass de
 
 from __future__ import annotations
 
-import hashlib
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pdhef_logtool.records.documents import read_json
+from pdhef_logtool.records.documents import digest, read_json
 from pdhef_logtool.records.errors import ModelError
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.features import FEATURES
@@ -44,7 +43,7 @@ class LinearModel:
     @property
     def sha256(self) -> str:
         """Hash of everything that decides the outputs."""
-        return hashlib.sha256(json.dumps(self._document(), sort_keys=True).encode()).hexdigest()
+        return digest(self._document())
 
     def sideslip_rad(self, features: FloatArray) -> FloatArray:
         """Return the sideslip before the low-pass, [N], of the full feature array."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.results.pairing import Pair
-from pdhef_logtool.sinks.base import TRUTH
+from pdhef_logtool.sinks.base import TRUTH, resolution
 
 if TYPE_CHECKING:
     import polars as pl
@@ -18,7 +18,7 @@ _SIGNALS = ("sideslip_rad", "vy_m_s", "vx_m_s", "yaw_rate_rad_s", "ay_m_s2", "si
 
 @dataclass(frozen=True, slots=True)
 class ChangedSignal:
-    """A column of a track that is not the same bit for bit.
+    """A column of a track that is not the same; what files round off, which versions do differently, does not count.
 
     ``track``: an estimator, or :data:`TRUTH`. ``first_ns``: first stamp that differs; ``first_s``: counted from the
     track's first. ``stamps``: how many differ, of ``of``; a stamp that one side lacks does too. ``largest``: largest
@@ -66,11 +66,11 @@ def _changed(joined: pl.DataFrame, drive: str, track: str, column: str) -> Chang
     if joined[column].is_null().all() and joined[f"{column}_b"].is_null().all():
         return None
     missing = pl.col("there").is_null() | pl.col("there_b").is_null()
-    found = joined.select(
-        "stamp_ns",
-        differs=missing | pl.col(column).ne_missing(pl.col(f"{column}_b")),
-        by=(pl.col(column) - pl.col(f"{column}_b")).abs(),
-    ).filter("differs")
+    step, share = resolution(column)
+    by = (pl.col(column) - pl.col(f"{column}_b")).abs()
+    only_one = pl.col(column).is_null() != pl.col(f"{column}_b").is_null()
+    apart = (by.fill_nan(0.0) > 2.0 * (step + share * pl.col(column).abs())).fill_null(value=False)
+    found = joined.select("stamp_ns", differs=missing | only_one | apart, by=by).filter("differs")
     if not len(found):
         return None
     largest = found["by"].max()

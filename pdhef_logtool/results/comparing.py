@@ -231,15 +231,15 @@ def compare_runs(
         raise OutputError(
             expected="a drive that is in both runs",
             got=f"none of {len(a.logs)} and {len(b.logs)} by signals, content or name",
-            where=f"{a.folder} and {b.folder}",
+            where=f"{a.place} and {b.place}",
             remedy="run both on the same drives",
         )
     gated = any(f.limit is not None for f in gate.figures)
     tables = _Tables(a, b, pairing.pairs)
     changed = tables.changed()
     found = Comparison(
-        a=str(a.folder),
-        b=str(b.folder),
+        a=a.place,
+        b=b.place,
         pairs=Counter(pair.by for pair in pairing.pairs),
         only_a=tuple(log.label for log in pairing.only_a),
         only_b=tuple(log.label for log in pairing.only_b),

@@ -339,7 +339,7 @@ def collected(rows: pl.LazyFrame, run: OpenedRun) -> pl.DataFrame:
         raise OutputError(
             expected="the metrics of a run",
             got=" ".join(str(error).split())[:200],
-            where=str(run.folder / METRICS_FILE),
+            where=f"{run.place}/{METRICS_FILE}",
             remedy="run the logs again",
         ) from None
 

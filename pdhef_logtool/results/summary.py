@@ -48,12 +48,12 @@ class RunSummary:
 
     Attributes
     ----------
-    output : folder. exit_code : of the run. logs, done, lost : logs, those with figures, those with input lost.
+    output : folder or URL. exit_code : of the run. logs, done, lost : logs, those with figures, those with input lost.
     scored : drives whose answer is scored. remaining : logs that are not done. checks_failed : logs with failed checks
         that count.
     """
 
-    output: Path
+    output: Path | str
     exit_code: int
     logs: int
     done: int
@@ -83,7 +83,7 @@ def summarise(run: OpenedRun, exit_code: int, checks_failed: Sequence[str]) -> R
             told.append(ErrorsOf(name, *_spread(own)))
     failed = [(log.label, log.outcome.partition(": ")[2]) for log in run.logs if log.outcome.startswith("failed")]
     return RunSummary(
-        output=run.folder,
+        output=run.place,
         exit_code=exit_code,
         logs=len(run.logs),
         done=len(run.logs) - len(failed),

@@ -15,6 +15,7 @@ from pdhef_logtool.drive.friction import parse_friction
 from pdhef_logtool.drive.options import WINDOW_S, ReadOptions, parse_time
 from pdhef_logtool.records.documents import read_toml, validated
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.object_store import is_url
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
 from pdhef_logtool.residual_model.bundle import NO_MODEL, SHIPPED_FOLDERS
 
@@ -73,6 +74,7 @@ class RunConfig:
     waived : names of checks whose failure does not count.
     calibrate : a car without evidence, without truth: on each ``log`` for itself, on the ``pool`` of all, or ``off``.
     cache : folder or URL of slim logs, which stand for logs that were read before; changes no number.
+    cache_max_gb : what the cache may hold, in GB, if it is a folder: what was not used for longest goes; None = any.
     """
 
     estimators: Names | None = None
@@ -95,6 +97,7 @@ class RunConfig:
     calibrate: Literal["off", "log", "pool"] = "log"
     waived: Names = ()
     cache: str | None = None
+    cache_max_gb: Annotated[float, Field(gt=0)] | None = None
 
     @property
     def read_options(self) -> ReadOptions:
@@ -120,7 +123,7 @@ class RunConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as JSON-able values; files by name only, so that no machine's paths get out."""
         document = asdict(self)
-        del document["cache"]
+        del document["cache"], document["cache_max_gb"]
         document["waived"] = list(self.waived)
         document |= {"annotate": self.annotation, "keep": self.kept}
         document["estimators"] = None if self.estimators is None else list(self.estimators)
@@ -161,6 +164,8 @@ def load_config(path: Path | None, flags: dict[str, Any]) -> RunConfig:
             where="--annotate",
             remedy="a full copy reads all of each log: leave out --cache",
         )
+    if config.cache_max_gb is not None and (config.cache is None or is_url(config.cache)):
+        raise UsageError(expected="--cache DIR", got=config.cache or "none", where="--cache-max")
     # Times are understood without a log, so that a typing error is told before the first log is opened.
     for name, text in (("--start", config.start), ("--end", config.end)):
         if text is not None:

@@ -59,13 +59,14 @@ class _Parameter:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Case:
-    """The filter, what it is given, what it is held against, and the stamps [M] that count."""
+    """The filter, what it is given, what it is held against, and the stamps [M] that count; ``ran``: what it said."""
 
     physics: AdaptivePhysics
     signals: Signals
     truth: StateTrack
     counts: BoolArray
     low_speed_m_s: float
+    ran: StateTrack | None = None
 
     @property
     def vehicle(self) -> VehicleParameters:
@@ -73,20 +74,23 @@ class _Case:
 
     def error(self) -> FloatArray:
         """Return the sideslip error [M] in rad, NaN where it is not scored."""
-        track, _ = self.physics.run(self.signals, None)
-        error = signal_error(track, self.truth, "sideslip_rad", self.low_speed_m_s)
+        error = signal_error(self.estimate(), self.truth, "sideslip_rad", self.low_speed_m_s)
         return np.where(self.counts, error, np.nan)
+
+    def estimate(self) -> StateTrack:
+        """Return what the filter says; it runs where it has not."""
+        return self.physics.run(self.signals, None)[0] if self.ran is None else self.ran
 
     def with_vehicle(self, **changes: Any) -> _Case:
         """Return the case with entries of the filter's vehicle changed; its signals stay."""
         filter_ = self.physics.physics
         vehicle = filter_.vehicle.model_copy(update=changes)
         moved = replace(filter_, vehicle=vehicle)
-        return replace(self, physics=replace(self.physics, physics=moved))
+        return replace(self, physics=replace(self.physics, physics=moved), ran=None)
 
     def with_signals(self, **columns: Any) -> _Case:
         """Return the case with columns of the signals changed."""
-        return replace(self, signals=replace(self.signals, **columns))
+        return replace(self, signals=replace(self.signals, **columns), ran=None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +148,7 @@ def error_budget(estimator: Estimator, sample: DriveSample, low_speed_m_s: float
         assert part.truth is not None
         _, signals = bare_filter(estimator, part.signals)
         case = _Case(bare, signals, part.truth, part.block >= 0, low_speed_m_s)
+        case = replace(case, ran=case.estimate())
         halves.append(_Half(case, case.error()))
     scored = sum(h.scored for h in halves)
     seconds = sample.seconds * scored / max(1, int(np.count_nonzero(sample.block >= 0)))

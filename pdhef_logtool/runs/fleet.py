@@ -11,17 +11,17 @@ import itertools
 import math
 import os
 import platform
-import re
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.logs.discovery import (
     RUN_FILE,
@@ -36,6 +36,7 @@ from pdhef_logtool.logs.discovery import (
 from pdhef_logtool.mapping import Mapping, load_mapping
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
+from pdhef_logtool.records.object_store import is_url
 from pdhef_logtool.records.outputs import OutputFolder
 from pdhef_logtool.records.processes import own_name
 from pdhef_logtool.records.ray_supervisor import supervise_on_ray
@@ -66,6 +67,7 @@ from pdhef_logtool.runs.pipeline import (
     write_verdicts,
 )
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
+from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
 from pdhef_logtool.sinks.report import LogOutcome, build_run, tool_versions, write_json
 
 if TYPE_CHECKING:
@@ -82,13 +84,14 @@ _KEPT = ("metrics", "estimates", "full")
 #: What the workers have loaded; polars starts threads at its first query, and none of these makes one.
 _PRELOAD = ("pdhef_logtool.runs.*", "pdhef_logtool.logs.*", "pdhef_logtool.sinks.parquet", *FILTERS)
 #: Entries of the configuration that change no figure and no file that is kept, or are told apart by themselves.
-_NO_SETTING = frozenset({"keep", "annotate", "cache", "window_s", "car", "cars", "network", "intervals"})
+_NO_SETTING = frozenset(
+    {"keep", "annotate", "cache", "cache_max_gb", "window_s", "car", "cars", "network", "intervals"}
+)
 _FILES = ("mapping", "msgs", "thresholds", "cars")
 _READERS = 16
 _AGAIN = "they are tried again"
 #: Begins the name of a file by which nodes know the output's folder.
 _MARK = ".nodes-"
-_NOT_IN_FOLDERS = re.compile(r"[^\w.-]+")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +102,7 @@ class DriveTask:
     ----------
     log : with the label that it has in the run. output : folder of the run. setting : digest of what it is run with.
     pool : what all logs of the run together say of the car. page : whether its page is written.
-    run : a name of this run, by which cars that were read are known.
+    run : a name of this run, by which cars that were read are known. there : names of what a store has of the drive.
     """
 
     log: LogInput
@@ -110,6 +113,7 @@ class DriveTask:
     pool: SelfCalibration | None
     page: bool
     run: str
+    there: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +141,7 @@ Work = Callable[[DriveTask, Tell], DriveEnd]
 
 def run_logs(
     arguments: Sequence[str],
-    output: Path,
+    output: Path | str,
     config: RunConfig,
     *,
     jobs: int = 1,
@@ -161,9 +165,10 @@ def run_logs(
     Parameters
     ----------
     arguments : logs, folders, glob patterns.
+    output : a folder, or the URL of one in an object store.
     jobs : processes at work; changes no number.
-    ray : address of a Ray cluster that does the work instead, one drive a processor at a time; ``output``, the logs
-        and what the configuration names lie where every node sees them under the same path.
+    ray : address of a Ray cluster that does the work instead, one drive a processor at a time; a folder ``output``, the
+        logs and what the configuration names lie where every node sees them under the same path.
     resume : what the folder's journal has of these logs and settings stays; ``retry`` : but for logs that failed.
     only : labels of logs that are run now, everything of them kept; the rest of the run in the folder stays.
     limits : of one log; None: none for a few logs and one job, else :data:`SILENCE_S`.
@@ -179,8 +184,13 @@ def run_logs(
     UsageError, VehicleError, MappingError
         What holds for all logs is wrong: arguments, vehicle or mapping file, or an output would replace an input.
     OutputError
-        The output folder cannot be written, or another command is writing to it.
+        The output cannot be written, or another command is writing to it.
     """
+    if is_url(output):
+        stored = StoredOutput(str(output))
+        output = stored.folder
+    else:
+        stored, output = None, Path(output)
     inputs = find_logs(arguments)
     cars = RunCars.of(config, warn)
     mapping = None if config.mapping is None else load_mapping(config.mapping)
@@ -189,7 +199,8 @@ def run_logs(
     many = len(inputs) > FEW_LOGS
     if limits is None:
         limits = Limits(SILENCE_S) if jobs > 1 or many or ray else Limits()
-    if len(inputs) == 1 and jobs == 1 and not ray and limits == Limits() and not resume and work is None:
+    alone = len(inputs) == 1 and jobs == 1 and not ray and not resume and work is None
+    if alone and limits == Limits() and stored is None:
         check_places(inputs, output, config, mapping, junit, cars.paths)
         return _run_alone(inputs[0], output, config, cars, mapping, thresholds, junit, report, progress, warn)
     if full_worst is None:
@@ -200,42 +211,53 @@ def run_logs(
             f"it of the {full_worst} worst, of any other later by --only NAME, of every one by --keep full"
         )
     config = replace(config, keep=config.keep or ("metrics" if many else "full"))
-    journal = Journal.read(output) if resume else Journal.of(output)
-    planned = _plan(inputs, journal, twice=config.cars is not None, warn=warn)
-    check_places([p.log for p in planned], output, config, mapping, junit, cars.paths)
-    pools = _pools(planned, cars, mapping, config)
-    told = _setting(config, pools)
-    fleet = _Fleet(
-        output, config, cars, journal, planned, told, digest_of(told), thresholds, pools,
-        jobs, ray, limits, report, work or run_drive, progress, warn, say,
-    )  # fmt: skip
-    if only:
-        fleet.check_only(only)
-    with OutputFolder(output, (LOGS,)) as outputs:
-        journal.begin()
-        journal.add_setting(fleet.setting, told)
-        for one in planned:
-            if one.moved:
-                journal.add_place(one.log.stem, one.place, one.identity or "")
-        _sweep_parts(output, {e.part for e in journal.entries.values()})
-        try:
-            fleet.run(*((only, "full") if only else (None, config.kept)), retry=retry or bool(only))
-            if full_worst and not only:
-                fleet.run(fleet.worst(full_worst), "full")
-        except BaseException as stop:
-            if fleet.done:
-                stop.add_note("--resume goes on")
-            stop.add_note(f"{fleet.done} of {len(planned)} logs are done")
-            with suppress(PdhefError):
-                fleet.collect()
-            raise
-        if fleet.lost or ray:  # a node that was lost has been made good and is not told of
-            outputs.sweep()
+    with nullcontext() if stored is None else stored:
+        if stored is not None:
+            stored.check_no_input(inputs)
+            if resume:
+                stored.fetch_journal()
+        journal = Journal.read(output) if resume else Journal.of(output)
+        planned = _plan(inputs, journal, twice=config.cars is not None, warn=warn)
+        check_places([p.log for p in planned], output, config, mapping, junit, cars.paths)
+        pools = _pools(planned, cars, mapping, config)
+        told = _setting(config, pools)
+        fleet = _Fleet(
+            output, config, cars, journal, planned, told, digest_of(told), thresholds, pools,
+            jobs, ray, limits, report, work or run_drive, progress, warn, say, stored,
+        )  # fmt: skip
+        if only:
+            fleet.check_only(only)
+        with OutputFolder(output, (LOGS,)) as outputs:
+            journal.begin()
+            journal.add_setting(fleet.setting, told)
+            for one in planned:
+                if one.moved:
+                    journal.add_place(one.log.stem, one.place, one.identity or "")
             _sweep_parts(output, {e.part for e in journal.entries.values()})
-        results = fleet.collect()
-        write_verdicts(junit, results)
-        fleet.write_pages()
-    return RunResult(output, tuple(results))
+            try:
+                if stored is not None:
+                    stored.begin()
+                fleet.run(*((only, "full") if only else (None, config.kept)), retry=retry or bool(only))
+                if full_worst and not only:
+                    fleet.run(fleet.worst(full_worst), "full")
+            except BaseException as stop:
+                if fleet.done:
+                    stop.add_note("--resume goes on")
+                stop.add_note(f"{fleet.done} of {len(planned)} logs are done")
+                with suppress(PdhefError):
+                    fleet.collect()
+                    if stored is not None:
+                        stored.publish()
+                raise
+            if fleet.lost or ray:  # a node that was lost has been made good and is not told of
+                outputs.sweep()
+                _sweep_parts(output, {e.part for e in journal.entries.values()})
+            results = fleet.collect()
+            write_verdicts(junit, results)
+            fleet.write_pages()
+            if stored is not None:
+                stored.publish()
+        return RunResult(output, tuple(results), stored)
 
 
 def limits_of(silence_s: float | None, memory_mb: int | None) -> Limits | None:
@@ -260,14 +282,17 @@ def run_drive(task: DriveTask, tell: Tell) -> DriveEnd:
         return DriveEnd(outcome, _identity(task.log), warned=tuple(warned), again=again)
 
 
-def _on_node(work: Work, here: Path, mark: Path, task: DriveTask, tell: Tell) -> DriveEnd | OutputError:
-    """Do a drive's work on a node of a cluster, in the folder that the run was begun in if the node has it."""
-    if not mark.is_file():
+def _on_node(work: Callable[[DriveTask, Tell], Any], here: Path, mark: Path | None, task: DriveTask, tell: Tell) -> Any:
+    """Do a drive's work on a node of a cluster, in the folder that the run was begun in if the node has it.
+
+    ``mark``: a file by which the node sees the output's folder; None where it needs not.
+    """
+    if mark is not None and not mark.is_file():
         return OutputError(
             expected="a folder that all nodes of the cluster see under this path",
             got=f"another one, or none, on {platform.node()}",
             where=str(mark.parent),
-            remedy="choose one on a shared file system with -o",
+            remedy="choose one on a shared file system, or a URL, with -o",
         )
     with suppress(OSError):
         os.chdir(here)
@@ -286,8 +311,8 @@ def _run_drive(task: DriveTask, tell: Tell, warned: list[str]) -> DriveEnd:
         pool=task.pool, thresholds=task.thresholds, progress=tell, warn=warned.append,
     )  # fmt: skip
     record = car_record(car)
-    place = _NOT_IN_FOLDERS.sub("_", car.vehicle.name)[:60]
-    part = f"{PARTS}/run={task.setting}/car={place}-{car.physics_sha256[:8]}/part-{digest_of(task.log.stem)}.parquet"
+    place = car_folder(car.vehicle.name, car.physics_sha256)
+    part = f"{PARTS}/run={task.setting}/{place}/part-{digest_of(task.log.stem)}.parquet"
     write_metrics(task.output / part, result.rows)
     if task.page:
         warned += _page_of(task.output, result.outcome)
@@ -501,6 +526,7 @@ class _Fleet:
     progress: Progress
     warn: Callable[[str], None]
     say: Callable[[str], None]
+    stored: StoredOutput | None = None
     lost: int = 0
     _current: dict[str, dict[str, Any]] | None = None
     _said: set[str] = field(default_factory=set)
@@ -557,27 +583,50 @@ class _Fleet:
         self, tasks: Iterator[DriveTask], hear: Callable[[int, str, float], None]
     ) -> Iterator[Ended[DriveTask, DriveEnd]]:
         """Yield how the tasks end, here or on a cluster."""
-        if self.ray is None:
-            yield from supervise(self.work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear)
-            return
-        here, mark = Path.cwd(), self.output.resolve() / f"{_MARK}{self._run}"
-        work = partial(_on_node, self.work, here, mark)
-        with writing(mark):
-            mark.touch()
+        work = self.work if self.stored is None else partial(stored_drive, self.stored.objects, self.work)
+        ends = (
+            supervise(work, tasks, jobs=self.jobs, limits=self.limits, preload=_PRELOAD, progress=hear)
+            if self.ray is None
+            else self._on_cluster(work, tasks, self.ray)
+        )
+        with closing(ends):
+            for ended in ends:
+                result = ended.result
+                if isinstance(result, OutputError):
+                    if self.stored is not None:
+                        result.remedy += "; --resume goes on"
+                    raise result
+                if isinstance(result, StoredEnd):
+                    assert self.stored is not None
+                    result = self.stored.take(result)
+                yield Ended(ended.number, ended.item, result, ended.failure)
+
+    def _on_cluster(
+        self, work: Callable[[DriveTask, Tell], Any], tasks: Iterator[DriveTask], address: str
+    ) -> Generator[Ended[DriveTask, Any], None, None]:
+        """Yield how the tasks end on the nodes of a cluster, which see the output's folder if it is none of a store."""
+        mark = None if self.stored is not None else self.output.resolve() / f"{_MARK}{self._run}"
+        on_node = partial(_on_node, work, Path.cwd(), mark)
+        if mark is not None:
+            with writing(mark):
+                mark.touch()
         try:
-            for ended in supervise_on_ray(work, tasks, address=self.ray, limits=self.limits, preload=_PRELOAD):
-                if isinstance(ended.result, OutputError):
-                    raise ended.result
-                yield Ended(ended.number, ended.item, ended.result, ended.failure)
+            yield from supervise_on_ray(on_node, tasks, address=address, limits=self.limits, preload=_PRELOAD)
         finally:
-            mark.unlink(missing_ok=True)
+            if mark is not None:
+                mark.unlink(missing_ok=True)
 
     def _task(self, one: _Planned, keep: Keep) -> DriveTask:
         full = keep == "full"
         config = replace(self.config, keep=keep)
         pool = self.pools.get(one.log.stem)
         page = self.report and full
-        return DriveTask(one.log, self.output, config, self.setting, self.thresholds, pool, page, self._run)
+        there: tuple[str, ...] = ()
+        if self.stored is not None:
+            there = self.stored.there(one.log.stem)
+            if (entry := self.journal.entries.get(one.log.stem)) is not None:
+                self.stored.forget(entry.part)
+        return DriveTask(one.log, self.output, config, self.setting, self.thresholds, pool, page, self._run, there)
 
     def _end(self, ended: Ended[DriveTask, DriveEnd]) -> DriveEnd:
         if ended.result is not None:
@@ -660,9 +709,8 @@ class _Fleet:
         if quarantined and not retry:
             self.say(f"{quarantined} logs that took their worker along are not tried again; --retry does")
         if other := len(self.journal.entries) - sum(map(self._known, chosen)):
-            self.say(
-                f"{other} drives in {self.output} are of logs that are not named now: they are left out of the run"
-            )
+            place = self.output if self.stored is None else self.stored.objects.shown
+            self.say(f"{other} drives in {place} are of logs that are not named now: they are left out of the run")
 
     def _known(self, one: _Planned) -> bool:
         return one.log.stem in self.journal.entries

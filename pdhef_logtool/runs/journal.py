@@ -18,7 +18,7 @@ from typing import Any
 
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.logs.remote_place import RemotePlace
-from pdhef_logtool.records.documents import jsonable
+from pdhef_logtool.records.documents import digest, jsonable
 from pdhef_logtool.records.files import open_new, write_bytes, writing
 from pdhef_logtool.results.opened_run import JOURNAL_FILE
 from pdhef_logtool.sinks.report import CarFacts, LogOutcome
@@ -232,8 +232,7 @@ def _line(document: Mapping[str, Any]) -> bytes:
 
 def digest_of(told: Any) -> str:
     """Return a short digest of JSON-able values."""
-    text = json.dumps(told, sort_keys=True, default=str)
-    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()[:_DIGITS]
+    return digest(told)[:_DIGITS]
 
 
 def changes(old: Mapping[str, str], new: Mapping[str, str]) -> Iterator[str]:

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 from pdhef_logtool.car.car import SHOWN_DIGITS, Car
 from pdhef_logtool.car.parts import PHYSICS
+from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
 from pdhef_logtool.estimators.stand_in import StandIn
-from pdhef_logtool.estimators.table import SPECS, Options, Skipped, runnable
+from pdhef_logtool.estimators.table import ALL_ESTIMATORS, SPECS, Options, Skipped, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping, merge_losses
 from pdhef_logtool.records.errors import (
@@ -40,14 +41,13 @@ from pdhef_logtool.results.opened_run import (
     REPORT_FILE,
     OpenedLog,
 )
-from pdhef_logtool.runs.cached import read_cached
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.estimating import calibrator, estimate_windows
 from pdhef_logtool.runs.guard import GUARDED, Distrust, choose_main, default_names, distrust
 from pdhef_logtool.runs.scoring import evaluate, in_time
 from pdhef_logtool.runs.self_calibrating import calibrate_drive, checked, log_sensors, self_calibrated
 from pdhef_logtool.runs.track_store import TrackStore
-from pdhef_logtool.sinks.base import TRUTH, Event, Shown, Sink
+from pdhef_logtool.sinks.base import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink
 from pdhef_logtool.sinks.report import (
     CarFacts,
     EstimatorFacts,
@@ -69,6 +69,7 @@ from pdhef_logtool.watches.intervals import TrackCalibrator
 if TYPE_CHECKING:
     from pdhef_logtool.evaluation.metrics import MetricRow
     from pdhef_logtool.evaluation.thresholds import Threshold, Verdict
+    from pdhef_logtool.records.object_store import Mirror
     from pdhef_logtool.self_calibration.calibration import SelfCalibration
     from pdhef_logtool.sinks.answer import MainFacts
 
@@ -88,6 +89,9 @@ LOG_FILES = (
     REPORT_FILE,
     PAGE_FILE,
 )
+
+#: What of an earlier run's goes where a drive's new files have it not.
+STALE_FILES = (PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
 
 _SILENT = "{} has no valid row although the car moves"
 _ALL_SILENT = "no estimator has a valid row although the car moves"
@@ -140,10 +144,20 @@ class LogResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """What came out of a run; ``output`` is None when nothing was to be written."""
+    """What came out of a run; ``output`` is None when nothing was to be written.
+
+    Where outputs are at a URL, ``stored`` says so, and ``output`` is a folder with what is told of them, which goes
+    with this result.
+    """
 
     output: Path | None
     results: tuple[LogResult, ...]
+    stored: Mirror | None = None
+
+    @property
+    def place(self) -> Path | str | None:
+        """Where people find the outputs."""
+        return self.output if self.stored is None else self.stored.objects.shown
 
     @property
     def is_fleet(self) -> bool:
@@ -159,6 +173,9 @@ class RunResult:
             return EXIT_GATE
         return EXIT_OK if all(r.is_whole for r in self.results) else EXIT_PARTIAL
 
+    def _shown(self, folder: Path) -> str:
+        return str(folder) if self.output is None else str(folder).replace(str(self.output), str(self.place), 1)
+
     @property
     def verdicts(self) -> tuple[Verdict, ...]:
         """The verdicts of all logs in order."""
@@ -167,13 +184,13 @@ class RunResult:
     def to_dict(self) -> dict[str, Any]:
         """Return the result as one JSON-able document; of many logs without their reports."""
         return {
-            "output": None if self.output is None else str(self.output),
+            "output": None if self.place is None else str(self.place),
             "exit_code": self.exit_code,
             "logs": [
                 {
                     "log": r.outcome.log,
                     "outcome": r.outcome.outcome,
-                    "output": None if r.output is None else str(r.output),
+                    "output": None if r.output is None else self._shown(r.output),
                     "report": None if self.is_fleet else r.report,
                     **({} if r.verdicts is None else {"verdicts": [v.to_dict() for v in r.verdicts]}),
                 }
@@ -238,7 +255,7 @@ def run_log(
         Nothing of the log can be used; nothing is then left under a final name.
     """
     progress(log_input.stem, 0.0)
-    with read_cached(log_input, car, mapping, config, warn) as drive:
+    with read_cached(log_input, car, mapping, config.read_options, warn) as drive:
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
@@ -291,8 +308,7 @@ def _run_estimators(
     drive, car, ready = job.drive, job.car, job.ready
     algorithms = {e.name: resolve(e) for e in ready}
     intervals = calibrator(car, ready)
-    stale = (PAGE_FILE, METRICS_FILE, ESTIMATES_FILE, RECORDING_FILE)
-    with outputs.begin(log_place(drive.name), stale=stale) as change, ExitStack() as opened:
+    with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
         signals = _estimate(drive, ready, intervals, store, progress)
         sensors = log_sensors(drive.car.vehicle, job.calibration)
@@ -404,8 +420,11 @@ def _open_sinks(
             sinks.append(EstimatesSink(change.file(ESTIMATES_FILE)))
         if config.annotation != "none":
             source = drive.log if config.annotation == "full" else None
-            names = None if config.estimators else frozenset({shown.main, TRUTH})
-            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names, shown={shown.main, TRUTH}))
+            first = frozenset({shown.main, TRUTH})
+            names = None if config.estimators else first
+            unnamed = config.estimators == (ALL_ESTIMATORS,)
+            thin = unnamed and drive.plan.end_ns - drive.plan.start_ns > LONGEST_WHOLE_NS
+            sinks.append(AnnotatedMcapSink(change.file("annotated.mcap"), source, names, shown=first, thin=thin))
             layouts = change.file("foxglove.json"), change.file("plotjuggler.xml")
             sinks.append(LayoutsSink(*layouts, names, colours))
         if config.kept == "full":

@@ -53,7 +53,7 @@ def evaluate(
     signals : what the estimators saw. sensors : as the log calibrated them; None: as the car's file says.
     """
     from pdhef_logtool.evaluation.consistency import d2_rows, disagreement_rows, sensor_rows, whiteness_rows
-    from pdhef_logtool.evaluation.metrics import score_track, state_rows
+    from pdhef_logtool.evaluation.metrics import Scorer, state_rows
     from pdhef_logtool.evaluation.reasons import summarise_reasons
     from pdhef_logtool.evaluation.segments import moving_mask, segment_masks
 
@@ -66,17 +66,17 @@ def evaluate(
     rows: list[MetricRow] = []
     reasons: dict[str, tuple[ReasonFacts, ...] | None] = {}
     events = segment_events(signals, masks)
-    for name in names:
-        track = read(name)
-        assert track is not None
+    scorer = None
+    if truth is not None:
+        scorer = Scorer(truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
+    tracks = {name: track for name in names if (track := read(name)) is not None}
+    of_d2 = d2_rows([*tracks.values()], signals, masks, log=stem, low_speed_m_s=slow, sensors=sensors)
+    for name, track in tracks.items():
         if moving.any() and not _known_at(track, moving):
             silent.append(name)
-        if truth is not None:
-            rows += score_track(track, truth, masks, log=stem, low_speed_m_s=slow, not_independent=drive.plan.dependent)
-        else:
-            rows += state_rows(track, masks, log=stem)
+        rows += state_rows(track, masks, log=stem) if scorer is None else scorer.rows(track)
         rows += whiteness_rows(track, masks, log=stem)
-        rows += d2_rows(track, signals, masks, log=stem, low_speed_m_s=slow, sensors=sensors)
+        rows += [r for r in of_d2 if r.estimator == name]
         reasons[name] = summarise_reasons(track)
         events += diverged_events(track)
     if truth is None:

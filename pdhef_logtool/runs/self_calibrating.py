@@ -11,6 +11,7 @@ import numpy as np
 
 from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Drive
 from pdhef_logtool.estimators.base import Estimator, run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
@@ -19,7 +20,6 @@ from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.errors import PdhefError
 from pdhef_logtool.runs import guard
-from pdhef_logtool.runs.cached import read_cached
 from pdhef_logtool.runs.config import RunConfig
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def calibrate_pool(
     found = []
     for log_input in inputs:
         try:
-            with read_cached(log_input, car, mapping, config) as drive:
+            with read_cached(log_input, car, mapping, config.read_options) as drive:
                 if not lacking(drive):
                     found.append(read_driving(drive))
         except PdhefError:
@@ -111,7 +111,7 @@ def _d2_of(drive: Drive, estimators: Sequence[Estimator], sensors: LogSensors) -
         whole = {ALL: np.ones(len(signals), dtype=np.bool_)}
         for i, estimator in enumerate(estimators):
             track, carries[i] = run_window(estimator, signals, carries[i], None)
-            for row in d2_rows(track, signals, whole, log="", low_speed_m_s=slow, sensors=sensors):
+            for row in d2_rows([track], signals, whole, log="", low_speed_m_s=slow, sensors=sensors):
                 squares[i] += row.value**2 * row.n
                 counts[i] += row.n
             more, lasted = driving_products(track, signals, low_speed_m_s=slow, sensors=sensors)

@@ -1,7 +1,7 @@
 """Whole tracks and signals of a log on disk, column by column, so that scoring holds only what it works on.
 
 Ten hours at 100 Hz are 3.6 million rows: a track of them takes 0.8 GB, a column 29 MB. The columns of a short drive
-never see the disk: its files would take longer than its figures.
+never see the disk, for its files would take longer than its figures, and neither do those that never change.
 """
 
 from __future__ import annotations
@@ -27,35 +27,58 @@ ROWS_HELD = 1 << 14
 
 @dataclass(slots=True)
 class _Column:
-    """A column that grows, in memory and from :data:`ROWS_HELD` on in a file: rows so far, and what a row is."""
+    """A column that grows: rows so far, and what a row is.
+
+    While all rows are the same, as of what an estimator does not know, that one row stands for them; then they are in
+    memory, and from :data:`ROWS_HELD` on in a file.
+    """
 
     path: Path
     dtype: DTypeLike
     row: tuple[int, ...]
     rows: int = 0
+    _same: NDArray[Any] | None = field(init=False, default=None)
     _held: NDArray[Any] | None = field(init=False)
 
     def __post_init__(self) -> None:
         self._held = np.empty((0, *self.row), self.dtype)
 
     def append(self, values: NDArray[Any]) -> None:
-        self.rows += values.shape[0]
+        if not values.shape[0]:
+            return
+        before, self.rows = self.rows, self.rows + values.shape[0]
+        if not before or self._same is not None:
+            first = values[:1] if self._same is None else self._same
+            if _all_are(values, first):
+                self._same = first.copy()
+                return
+            values, self._same = np.concatenate([np.repeat(first, before, axis=0), values]), None
+        is_first = self._held is not None
         if self._held is not None:
             values = np.concatenate([self._held, values])
             self._held = values if self.rows <= ROWS_HELD else None
         if self._held is None:
             with writing(self.path):
-                self.path.parent.mkdir(parents=True, exist_ok=True)
+                if is_first:
+                    self.path.parent.mkdir(parents=True, exist_ok=True)
                 with open_new(self.path, "ab") as file:
                     file.write(np.ascontiguousarray(values).data)
 
     def read(self, start: int, end: int) -> NDArray[Any]:
+        rows = max(min(end, self.rows) - start, 0)
+        if self._same is not None:
+            return np.repeat(self._same, rows, axis=0)
         if self._held is not None:
             return self._held[start:end]
-        rows = max(min(end, self.rows) - start, 0)
         width = int(np.prod(self.row, dtype=np.int64))
         values = np.fromfile(self.path, self.dtype, rows * width, offset=start * width * np.dtype(self.dtype).itemsize)
         return values.reshape(rows, *self.row)
+
+
+def _all_are(values: NDArray[Any], row: NDArray[Any]) -> bool:
+    """Return whether all rows [N] have the bits of a row [1], so that not known is the same as not known."""
+    bits = [np.ascontiguousarray(v).view(f"u{v.dtype.itemsize}") for v in (values, row)]
+    return bool((bits[0] == bits[1]).all())
 
 
 @dataclass(slots=True)

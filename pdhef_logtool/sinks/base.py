@@ -15,8 +15,25 @@ from pdhef_logtool.records.tracks import StateTrack
 #: Name of the track that holds the truth.
 TRUTH = "truth"
 
-#: What positions are rounded to in files: a power of two, so that their last bytes are zero.
-_PLACE_M = 2.0**-13
+#: A drive that takes longer is long: of it less is written than every stamp where a person only looks.
+LONGEST_WHOLE_NS = 600_000_000_000
+
+#: What numbers are rounded to in files, far below what sensors can tell: powers of two, so that last bytes are zero.
+_STEPS = {
+    "x_m": 2.0**-10,
+    "y_m": 2.0**-10,
+    "yaw_rad": 2.0**-17,
+    "vx_m_s": 2.0**-13,
+    "vy_m_s": 2.0**-13,
+    "yaw_rate_rad_s": 2.0**-17,
+    "sideslip_rad": 2.0**-20,
+    "ay_m_s2": 2.0**-12,
+    "orientation": 2.0**-18,
+}
+#: What stays in single precision: a person has told it, and reads 0.85 there.
+_SINGLE = frozenset({"friction", "network_trust", "r_scale"})
+#: Bits of a single precision number that are left out of all else, so that 12 stand behind the first.
+_BITS_OUT = 11
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +54,27 @@ class Shown:
     baseline: str | None = None
 
 
-def single(values: FloatArray) -> FloatArray:
-    """Round to single precision: the bytes that are zero then take no space in a compressed file."""
-    with np.errstate(over="ignore"):
-        return np.asarray(values, dtype=np.float32).astype(np.float64)
+def rounded(name: str, values: FloatArray) -> FloatArray:
+    """Round a column as files hold it: motion to a step, what was told to single precision, else to 1.2e-4 of itself.
+
+    The bytes that are then zero take no space in a compressed file.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # beyond single precision; numbers that signal
+        step = _STEPS.get(name)
+        if step is not None:
+            return np.asarray(np.rint(values / step) * step + 0.0, dtype=np.float64)  # + 0.0: no negative zeros
+        short = np.array(values, dtype=np.float32)
+        if name not in _SINGLE:
+            bits = short.view(np.uint32)
+            bits += np.uint32(1 << (_BITS_OUT - 1))
+            bits &= np.uint32((0xFFFFFFFF << _BITS_OUT) & 0xFFFFFFFF)
+            short[np.isnan(values)] = np.nan  # some of which have become numbers
+        return short.astype(np.float64)
 
 
-def to_place(values: FloatArray) -> FloatArray:
-    """Round positions in m to 0.12 mm."""
-    return np.asarray(np.round(values / _PLACE_M) * _PLACE_M, dtype=np.float64)
+def resolution(name: str) -> tuple[float, float]:
+    """Return by how much a column as files hold it may be off at most: absolute, and as a share of itself."""
+    return (_STEPS[name] / 2.0, 0.0) if name in _STEPS else (0.0, 2.0 ** (_BITS_OUT - 24))
 
 
 def first_of_slots(stamps_ns: IntArray, step_ns: int, before_ns: int | None) -> IntArray:

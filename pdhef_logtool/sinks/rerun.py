@@ -24,7 +24,7 @@ from pdhef_logtool.records.geometry import DEGREES, wrap_angle
 from pdhef_logtool.records.reasons import REASONS
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
-from pdhef_logtool.sinks.base import TRUTH, Event, Shown, Sink, first_of_slots
+from pdhef_logtool.sinks.base import LONGEST_WHOLE_NS, TRUTH, Event, Shown, Sink, first_of_slots
 from pdhef_logtool.sinks.palette import colour_rgb
 from pdhef_logtool.sinks.report import report_markdown
 
@@ -40,11 +40,11 @@ LONGEST_BRIDGE_NS = 1_000_000_000
 #: Points of one trajectory in the plan view; it is thinned when it would grow beyond.
 MOST_TRAJECTORY_POINTS = 20_000
 
-#: Steps of the moving dot in the plan view, and between the rows of a long drive.
-DOT_STEP_NS = 50_000_000
+#: Steps of the moving dot in the plan view, and in that of a long drive.
+DOT_STEP_NS, LONG_DOT_STEP_NS = 50_000_000, 500_000_000
 
-#: A drive that takes longer is long: of it are drawn 20 rows a second.
-LONGEST_WHOLE_NS = 600_000_000_000
+#: Between the rows of a long drive: of what the recording opens on, and of the others.
+LONG_STEP_NS, OTHERS_STEP_NS = 100_000_000, 200_000_000
 
 #: How long Rerun may keep one call waiting before the recording is given up.
 LONGEST_WAIT_S = 60.0
@@ -98,8 +98,8 @@ _REASON_TEXTS = {r.name: r.text for r in REASONS}
 class RerunSink(Sink):
     """Writes recording.rrd window by window; memory does not grow with the log but for the thinned trajectories.
 
-    Each track is one entity with a row a stamp (of a drive above ten minutes, 20 rows a second) and a component a
-    quantity, which holds value and band. Entities are named by what a track is for (``/truth``, ``/main``,
+    Each track is one entity with a row a stamp (of a drive above ten minutes 10 a second, of other estimators 5) and a
+    component a quantity, which holds value and band. Entities are named by what a track is for (``/truth``, ``/main``,
     ``/baseline``, ``/other/1``), so that one blueprint suits all drives of a run whatever ran on them; the lines carry
     the estimators' names. Errors stand where truth and estimate share a stamp.
 
@@ -320,7 +320,8 @@ class RerunSink(Sink):
         first row of each step is sent, with the largest value that a sparse component has in the step.
         """
         if len(stamps_ns) and self._is_long:
-            first = first_of_slots(stamps_ns, DOT_STEP_NS, rows.last_ns)
+            step_ns = OTHERS_STEP_NS if entity.startswith("/other/") else LONG_STEP_NS
+            first = first_of_slots(stamps_ns, step_ns, rows.last_ns)
             columns = {
                 name: np.fmax.reduceat(values, first) if name in sparse and len(first) else values[first]
                 for name, values in columns.items()
@@ -349,7 +350,7 @@ class RerunSink(Sink):
             style = rr.Points2D.from_fields(colors=[rgb], radii=[rr.Radius.ui_points(5.0)], labels=[track.name])
             self._log_static(f"/plan/{place}/now", style)
         self._paths[track.name].append(np.where(known[:, None], plan, np.nan))
-        slot = track.stamps_ns // DOT_STEP_NS
+        slot = track.stamps_ns // (LONG_DOT_STEP_NS if self._is_long else DOT_STEP_NS)
         shown = known & (np.diff(slot, prepend=slot[:1] - 1) != 0)
         if shown.any():
             points = rr.Points2D.columns(positions=plan[shown])

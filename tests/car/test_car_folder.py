@@ -39,7 +39,7 @@ from pdhef_logtool.car.parts import (
     Record,
     TriedParts,
     Trust,
-    digest,
+    car_folder,
     physics_sha256,
 )
 from pdhef_logtool.car.store import Change, check_output, update_car, write_change
@@ -47,6 +47,7 @@ from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records import outputs
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import OutputError, PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS
 
@@ -746,3 +747,8 @@ def test_noise_of_physics_belongs_to_the_values_that_were_found_through_it(folde
     car = load(folder)
     assert car.noise[OURS] == found.noise
     assert car.notes == ("noise of physics is not used: it belongs to other physics; pdhef tune makes it anew",)
+
+
+def test_the_folder_of_a_cars_drives_is_short_and_portable() -> None:
+    assert car_folder("Saloon/2: my first – a_b.c", "0123456789abcdef") == "car=Saloon-2-my-first-a_b.c-01234567"
+    assert car_folder("n" * 99, "f" * 64) == f"car={'n' * 24}-ffffffff"

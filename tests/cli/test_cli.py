@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -40,33 +41,51 @@ def test_help_names_every_command_with_a_whole_sentence() -> None:
     assert all(line.endswith(".") and not line.endswith("...") for line in listed)
 
 
-@pytest.mark.parametrize("width", [80, pytest.param(120, marks=pytest.mark.slow)])
+#: Asks for help of all commands in one process, at two widths, and says after each what it has loaded.
+_HELPS = """
+import contextlib, io, json, os, sys
+from pdhef_logtool.cli.app import main
+told = {}
+for command in ["", *sys.argv[1:]]:
+    told[command] = {}
+    for width in ("80", "120"):
+        os.environ["COLUMNS"] = width
+        sys.argv = ["pdhef", *command.split(), "--help"]
+        with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+            main()
+        told[command][width] = out.getvalue()
+    told[command]["loaded"] = [*sys.modules]
+print(json.dumps(told))
+"""
+
+
+@pytest.fixture(scope="module")
+def helps() -> dict[str, dict[str, Any]]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", _HELPS, *COMMANDS]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    told: dict[str, dict[str, Any]] = json.loads(done.stdout)
+    return told
+
+
+@pytest.mark.parametrize("width", [80, 120])
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_says_what_the_command_does(command: str, width: int) -> None:
-    result = _pdhef(*command.split(), "--help", env={"COLUMNS": str(width)})
-    assert result.returncode == 0
-    assert f"Usage: pdhef {command} [OPTIONS]" in result.stdout
-    assert all(len(line) <= width for line in result.stdout.splitlines())
-    assert not {"--vehicle", "--model", "--calibration"} & set(result.stdout.split()) or command == "simulate"
+def test_help_says_what_the_command_does(command: str, width: int, helps: dict[str, dict[str, Any]]) -> None:
+    text = helps[command][str(width)]
+    assert f"Usage: pdhef {command} [OPTIONS]" in text
+    assert all(len(line) <= width for line in text.splitlines())
+    assert not {"--vehicle", "--model", "--calibration"} & set(text.split()) or command == "simulate"
     if command != "estimators":
-        examples = result.stdout[result.stdout.index("Examples:") :].splitlines()[1:]
+        examples = text[text.index("Examples:") :].splitlines()[1:]
         assert examples[0].startswith(f"    pdhef {command} ")
 
 
-@pytest.mark.parametrize(
-    "command", ["", "run", *(pytest.param(c, marks=pytest.mark.slow) for c in COMMANDS if c != "run")]
-)
-def test_help_imports_nothing_heavy(command: str) -> None:
+@pytest.mark.parametrize("command", ["", *COMMANDS])
+def test_help_imports_nothing_heavy(command: str, helps: dict[str, dict[str, Any]]) -> None:
     heavy = {"numpy", "numba", "torch", "polars", "pyarrow", "rerun", "rich", "scipy", "rosbags", "mcap", "truthsim"}
     # Typer itself reads the options of a single command by pydantic.
     heavy |= set() if command else {"pydantic"}
-    code = (
-        "import atexit, sys\nfrom pdhef_logtool.cli.app import main\n"
-        f"atexit.register(lambda: print('loaded:', sorted({heavy} & set(sys.modules))))\n"
-        f"sys.argv = ['pdhef', *{command.split()}, '--help']\nmain()"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.splitlines()[-1] == "loaded: []"
+    assert not heavy & set(helps[command]["loaded"]), "this command or one before it"
 
 
 def test_version() -> None:

@@ -25,7 +25,7 @@ print("loaded:", *(name for name in heavy if name in sys.modules))
 
 @pytest.mark.slow
 def test_a_light_run_loads_no_torch_scipy_or_rerun(tmp_path: Path) -> None:
-    words = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "-o", str(tmp_path / "out"))
+    words = ("run", "sample_logs/dlc.mcap", "--car", "saloon", "-o", str(tmp_path / "out"), "--end", "2")
     done = subprocess.run(
         [sys.executable, "-c", _CODE, *words, "--keep", "metrics", "--no-report"],
         cwd=ROOT,

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pdhef_logtool.drive.correlation import CommonGrid, Shift, _correlation, find_shift, parabolic_peak
+from pdhef_logtool.drive.correlation import (
+    CommonGrid,
+    EvenGrid,
+    Shift,
+    _correlation,
+    find_shift,
+    on_common_grid,
+    parabolic_peak,
+)
+from pdhef_logtool.drive.interpolation import Bracket
 from pdhef_logtool.records.signals import FloatArray
 
 _UNKNOWN = Shift(float("nan"), float("nan"), False)
@@ -47,3 +56,31 @@ def test_the_shift_is_that_of_every_shift(kind: str) -> None:
     for _ in range(40):
         grid = CommonGrid(0.01, *pair(kind, rng, int(rng.integers(2, 200))))
         assert repr(find_shift(grid, 0.3)) == repr(by_every_shift(grid, 30))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.4])
+def test_columns_on_an_even_grid_are_those_of_numpy(share: float) -> None:
+    rng = np.random.default_rng(1)
+    stamps = np.cumsum(rng.integers(8_000_000, 12_000_000, 500)).astype(np.int64)
+    stamps = stamps[(rng.random(500) >= share) | (np.arange(500) % 499 == 0)]
+    grid = EvenGrid(stamps, stamps)
+    for _ in range(3):
+        values = np.cumsum(rng.standard_normal(len(stamps)))
+        found = on_common_grid(stamps, values, stamps.copy(), values)
+        on_grid = Bracket(
+            stamps,
+            np.arange(stamps[0], stamps[-1] + 1, round(grid.step_s * 1e9)),
+            round(3 * np.median(np.diff(stamps))),
+        ).linear(values)
+        known, n = np.flatnonzero(np.isfinite(on_grid)), len(on_grid)
+        slope, offset = np.polyfit(known / n, on_grid[known], 1)
+        expected = on_grid - offset - slope * (np.arange(n) / n)
+        for column in (grid.of_a(values), grid.of_b(values), found.a, found.b):
+            np.testing.assert_array_equal(column, expected)
+
+
+def test_what_never_moves_has_no_shift() -> None:
+    moving = np.sin(np.arange(300) * 0.1)
+    holed = np.where(np.arange(300) % 7 == 0, np.nan, 0.0)
+    for still in (np.zeros(300), holed):
+        assert repr(find_shift(CommonGrid(0.01, moving, still), 0.3)) == repr(_UNKNOWN)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,7 +15,7 @@ from pdhef_logtool.drive import slim_cache
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import read_drive
 from pdhef_logtool.drive.slim_cache import SlimCache
-from pdhef_logtool.logs.discovery import LogInput
+from pdhef_logtool.logs.discovery import LogInput, identity_of
 from pdhef_logtool.logs.slim_log import is_whole
 from pdhef_logtool.mapping import Mapping, SignalSource
 from pdhef_logtool.records.errors import UsageError
@@ -116,6 +118,35 @@ def test_several_processes_share_a_cache(tmp_path: Path) -> None:
     assert len(_entries(tmp_path)) == 1
 
 
+def test_a_bounded_cache_lets_go_of_what_was_not_used_for_longest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slim(_log: LogInput, target: Path, *_: object) -> object:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(bytes(1000))
+        return SimpleNamespace(identity=target.name.partition("-")[0])
+
+    def use(name: str) -> None:
+        with cache.standing_in(LogInput(tmp_path / name, name)):
+            pass
+
+    monkeypatch.setattr(slim_cache, "slim_log", slim)
+    monkeypatch.setattr(slim_cache, "_is_sound", Path.is_file)
+    cache = _cache(tmp_path / "cache", options=ReadOptions(cache_max_gb=3.5e-6))
+    kept = {}
+    for number, name in enumerate("abcd"):
+        (tmp_path / name).write_text(name)
+        kept[name] = f"{identity_of(LogInput(tmp_path / name, name))}-"
+        use(name)
+        for path in _entries(tmp_path / "cache"):
+            if path.name.startswith(kept[name]):
+                os.utime(path, ns=(number, number))
+        if name == "c":
+            use("a")
+    left = {name for name in "abcd" for p in _entries(tmp_path / "cache") if p.name.startswith(kept[name])}
+    assert left == {"a", "c", "d"}, "b was not used for longest"
+
+
 def test_a_store_serves_as_well() -> None:
     import fsspec
 
@@ -145,5 +176,5 @@ def test_a_cache_that_cannot_be_written_is_done_without(tmp_path: Path) -> None:
     with _cache(tmp_path / "file").standing_in(LOG, told.append) as found:
         assert found == LOG
     assert len(told) == 1 and "the cache" in told[0] and "\n" not in told[0]
-    with pytest.raises(UsageError, match="--cache nothing://x"), _cache("nothing://x").standing_in(LOG):
+    with pytest.raises(UsageError, match="nothing://x"), _cache("nothing://x").standing_in(LOG):
         pass

@@ -169,7 +169,7 @@ def test_sigma_points_move_and_measure_as_one_state_does(car, name, seed, mu, dt
     points = np.full(work_size(len(chi)), np.nan)
 
     zeta = np.empty((len(chi), shell.MEASUREMENTS))
-    physics._measure(chi, steer, mu, rate_vy, layout, p, points, zeta)
+    physics.measure_sigma_points(chi, steer, mu, rate_vy, layout, p, points, zeta)
     want_zeta, want = np.empty_like(zeta), chi.copy()
     for i, state in enumerate(chi):
         force, ay_bias, yaw_rate_bias, steer_bias = optional(state, layout)

@@ -37,17 +37,28 @@ from pdhef_logtool.estimators.filter_shell import Meanwhile
 from pdhef_logtool.estimators.physics import LINK_NONE, LINK_WHOLE, PhysicsUkf
 from pdhef_logtool.estimators.physics_model import (
     CORE,
+    PLACES,
+    WIDTH,
     advance,
     grip_under_braking,
     layout_of,
     physics_parameters,
+    places_of,
     planar_ay,
     sensed_ay,
     settle_forces,
     step_count,
 )
-from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, PhysicsFilter, _draw, _moments, physics_filter
+from pdhef_logtool.estimators.physics_ukf import (
+    PHYSICS_Q_STD,
+    PhysicsFilter,
+    _draw,
+    _make_constants,
+    _moments,
+    physics_filter,
+)
 from pdhef_logtool.estimators.table import Options, all_names, make_estimator
+from pdhef_logtool.estimators.unscented import wide_root
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import concatenate
 
@@ -290,36 +301,63 @@ def spread(layout, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return rng.normal(size=layout.size), root @ root.T / layout.size + 0.1 * np.eye(layout.size)
 
 
-@pytest.mark.parametrize("names", [(), ("roll",), ("biases",), ALL_PARTS], ids="+".join)
+def drawn(layout, x: np.ndarray, P: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What _draw writes, [PLACES, WIDTH], and the places of the state's entries."""
+    places, wide = places_of(layout), np.zeros(16)
+    P_wide, L, points = np.zeros((16, 16)), np.zeros((16, 16)), np.full(PLACES * WIDTH, np.nan)
+    wide[places], P_wide[np.ix_(places, places)] = x, P
+    there = np.isin(np.arange(16), places)
+    wide_root(P_wide, places, there, L)
+    root = np.zeros((16, 16))
+    root[np.ix_(places, places)] = np.linalg.cholesky(P)
+    np.testing.assert_allclose(L, root, rtol=1e-12, atol=1e-14)
+    np.testing.assert_array_equal(L, np.tril(L))
+    _draw(wide, L, float(layout.size), _make_constants(), points)
+    return points.reshape(PLACES, WIDTH), places
+
+
+@pytest.mark.parametrize("names", [(), ("roll",), ("bank", "biases"), ALL_PARTS], ids="+".join)
 def test_sigma_points_are_those_of_numpy_and_give_their_moments_back(names):
     layout = layout_of(vehicle(*names))
     n = layout.size
+    moving = n - 2 if "biases" in names else n
     x, P = spread(layout, 4)
-    points, L = np.empty((n, 2 * n + 1)), np.empty((n, n))
-    count = _draw(x, P.copy(), float(n), layout, L, points)
+    points, places = drawn(layout, x, P)
+    body = places[:moving]
     root = np.linalg.cholesky(n * P)
-    assert count == 2 * n + 1 - (4 if "biases" in names else 0)
-    np.testing.assert_allclose(points[:, 0], x)
-    wanted = np.concatenate([x + root.T, x - root.T])
-    got = points[:, 1:].T
-    order = [int(np.argmin(np.abs(got - w).sum(axis=1))) for w in wanted]
-    assert sorted(order) == list(range(2 * n))
-    np.testing.assert_allclose(got[order], wanted, rtol=1e-12, atol=1e-12)
-    still = points[: n - 2] if "biases" in names else points[:0]
-    np.testing.assert_array_equal(still[:, count:], np.repeat(still[:, :1], 2 * n + 1 - count, axis=1))
-    # a function that is not linear, so that the centre's weight is seen
-    bent = np.sin(points) + 0.1 * points**2
-    mean, covariance, deviation = np.empty(n), np.empty((n, n)), np.empty_like(points)
-    _moments(bent, mean, covariance, deviation)
-    want = bent[:, 1:].mean(axis=1)
-    apart = bent - want[:, None]
+    centre = points[body, 11]
+    np.testing.assert_array_equal(centre, x[:moving])
+    mirrored = np.where(body < 8, body + 16, body + 4)
+    for i, column in enumerate(body):
+        for at, sign in ((column, 1.0), (mirrored[i], -1.0)):
+            apart = points[:, at] - np.where(np.arange(PLACES) < 11, points[:, 11], 0.0)
+            np.testing.assert_allclose(apart[places], sign * root[:, i], rtol=1e-12, atol=1e-12)
+    rest = np.setdiff1d(np.arange(WIDTH), [*body, *mirrored])
+    np.testing.assert_array_equal(points[body][:, rest], np.repeat(centre[:, None], len(rest), axis=1))
+
+    # a function that is not linear, so that the centre's weight is seen; the sensors' biases stay as they are
+    def bent(v: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.sin(v[:moving]) + 0.1 * v[:moving] ** 2, v[moving:]])
+
+    every = bent(np.concatenate([x[:, None], x[:, None] + root, x[:, None] - root], axis=1))
+    want = every[:, 1:].mean(axis=1)
+    apart = every - want[:, None]
     weights = np.array([2.0, *([0.5 / n] * (2 * n))])
-    np.testing.assert_allclose(mean, want, rtol=1e-12)
-    np.testing.assert_allclose(covariance, (weights * apart) @ apart.T, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(deviation, apart, rtol=1e-12, atol=1e-12)
-    _moments(points, mean, covariance, deviation)
-    np.testing.assert_allclose((mean, covariance[0]), (x, P[0]), rtol=1e-10)
-    np.testing.assert_allclose(covariance, P, rtol=1e-10)
+    moved = points.copy()
+    moved[:11] = np.sin(points[:11]) + 0.1 * points[:11] ** 2
+    mean, covariance = np.zeros(16), np.zeros((16, 16))
+    mean[places], covariance[np.ix_(places, places)] = x, P
+    first_mean, first, constants = mean.copy(), np.zeros((16, 16)), _make_constants()
+    q = np.zeros(16)
+    q[places] = np.linspace(0.1, 0.4, n)
+    _moments(moved.ravel().copy(), float(n), q, constants, first_mean, first, False)
+    _moments(moved.ravel(), float(n), q, constants, mean, covariance, True)
+    np.testing.assert_allclose(mean[places], want, rtol=1e-12)
+    want = (weights * apart) @ apart.T + np.diag(q[places])
+    np.testing.assert_array_equal(covariance, covariance.T)
+    np.testing.assert_allclose(covariance[np.ix_(places, places)], want, rtol=1e-10, atol=1e-12)
+    np.testing.assert_array_equal(first_mean, mean)
+    np.testing.assert_array_equal(first[:3, :3], covariance[:3, :3])
 
 
 # --- the filter ------------------------------------------------------------------------------------------------------
@@ -421,12 +459,12 @@ def test_linked_steps_are_the_steps_and_what_ties_them(names, noisy):
     restarted = np.flatnonzero(links.kind == LINK_NONE)
     assert restarted.tolist() == [0, int(np.argmax(np.diff(noisy.stamps_ns))) + 1]
     assert (np.delete(links.kind, restarted) == LINK_WHOLE).all()
-    layout, v, scale = estimator.layout, estimator.vehicle, float(estimator.layout.size)
+    layout, v = estimator.layout, estimator.vehicle
     n = layout.size
     for k in (1, 40, 300, 560):
         assert links.kind[k] == LINK_WHOLE
-        before, L = np.empty((n, 2 * n + 1)), np.empty((n, n))
-        count = _draw(steps.x[k - 1].copy(), steps.P[k - 1].copy(), scale, layout, L, before)
+        x, root = steps.x[k - 1][:, None], np.linalg.cholesky(n * steps.P[k - 1])
+        before = np.concatenate([x, x + root, x - root], axis=1)
         after = before.copy()
         over = Meanwhile(
             *(0.5 * (steps.inputs[k - 1, i] + steps.inputs[k, i]) for i in (0, 1)),
@@ -436,7 +474,6 @@ def test_linked_steps_are_the_steps_and_what_ties_them(names, noisy):
         dt = (noisy.stamps_ns[k] - noisy.stamps_ns[k - 1]) * 1e-9
         models = (layout, model_parameters(v), physics_parameters(v))
         advance(after, 2 * n + 1, over, dt, step_count(steps.x[k - 1, 0], dt, over.friction, *models), *models)
-        assert count <= 2 * n + 1
         mean = after[:, 1:].mean(axis=1)
         np.testing.assert_allclose(steps.prior[k], mean, rtol=1e-9, atol=1e-9)
         cross = (before - before[:, :1])[:, 1:] @ (after[:, 1:] - mean[:, None]).T * (0.5 / n)

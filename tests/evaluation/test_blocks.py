@@ -207,9 +207,9 @@ def test_masks_take_a_bit_each_and_refuse_another_shape():
 
 
 @pytest.mark.slow
-def test_scoring_a_stored_track_holds_no_column(tmp_path, monkeypatch):
+def test_scoring_a_stored_track_holds_few_columns(tmp_path, monkeypatch):
     monkeypatch.setattr(track_store, "ROWS_HELD", 0)
-    signals, truth, estimate, _ = drive(3, seconds=600.0)
+    signals, truth, estimate, _ = drive(3, seconds=2400.0)
     with TrackStore(tmp_path / "tracks") as store, patch.object(metrics, "LAG_SPAN_NS", 10**10):
         expected = score_track(estimate, truth, {}, log="drive", low_speed_m_s=3.0)
         masks = segment_masks(signals, truth, VEHICLE)
@@ -227,6 +227,7 @@ def test_scoring_a_stored_track_holds_no_column(tmp_path, monkeypatch):
                 tracemalloc.stop()
     assert_same_rows(found, expected)
     assert all(np.array_equal(stored[name], masks[name]) for name in masks)
+    # What the estimates of a drive share of its truth, and what a block takes.
     assert peak < 4 * truth.vx_m_s.nbytes
 
 

@@ -44,7 +44,7 @@ def track(vy: np.ndarray) -> StateTrack:
 
 
 def d2(of: Signals, vy: np.ndarray, sensors: LogSensors) -> MetricRow:
-    (row,) = d2_rows(track(vy), of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
+    (row,) = d2_rows([track(vy)], of, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=sensors)
     return row
 
 
@@ -105,9 +105,9 @@ def test_gaps_and_invalid_stamps_are_left_out() -> None:
     row = d2(replace(s, ay_m_s2=ay), VY, SENSORS)
     assert row.value < 2e-3
     assert row.n < T.size - 300
-    nothing = d2_rows(track(np.full(T.size, np.nan)), s, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=SENSORS)
+    nothing = d2_rows([track(np.full(T.size, np.nan))], s, EVERYTHING, log="drive", low_speed_m_s=3.0, sensors=SENSORS)
     assert nothing == []
-    assert d2_rows(track(VY), s, EVERYTHING, log="drive", low_speed_m_s=30.0, sensors=SENSORS) == []
+    assert d2_rows([track(VY)], s, EVERYTHING, log="drive", low_speed_m_s=30.0, sensors=SENSORS) == []
 
 
 def test_blocks_change_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:

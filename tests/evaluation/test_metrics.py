@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference, block_bootstrap_interval
 from pdhef_logtool.evaluation.metrics import (
+    Scorer,
     lag_s,
     lateral_errors_after_one_second,
     nees,
@@ -408,3 +409,40 @@ def test_too_short_for_an_interval():
     assert (one.value, one.blocks) == (1.0, 1)
     assert np.isnan(one.low)
     assert np.isnan(block_bootstrap_interval(np.full(5, np.nan), stamps_of(5)).value)
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e-4, 1e-7, 1e-12])
+def test_nees_is_that_of_every_eigenvalue_and_solution(spread: float) -> None:
+    rng = np.random.default_rng(0)
+    turned = np.linalg.qr(rng.standard_normal((400, 3, 3)))[0]
+    sizes = 10.0 ** rng.uniform(np.log10(spread), 0.0, (400, 3)) * rng.choice([1.0, 1.0, 1.0, -1.0], (400, 3))
+    p = (turned * sizes[:, None, :]) @ turned.transpose(0, 2, 1)
+    e = rng.standard_normal((400, 3))
+    whole = np.linalg.eigvalsh(p)[:, 0] > 0
+    expected = np.full(400, np.nan)
+    expected[whole] = (e[whole] * np.linalg.solve(p[whole], e[whole, :, None])[:, :, 0]).sum(axis=1)
+    np.testing.assert_array_equal(nees(e, p), expected)
+    assert 50 < whole.sum() < 350
+
+
+def test_estimates_do_not_know_what_was_scored_before_them() -> None:
+    rng = np.random.default_rng(4)
+    n = 3000
+    stamps = T0 + np.arange(n, dtype=np.int64) * 10_000_000
+    motion = {"vx_m_s": 10.0 + np.sin(np.arange(n) * 0.01), "vy_m_s": np.cumsum(rng.standard_normal(n)) * 0.01}
+    motion["yaw_rate_rad_s"] = np.cumsum(rng.standard_normal(n)) * 0.01
+    pose = {"x_m": np.arange(n) * 0.1, "y_m": np.zeros(n), "yaw_rad": np.zeros(n)}
+    truth = make_track("truth", stamps, **motion, **pose)
+    estimates = []
+    for i, lost in enumerate((0, 0, 40, 700, 0)):
+        noisy = {c: v + 0.1 * rng.standard_normal(n) for c, v in motion.items()}
+        valid = np.arange(n) >= lost
+        estimates.append(
+            make_track(f"e{i}", stamps, **noisy, covariance=np.tile(0.01 * np.eye(3), (n, 1, 1)), valid=valid)
+        )
+    masks = {"all": np.ones(n, dtype=bool), "late": np.arange(n) > 1000}
+    scorer = Scorer(truth, masks, log="drive", low_speed_m_s=3.0)
+    for estimate in estimates:
+        alone = score_track(estimate, truth, masks, log="drive", low_speed_m_s=3.0)
+        assert repr(scorer.rows(estimate)) == repr(alone)
+        assert {"lag_s", "nees", "coverage95"} <= {r.metric for r in alone}

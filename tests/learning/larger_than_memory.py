@@ -35,25 +35,25 @@ STEPS = 6000
 ROW_BYTES = 4 * (len(FEATURES) + 3)
 
 
-def write_set(folder: Path, drives: int) -> Path:
+def write_set(folder: Path, drives: int, steps: int = STEPS) -> Path:
     """Write a set of random drives, one in ten of them to validate on."""
-    entries, some = [], np.random.default_rng(0).normal(size=(STEPS, len(FEATURES)))
+    entries, some = [], np.random.default_rng(0).normal(size=(steps, len(FEATURES)))
     for number in range(drives):
         features = np.roll(some, number, axis=0)
-        weight = np.ones(STEPS)
+        weight = np.ones(steps)
         weight[-1] = 0.0
         rows = ResidualRows(
-            stamps_ns=np.arange(STEPS) * 10_000_000,
+            stamps_ns=np.arange(steps) * 10_000_000,
             features=features,
             targets=0.01 * features[:, :2],
-            step_s=np.full(STEPS, 0.01),
+            step_s=np.full(steps, 0.01),
             weight=weight,
-            segment=np.zeros(STEPS, dtype=np.int64),
+            segment=np.zeros(steps, dtype=np.int64),
             truth_velocity=features[:, :2],
         )
         split = "validation" if number % 10 == 9 else "train"
         entry = {
-            "name": f"d{number:05}", "log": f"d{number:05}", "split": split, "rows": STEPS, "usable_rows": STEPS - 1,
+            "name": f"d{number:05}", "log": f"d{number:05}", "split": split, "rows": steps, "usable_rows": steps - 1,
             "period_s": 0.01, "signals_sha256": None, "cells": {}, "car": "a car", "vehicle_sha256": "f" * 64,
         }  # fmt: skip
         writer = DriveWriter(drive_file(folder, entry))

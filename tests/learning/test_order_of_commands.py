@@ -11,12 +11,12 @@ import pytest
 import torch
 
 from pdhef_logtool.car.car import Car, read_history
-from pdhef_logtool.car.parts import digest
 from pdhef_logtool.learning.car import identify_command
 from pdhef_logtool.learning.drives import LearnSettings
 from pdhef_logtool.learning.evidence.calibrate_command import CalibrateSettings, calibrate
 from pdhef_logtool.learning.evidence.trust_command import trust
 from pdhef_logtool.learning.noise.tune_command import TuneSettings, tune
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.residual_model.bundle import ModelBundle, Normalisation
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork

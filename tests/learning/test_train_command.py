@@ -20,6 +20,7 @@ from pdhef_logtool.residual_model.bundle import load_bundle
 from pdhef_logtool.residual_model.features import NOMINAL_FEATURES
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.command_line import pdhef, said
 
 pytestmark = pytest.mark.slow
 
@@ -36,17 +37,18 @@ def dataset(sample_logs_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def extracted(sample_logs_dir: Path, folder: Path, *options: str) -> Path:
     """Three slices of one drive, for there are no other sample drives of this length; calls add up."""
-    vehicle = str(sample_logs_dir / "vehicle.toml")
-    for split, start, end in (("train", "30", "110"), ("validation", "115", "150"), ("test", "155", "190")):
-        done = _pdhef(
-            "extract", str(sample_logs_dir / "road.mcap"), "-o", str(folder), "--car", vehicle, "--split", split,
+    vehicle = sample_logs_dir / "vehicle.toml"
+    for split, start, end in (("train", "30", "62"), ("validation", "115", "130"), ("test", "155", "170")):
+        pdhef(
+            "extract", sample_logs_dir / "road.mcap", "-o", folder, "--car", vehicle, "--split", split,
             "--start", start, "--end", end, *options,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
     return folder
 
 
-def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tmp_path: Path) -> None:
+def test_train_writes_a_model_that_runs(
+    sample_logs_dir: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     joined = dataset
     done = _pdhef("train", str(joined), "-o", str(tmp_path / "model"), "--epochs", "2", "--json")
     assert done.returncode == 0, done.stderr
@@ -60,7 +62,7 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     assert pl.read_parquet(tmp_path / "model" / "history.parquet").height == 2
     assert bundle.provenance["dataset_sha256"]
     car, network = sample_logs_dir / "vehicle.toml", tmp_path / "model"
-    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none")
+    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none", end="5")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path / "out", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pd-hef-fixed-r", "pd-hef"}
     again = run_training(joined, tmp_path / "again", epochs=2)
@@ -74,14 +76,14 @@ def test_train_writes_a_model_that_runs(sample_logs_dir: Path, dataset: Path, tm
     with pytest.raises(OutputError, match="--filter phy-ukf"):
         run_training(joined, tmp_path / "paper", paper=True, epochs=1)
     nominal = extracted(sample_logs_dir, tmp_path / "nominal", "--filter", "phy-ukf")
-    check_baselines(sample_logs_dir, nominal, tmp_path, bundle.sha256)
+    check_baselines(sample_logs_dir, nominal, tmp_path, bundle.sha256, capsys)
 
 
-def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str) -> None:
+def check_baselines(
+    sample_logs_dir: Path, dataset: Path, folder: Path, network_sha256: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Train the baselines into the model; they run, the network stays as it was, the split is the network's."""
-    done = _pdhef("train", str(dataset), "-o", str(folder / "model"), "--epochs", "2", "--baselines", "--json")
-    assert done.returncode == 0, done.stderr
-    document = json.loads(done.stdout)
+    document = said(capsys, "train", dataset, "-o", folder / "model", "--epochs", 2, "--baselines")
     bundle = load_bundle(folder / "model")
     assert bundle.sha256 == network_sha256
     assert bundle.pure_lstm is not None
@@ -95,12 +97,11 @@ def check_baselines(sample_logs_dir: Path, dataset: Path, folder: Path, network_
     assert 0.0 < errors["train"] < 1.0
     assert errors["test"] is not None
     car, network = sample_logs_dir / "vehicle.toml", folder / "model"
-    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none")
+    config = RunConfig(car=car, network=network, estimators=("all",), annotate="none", end="5")
     result = run_logs([str(sample_logs_dir / "dlc.mcap")], folder / "with_baselines", config)
     assert {r.estimator for r in result.results[0].rows} >= {"pure-lstm", "linear-regression"}
-    both = _pdhef("train", str(dataset), "-o", str(folder / "m"), "--baselines", "--init", str(folder / "model"))
-    assert both.returncode == 2
-    assert len(both.stderr.splitlines()) == 1
+    with pytest.raises(UsageError, match="--baselines or --init"):
+        pdhef("train", dataset, "-o", folder / "m", "--baselines", "--init", folder / "model")
 
 
 def test_wrong_calls_are_one_line(dataset: Path, tmp_path: Path) -> None:

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
-import subprocess
-import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
@@ -45,6 +42,7 @@ from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.network import Architecture, ResidualNetwork
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
+from tests.command_line import said
 
 pytestmark = pytest.mark.slow
 
@@ -255,19 +253,15 @@ def test_what_is_written_runs_with_the_scores_that_are_recorded(
 
 
 def test_processes_change_nothing_and_the_command_prints_json(
-    sample_logs_dir: Path, drives: Path, tmp_path: Path
+    sample_logs_dir: Path, drives: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    vehicle = str(sample_logs_dir / "vehicle.toml")
     texts = []
-    for jobs in ("1", "2"):
-        output = tmp_path / jobs / "car.toml"
-        done = subprocess.run(
-            [sys.executable, "-m", "pdhef_logtool", "tune", str(drives), "--split", "validation", "--car", vehicle,
-             "--network", "none", "-o", str(output), "-e", "phy-ukf-tuned", "--trials", "4", "--jobs", jobs, "--json"],
-            capture_output=True, text=True, check=False, env={**os.environ, "OMP_NUM_THREADS": "1"},
+    for jobs in (1, 2):
+        output = tmp_path / str(jobs) / "car.toml"
+        document = said(
+            capsys, "tune", drives, "--split", "validation", "--car", sample_logs_dir / "vehicle.toml",
+            "--network", "none", "-o", output, "-e", "phy-ukf-tuned", "--trials", 4, "--jobs", jobs,
         )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        document = json.loads(done.stdout)
         assert document["estimators"]["phy-ukf-tuned"]["trials"] == 4
         texts.append((output.read_text(), output.with_name("car.noise.record.json").read_text()))
     assert texts[0] == texts[1]

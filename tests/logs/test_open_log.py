@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zstandard
+from mcap.writer import Writer
 
+from pdhef_logtool.logs.container import Block
 from pdhef_logtool.logs.open_log import is_log_folder, looks_like_log, open_log
 from pdhef_logtool.logs.writer import McapLogWriter, TopicBatch
 from pdhef_logtool.records.errors import EXIT_FAILURE, LogError
@@ -183,3 +186,24 @@ def test_rows_in_a_write_ahead_log_are_read_and_nothing_is_written_beside(tmp_pa
     before = {p.name: p.read_bytes() for p in path.parent.iterdir()}
     assert len(_values(path, "/v", "x")) == len(VALUES) + 1
     assert {p.name: p.read_bytes() for p in path.parent.iterdir()} == before
+
+
+def test_a_chunk_costs_the_same_however_many_there_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (tmp_path / "many.mcap").open("wb") as file:
+        writer = Writer(file, chunk_size=1)
+        writer.start()
+        channel = writer.register_channel("/a", "json", 0)
+        for i in range(300):
+            writer.add_message(channel, i, b'{"x": 1.0}', i)
+        writer.finish()
+    asked = 0
+
+    def nbytes(block: Block) -> int:
+        nonlocal asked
+        asked += 1
+        return len(block.buffer)
+
+    monkeypatch.setattr(Block, "nbytes", property(nbytes))
+    with closing(open_log(tmp_path / "many.mcap")) as log:
+        assert len(log.read({"/a": ["x"]})["/a"].fields["x"]) == 300
+    assert 300 <= asked <= 2 * 300

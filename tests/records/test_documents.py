@@ -16,12 +16,13 @@ from hypothesis import strategies as st
 from pdhef_logtool.car.car import SHIPPED_CARS, Car, load_intervals
 from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.evaluation.thresholds import load_thresholds
-from pdhef_logtool.mapping import load_mapping
-from pdhef_logtool.records.documents import MAX_DEPTH, read_json, read_toml, unknown
+from pdhef_logtool.mapping import Mapping, SignalSource, load_mapping
+from pdhef_logtool.records.documents import MAX_DEPTH, digest, read_json, read_toml, unknown
 from pdhef_logtool.records.errors import PdhefError, UsageError, VehicleError
 from pdhef_logtool.residual_model.bundle import DOCUMENT_FILE, SHIPPED_FOLDERS, WEIGHTS_FILE, load_network
-from pdhef_logtool.residual_model.linear_model import load_linear_model
+from pdhef_logtool.residual_model.linear_model import LinearModel, load_linear_model
 from pdhef_logtool.runs.config import load_config
+from pdhef_logtool.runs.journal import digest_of
 
 SHIPPED, CAR = SHIPPED_FOLDERS["default"], SHIPPED_CARS["saloon"]
 VALID_CONFIG = {
@@ -283,3 +284,14 @@ def test_the_nearest_name_is_told() -> None:
 def test_misspelt_entries_are_told_with_the_nearest_name(loader: Loader, line: str, said: str, tmp_path: Path) -> None:
     (tmp_path / loader.name).write_text(line)
     assert said in outcome(loader, tmp_path / loader.name)
+
+
+def test_hashes_that_stand_in_files_stay_what_they_were() -> None:
+    """Of version 0.2.0: journals, caches, datasets and cars name by them what they rest on."""
+    document = {"b": [1, 2.5, None, True], "a": {"ü\udc80": "/", "": (1e-9, 1e22)}}
+    assert digest(document) == "67b92e78790c0c9feafdf6c5b26ff7e18525bc442921e21ed792a5d1dbcc28d6"
+    assert digest_of(document) == "67b92e78790c0c9f"
+    mapping = Mapping({"speed_m_s": SignalSource("speed_m_s", "/can", "speed", scale=0.5)})
+    assert mapping.sha256 == "95bc15effd8048a668853de7ce24f1e84c771acd8e1692d120c193d57d689937"
+    linear = LinearModel(("ay_m_s2",), (0.5,), 0.25, 2.0)
+    assert linear.sha256 == "47076088d4172941685a059bf407bb89750dff940ccc307b7ca6278cb1868aed"

@@ -152,3 +152,10 @@ def test_dead_reckoning_skips_what_is_not_known():
     assert all(len(a) == 0 for a in dead_reckon(stamps[:0], vx[:0], vx[:0], vx[:0], (1.0, 2.0, 3.0)))
     one = dead_reckon(stamps[:1], vx[:1], vx[:1], vx[:1], (1.0, 2.0, 3.0))
     assert [a.tolist() for a in one] == [[1.0], [2.0], [3.0]]
+
+
+def test_angles_beyond_a_turn_change_none_beside_them() -> None:
+    within = np.array([-np.pi, -1e-300, -0.0, 0.0, 3.0, np.nextafter(np.pi, 0.0), np.nan])
+    alone, beside = wrap_angle(within), wrap_angle(np.append(within, [7.0, -9.0]))
+    assert alone.tobytes() == beside[:-2].tobytes()
+    assert ((beside[:-1] >= -np.pi) & (beside[:-1] < np.pi))[:-2][:6].all()

@@ -98,3 +98,10 @@ def test_an_inspection_of_hostile_names_is_plain(
         assert json.loads(out)["topics"][0]["name"] == topic
     else:
         assert "[red][/]" in out.replace("\n", "").replace(" ", "")
+
+
+def test_numbers_and_nothing_stay_what_they_are() -> None:
+    given = {"a": [1, 2.5, None, True, float("inf")], "b": ({"c\x1b": "d\n"},)}
+    found = all_shown(given)
+    assert repr(found) == repr({"a": [1, 2.5, None, True, float("inf")], "b": ({"c\\x1b": "d\\n"},)})
+    assert found["a"] is not given["a"]

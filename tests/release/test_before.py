@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.cli.app import app
 from pdhef_logtool.learning.network.dataset import read_dataset
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.results.opened_run import open_run
+from tests.command_line import pdhef, said
 
 HERE = Path(__file__).parent
 DLC = HERE.parents[1] / "sample_logs/dlc.mcap"
@@ -32,26 +30,15 @@ def before(written: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(written, tmp_path / "before"))
 
 
-def _pdhef(*arguments: object) -> None:
-    assert not app([str(a) for a in arguments], prog_name="pdhef", standalone_mode=False)
-
-
-def _said(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
-    capsys.readouterr()
-    _pdhef(*arguments, "--json")
-    found: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return found
-
-
 def test_a_run_opens_and_has_its_page_its_events_and_its_comparison(
     before: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (log,) = open_run(before / "run").logs
     assert (log.label, log.report()["log"]["file"]) == ("dlc", "dlc.mcap")
-    _pdhef("report", before / "run")
+    pdhef("report", before / "run")
     assert "dlc" in (before / "run/logs/dlc/report.html").read_text()
-    assert _said(capsys, "events", before / "run", "--where", "abs(ay_m_s2) > 1")["events"]
-    compared = _said(capsys, "compare", before / "run", before / "again")
+    assert said(capsys, "events", before / "run", "--where", "abs(ay_m_s2) > 1")["events"]
+    compared = said(capsys, "compare", before / "run", before / "again")
     assert compared["pairs"] == {"signals": 1}
     assert len(compared["figures"]) == 1
 
@@ -66,13 +53,13 @@ def test_a_car_opens_with_all_of_its_parts(before: Path) -> None:
 @pytest.mark.slow
 def test_a_car_and_a_network_run(before: Path, tmp_path: Path) -> None:
     car = ("--car", before / "car", "--network", before / "bundle")
-    _pdhef("run", DLC, "-o", tmp_path / "out", *car, "-e", "pd-hef,zero", "--annotate", "none", "--no-report", *SLICE)
+    pdhef("run", DLC, "-o", tmp_path / "out", *car, "-e", "pd-hef,zero", "--annotate", "none", "--no-report", *SLICE)
 
 
 @pytest.mark.slow
 def test_a_run_is_gone_on_with(before: Path) -> None:
     car = ("--car", before / "car", "--network", before / "bundle")
-    _pdhef(
+    pdhef(
         "run", DLC, "-o", before / "run", *car, "-e", "pd-hef,physics,zero", "--annotate", "none", "--resume",
         "--no-report", *SLICE,
     )  # fmt: skip
@@ -91,6 +78,6 @@ def test_a_dataset_is_trained_on_from_a_network_and_what_cannot_go_into_it_is_to
 ) -> None:
     logs = ("--car", before / "car", "--split", "train", "--start", "2", "--end", "3.2")
     with pytest.raises(UsageError, match="choose another"):  # it has no cells of driving
-        _pdhef("extract", DLC, *logs, "-o", before / "dataset", "--resume")
-    _pdhef("train", before / "dataset", "-o", tmp_path / "network", "--init", before / "bundle", "--epochs", 1)
+        pdhef("extract", DLC, *logs, "-o", before / "dataset", "--resume")
+    pdhef("train", before / "dataset", "-o", tmp_path / "network", "--init", before / "bundle", "--epochs", 1)
     assert (tmp_path / "network/model.json").is_file()

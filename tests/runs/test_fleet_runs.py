@@ -17,6 +17,7 @@ from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.supervisor import Limits, Tell
 from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
 from pdhef_logtool.results.summary import summarise
+from pdhef_logtool.runs import fleet
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import DriveEnd, DriveTask, run_logs
 from pdhef_logtool.sinks.report import LogOutcome
@@ -208,7 +209,10 @@ def test_a_failure_that_may_pass_is_tried_again_and_others_when_asked(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(tmp_path: Path) -> None:
+def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fleet, "_PRELOAD", ("tests.fleet_soak.planted",))  # all that a stub needs
     logs, out = named_logs(tmp_path / "logs", "a", "hangs", "b", "kills"), tmp_path / "out"
     result = run(logs, out, work=planted_stub, jobs=2, limits=Limits(2.0))
     assert result.exit_code == 3
@@ -224,9 +228,11 @@ def test_a_log_that_hangs_or_ends_its_worker_is_given_up_and_not_tried_again(tmp
 
 
 @pytest.mark.slow
-def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(sample_logs_dir: Path, tmp_path: Path) -> None:
+def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(
+    sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     logs = [str(sample_logs_dir / f"{name}.mcap") for name in ("dlc", "step")]
-    config = RunConfig(car=Path("saloon"), estimators=("zero", "kinematic"), keep="estimates", end="3")
+    config = RunConfig(car=Path("saloon"), estimators=("zero", "kinematic"), keep="estimates", end="1.5")
     one, two = tmp_path / "one", tmp_path / "two"
     assert run_logs(logs, one, config).exit_code == 0
 
@@ -234,7 +240,8 @@ def test_two_jobs_that_are_killed_and_go_on_leave_what_one_job_leaves(sample_log
         if share > 0.5:
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(fleet, "_PRELOAD", ("pdhef_logtool.runs.*",))  # compiled code is for those that get on
         run_logs(logs, two, config, jobs=2, progress=killed)
     assert run_logs(logs, two, config, jobs=2, resume=True).exit_code == 0
     assert contents(one) == contents(two)

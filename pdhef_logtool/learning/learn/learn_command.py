@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from pdhef_logtool.car.car import NO_INTERVALS, VEHICLE_FILE, Car
-from pdhef_logtool.car.parts import PHYSICS, digest
+from pdhef_logtool.car.parts import PHYSICS
 from pdhef_logtool.car.store import Change, check_output, update_car, vehicle_file
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import spec_of
@@ -58,6 +58,7 @@ from pdhef_logtool.learning.stages import Stages
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs
 from pdhef_logtool.logs.remote_place import LogPlace
 from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,10 +23,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from pdhef_logtool.car.parts import digest
+from pdhef_logtool.car.parts import car_folder
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.learning.network.cells import COUNT, EVERYTHING, Picked, Picking, draw_limits, is_chosen, table_of
 from pdhef_logtool.learning.network.residuals import ResidualRows
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import OutputError
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray
 from pdhef_logtool.residual_model.features import FEATURES
@@ -44,8 +44,6 @@ MANIFEST = "manifest.json"
 NAMED_VEHICLES = 4
 #: All files of a dataset that may be drives, by a pattern of its folder.
 FILES = "split=*/car=*/part-*.parquet"
-#: Signs of a car's name in the name of its folder, and of the digest behind them.
-_CAR_NAME, _CAR_DIGEST = 24, 8
 TARGETS = (("target_dvy_m_s", "m/s"), ("target_dyaw_rate_rad_s", "rad/s"))
 TRUTH = ("truth_vx_m_s", "truth_vy_m_s")
 SPLITS = ("train", "validation", "test")
@@ -116,8 +114,7 @@ def read_entry(path: Path) -> dict[str, Any] | None:
 
 def drive_file(folder: Path, entry: Mapping[str, Any]) -> Path:
     """Return where a drive stands in a dataset, by its entry: split, car and the name of its log and slice."""
-    name = re.sub(r"[^A-Za-z0-9._]+", "-", entry["car"])[:_CAR_NAME]
-    car = f"car={name}-{entry['vehicle_sha256'][:_CAR_DIGEST]}"
+    car = car_folder(entry["car"], entry["vehicle_sha256"])
     return folder / split_folder(entry["split"]) / car / f"part-{entry['name']}.parquet"
 
 
@@ -158,12 +155,11 @@ def write_manifest(
     cells = {name: _seconds_by_cell([d for d in drives if d["split"] == name]) for name in splits}
     per_cell_s = settings.get("per_cell_s")
     limits = None if per_cell_s is None else _limits(folder, drives, per_cell_s)
-    content = json.dumps([[[d["name"], d["file_sha256"]] for d in drives], limits]).encode()
     document = {
         "format": FORMAT,
         "version": FORMAT_VERSION,
         "model": settings["model"],
-        "sha256": hashlib.sha256(content).hexdigest(),
+        "sha256": digest([[[d["name"], d["file_sha256"]] for d in drives], limits]),
         "features": list(FEATURES),
         "targets": [{"name": name, "unit": unit} for name, unit in TARGETS],
         "period_s": float(np.median([d["period_s"] for d in drives])) if drives else None,

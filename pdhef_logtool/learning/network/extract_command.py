@@ -18,8 +18,9 @@ import numpy as np
 from pdhef_logtool.car.car import NO_INTERVALS, Car
 from pdhef_logtool.car.parts import physics_sha256
 from pdhef_logtool.car.vehicle import VehicleParameters
+from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.correlation import GAP_PERIODS as TRUTH_GAP_PERIODS
-from pdhef_logtool.drive.reading import Tell, friction_of, no_samples, read_drive
+from pdhef_logtool.drive.reading import Tell, friction_of, no_samples
 from pdhef_logtool.drive.truth import derive_truth
 from pdhef_logtool.drive.windows import DrivePlan
 from pdhef_logtool.estimators.parallel_physics import filter_of
@@ -59,6 +60,7 @@ from pdhef_logtool.learning.variation import vary
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
 from pdhef_logtool.mapping.recognition import PERFECT_PREFIX
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import EstimatorError, PdhefError, UsageError
 from pdhef_logtool.records.files import writing
 from pdhef_logtool.records.outputs import OutputFolder, check_no_input
@@ -473,7 +475,7 @@ def _extract(job: _Job, progress: Callable[[float], None]) -> DriveResult:
             losses = tuple(Loss(**x) for x in entry["losses"])
             record = DriveRecord(stem, name, source, split, entry["duration_s"], losses=losses)
             return DriveResult(record, entry, kept=True)
-    with read_drive(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
+    with read_cached(job.log_input, job.car, job.mapping, settings.config.read_options) as drive:
         drive.plan = plan = _strict_truth(drive.plan)
         _check_plan(plan, job)
         smoothing = _choose_smoothing(plan, settings)
@@ -540,8 +542,8 @@ def choose_split(
         return chosen, "option"
     if listed is not None:
         return listed, "manifest"
-    digest = hashlib.sha256(f"{seed}:{source_sha256}".encode()).digest()
-    place = int.from_bytes(digest[:8], "big") / 2.0**64
+    drawn = hashlib.sha256(f"{seed}:{source_sha256}".encode()).digest()
+    place = int.from_bytes(drawn[:8], "big") / 2.0**64
     return SPLITS[sum(place >= end for end in SPLIT_ENDS)], "hash"
 
 
@@ -689,4 +691,4 @@ def _fingerprint(job: _Job, split: str) -> str:
         "mapping": None if mapping is None else hashlib.sha256(Path(mapping).read_bytes()).hexdigest(),
         "versions": tool_versions(),
     }
-    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
+    return digest(document)

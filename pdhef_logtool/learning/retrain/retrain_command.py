@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import digest
-from pdhef_logtool.drive.reading import Tell, read_drive
+from pdhef_logtool.drive.cached import read_cached
+from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.table import FILTERS
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -43,6 +43,7 @@ from pdhef_logtool.learning.retrain.roles import GATE, INTERVALS, LEAST, SHARES,
 from pdhef_logtool.learning.stages import Stages
 from pdhef_logtool.logs.discovery import LogInput, Logs, find_logs, hash_log, identity_of
 from pdhef_logtool.mapping import Mapping as SignalMapping
+from pdhef_logtool.records.documents import digest
 from pdhef_logtool.records.errors import EXIT_GATE, EstimatorError, PdhefError
 from pdhef_logtool.records.files import write_bytes, writing
 from pdhef_logtool.records.outputs import FolderTransaction, OutputFolder, check_no_input
@@ -241,7 +242,7 @@ class _Seen:
 def _read_log(log: _Log, tell: Progress) -> _Seen:
     """Read a log once, for what its signals are known by and whether it has a truth."""
     try:
-        with read_drive(log.log_input, log.car, log.mapping, log.config.read_options) as drive:
+        with read_cached(log.log_input, log.car, log.mapping, log.config.read_options) as drive:
             if left_out := no_true_sideslip(drive.plan):
                 return _Seen(record_of(drive, left_out=left_out), None)
             first, last = math.inf, -math.inf

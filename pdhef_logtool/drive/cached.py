@@ -1,4 +1,4 @@
-"""Logs of a run: their slim logs, where the run has a cache of these, else the logs themselves."""
+"""Logs that are read more than once: their slim logs, where a cache of these is named, else the logs themselves."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from pdhef_logtool.car.car import Car
+from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Drive, read_drive
 from pdhef_logtool.logs.discovery import LogInput
 from pdhef_logtool.mapping import Mapping
-from pdhef_logtool.runs.config import RunConfig
 
 Warn = Callable[[str], None]
 
@@ -20,25 +20,25 @@ def _silent(_text: str) -> None:
 
 @contextmanager
 def cached(
-    log: LogInput, config: RunConfig, mapping: Mapping | None, warn: Warn = _silent
+    log: LogInput, mapping: Mapping | None, options: ReadOptions, warn: Warn = _silent
 ) -> Iterator[tuple[LogInput, Mapping | None]]:
     """Yield what to read in place of a log, and with which mapping; a slim log has its own."""
-    if config.cache is None:
+    if options.cache is None:
         yield log, mapping
         return
     from pdhef_logtool.drive.slim_cache import SlimCache
 
-    with SlimCache(config.cache, mapping, config.read_options).standing_in(log, warn) as found:
+    with SlimCache(options.cache, mapping, options).standing_in(log, warn) as found:
         yield found, mapping if found.path == log.path else None
 
 
 @contextmanager
 def read_cached(
-    log: LogInput, car: Car, mapping: Mapping | None, config: RunConfig, warn: Warn = _silent
+    log: LogInput, car: Car, mapping: Mapping | None, options: ReadOptions, warn: Warn = _silent
 ) -> Iterator[Drive]:
-    """Open a log of a run as :func:`~pdhef_logtool.drive.reading.read_drive` does, or what stands for it."""
+    """Open a log as :func:`~pdhef_logtool.drive.reading.read_drive` does, or what stands for it."""
     with (
-        cached(log, config, mapping, warn) as (found, of_it),
-        read_drive(found, car, of_it, config.read_options, tell=warn) as drive,
+        cached(log, mapping, options, warn) as (found, of_it),
+        read_drive(found, car, of_it, options, tell=warn) as drive,
     ):
         yield drive

@@ -1,0 +1,90 @@
+"""A fleet whose output is in an object store, killed and gone on with: it equals an undisturbed one in a folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdhef_logtool.records.outputs import LOCK_FILE
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, open_run
+from tests.conftest import ROOT
+from tests.s3_store import objects_of, s3_store
+
+pytestmark = [pytest.mark.fleet, pytest.mark.slow]
+
+#: The command line, which puts the journal more often.
+COMMAND = """
+import sys
+from pdhef_logtool.runs import stored_output
+stored_output.EVERY_S = 0.2
+from pdhef_logtool.__main__ import main
+sys.exit(main())
+"""
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", COMMAND, "run", *arguments, "--jobs", "2"]
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(command, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=env)
+
+
+def drives_in(journal: bytes) -> int:
+    return sum(b'"outcome":' in line for line in journal.splitlines())
+
+
+def contents(files: dict[str, bytes]) -> dict[str, bytes]:
+    """Leave out the journal and the recordings, which hold times."""
+    return {name: data for name, data in files.items() if name != JOURNAL_FILE and not name.endswith(".rrd")}
+
+
+def put_so_far(client: Any) -> int:
+    """Return how many drives the journal in the store has."""
+    return drives_in(objects_of(client, "cars", "day/out").get(JOURNAL_FILE, b""))
+
+
+def test_a_killed_run_goes_on_on_another_machine(tmp_path: Path, sample_logs_dir: Path) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for name in ("dlc", "fishhook", "step", "sweep"):
+        shutil.copy(sample_logs_dir / f"{name}.mcap", logs)
+    undisturbed = start(str(logs), "-o", str(tmp_path / "out"))
+    with s3_store("cars") as client:
+        process = start(str(logs), "-o", "s3://cars/day/out")
+        ends = time.monotonic() + 300.0
+        while put_so_far(client) < 1 and time.monotonic() < ends:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        done = put_so_far(client)
+        assert 1 <= done < 4, "it was killed under way"
+        holder = client.get_object(Bucket="cars", Key=f"day/out/{LOCK_FILE}")["Body"].read().decode()
+        assert holder.split("-")[1] == str(process.pid), "it still holds the place"
+        client.put_object(Bucket="cars", Key=f"day/out/{LOCK_FILE}", Body=b"00000000-17-1")
+        told = start(str(logs), "-o", "s3://cars/day/out", "--resume")
+        assert f"or remove {LOCK_FILE} there if that command has ended" in told.communicate()[1]
+        assert told.returncode == 1
+        client.put_object(Bucket="cars", Key=f"day/out/{LOCK_FILE}", Body=holder.encode())
+        again = start(str(logs), "-o", "s3://cars/day/out", "--resume")
+        said = again.communicate()
+        assert again.returncode in (0, 3), said
+        found = objects_of(client, "cars", "day/out")
+        assert drives_in(found[JOURNAL_FILE]) == 4, "what was put is not done again"
+        undisturbed.communicate()
+        folder = tmp_path / "out"
+        here = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+        assert set(found) == set(here)
+        assert contents(found) == contents(here)
+        run = open_run("s3://cars/day/out")
+        assert [log.outcome for log in run.logs] == ["ok"] * 4
+        assert {log["log"] for log in json.loads(found["run.json"])["logs"]} == {"dlc", "fishhook", "step", "sweep"}
+        frame = run.logs[0].estimates()
+        assert frame is not None and frame.collect().height > 0

@@ -1,0 +1,263 @@
+"""A run whose output is at a URL: the same files as in a folder, one command at a time, and what goes wrong told."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+
+from pdhef_logtool.records import object_store
+from pdhef_logtool.records.errors import OutputError, UsageError
+from pdhef_logtool.records.object_store import LEFT_OVER_S, HeldError
+from pdhef_logtool.records.outputs import LOCK_FILE
+from pdhef_logtool.records.supervisor import Tell
+from pdhef_logtool.results.opened_run import JOURNAL_FILE, METRICS_FILE, open_run
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import DriveEnd, DriveTask
+from tests.runs.stub_drives import stub_drive
+from tests.runs.test_fleet_runs import Counted, named_logs, run
+from tests.s3_store import s3_store
+
+#: What holds times, or where logs lie.
+TIMED = ("run.json", JOURNAL_FILE)
+URL = "memory://fleet/out"
+
+
+@pytest.fixture(autouse=True)
+def memory() -> Iterator[Any]:
+    """The store of this process, empty."""
+    import fsspec
+
+    store = fsspec.filesystem("memory")
+    store.store.clear()
+    yield store
+    assert not [path for path in store.store if path.endswith(LOCK_FILE)], "it is held for good"
+    store.store.clear()
+
+
+@pytest.fixture(scope="module")
+def s3() -> Iterator[Any]:
+    with s3_store("cars") as client:
+        yield client
+
+
+def stored(store: Any, url: str = URL) -> dict[str, bytes]:
+    root = url.removeprefix("memory:/") + "/"
+    return {path.removeprefix(root): store.cat_file(path) for path in store.find(root) if Path(path).name not in TIMED}
+
+
+def local(output: Path) -> dict[str, bytes]:
+    files = [p for p in output.rglob("*") if p.is_file() and p.name not in TIMED]
+    return {p.relative_to(output).as_posix(): p.read_bytes() for p in sorted(files)}
+
+
+def test_a_store_has_what_a_folder_has_and_is_gone_on_with(tmp_path: Path, memory: Any) -> None:
+    logs, work = named_logs(tmp_path / "logs", "a", "b"), Counted()
+    result = run(logs, URL, work=work)
+    run(logs, tmp_path / "out")
+    assert stored(memory) == local(tmp_path / "out")
+    assert result.to_dict()["output"] == URL
+    assert result.to_dict()["logs"][0]["output"] == f"{URL}/logs/a"
+    assert result.results[0].report == {"log": "a"}
+    named_logs(logs, "c")
+    said: list[str] = []
+    run(logs, URL, work=work, resume=True, say=said.append)
+    run(logs, tmp_path / "out", resume=True)
+    assert work.asked == ["a", "b", "c"], "only what is new"
+    assert (said, stored(memory)) == ([], local(tmp_path / "out"))
+    opened = open_run(URL)
+    assert (opened.place, [log.label for log in opened.logs]) == (URL, ["a", "b", "c"])
+    assert opened.logs[2].report() == {"log": "c"}
+    assert opened.logs[2].estimates() is None
+    assert opened.metrics().collect().equals(pl.read_parquet(tmp_path / "out" / METRICS_FILE))
+
+
+def test_a_name_that_is_a_pattern_means_itself(tmp_path: Path, s3: Any) -> None:
+    logs = named_logs(tmp_path / "logs", "d1", "d[1]")
+    for url in (URL, "s3://cars/odd"):
+        for start in ("1", "2"):
+            run(logs, url, config=RunConfig(keep="metrics", start=start))
+        run(logs, url, config=RunConfig(keep="metrics", start="2"), only=["d[1]"])
+        assert [log.report() for log in open_run(url).logs] == [{"log": name} for name in ("d1", "d[1]")]
+
+
+def test_what_was_fetched_in_part_is_fetched_again(
+    tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run(named_logs(tmp_path / "logs", "a"), URL)
+    opened = open_run(URL)
+
+    def cut(_: Any, _name: str, to: str, **_options: Any) -> None:
+        Path(to).write_text("{")
+        raise TimeoutError
+
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match="no answer"):
+        patch.setattr(type(memory), "get_file", cut)
+        opened.logs[0].report()
+    assert opened.logs[0].report() == {"log": "a"}
+
+
+def test_a_place_whose_files_do_not_appear_whole_is_written_by_temporary_names(tmp_path: Path) -> None:
+    logs = named_logs(tmp_path / "logs", "a", "b")
+    for names in ((), ("c",)):
+        named_logs(logs, *names)
+        run(logs, f"file://{tmp_path}/there/out", resume=bool(names))
+        run(logs, tmp_path / "out", resume=bool(names))
+    assert local(tmp_path / "there/out") == local(tmp_path / "out")
+
+
+def test_figures_of_an_earlier_run_go_and_what_is_gone_is_made_anew(tmp_path: Path, memory: Any) -> None:
+    logs, work = named_logs(tmp_path / "logs", "a", "b"), Counted()
+    run(logs, URL, work=work, config=RunConfig(keep="metrics"))
+    run(logs, URL, work=work, config=RunConfig(keep="metrics", start="1"))
+    run(logs, tmp_path / "out", RunConfig(keep="metrics", start="1"))
+    assert stored(memory) == local(tmp_path / "out"), "the figures of the first run are gone"
+    memory.rm("/fleet/out/logs/b/report.json")
+    run(logs, URL, work=work, resume=True, config=RunConfig(keep="metrics", start="1"))
+    assert work.asked == ["a", "b"] * 2 + ["b"]
+    run(logs, URL, work=work, only=["a"], config=RunConfig(keep="metrics", start="1"))
+    assert work.asked[5:] == ["a"]
+    assert stored(memory) == local(tmp_path / "out")
+
+
+def test_a_run_that_ends_has_put_what_is_done(tmp_path: Path, memory: Any) -> None:
+    logs, work = named_logs(tmp_path / "logs", "a", "b", "c"), Counted()
+
+    def stopped(task: DriveTask, tell: Tell) -> DriveEnd:
+        if task.log.stem == "b":
+            raise KeyboardInterrupt
+        return stub_drive(task, tell)
+
+    with pytest.raises(KeyboardInterrupt) as raised:
+        run(logs, URL, work=stopped)
+    assert raised.value.__notes__ == ["--resume goes on", "1 of 3 logs are done"]
+    document = json.loads(memory.cat_file("/fleet/out/run.json"))
+    assert (document["remaining"], [log["log"] for log in document["logs"]]) == (2, ["a"])
+    run(logs, URL, work=work, resume=True)
+    run(logs, tmp_path / "out")
+    assert (work.asked, stored(memory)) == (["b", "c"], local(tmp_path / "out"))
+
+
+def test_a_store_that_fails_ends_the_run_and_what_is_put_counts(
+    tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs, work = named_logs(tmp_path / "logs", "a", "b", "c"), Counted()
+    put = type(memory).put_file
+
+    def failing(self: Any, path: str, name: str, **options: Any) -> None:
+        if "/logs/b/" in name:
+            raise ConnectionError("the store is\nbusy")
+        put(self, path, name, **options)
+
+    with monkeypatch.context() as patch, pytest.raises(OutputError) as raised:
+        patch.setattr(type(memory), "put_file", failing)
+        run(logs, URL, work=work)
+    assert "\n" not in str(raised.value) and f"{URL}/logs/b/report.json" in str(raised.value)
+    assert str(raised.value).endswith("--resume goes on")
+    assert (raised.value.exit_code, work.asked) == (1, ["a", "b"]), "the third is not worked on for nothing"
+    run(logs, URL, work=work, resume=True)
+    run(logs, tmp_path / "out")
+    assert (work.asked[2:], stored(memory)) == (["b", "c"], local(tmp_path / "out"))
+
+
+def test_a_drive_that_is_replaced_halfway_does_not_count_as_done(
+    tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A command that dies leaves the journal of the run before; its figures must not stand beside new files."""
+    logs, work = named_logs(tmp_path / "logs", "a", "b"), Counted()
+    first = RunConfig(keep="metrics")
+    run(logs, URL, work=work, config=first)
+    journal = memory.cat_file(f"/fleet/out/{JOURNAL_FILE}")
+    run(logs, URL, work=work, resume=True, config=RunConfig(keep="metrics", start="1"))
+    memory.pipe_file(f"/fleet/out/{JOURNAL_FILE}", journal)
+    run(logs, URL, work=work, resume=True, config=first)
+    assert work.asked == ["a", "b"] * 3
+
+
+def test_one_command_at_a_time_holds_the_place(tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    logs, lock = named_logs(tmp_path / "logs", "a"), f"/fleet/out/{LOCK_FILE}"
+
+    def within(task: DriveTask, tell: Tell) -> DriveEnd:
+        with pytest.raises(HeldError, match="another command is writing to; it is process"):
+            run(logs, URL)
+        return stub_drive(task, tell)
+
+    run(logs, URL, work=within)
+    memory.pipe_file(lock, b"00000000-17-1")  # of another machine
+    with pytest.raises(HeldError, match=f"or remove {LOCK_FILE} there if that command has ended"):
+        run(logs, URL)
+    monkeypatch.setattr(object_store, "LEFT_OVER_S", -1.0)
+    run(logs, URL)
+    monkeypatch.undo()
+    memory.pipe_file(lock, object_store.own_name().rpartition("-")[0].encode() + b"-1")  # a process that has ended
+    run(logs, URL)
+    assert timedelta(seconds=LEFT_OVER_S) > timedelta(minutes=15)
+    assert datetime.now(UTC) - memory.modified(f"/fleet/out/{JOURNAL_FILE}") < timedelta(seconds=60)
+
+
+def test_what_has_lost_its_hold_ends(tmp_path: Path, memory: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pdhef_logtool.runs.stored_output.EVERY_S", 0.01)
+    logs, lock = named_logs(tmp_path / "logs", "a", "b"), f"/fleet/out/{LOCK_FILE}"
+
+    def taken(task: DriveTask, tell: Tell) -> DriveEnd:
+        memory.pipe_file(lock, b"00000000-17-1")
+        time.sleep(0.2)
+        return stub_drive(task, tell)
+
+    with pytest.raises(HeldError):
+        run(logs, URL, work=taken)
+    assert memory.cat_file(lock) == b"00000000-17-1", "it is theirs"
+    memory.rm(lock)
+
+
+def test_what_cannot_be_an_output_is_told_in_one_line(tmp_path: Path, s3: Any) -> None:
+    logs = named_logs(tmp_path / "logs", "a")
+    for url, error, match in (
+        ("https://user:secret@host/out", UsageError, "https://host/out: expected a folder, or a URL"),
+        ("nothing://x/out", UsageError, "nothing://x/out"),
+        ("s3://bikes/out", OutputError, "s3://bikes/out: expected .*bucket.*make the bucket first"),
+    ):
+        with pytest.raises(error, match=match) as raised:
+            run(logs, url)
+        assert "secret" not in str(raised.value) and "\n" not in str(raised.value)
+    with pytest.raises(OutputError, match=r"s3://cars/none: .* without run\.json"):
+        open_run("s3://cars/none")
+    s3.put_object(Bucket="cars", Key="out/logs/a/annotated.mcap", Body=b"x")
+    with pytest.raises(UsageError, match="which lies in it"):
+        run(["s3://cars/out/logs/a/annotated.mcap"], "s3://cars/out")
+    s3.put_object(Bucket="cars", Key=f"held/{LOCK_FILE}", Body=b"00000000-17-1")
+    with pytest.raises(HeldError):
+        run(logs, "s3://cars/held")
+
+
+@pytest.mark.parametrize("command", [("slim", "x"), ("metrics", "x")])
+def test_what_writes_to_folders_alone_takes_no_url(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from pdhef_logtool.cli.app import app
+
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UsageError, match="expected a place on this machine, got s3://cars/out"):
+        app([*command, "-o", "s3://cars/out"], standalone_mode=False)
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_credentials_there_is_one_line(tmp_path: Path, s3: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import s3fs
+
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+    monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "none"))
+    s3fs.S3FileSystem.clear_instance_cache()
+    object_store._opened.cache_clear()
+    with pytest.raises(OutputError, match="no credentials; give credentials that may write"):
+        run(named_logs(tmp_path / "logs", "a"), "s3://cars/out")
+    s3fs.S3FileSystem.clear_instance_cache()
+    object_store._opened.cache_clear()
