@@ -16,6 +16,7 @@ from typing import Any, Literal
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.drive.checks import (
     LEVER_M,
+    MOST_LEVER_M,
     SURE,
     SensorErrors,
     ay_delay,
@@ -36,11 +37,10 @@ LEAST_GAIN = 0.01
 LEAST_LEVER_M = 0.3 * LEVER_M
 #: Less is within what the roll of the body does.
 LEAST_AY_DELAY_S = 0.015
-#: Beyond, it is no gain but a unit, and no place in a car.
+#: Beyond, it is no gain but a unit.
 MOST_GAIN = 0.25
 #: As well as recorded frames know a place.
 FRAMES_M = 0.15
-MOST_LEVER_M = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

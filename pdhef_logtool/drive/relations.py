@@ -42,6 +42,8 @@ SIDESLIP_RANGE = (0.3, 3.0)
 COMPLIANCE_RAD_PER_M_S2 = (0.0005, 0.5)
 #: Of the truth ahead of the rear axle. A truth that stands near that axle says nothing: its lever may be of any sign.
 REAR_LEVER_M = (1.0, 12.0)
+#: What is left of sideslip beside a_y must move by more: a good truth is not surer of it, nor is a road flatter.
+LEAST_SIDESLIP_RAD = 0.05 * DEGREE
 #: Beyond, sideslip times lateral acceleration is no longer small beside the derivative of the speed.
 STRAIGHT_M_S2 = 3.0
 #: Rim speed over ground speed, 5 % of slip and 5 % of radius; angular over rim speed, wheels of 4 cm to 80 cm radius.
@@ -75,7 +77,7 @@ class Relation:
     ----------
     expected : range of a plausible gain. samples : independent ones. moves : both sides, or one of two that must move
         together, move by more than what disturbs them. signless : a side is a size.
-    least_correlation : below it the gain says nothing.
+    least_correlation : below it the gain says nothing. spread : 1-sigma of the measured side.
     """
 
     text: str
@@ -87,6 +89,7 @@ class Relation:
     moves: bool = False
     signless: bool = False
     least_correlation: float = MIN_CORRELATION
+    spread: float = 0.0
 
     @property
     def tells(self) -> bool:
@@ -373,7 +376,7 @@ def compare(
     correlation = float(np.mean(a * b) / (spread_a * spread_b))
     # The ratio of the spreads lies between the two regressions, neither of which knows where the noise is.
     gain = float(np.copysign(spread_b / spread_a, correlation))
-    return [Relation(text, powers, correlation, gain, expected, samples, both)]
+    return [Relation(text, powers, correlation, gain, expected, samples, both, spread=spread_b)]
 
 
 def compare_at_ease(
@@ -595,7 +598,11 @@ def _sideslips(columns: Mapping[str, FloatArray]) -> list[Relation]:
     return [
         *(replace(r, expected=SIDESLIP_RANGE) for r in kinematic),
         *(replace(r, expected=COMPLIANCE_RAD_PER_M_S2) for r in handling),
-        *(replace(r, expected=REAR_LEVER_M) for r in rolling if abs(r.gain) > REAR_LEVER_M[0]),
+        *(
+            replace(r, expected=REAR_LEVER_M)
+            for r in rolling
+            if abs(r.gain) > REAR_LEVER_M[0] and r.spread > LEAST_SIDESLIP_RAD
+        ),
     ]
 
 
