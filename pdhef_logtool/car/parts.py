@@ -178,10 +178,12 @@ class FittedPhysics(Record):
 
     ``varied``: what of the values is another one posterior 1-sigma away, by direction. The directions are independent,
     and those that move the sideslip of the drives most: what the drives leave open of the values.
+    ``smoothing``: by what the process noise of v_y and yaw rate is multiplied where the filter is smoothed.
     """
 
     values: FittedValues
     noise: FilterNoise
+    smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = (1.0, 1.0)
     varied: Annotated[tuple[FittedValues, ...], Field(strict=False)] = ()
     tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 

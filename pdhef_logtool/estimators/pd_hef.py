@@ -5,11 +5,12 @@ The trust is what the car's evidence allows; without a network or evidence it is
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.physics_ukf import of_car
-from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics
+from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -33,8 +34,10 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 
 
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
-    """Return the same smoothed; ``name`` is that of the result."""
+    """Return the same smoothed, with the noise for that; ``name`` is that of the result."""
     filtered = build(name, car, options)
+    if car.fitted_physics is not None:
+        filtered = replace(filtered, physics=for_smoothing(filtered.physics, car.fitted_physics.smoothing))
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *filtered.notes))
 
 

@@ -8,7 +8,8 @@ backward goes each of them, from the last step that is seen,
     P^s_k = P_k + G_k (P^s_{k+1} − P_{k+1|k}) G_kᵀ
 
 with C from the sigma points of the step before Q is added and they are drawn anew (Särkkä 2008). The network's residual
-is a known input of the step, so that it stands in x_{k+1|k} and needs no term of its own.
+is a known input of the step, so that it stands in x_{k+1|k} and needs no term of its own. The process noise is what
+identification found for smoothing, another one than the filter's (:func:`for_smoothing`).
 
 - A start (first step, gap, failure) ends the recursion: nothing behind it tells of what lies before it.
 - A standstill overwrites the motion with zero. That is no measurement, so none of it goes back.
@@ -41,6 +42,7 @@ from pdhef_logtool.estimators.adaptive_physics import (
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, r_scale
 from pdhef_logtool.estimators.filter_shell import AX_BIAS, VX, PosteriorSteps
 from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry, StepLinks
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.unscented import ROOM, wide_root
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, step_durations_s
@@ -289,6 +291,12 @@ def _look_back(dt, likelihood, starts, span, out):  # type: ignore[no-untyped-de
             later *= math.exp(-dt[k + 1] / FORGET_S)
         if k <= last:
             out[k] += later
+
+
+def for_smoothing(physics: PhysicsFilter, factors: Sequence[float]) -> PhysicsFilter:
+    """Return a filter with factors on its process noise of v_y and yaw rate."""
+    along, vy, rate, *rest = physics.q_std
+    return replace(physics, q_std=(along, vy * factors[0], rate * factors[1], *rest))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

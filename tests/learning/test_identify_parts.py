@@ -435,8 +435,13 @@ def _identification(monkeypatch: pytest.MonkeyPatch, std: dict[str, float], **na
         progress("finding physics", 0.5)
         return FITTED, PHYSICS
 
+    def smoothing(drives: Any, start: Any, physics: Any) -> tuple[float, float]:
+        assert (len(drives), start, physics) == (1, CAR, FITTED)
+        return 0.5, 2.0
+
     monkeypatch.setattr(identify, "_score", score)
     monkeypatch.setattr(identify, "find_physics", find)
+    monkeypatch.setattr(identify, "fit_smoothing", smoothing)
     found = fit_car(
         [fit_drive(25.0, 0.05)], named.pop("held_out", []), CAR, progress=lambda *x: told.append(x), **named
     )
@@ -467,9 +472,9 @@ def test_what_is_not_excited_goes_back_to_its_prior_and_the_rest_is_fitted_again
     fitting = "fitting the filter's sideslip to the truth"
     assert told == [
         (fitting, 0.0), (fitting, pytest.approx(0.1)), (fitting, pytest.approx(0.2)), ("finding physics", 0.6),
-        ("scoring", 0.95),
+        ("fitting the smoother's sideslip to the truth", 0.9), ("scoring", 0.95),
     ]  # fmt: skip
-    assert found.physics is PHYSICS
+    assert found.physics == PHYSICS.model_copy(update={"smoothing": (0.5, 2.0)})
     frequency, noise = found.physics_parameters
     assert (frequency.value, frequency.low) == (pytest.approx(9.5), pytest.approx(9.5 - 1.96 * 0.45))
     assert (frequency.excited, noise.excited) == (False, True)  # noise is the filter's: no prior to go back to

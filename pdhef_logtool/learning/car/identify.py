@@ -41,6 +41,7 @@ from pdhef_logtool.learning.car.axle_forces import (
 )
 from pdhef_logtool.learning.car.fit_data import FitDrive, signals_of
 from pdhef_logtool.learning.car.physics_fit import PhysicsFit, find_physics
+from pdhef_logtool.learning.car.smoothing_fit import fit_smoothing
 from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.signals import BoolArray, FloatArray
 
@@ -174,6 +175,8 @@ def fit_car(
         parts=parts,
         progress=lambda text, share: progress(text, 0.3 + 0.6 * share),
     )
+    progress("fitting the smoother's sideslip to the truth", 0.9)
+    physics = physics.model_copy(update={"smoothing": fit_smoothing(fit, start, found)})
     progress("scoring", 0.95)
     scores = [_score("fit", fit, start, vehicle, noise, found)]
     if held_out:

@@ -240,19 +240,15 @@ def fit_physics(
     def errors(theta: FloatArray) -> list[DriveError]:
         return drive_errors(drives, start, *build_car(start, parts, priors, theta))
 
-    def cost(found: Sequence[DriveError], theta: FloatArray) -> float:
-        fit = sum(d.seconds / CORRELATION_S * math.log(_robust_square(d) + FLOOR_RAD**2) for d in found)
-        return fit + float(theta @ theta) + _nis_residual(found) ** 2
-
     firsts = [np.array([first.get(p.name, 0.0) for p in priors]) for first in starts]
     ends = [
         descend(
             errors,
-            cost,
-            _scaled,
+            fit_cost,
+            scaled_errors,
             first,
             iterations=iterations,
-            least_gain=_least_gain,
+            least_gain=least_gain,
             derivative_step=DERIVATIVE_STEP,
             max_step=MAX_STEP,
         )
@@ -287,6 +283,12 @@ def varied_vehicles(
     return tuple(vehicle(theta, digits=6) for theta in varied_parameters(found.theta, root, errors))
 
 
+def fit_cost(found: Sequence[DriveError], theta: FloatArray) -> float:
+    """Return the cost of the head of this file."""
+    fit = sum(d.seconds / CORRELATION_S * math.log(_robust_square(d) + FLOOR_RAD**2) for d in found)
+    return fit + float(theta @ theta) + _nis_residual(found) ** 2
+
+
 def _scale(drive: DriveError) -> float:
     return math.sqrt(_robust_square(drive) + FLOOR_RAD**2)
 
@@ -302,11 +304,12 @@ def _nis_residual(found: Sequence[DriveError]) -> float:
     return math.log(sum(d.nis * d.seconds for d in found) / max(total, 1e-9)) / NIS_LOG_STD
 
 
-def _least_gain(found: Sequence[DriveError]) -> float:
+def least_gain(found: Sequence[DriveError]) -> float:
+    """Return what a step of a fit must gain of :func:`fit_cost`."""
     return MIN_GAIN * max(1.0, sum(d.seconds for d in found) / CORRELATION_S)
 
 
-def _scaled(there: Sequence[DriveError], at: Sequence[DriveError]) -> FloatArray:
+def scaled_errors(there: Sequence[DriveError], at: Sequence[DriveError]) -> FloatArray:
     """Return the errors and the term of the NIS as residuals, with the scales of the errors ``at`` a place."""
     parts = []
     for d, now in zip(there, at, strict=True):
