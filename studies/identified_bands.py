@@ -1,4 +1,4 @@
-"""95 % bands of identified cars on driving that took no part: simulated cars, identified by the tool on one drive.
+"""Identified cars on driving that took no part, 95 % bands and smoothing: simulated, identified by the tool on a drive.
 
     python -m studies.identified_bands [--cars 12] [--seed 88003] [--out docs]
 
@@ -25,6 +25,8 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.learning.car.fit_data import FitDrive
 from pdhef_logtool.learning.car.physics_fit import fit_physics, varied_vehicles
+from pdhef_logtool.learning.car.smoothing_fit import fit_smoothing
+from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.self_calibration.calibration import VARIED
 from studies.condition_drives import SIDESLIP
@@ -43,6 +45,7 @@ DRIVEN = (
     ("sine-sweep-wide", 70.0, None),
 )
 FIT_ON = ("sine-sweep-wide", "road")
+SMOOTHED = "pd-hef-smoothed"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +54,7 @@ class Judged:
 
     ``own``, ``band`` : of the filter alone, and with the posterior: share of the errors inside, and the whole mean
     width over the RMSE.
+    smoothed : RMSE over that of the filter, smoothed with the filter's noise and with the smoother's own.
     """
 
     fit: str
@@ -58,6 +62,7 @@ class Judged:
     rmse: float
     own: tuple[float, float]
     band: tuple[float, float]
+    smoothed: tuple[float, float]
 
 
 def identified(one: Simulated) -> Car:
@@ -72,7 +77,10 @@ def identified(one: Simulated) -> Car:
         return FittedValues.between(found.vehicle, vehicle)
 
     varied = tuple(map(values, varied_vehicles(fit, file, found)))
-    physics = FittedPhysics(values=FittedValues.of(found.vehicle), noise=found.noise, varied=varied)
+    smoothing = fit_smoothing(fit, file, found)
+    physics = FittedPhysics(
+        values=FittedValues.of(found.vehicle), noise=found.noise, smoothing=smoothing, varied=varied
+    )
     return replace(Car.of(file), fitted_physics=physics).with_noise(PHYSICS, found.noise)
 
 
@@ -90,7 +98,18 @@ def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
         half = NORMAL_95 * std[known]
         return float(np.mean(error <= half)), float(2.0 * np.mean(half) / rmse)
 
-    return Judged(fit.manoeuvre, one.manoeuvre, rmse, stands(plain.sideslip_std_rad), stands(wide.sideslip_std_rad))
+    assert car.fitted_physics is not None
+    as_filtered = replace(car, fitted_physics=car.fitted_physics.model_copy(update={"smoothing": (1.0, 1.0)}))
+    smoothed = tuple(_smoothed_rmse(c, one, known) / rmse for c in (as_filtered, car))
+    own, band = stands(plain.sideslip_std_rad), stands(wide.sideslip_std_rad)
+    return Judged(fit.manoeuvre, one.manoeuvre, rmse, own, band, (smoothed[0], smoothed[1]))
+
+
+def _smoothed_rmse(car: Car, one: Simulated, known: BoolArray) -> float:
+    track, _ = run_window(make_estimator(SMOOTHED, car), one.drive.signals, None, None)
+    assert one.drive.truth is not None
+    error = signal_error(track, one.drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
+    return float(np.sqrt(np.nanmean(error[known] ** 2)))
 
 
 def judge(cars: int, seed: int) -> list[Judged]:
@@ -114,15 +133,31 @@ def _fitted(own: Sequence[Simulated]) -> list[Simulated]:
     return [next(d for d in own if d.manoeuvre == kind) for kind in FIT_ON if any(d.manoeuvre == kind for d in own)]
 
 
-def bands_table(found: Sequence[Judged]) -> str:
-    """Return shares and widths, driving like that of the identification apart."""
-    groups = {
+def _groups(found: Sequence[Judged]) -> dict[str, list[Judged]]:
+    """Return driving like that of the identification, and other driving."""
+    return {
         "of the kind that it was identified on": [j for j in found if j.fit == j.driven],
         "of other kinds": [j for j in found if j.fit != j.driven],
         "all": list(found),
     }
+
+
+def smoothing_table(found: Sequence[Judged]) -> str:
+    """Return how the smoothed error stands to the filter's."""
     body = []
-    for name, some in groups.items():
+    for name, some in _groups(found).items():
+        for which, ratios in zip(("the filter's", "its own"), np.array([j.smoothed for j in some]).T, strict=True):
+            low, middle, high = (number(float(x), 2) for x in np.percentile(ratios, [10, 50, 90]))
+            row = [name, str(len(some)), which, number(float(np.exp(np.mean(np.log(ratios)))), 2), low, middle, high]
+            body.append([*row, f"{np.mean(ratios > 1.05):.0%}"])
+    head = ["driving", "drives", "process noise", "smoothed / filter: geometric mean", "10 %", "median", "90 %"]
+    return table([*head, "more than 5 % worse"], body, right_from=3)
+
+
+def bands_table(found: Sequence[Judged]) -> str:
+    """Return shares and widths, driving like that of the identification apart."""
+    body = []
+    for name, some in _groups(found).items():
         for which, values in (("its own", [j.own for j in some]), ("with the posterior", [j.band for j in some])):
             shares, widths = np.array(values).T
             low, middle, high = (f"{x:.0%}" for x in np.percentile(shares, [10, 50, 90]))
@@ -149,6 +184,13 @@ with errors of one normal distribution a band that covers 95 % is 3.92 times the
 
 An identification believes no error below 0.05° (`FLOOR_RAD`). On driving like that of the fit, where a simulated car
 has less, its band is far too wide: that is what a posterior can say of a model that may be wrong elsewhere.
+
+## Smoothing
+
+`pd-hef-smoothed` of the same cars on the same drives, with the noise of the filter and with that which `identify`
+finds through the smoother, on the drive of the fit. Not causal.
+
+{smoothing}
 """
 
 
@@ -163,9 +205,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command += "".join(
         f" --{n} {v}" for n, v, usual in (("cars", given.cars, CARS), ("seed", given.seed, SEED)) if v != usual
     )
-    bands = bands_table(judge(given.cars, given.seed))
+    found = judge(given.cars, given.seed)
     told = {"command": command, "cars": given.cars, "seed": given.seed, "own": OWN_SHARE, "varied": VARIED}
-    write(given.out / "identified_bands.md", PAGE.format(**told, bands=bands))
+    write(
+        given.out / "identified_bands.md",
+        PAGE.format(**told, bands=bands_table(found), smoothing=smoothing_table(found)),
+    )
     return 0
 
 
