@@ -123,12 +123,12 @@ def judge(cars: int, seed: int) -> list[Judged]:
             if fit is None:
                 continue
             car = identified(fit)
-            found += [judged(car, fit, d) for d in own if d is not fit and d not in _fitted(own)]
+            found += [judged(car, fit, d) for d in own if d is not fit and d not in fit_drives(own)]
             say(f"car {index}, identified on {kind}")
     return found
 
 
-def _fitted(own: Sequence[Simulated]) -> list[Simulated]:
+def fit_drives(own: Sequence[Simulated]) -> list[Simulated]:
     """Return the drives that some car was identified on: they judge none."""
     return [next(d for d in own if d.manoeuvre == kind) for kind in FIT_ON if any(d.manoeuvre == kind for d in own)]
 

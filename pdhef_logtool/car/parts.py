@@ -38,6 +38,9 @@ FORMER_FILTERS = {
     "pd-hef": "physics with a network",
     "pd-hef-smoothed": "physics with a network",
 }
+#: By what the process noise of v_y and yaw rate is multiplied where ``physics`` is smoothed, and nothing was found on
+#: truth: ``studies.defaults.tune_smoothing``, on simulated cars.
+SMOOTHING = (0.5, 3.0)
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
@@ -178,12 +181,12 @@ class FittedPhysics(Record):
 
     ``varied``: what of the values is another one posterior 1-sigma away, by direction. The directions are independent,
     and those that move the sideslip of the drives most: what the drives leave open of the values.
-    ``smoothing``: by what the process noise of v_y and yaw rate is multiplied where the filter is smoothed.
+    ``smoothing``: as :data:`SMOOTHING`, found through the smoother.
     """
 
     values: FittedValues
     noise: FilterNoise
-    smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = (1.0, 1.0)
+    smoothing: Annotated[tuple[Positive, Positive], Field(strict=False)] = SMOOTHING
     varied: Annotated[tuple[FittedValues, ...], Field(strict=False)] = ()
     tried: Annotated[tuple[TriedParts, ...], Field(strict=False)] = ()
 

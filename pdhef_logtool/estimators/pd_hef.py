@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.estimators.smoothed import NOT_CAUSAL, SmoothedPhysics, for_smoothing
@@ -36,8 +37,8 @@ def build(name: str, car: Car, options: Options) -> AdaptivePhysics:
 def build_smoothed(name: str, car: Car, options: Options) -> SmoothedPhysics:
     """Return the same smoothed, with the noise for that; ``name`` is that of the result."""
     filtered = build(name, car, options)
-    if car.fitted_physics is not None:
-        filtered = replace(filtered, physics=for_smoothing(filtered.physics, car.fitted_physics.smoothing))
+    factors = SMOOTHING if car.fitted_physics is None else car.fitted_physics.smoothing
+    filtered = replace(filtered, physics=for_smoothing(filtered.physics, factors))
     return SmoothedPhysics(filtered, name=name, notes=(NOT_CAUSAL, *filtered.notes))
 
 

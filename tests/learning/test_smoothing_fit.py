@@ -9,7 +9,7 @@ import pytest
 from test_physics_fit import STATIC, guess, static_drive
 
 from pdhef_logtool.car.car import Car
-from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues
+from pdhef_logtool.car.parts import SMOOTHING, FilterNoise, FittedPhysics, FittedValues
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
@@ -49,9 +49,9 @@ def test_noise_of_vy_that_is_too_large_is_taken_back(short: FitDrive) -> None:
 def test_what_gains_too_little_is_left_alone(short: FitDrive, monkeypatch: pytest.MonkeyPatch) -> None:
     found = fitted(guess().model_copy(update={"physics": STATIC}), vy=1.0, yaw_rate=0.02)
     monkeypatch.setattr(smoothing_fit, "MAX_ITERATIONS", 1)
-    assert fit_smoothing([short], guess(), found) != (1.0, 1.0)
+    assert fit_smoothing([short], guess(), found) != SMOOTHING
     monkeypatch.setattr(smoothing_fit, "LEAST_GAIN", 10.0)
-    assert fit_smoothing([short], guess(), found) == (1.0, 1.0)
+    assert fit_smoothing([short], guess(), found) == SMOOTHING
 
 
 def test_the_smoother_alone_takes_the_factors() -> None:
@@ -61,3 +61,6 @@ def test_the_smoother_alone_takes_the_factors() -> None:
     noise = {n: resolve(spec_of(n).make(car, Options())).noise for n in ("pd-hef", "pd-hef-smoothed")}
     assert noise["pd-hef"]["physics.q_std"] == list(q)
     assert noise["pd-hef-smoothed"]["filtered.physics.q_std"] == pytest.approx([0.1, 0.1, 0.12, 0.05, 0.3, 0.3])
+    bare = resolve(spec_of("pd-hef-smoothed").make(Car.of(guess()), Options())).noise["filtered.physics.q_std"]
+    usual = [PHYSICS_Q_STD[0], *(q * by for q, by in zip(PHYSICS_Q_STD[1:3], SMOOTHING, strict=True))]
+    assert bare[:3] == pytest.approx(usual)

@@ -2,18 +2,19 @@
 
 A filter hears of an error of its model once, a smoother from both sides, and what a model lacks is no white noise: with
 the noise that suits the filter it follows the model too far. Two factors, on the noise of v_y and of the yaw rate, are
-found as the filter's noise is (:mod:`~.physics_fit`), on the same drives and with the fitted values.
+found as the filter's noise is (:mod:`~.physics_fit`), on the same drives and with the fitted values, about what other
+cars have asked for.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from pdhef_logtool.car.descent import descend
+from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.physics_ukf import physics_filter
 from pdhef_logtool.estimators.smoothed import BLOCK_S, for_smoothing, smooth_steps
@@ -34,8 +35,6 @@ from pdhef_logtool.learning.car.physics_fit import (
 )
 from pdhef_logtool.records.signals import FloatArray
 
-#: Where the search starts, which is where most end, and its steps.
-START = (0.5, 2.0)
 MAX_ITERATIONS, DIGITS = 6, 4
 
 
@@ -56,27 +55,28 @@ def smoothed_errors(
 
 
 def fit_smoothing(drives: Sequence[FitDrive], start: VehicleParameters, found: PhysicsFit) -> tuple[float, float]:
-    """Return the factors on the process noise of v_y and yaw rate; (1, 1) where others are not worth having."""
+    """Return the factors on the process noise of v_y and yaw rate; the usual ones where others are not worth having."""
 
     def factors(theta: FloatArray) -> tuple[float, float]:
-        vy, rate = (float(f"{math.exp(NOISE_LOG_STD * t):.{DIGITS}g}") for t in theta)
+        scale = np.exp(NOISE_LOG_STD * theta)
+        vy, rate = (float(f"{usual * by:.{DIGITS}g}") for usual, by in zip(SMOOTHING, scale, strict=True))
         return vy, rate
 
     def errors(theta: FloatArray) -> list[DriveError]:
         return smoothed_errors(drives, start, found, factors(theta))
 
+    usual = np.zeros(2)
     (theta, _, cost), _ = descend(
         errors,
         fit_cost,
         scaled_errors,
-        np.log(START) / NOISE_LOG_STD,
+        usual,
         iterations=MAX_ITERATIONS,
         least_gain=least_gain,
         derivative_step=DERIVATIVE_STEP,
         max_step=MAX_STEP,
     )
-    none = np.zeros(2)
-    as_filtered = errors(none)
-    independent = sum(d.seconds for d in as_filtered) / CORRELATION_S
-    gain = 0.5 * (fit_cost(as_filtered, none) - cost) / max(independent, 1.0)
-    return factors(theta) if gain > LEAST_GAIN else (1.0, 1.0)
+    at_first = errors(usual)
+    independent = sum(d.seconds for d in at_first) / CORRELATION_S
+    gain = 0.5 * (fit_cost(at_first, usual) - cost) / max(independent, 1.0)
+    return factors(theta) if gain > LEAST_GAIN else SMOOTHING

@@ -1,0 +1,95 @@
+"""Tune by what the process noise of v_y and yaw rate is multiplied where a car is smoothed, before truth says better.
+
+    python -m studies.defaults.tune_smoothing
+
+Simulated cars with wrong files. Each drive is smoothed with all pairs of factors on two cars: one that calibrated
+itself on that drive, and one that was identified on another drive. Criterion: the geometric mean of the smoothed error
+over that of the filter. Writes results/smoothing.json; the result is entered as SMOOTHING in ``car/parts.py``.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.physics_ukf import of_car
+from pdhef_logtool.estimators.smoothed import SmoothedPhysics, for_smoothing
+from pdhef_logtool.evaluation.metrics import signal_error
+from pdhef_logtool.records.files import write_bytes
+from studies.condition_drives import SIDESLIP
+from studies.identified_bands import DRIVEN, fit_drives, identified
+from studies.pages import options
+from studies.self_calibration import Simulated, calibrate, make_wrong, simulate, taken
+
+SEED, CARS = 79_000, 8
+PAIRS = tuple(product((1.0, 0.7, 0.5, 0.35), (1.0, 2.0, 3.0)))
+RESULT = Path(__file__).parent / "results" / "smoothing.json"
+#: Ratio from which on a drive counts as one that smoothing has made worse.
+WORSE = 1.05
+
+
+def cases(own: list[Simulated]) -> Iterator[tuple[str, Car, Simulated]]:
+    """Yield how the car of some drives was taught, the car, and a drive that it is smoothed on."""
+    for one in own:
+        file = make_wrong(one.file, *one.factors)
+        found = calibrate(one.drive.signals, file)
+        if not found.refused:
+            yield "self-calibrated", taken(one.drive.signals, file, found).calibrated_car, one
+    fits = fit_drives(own)
+    for fit in fits:
+        car = identified(fit)
+        yield from (("identified", car, one) for one in own if one not in fits)
+
+
+def ratios(car: Car, one: Simulated) -> list[float]:
+    """Return the smoothed RMSE over the filter's by pair of factors."""
+    physics = of_car(car)
+
+    def rmse(estimator: Estimator) -> float:
+        track, _ = estimator.run(one.drive.signals, None)
+        assert one.drive.truth is not None
+        error = signal_error(track, one.drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
+        return float(np.sqrt(np.nanmean(error**2)))
+
+    filtered = rmse(AdaptivePhysics(physics))
+    return [rmse(SmoothedPhysics(AdaptivePhysics(for_smoothing(physics, p)))) / filtered for p in PAIRS]
+
+
+def main() -> None:
+    """Try all pairs on all cases, print what comes of each, write the result."""
+    options("defaults.tune_smoothing", __doc__).parse_args()
+    drives = simulate(CARS, SEED, DRIVEN)
+    found: dict[str, list[list[float]]] = {}
+    for car in range(CARS):
+        for taught, of, one in cases([d for d in drives if d.car == car]):
+            found.setdefault(taught, []).append(ratios(of, one))
+    rows = []
+    for i, (vy, rate) in enumerate(PAIRS):
+        means = {taught: float(np.exp(np.mean(np.log(some), axis=0)[i])) for taught, some in found.items()}
+        worse = {f"{taught}_worse": float(np.mean(np.array(some)[:, i] > WORSE)) for taught, some in found.items()}
+        both = float(np.sqrt(np.prod(list(means.values()))))
+        figures = {k: round(v, 4) for k, v in {"both": both, **means, **worse}.items()}
+        rows.append({"vy_factor": vy, "yaw_rate_factor": rate, **figures})
+        print(rows[-1])
+    best = min(rows, key=lambda row: row["both"])
+    print(f"chosen: {best}")
+    document = {
+        "made_by": "python -m studies.defaults.tune_smoothing",
+        "criterion": "geometric mean over drives of the smoothed sideslip RMSE over the filter's, both kinds alike",
+        "seed": SEED,
+        "drives": {taught: len(some) for taught, some in found.items()},
+        "chosen": best,
+        "grid": rows,
+    }
+    write_bytes(RESULT, (json.dumps(document, indent=2) + "\n").encode())
+
+
+if __name__ == "__main__":
+    main()
