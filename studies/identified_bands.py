@@ -22,14 +22,14 @@ from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import run_window
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
-from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
+from pdhef_logtool.evaluation.metrics import NORMAL_95
 from pdhef_logtool.learning.car.fit_data import FitDrive
 from pdhef_logtool.learning.car.physics_fit import fit_physics, varied_vehicles
 from pdhef_logtool.learning.car.smoothing_fit import fit_smoothing
 from pdhef_logtool.records.signals import BoolArray
 from pdhef_logtool.runs.estimating import calibrator
 from pdhef_logtool.self_calibration.calibration import VARIED
-from studies.condition_drives import SIDESLIP
+from studies.condition_drives import root_mean_square
 from studies.many_cars import FIT_ITERATIONS, PARTS
 from studies.pages import DOCS, number, options, table, write
 from studies.self_calibration import Simulated, make_wrong, say, simulate
@@ -89,10 +89,9 @@ def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
     estimator, signals = make_estimator(PHYSICS, car), one.drive.signals
     plain, _ = run_window(estimator, signals, None, None)
     wide = calibrator(car, [estimator]).add(plain, signals)
-    assert one.drive.truth is not None
-    error = signal_error(plain, one.drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
+    error = one.error(plain)
     known = np.isfinite(error) & np.isfinite(plain.sideslip_std_rad)
-    error, rmse = np.abs(error[known]), float(np.sqrt(np.mean(error[known] ** 2)))
+    error, rmse = np.abs(error[known]), root_mean_square(error[known])
 
     def stands(std: np.ndarray) -> tuple[float, float]:
         half = NORMAL_95 * std[known]
@@ -107,9 +106,7 @@ def judged(car: Car, fit: Simulated, one: Simulated) -> Judged:
 
 def _smoothed_rmse(car: Car, one: Simulated, known: BoolArray) -> float:
     track, _ = run_window(make_estimator(SMOOTHED, car), one.drive.signals, None, None)
-    assert one.drive.truth is not None
-    error = signal_error(track, one.drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
-    return float(np.sqrt(np.nanmean(error[known] ** 2)))
+    return root_mean_square(one.error(track)[known])
 
 
 def judge(cars: int, seed: int) -> list[Judged]:

@@ -28,7 +28,8 @@ from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.consistency import d2_rows, driven_d2, driving_products
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, signal_error
 from pdhef_logtool.records.errors import PdhefError, SimulationError
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.runs.config import RunConfig
 from pdhef_logtool.runs.fleet import run_logs
 from pdhef_logtool.runs.guard import FACTOR, SIMPLE
@@ -78,6 +79,11 @@ class Simulated:
     drive: WholeDrive
     file: VehicleParameters
     factors: tuple[float, float]
+
+    def error(self, track: StateTrack) -> FloatArray:
+        """Return the sideslip error [N] of an estimate in rad, NaN where it is not scored."""
+        assert self.drive.truth is not None
+        return signal_error(track, self.drive.truth, SIDESLIP, self.file.low_speed_blend_m_s)
 
 
 def make_wrong(vehicle: VehicleParameters, front: float, rear: float) -> VehicleParameters:

@@ -20,7 +20,7 @@ from pdhef_logtool.estimators.base import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.runs.estimating import calibrator
-from studies.condition_drives import SIDESLIP, as_logged
+from studies.condition_drives import SIDESLIP, as_logged, root_mean_square
 from studies.pages import DOCS, number, options, table, write
 from truthsim.drive import simulate_drive
 
@@ -74,7 +74,7 @@ def roads() -> tuple[dict[str, list[float]], dict[str, list[float]]]:
             track = calibrator(car, [estimator]).add(plain, drive.signals)
             error = signal_error(track, drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
             known = np.isfinite(error)
-            rmse[name].append(float(np.degrees(np.sqrt(np.mean(error[known] ** 2)))))
+            rmse[name].append(float(np.degrees(root_mean_square(error))))
             inside[name].append(float(np.mean(np.abs(error[known]) <= NORMAL_95 * track.sideslip_std_rad[known])))
     return rmse, inside
 

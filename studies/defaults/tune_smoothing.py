@@ -21,9 +21,8 @@ from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
 from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics, for_smoothing
-from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.files import write_bytes
-from studies.condition_drives import SIDESLIP
+from studies.condition_drives import root_mean_square
 from studies.identified_bands import DRIVEN, fit_drives, identified
 from studies.pages import options
 from studies.self_calibration import Simulated, calibrate, make_wrong, simulate, taken
@@ -53,10 +52,7 @@ def ratios(car: Car, one: Simulated) -> list[float]:
     physics = of_car(car)
 
     def rmse(estimator: Estimator) -> float:
-        track, _ = estimator.run(one.drive.signals, None)
-        assert one.drive.truth is not None
-        error = signal_error(track, one.drive.truth, SIDESLIP, car.vehicle.low_speed_blend_m_s)
-        return float(np.sqrt(np.nanmean(error**2)))
+        return root_mean_square(one.error(estimator.run(one.drive.signals, None)[0]))
 
     filtered = rmse(AdaptivePhysics(physics))
     return [rmse(SmoothedPhysics(AdaptivePhysics(for_smoothing(physics, p)))) / filtered for p in PAIRS]

@@ -25,6 +25,7 @@ from pdhef_logtool.car.descent import descend
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters
+from pdhef_logtool.estimators.filter_shell import PosteriorSteps
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD, physics_filter
 from pdhef_logtool.learning.car.axle_forces import (
     PEAK_LOG_STD,
@@ -178,6 +179,13 @@ class DriveError:
     seconds: float
     nis: float
 
+    @classmethod
+    def of(cls, drive: FitDrive, start: VehicleParameters, steps: PosteriorSteps, nis: float) -> DriveError:
+        """Return the errors of a filter's steps on a drive."""
+        error, use, each_s = sampled_errors(drive, start, steps, SETTLE_S)
+        counted = int(np.count_nonzero(use))
+        return cls(error, counted, counted * each_s, nis)
+
     @property
     def rms(self) -> float:
         """RMS of what counts."""
@@ -192,11 +200,9 @@ def drive_errors(
     found = []
     for drive in drives:
         steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
-        error, use, each_s = sampled_errors(drive, start, steps, SETTLE_S)
         known = steps.nis_dof > 0
         nis = float(np.minimum(steps.nis[known], 50.0).sum() / max(steps.nis_dof[known].sum(), 1.0))
-        counted = int(np.count_nonzero(use))
-        found.append(DriveError(error, counted, counted * each_s, max(nis, 1e-3)))
+        found.append(DriveError.of(drive, start, steps, max(nis, 1e-3)))
     return found
 
 

@@ -18,7 +18,6 @@ from pdhef_logtool.car.parts import SMOOTHING
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.physics_ukf import physics_filter
 from pdhef_logtool.estimators.smoothed import BLOCK_S, for_smoothing, smooth_steps
-from pdhef_logtool.learning.car.axle_forces import sampled_errors
 from pdhef_logtool.learning.car.fit_data import FitDrive, signals_of
 from pdhef_logtool.learning.car.physics_fit import (
     CORRELATION_S,
@@ -26,7 +25,6 @@ from pdhef_logtool.learning.car.physics_fit import (
     LEAST_GAIN,
     MAX_STEP,
     NOISE_LOG_STD,
-    SETTLE_S,
     DriveError,
     PhysicsFit,
     fit_cost,
@@ -48,9 +46,7 @@ def smoothed_errors(
         steps, _, links = estimator.linked_steps(signals_of(drive, start, found.vehicle), None)
         stamps = steps.stamps_ns
         x, _ = smooth_steps(steps, links, len(stamps), int(stamps[0]), round(BLOCK_S * 1e9))
-        error, use, each_s = sampled_errors(drive, start, replace(steps, x=x), SETTLE_S)
-        counted = int(np.count_nonzero(use))
-        errors.append(DriveError(error, counted, counted * each_s, 1.0))  # a smoothed state has no innovation
+        errors.append(DriveError.of(drive, start, replace(steps, x=x), 1.0))  # a smoothed state has no innovation
     return errors
 
 
