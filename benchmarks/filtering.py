@@ -89,7 +89,7 @@ def rows() -> list[Row]:
     """Measure."""
     signals = drive(STEPS)
     estimator = PhysicsUkf(default_vehicle(), q_std=PHY_UKF_Q_STD, r_std=R_STD)
-    steps, _ = estimator.filter_steps(signals, None)
+    steps, _ = estimator.run(signals, None)
     theirs = run_filterpy(signals, steps.x[0], PEER_STEPS)
     if not np.allclose(steps.x[:PEER_STEPS], theirs, rtol=1e-4, atol=1e-4):
         worst = np.abs(steps.x[:PEER_STEPS] - theirs).max(axis=0)
@@ -98,9 +98,9 @@ def rows() -> list[Row]:
     whole = PhysicsFilter(default_vehicle().model_copy(update={"physics": parts}), r_std=R_STD)
     seconds = best_seconds(
         {
-            "ours": lambda: estimator.filter_steps(signals, None),
+            "ours": lambda: estimator.run(signals, None),
             "filterpy": lambda: run_filterpy(signals, steps.x[0], PEER_STEPS),
-            "physics": lambda: whole.filter_steps(signals, None),
+            "physics": lambda: whole.run(signals, None),
         }
     )
     ours, peer = 1e6 * seconds["ours"] / STEPS, 1e6 * seconds["filterpy"] / PEER_STEPS

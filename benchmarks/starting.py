@@ -20,6 +20,7 @@ from benchmarks.measuring import CACHE, ROOT, Row, best_seconds
 from pdhef_logtool.car.car import SHIPPED_CARS, Car
 from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.records.signals import FloatArray
 from pdhef_logtool.residual_model.bundle import SHIPPED_FOLDERS, ModelBundle, load_bundle
@@ -87,9 +88,9 @@ def rows() -> list[Row]:
             "all": _start,
             "network": lambda: network.run(features, starts, None),
             "torch": lambda: said_by_torch(bundle, features),
-            "physics": lambda: physics.filter_steps(signals, None),
-            "hybrid": lambda: hybrid.run(signals, None),
-            "bank": lambda: bank.run(signals, None),
+            "physics": lambda: physics.run(signals, None),
+            "hybrid": lambda: run_window(hybrid, signals),
+            "bank": lambda: run_window(bank, signals),
         }
     )
     step = {name: 1e6 * s / STEPS for name, s in seconds.items()}

@@ -21,6 +21,7 @@ from pdhef_logtool.drive import reading
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.drive.reading import Tell
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.evaluation.metrics import ALL, NORMAL_95, MetricRow, score_track, signal_error
 from pdhef_logtool.evaluation.segments import GRIP_SMOOTHING_HZ, NONLINEAR_SHARE, smooth
 from pdhef_logtool.logs.drive_log import DriveLog
@@ -159,7 +160,7 @@ def interval_rows(
 
 def sideslip_error(estimator: Estimator, drive: ConditionDrive, signals: Signals | None = None) -> FloatArray:
     """Run an estimator on signals, None: the drive's; returns its sideslip error [N] in rad, NaN where not scored."""
-    return drive.error(estimator.run(drive.signals if signals is None else signals, None)[0])
+    return drive.error(run_window(estimator, drive.signals if signals is None else signals, None)[0])
 
 
 def root_mean_square(error: FloatArray) -> float:

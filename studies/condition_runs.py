@@ -22,6 +22,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import FILTERS, Options, make_estimator, runnable
 from pdhef_logtool.evaluation.metrics import MetricRow
 from pdhef_logtool.records.documents import digest
@@ -204,7 +205,7 @@ def _score(setup: Setup, task: Task) -> tuple[list[MetricRow], list[str]]:
     rows: list[MetricRow] = []
     for estimator in estimators if task.kind == "score" else ():
         try:
-            track, _ = estimator.run(signals, None)
+            track, _ = run_window(estimator, signals)
             rows += score(intervals.add(track, signals), drive)
         except Exception as error:  # noqa: BLE001 (one estimator's failure on one drive is a result, not an end)
             notes.append(f"{estimator.name} failed on {task.row}/{drive.name}: {type(error).__name__}: {error}")

@@ -25,6 +25,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators import checked_inputs
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.reasons import ReasonIntervals
 from pdhef_logtool.records import reasons
@@ -342,7 +343,7 @@ def filters(car: Car, drives: int) -> list[list[str]]:
                 for choice in CHOICES.values():
                     with patch.object(checked_inputs, "find_faults", partial(changed, choice)):
                         estimator = make_estimator(name, car)
-                        errors = [root_mean_square(d.error(estimator.run(d.signals, None)[0])) for d in read]
+                        errors = [root_mean_square(d.error(run_window(estimator, d.signals)[0])) for d in read]
                     cells.append(number(math.degrees(float(np.median(errors))), 4))
                 lines.append(cells)
     return lines

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.latency_compensation import compensate
 from pdhef_logtool.evaluation.metrics import ALL, MetricRow
 from pdhef_logtool.records.signals import Signals
 from studies.condition_drives import ConditionDrive, bin_masks, rmse_row
@@ -62,7 +63,8 @@ def run_grid(base: AdaptivePhysics, signals: Signals, drive: ConditionDrive) -> 
     rate = base.inputs(signals, None)[0].rate
     masks = {name: m for name, m in bin_masks(drive).items() if name in (ALL, "nonlinear")}
     for setting in GRID:
-        track, _ = at(base, setting).physics.run(signals, None, setting.trust * rate)
+        physics = at(base, setting).physics
+        track, _ = compensate(physics, signals, physics.run(signals, None, setting.trust * rate)[0])
         error = drive.error(track)
         for segment, mask in masks.items():
             yield from rmse_row(drive.name, setting.name, segment, error[mask])

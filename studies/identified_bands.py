@@ -19,7 +19,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS, FittedPhysics, FittedValues
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95

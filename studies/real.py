@@ -33,6 +33,7 @@ from pdhef_logtool.car.parts import Trust
 from pdhef_logtool.drive.reading import WholeDrive, read_drive
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import SPECS, runnable
 from pdhef_logtool.evaluation.bootstrap import block_sums
@@ -254,7 +255,7 @@ def scored(case: Case, label: str, car: Car, names: Sequence[str]) -> list[Row]:
     rows = []
     for e in [*ready, *half_trust(ready)]:
         say(f"{case.name}: {e.name}, {label}")
-        track, _ = e.run(part.signals, None)
+        track, _ = run_window(e, part.signals)
         track = calibrator(car, [e]).add(track, part.signals)
         error = signal_error(track, part.truth, SIDESLIP, case.min_speed_m_s)
         shown = e.name if e.causal else f"{e.name} (not causal)"

@@ -22,7 +22,7 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters
 from pdhef_logtool.drive.reading import WholeDrive
-from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.consistency import d2_rows, driven_d2, driving_products
@@ -141,7 +141,7 @@ def taken(signals: Signals, file: VehicleParameters, found: SelfCalibration) -> 
         return Car.of(file)
     calibrated = WithoutTruth(found.vehicle, found.noise, told_friction=True, note="")
     car = replace(Car.of(file), self_calibrated=calibrated)
-    track, _ = run_window(make_estimator("physics", car), signals, None, None)
+    track, _ = run_window(make_estimator("physics", car), signals)
     low, sensors = file.low_speed_blend_m_s, log_sensors(file, found)
     driven = driven_d2(*driving_products(track, signals, low_speed_m_s=low, sensors=sensors))
     return replace(car, self_calibrated=replace(calibrated, varied=found.varied, driven_d2_m_s=driven))

@@ -23,6 +23,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.records.errors import SimulationError
@@ -75,7 +76,7 @@ def _with_option(physics: PhysicsFilter, name: str, value: bool) -> PhysicsFilte
 
 def run_plain(estimator: Estimator, drive: ConditionDrive) -> StateTrack:
     """Run as it is."""
-    return estimator.run(drive.signals, None)[0]
+    return run_window(estimator, drive.signals)[0]
 
 
 def run_option(name: str, value: bool, estimator: Estimator, drive: ConditionDrive) -> StateTrack:
@@ -86,7 +87,7 @@ def run_option(name: str, value: bool, estimator: Estimator, drive: ConditionDri
 def run_unpredicted(estimator: Estimator, drive: ConditionDrive) -> StateTrack:
     """Run without prediction over the latency: at each stamp stands the newest step whose samples had arrived."""
     signals: Signals = drive.signals
-    track = estimator.run(replace(signals, ready_ns=signals.stamps_ns), None)[0]
+    track = run_window(estimator, replace(signals, ready_ns=signals.stamps_ns), None)[0]
     index = released_steps(signals.ready_ns, signals.stamps_ns)
     newest = np.maximum(index, 0)
     late = {
@@ -104,7 +105,7 @@ def run_late_steering(estimator: Estimator, drive: ConditionDrive) -> StateTrack
     # The samples that arrived in the meantime are used at once: nothing waits for the steering.
     ready = np.minimum(signals.ready_ns, signals.ready_ns - round(LATE_S * 1e9))
     given = replace(signals, steer_rad=late, ready_ns=np.maximum(ready, signals.stamps_ns))
-    return estimator.run(given, None)[0]
+    return run_window(estimator, given)[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pdhef_logtool.car.car import SHIPPED_CARS, Car
-from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.evaluation.metrics import NORMAL_95, signal_error
 from pdhef_logtool.runs.estimating import calibrator

@@ -101,12 +101,12 @@ def _ask(question: str) -> str:
 @options.command(commands)
 def estimators(as_json: options.JsonFlag = False) -> None:
     """List the estimators that run can use."""
-    from pdhef_logtool.estimators.table import SPECS
+    from pdhef_logtool.estimators.table import all_specs
 
     if as_json:
-        console.print_json({"estimators": [{"name": s.name, "description": s.text} for s in SPECS]})
+        console.print_json({"estimators": [{"name": s.name, "description": s.text} for s in all_specs()]})
         return
     table = console.table("name", "what it is")
-    for spec in SPECS:
+    for spec in all_specs():
         table.add_row(spec.name, spec.text)
     console.stdout().print(table)

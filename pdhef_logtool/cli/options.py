@@ -96,6 +96,9 @@ _OPTIONS: dict[str, Any] = {
         Option("--cache-max", metavar="GB", help="What --cache DIR may hold; what was not used for longest goes."),
     ],
     "sensors": Annotated[_Text, Option(help="full, or esp: no wheel speeds in the filters after the start.")],
+    "clock": Annotated[
+        _Text, Option(help="arrival: samples count when they arrived, as in a car; stamp: by their stamps, not causal.")
+    ],
     "friction": Annotated[
         _Text, Option(help="auto (log's, else car's, else estimated), file, estimate, or a number; docs/friction.md")
     ],

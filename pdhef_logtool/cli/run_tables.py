@@ -281,6 +281,7 @@ def _below(report: _Report, told: Container[str], *, tabled: bool) -> Iterable[s
             skipped.setdefault(estimator["reason"], []).append(estimator["name"])
     for reason, names in skipped.items():
         yield f"{', '.join(names)} skipped: {reason}"
+    yield from (f"{e['name']} {e['reason']}" for e in report["estimators"] if e["outcome"] == "failed")
     happened: dict[str, list[str]] = {}
     for estimator in shown:
         for found in (diverged_line(report, estimator["name"]), reasons_line(estimator, report["log"]["start_ns"])):

@@ -13,21 +13,25 @@ Rules
   there is a new sample for it, otherwise a filter would count the same reading several times.
 * Nothing is interpolated or held across a gap of more than ``max_gap_s``; nothing is extrapolated.
 * A sample that came much later than its neighbours is not waited for: it counts as missing.
+* A channel whose samples all arrive too late to wait for, or any with ``clock="stamp"``, is read by its stamps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.errors import MappingError
+from pdhef_logtool.records.release import MAX_PREDICTION_S
 from pdhef_logtool.records.signals import WHEELS, BoolArray, Channel, FloatArray, IntArray, Signals
 
 Method: TypeAlias = Literal["exact", "interpolate", "hold", "next"]
+#: Which time makes a sample known: when it arrived at the recorder, or its own stamp (offline, not causal).
+Clock: TypeAlias = Literal["arrival", "stamp"]
 
 #: Only this much of the log's beginning decides the plan, so that a plan does not depend on how much was read.
 SURVEY_S = 600.0
@@ -65,6 +69,7 @@ class ChannelPlan:
     delay_s : median of arrival − stamp. late_limit_s : a sample this much slower than the fastest one within
         ``LATE_NEIGHBOURHOOD_S`` is not waited for.
     max_gap_s : longest step between samples that is bridged, and longest age of a held sample.
+    clock : ``stamp`` takes each sample as known at its own stamp, however late it arrived.
     """
 
     name: str
@@ -75,6 +80,7 @@ class ChannelPlan:
     delay_s: float
     late_limit_s: float
     max_gap_s: float
+    clock: Clock = "arrival"
 
     @property
     def max_delay_s(self) -> float:
@@ -108,6 +114,11 @@ class AlignmentPlan:
         return frozenset(names | ({"speed_m_s"} if self.speed_from != "none" else set()))
 
     @property
+    def by_stamp(self) -> tuple[ChannelPlan, ...]:
+        """Channels that are read by their stamps: what is estimated from them is not causal."""
+        return tuple(c for c in self.channels if c.clock == "stamp")
+
+    @property
     def lookback_ns(self) -> int:
         """Longest time between a grid stamp and the arrival of a sample used there."""
         return _ns(self._longest_gap_s + self._longest_delay_s)
@@ -130,7 +141,9 @@ class AlignmentPlan:
         return {**jsonable(self), "unused": dict(self.unused)}
 
 
-def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float) -> AlignmentPlan:
+def plan_alignment(
+    channels: Mapping[str, Channel], *, steering_ratio: float, wheel_radius_m: float, clock: Clock = "arrival"
+) -> AlignmentPlan:
     """Decide clock, method, gaps and lateness of every channel from the first ``SURVEY_S`` seconds.
 
     The grid channel is the first of yaw rate, a_y, a_x whose rate is within a factor 2 of the fastest of them.
@@ -139,6 +152,8 @@ def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wh
     ----------
     channels : every mapped signal by name, even if it has no sample in the survey.
     steering_ratio : steering-wheel angle over road-wheel angle. wheel_radius_m : m.
+    clock : ``stamp`` reads all channels by their stamps; ``arrival`` only those that arrive more than
+        ``MAX_PREDICTION_S`` late, which no estimate could wait for.
 
     Raises
     ------
@@ -151,7 +166,7 @@ def plan_alignment(channels: Mapping[str, Channel], *, steering_ratio: float, wh
     assert grid_period is not None
     chosen, unused = _choose_sources(survey, steering_ratio, wheel_radius_m)
     plans = tuple(
-        _plan_channel(survey[name], target, scale, survey[grid], grid_period)
+        _plan_channel(survey[name], target, scale, survey[grid], grid_period, clock)
         for name, (target, scale) in sorted(chosen.items())
     )
     if "speed_m_s" in chosen:
@@ -328,7 +343,9 @@ def _has_whole_axle(columns: set[str]) -> bool:
     return any({f"wheel_speed_{side}_m_s" for side in axle} <= columns for axle in (("fl", "fr"), ("rl", "rr")))
 
 
-def _plan_channel(channel: Channel, target: str, scale: float, grid: Channel, grid_period_s: float) -> ChannelPlan:
+def _plan_channel(  # positional: one call
+    channel: Channel, target: str, scale: float, grid: Channel, grid_period_s: float, clock: Clock
+) -> ChannelPlan:
     period = _median_period_s(channel)
     is_input = channel.name in _INPUTS
     method: Method
@@ -349,6 +366,7 @@ def _plan_channel(channel: Channel, target: str, scale: float, grid: Channel, gr
         delay_s=delay_s,
         late_limit_s=late_limit_s,
         max_gap_s=_max_gap_s(period),
+        clock="stamp" if delay_s > MAX_PREDICTION_S else clock,
     )
 
 
@@ -391,6 +409,8 @@ def _fastest_nearby(stamps_ns: IntArray, delay_ns: IntArray) -> IntArray:
 
 
 def _is_late(channel: Channel, p: ChannelPlan) -> BoolArray:
+    if p.clock == "stamp":
+        return np.zeros(len(channel), dtype=np.bool_)
     delay = channel.arrival_ns - channel.stamps_ns
     limit = _ns(p.late_limit_s)
     late = delay > _ns(p.max_delay_s)
@@ -400,6 +420,8 @@ def _is_late(channel: Channel, p: ChannelPlan) -> BoolArray:
 
 
 def _without_late(channel: Channel, p: ChannelPlan) -> Channel:
+    if p.clock == "stamp":
+        return replace(channel, arrival_ns=channel.stamps_ns)
     late = _is_late(channel, p)
     return channel.take(~late) if late.any() else channel
 

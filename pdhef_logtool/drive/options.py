@@ -28,6 +28,7 @@ class ReadOptions:
     friction : of :func:`~pdhef_logtool.drive.friction.parse_friction`; None leaves what the log says, if anything.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
+    clock : ``arrival`` takes samples as known when they arrived, as in a car; ``stamp`` by their stamps (not causal).
     budget : factor on what reading a log may cost.
     waived : names of checks that do not count.
     msgs : folder with definitions of message types that a log does not define.
@@ -41,6 +42,7 @@ class ReadOptions:
     friction: str | float | None = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: float = WINDOW_S
+    clock: Literal["arrival", "stamp"] = "arrival"
     budget: float = 1.0
     waived: tuple[str, ...] = ()
     msgs: Path | None = None

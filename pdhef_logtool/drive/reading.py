@@ -23,6 +23,7 @@ from pdhef_logtool.mapping import ChosenMapping, Mapping, check_mapping, choose_
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
+from pdhef_logtool.records.release import MAX_PREDICTION_S
 from pdhef_logtool.records.signals import Loss, Signals, join_signals
 from pdhef_logtool.records.tracks import StateTrack, concatenate
 
@@ -116,6 +117,14 @@ class Drive:
     def available(self) -> frozenset[str]:
         """Aligned signals that the log provides."""
         return self.plan.alignment.available
+
+    @property
+    def not_causal(self) -> str:
+        """Why no estimate of this drive is causal, whatever the estimator; empty if an estimator decides it."""
+        if not (late := self.plan.alignment.by_stamp):
+            return ""
+        names = "all signals" if self.options.clock == "stamp" else ", ".join(c.name for c in late)
+        return f"not causal: {names} read by stamp, not by arrival"
 
     @property
     def checks(self) -> tuple[Check, ...]:
@@ -292,7 +301,7 @@ def read_drive(
         if not isinstance(log_input.path, Path):
             opened = _reopened(opened, used, slice_ns, options)
             slice_ns = time_slice(options, opened.start_ns, opened.end_ns)
-        plan = plan_drive(opened, used, car.vehicle, *slice_ns, require_imu=require_sensors)
+        plan = plan_drive(opened, used, car.vehicle, *slice_ns, require_imu=require_sensors, clock=options.clock)
         for note in plan.mapping.notes[len(used.notes) :]:
             told(note)
         _tell_doubts(plan, options, told)
@@ -357,6 +366,13 @@ def _tell_doubts(plan: DrivePlan, options: ReadOptions, tell: Tell) -> None:
             tell(f"check {check.name} failed{' (waived)' if check.waived else ''}: {check.evidence}; {check.remedy}")
     for name in sorted(set(options.waived) - {c.name for c in plan.checks}):
         tell(f"--waive {name}: no check of this log is called that")
+    if options.clock == "arrival":
+        for channel in plan.alignment.by_stamp:
+            source = plan.mapping.signals[channel.name].label
+            tell(
+                f"{channel.name} ({source}) arrives {channel.delay_s:.2f} s after its stamps, expected at most "
+                f"{MAX_PREDICTION_S:g} s: it is read by its stamps, and no estimate of this log is causal"
+            )
     for name, reason in plan.alignment.unused:
         tell(f"{name} is not used: {reason}")
 

@@ -13,6 +13,7 @@ from pdhef_logtool.car.vehicle import VehicleParameters, correct_signals
 from pdhef_logtool.drive.alignment import (
     SURVEY_S,
     AlignmentPlan,
+    Clock,
     align,
     count_late,
     has_imu,
@@ -120,12 +121,14 @@ def plan_drive(
     end_ns: int,
     *,
     require_imu: bool = True,
+    clock: Clock = "arrival",
 ) -> DrivePlan:
     """Read at most ten minutes of the slice [start_ns, end_ns) and decide clocks, alignment and truth.
 
     Parameters
     ----------
     require_imu : False gives a plan with no alignment (``alignment.channels`` empty) where there is no IMU.
+    clock : as for :func:`~.alignment.plan_alignment`.
 
     Raises
     ------
@@ -138,7 +141,10 @@ def plan_drive(
     mapping, survey = looked_at.mapping, looked_at.channels
     if require_imu or has_imu(survey.signals):
         alignment = plan_alignment(
-            survey.signals, steering_ratio=vehicle.steering_ratio, wheel_radius_m=vehicle.wheel_radius_m
+            survey.signals,
+            steering_ratio=vehicle.steering_ratio,
+            wheel_radius_m=vehicle.wheel_radius_m,
+            clock=clock,
         )
     else:
         alignment = no_alignment(survey.signals)

@@ -33,7 +33,7 @@ from pdhef_logtool.estimators.filter_shell import VX, PosteriorSteps, sideslip_s
 from pdhef_logtool.estimators.physics import FilterCarry
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, release, step_durations_s
+from pdhef_logtool.records.release import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import ESTIMATED_COLUMNS, StateTrack
 from pdhef_logtool.residual_model.service import NetworkService
@@ -54,22 +54,27 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MixtureSteps(StepColumns):
-    """By step on measurement time, [K]: when it arrived, weights [K, H], factor on R, and the detector's bit mask."""
+    """Steps of all filters [H], and by step, [K]: weights [K, H], factor on R, and the detector's bit mask."""
 
-    ready_ns: IntArray
+    filters: tuple[PosteriorSteps, ...]
     weights: FloatArray
     r_scale: FloatArray
     reason: IntArray
 
+    @property
+    def valid(self) -> BoolArray:
+        """Whether a filter with weight has an estimate, [K]."""
+        used = np.stack([steps.valid for steps in self.filters], axis=1) & (self.weights > 0.0)
+        return np.asarray(used.any(axis=1), dtype=np.bool_)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdaptiveCarry:
-    """What the inputs, the filters [H] and their evidence take from window to window."""
+    """State of the inputs, the filters [H] and their evidence between windows."""
 
     inputs: InputCarry
     filters: tuple[FilterCarry, ...]
     evidence: FloatArray
-    waiting: MixtureSteps
 
 
 @njit(cache=True)
@@ -102,7 +107,7 @@ def gather_evidence(
     return out, evidence
 
 
-def weigh(evidence: FloatArray, usable: FloatArray) -> FloatArray:
+def weigh(evidence: FloatArray, usable: BoolArray) -> FloatArray:
     """Return weights [K, H] that go with exp(evidence), 0 where ``usable`` [K, H] is not; a row of zeros for none."""
     weights = np.empty_like(evidence)
     _weigh(evidence, usable, weights)
@@ -250,39 +255,34 @@ class AdaptivePhysics:
         rate, after = residual_rate(self.physics, self.network, signals, carry)
         return CheckedInputs(no_faults(signals), rate), after
 
-    def run(self, signals: Signals, carry: AdaptiveCarry | None) -> tuple[StateTrack, AdaptiveCarry]:
+    def run(self, signals: Signals, carry: AdaptiveCarry | None) -> tuple[MixtureSteps, AdaptiveCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         c = carry
         checked, inputs = self.inputs(signals, c.inputs if c else None)
         faults, rate = checked.faults, self.trust * checked.rate
         filters = self.filters
         before: Sequence[FilterCarry | None] = c.filters if c else [None] * len(filters)
-        runs = [
-            f.predicted_steps(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)
-        ]
-        steps_of = [steps for steps, _, _ in runs]
-        gathered, evidence = gather_evidence(steps_of, c.filters if c else None, c.evidence if c else None)
-        weights = weigh(gathered, np.stack([steps.valid for steps in steps_of], axis=1))
-        tracks, after = [], []
-        for h, (one, b, (steps, moved, predicted)) in enumerate(zip(filters, before, runs, strict=True)):
-            taken = replace(steps, valid=steps.valid & (weights[:, h] > 0.0))  # what the mixture takes
-            track, on = one.outputs(signals, b, taken, moved, predicted)
-            tracks.append(track)
-            after.append(on)
+        runs = [f.run(faults.filtered, b, rate, faults.extra_r) for f, b in zip(filters, before, strict=True)]
+        steps = tuple(one for one, _ in runs)
+        gathered, evidence = gather_evidence(steps, c.filters if c else None, c.evidence if c else None)
+        weights = weigh(gathered, np.stack([one.valid for one in steps], axis=1))
         raised = r_scale(faults.extra_r, self.physics.measurement_std)
-        mixture = MixtureSteps(signals.ready_ns, weights, raised, faults.reason)
-        if c is not None:
-            mixture = c.waiting.joined(mixture)
-        released = release(mixture.ready_ns, signals.stamps_ns)
-        at = released.at
-        track = mix(mixture.weights[at], tracks) if len(tracks) > 1 else tracks[0]
-        told: dict[str, Any] = {"network_trust": np.where(track.valid, self.trust, np.nan)}
+        after = AdaptiveCarry(inputs, tuple(state for _, state in runs), evidence)
+        return MixtureSteps(steps, weights, raised, faults.reason), after
+
+    def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate each filter's steps and mix them (see :class:`~.base.ModelPredictor`)."""
+        at, tracks = ahead.step, []
+        for h, (one, of_one) in enumerate(zip(self.filters, steps.filters, strict=True)):
+            weighed = of_one.valid[at] & (steps.weights[at, h] > 0.0)
+            tracks.append(one.predict(of_one, replace(ahead, usable=ahead.usable & weighed), stamps_ns))
+        track = mix(steps.weights[at], tracks) if len(tracks) > 1 else tracks[0]
+        columns: dict[str, Any] = {"network_trust": np.where(track.valid, self.trust, np.nan)}
         if self.adaptive:
-            told["r_scale"] = np.where(track.valid, mixture.r_scale[at], 1.0)
-            told["mixture_weight"] = np.where(track.valid, 1.0 - mixture.weights[at, 0], np.nan)
-            told["reason"] = np.where(released.arrived, mixture.reason[at], 0)
-        track = replace(track, name=self.name, **told)
-        return track, AdaptiveCarry(inputs, tuple(after), evidence, mixture.since(released.needed))
+            columns["r_scale"] = np.where(track.valid, steps.r_scale[at], 1.0)
+            columns["mixture_weight"] = np.where(track.valid, 1.0 - steps.weights[at, 0], np.nan)
+            columns["reason"] = np.where(ahead.arrived, steps.reason[at], 0)
+        return replace(track, name=self.name, **columns)
 
 
 def build(name: str, car: Car, options: Options) -> AdaptivePhysics:

@@ -14,7 +14,7 @@ from pdhef_logtool.residual_model.service import NetworkService
 
 #: Fields of an estimator that are no option: what it is called and told of it, what its signals come back from, and
 #: what it shares with others.
-_TOLD = {"name", "causal", "notes", "read_with", "calibration", "reason", "compared"}
+_TOLD = {"name", "causal", "notes", "read_with", "calibration", "reason"}
 _NOISE = {"q_std", "r_std"}
 
 

@@ -1,15 +1,70 @@
-"""What an estimator is, and the release of its output at the scored stamps."""
+"""The interface of estimators: steps on measurement time, from which the harness makes what is scored.
+
+An estimator turns the signals of a window into one step per sample, each from that sample and the ones before it, and
+never sees a scored stamp. :mod:`~.latency_compensation` decides for all estimators which step had arrived by a scored
+stamp, and how far it is extrapolated.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
-from pdhef_logtool.records.signals import Signals
-from pdhef_logtool.records.tracks import StateTrack
+import numpy as np
+
+from pdhef_logtool.records.release import Extrapolation, StepColumns
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack, make_track
+
+# Entries of a step's values and of their time derivatives.
+VX, VY, YAW_RATE, AY = 0, 1, 2, 3
+
+
+class StepRecord(Protocol):
+    """What an estimator returns: one row per sample of the window."""
+
+    @property
+    def valid(self) -> BoolArray:
+        """Whether the row is an estimate, [K]."""
+        ...
+
+    def joined(self, other: Any) -> Any:
+        """Append the steps of the next window."""
+        ...
+
+    def since(self, index: int) -> Any:
+        """Keep the steps from ``index`` on."""
+        ...
+
+    def until(self, index: int) -> Any:
+        """Keep the steps before ``index``."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Steps(StepColumns):
+    """Estimates on measurement time, [K]: the state after all samples of the stamp were used.
+
+    ``values`` [K, 4] over [v_x, v_y, r, a_y], NaN where unknown; ``rates`` [K, 4] their time derivatives, which the
+    latency compensation holds; ``valid`` [K].
+    """
+
+    values: FloatArray
+    rates: FloatArray
+    valid: BoolArray
+
+
+def make_steps(
+    vx_m_s: FloatArray, vy_m_s: FloatArray, yaw_rate_rad_s: FloatArray, ay_m_s2: FloatArray | None = None
+) -> Steps:
+    """Return steps of quantities [K] without rates, NaN where unknown; valid where v_x and yaw rate are known."""
+    ay = np.full(len(vx_m_s), np.nan) if ay_m_s2 is None else ay_m_s2
+    values = np.stack([vx_m_s, vy_m_s, yaw_rate_rad_s, ay], axis=1)
+    return Steps(values, np.zeros_like(values), np.isfinite(vx_m_s) & np.isfinite(yaw_rate_rad_s))
 
 
 class Estimator(Protocol):
-    """Turns aligned signals into estimates; immutable, so that its only memory is the carry."""
+    """Turns aligned signals into steps; immutable, so that its only memory is the state that it returns."""
 
     @property
     def name(self) -> str:
@@ -18,21 +73,32 @@ class Estimator(Protocol):
 
     @property
     def causal(self) -> bool:
-        """Whether an estimate at t uses only what had arrived by t."""
+        """Whether each step uses only its own sample and those before it; checked in every run."""
         ...
 
-    def run(self, signals: Signals, carry: Any | None) -> tuple[StateTrack, Any]:
+    def run(self, signals: Signals, state: Any | None) -> tuple[Any, Any]:
         """Process one window.
 
         Parameters
         ----------
-        signals : the window. carry : what the previous window's call returned, None at the start of a log.
+        signals : the window. state : what the call for the previous window returned, None at the start of a log.
 
         Returns
         -------
-        track : estimates at ``signals.stamps_ns``. carry : for the next window. Joining the tracks of consecutive
-            windows gives the same bits as one call over the whole log.
+        steps : one row per stamp of ``signals``: :class:`Steps`, or a record of its own where the estimator is a
+            :class:`ModelPredictor`. Joining the steps of consecutive windows gives the same bits as one call over the
+            whole log.
+        state : for the next window.
         """
+        ...
+
+
+@runtime_checkable
+class ModelPredictor(Protocol):
+    """An estimator that extrapolates its steps with its own model; others are extrapolated by :func:`linear_track`."""
+
+    def predict(self, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Return the track at the scored stamps [M]; rows that are not ``usable`` are not valid."""
         ...
 
 
@@ -45,7 +111,7 @@ class LookingAhead(Protocol):
         """How much of what follows a window it must be given for its result not to depend on the windows."""
         ...
 
-    def run(self, signals: Signals, carry: Any | None, ahead: Signals | None = None) -> tuple[StateTrack, Any]:
+    def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[Any, Any]:
         """Process one window as :meth:`Estimator.run`; ``ahead`` is what follows, and the next window begins with it.
 
         Without it the log ends with the window for all that the estimator knows.
@@ -58,13 +124,33 @@ def look_ahead_of(estimator: Estimator) -> float:
     return estimator.look_ahead_s if isinstance(estimator, LookingAhead) else 0.0
 
 
-def run_window(
-    estimator: Estimator, signals: Signals, carry: Any | None, ahead: Signals | None
-) -> tuple[StateTrack, Any]:
-    """Process one window; only an estimator that is not causal gets what follows."""
+def run_steps(estimator: Estimator, signals: Signals, state: Any | None, ahead: Signals | None) -> tuple[Any, Any]:
+    """Run one window; only an estimator that looks ahead gets what follows."""
     if isinstance(estimator, LookingAhead):
-        return estimator.run(signals, carry, ahead)
-    return estimator.run(signals, carry)
+        return estimator.run(signals, state, ahead)
+    return estimator.run(signals, state)
+
+
+def predict_track(estimator: Estimator, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+    """Extrapolate steps to the scored stamps [M], by the estimator's model if it has one."""
+    if isinstance(estimator, ModelPredictor):
+        return estimator.predict(steps, ahead, stamps_ns)
+    return linear_track(estimator.name, steps, ahead, stamps_ns)
+
+
+def linear_track(name: str, steps: Steps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+    """Extrapolate steps to first order, with their rates held."""
+    out = steps.values[ahead.step] + steps.rates[ahead.step] * ahead.horizon_s[:, None]
+    out[~ahead.usable] = np.nan
+    return make_track(
+        name,
+        stamps_ns,
+        vx_m_s=out[:, VX].copy(),
+        vy_m_s=out[:, VY].copy(),
+        yaw_rate_rad_s=out[:, YAW_RATE].copy(),
+        ay_m_s2=out[:, AY].copy(),
+        valid=ahead.usable,
+    )
 
 
 def notes_of(estimator: Estimator) -> tuple[str, ...]:

@@ -13,11 +13,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
+from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry
-from pdhef_logtool.estimators.stepwise import AY, VX, VY, YAW_RATE, StepCarry, run_stepwise
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
 
@@ -28,39 +27,30 @@ if TYPE_CHECKING:
 _VX, _AX, _AY, _RATE = (FEATURES.index(n) for n in ("vx_m_s", "ax_m_s2", "ay_m_s2", "yaw_rate_rad_s"))
 
 
-def write_direct_steps(
-    vehicle: VehicleParameters,
-    features: FloatArray,
-    vy_m_s: FloatArray,
-    known: BoolArray,
-    values: FloatArray,
-    rates: FloatArray,
-    valid: BoolArray,
-) -> None:
-    """Write the steps of an estimator that says v_y alone; the rest is as the features have it.
+def direct_steps(vehicle: VehicleParameters, features: FloatArray, vy_m_s: FloatArray, known: BoolArray) -> Steps:
+    """Return the steps of an estimator whose only own output is v_y; the other quantities are the features'.
 
     Parameters
     ----------
     vehicle : its roll gradient gives the planar a_y.
-    features : [K, f] as of :func:`~.parallel_physics.run_features`. vy_m_s : [K]. known : [K], where both hold.
-    values, rates, valid : [K, 4], [K, 4], [K] as of :mod:`~.stepwise`, written in place.
+    features : [K, f] of :func:`~.parallel_physics.run_features`. vy_m_s : [K]. known : [K], where both are known.
     """
+    values, rates = np.full((len(features), 4), np.nan), np.zeros((len(features), 4))
     vx, yaw_rate, vy = features[known, _VX], features[known, _RATE], vy_m_s[known]
     ay = features[known, _AY] / (1.0 + GRAVITY_M_S2 * vehicle.roll_gradient_rad_per_m_s2)
     values[known, VX], values[known, VY] = vx, vy
     values[known, YAW_RATE], values[known, AY] = yaw_rate, ay
     rates[known, VX] = features[known, _AX] + vy * yaw_rate
     rates[known, VY] = ay - vx * yaw_rate
-    valid[:] = known
+    return Steps(values, rates, known)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DirectCarry:
-    """What the parallel filter, the network and the release of outputs take from window to window."""
+    """State of the parallel filter and the network between windows."""
 
     physics: FilterCarry
     network: NetworkCarry
-    steps: StepCarry
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +69,7 @@ class DirectNetwork:
         """Say which file ran: run.json has the residual network's hash alone."""
         return (f"network {self.network.bundle.sha256}",)
 
-    def run(self, signals: Signals, carry: DirectCarry | None) -> tuple[StateTrack, DirectCarry]:
+    def run(self, signals: Signals, carry: DirectCarry | None) -> tuple[Steps, DirectCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
             parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
@@ -89,14 +79,7 @@ class DirectNetwork:
         starts = ~np.isfinite(physics.prior[:, 0])
         output, network = self.network.run(features, starts, carry.network if carry else None)
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
-
-        def step(
-            _dt: FloatArray, _s: Signals, _state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
-        ) -> None:
-            write_direct_steps(self.vehicle, features, output[:, 0], known, values, rates, valid)
-
-        track, steps = run_stepwise(self.name, signals, carry.steps if carry else None, 0, step)
-        return track, DirectCarry(after, network, steps)
+        return direct_steps(self.vehicle, features, output[:, 0], known), DirectCarry(after, network)
 
 
 def build(name: str, car: Car, options: Options) -> DirectNetwork:

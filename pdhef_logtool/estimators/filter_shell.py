@@ -1,6 +1,7 @@
 """What the unscented filters do alike at a step, whatever their state and model: one shell about the state.
 
-Restart behind a gap, inputs held where they miss, start, gate, standstill, divergence and release are here. The first
+Reset after a time gap, zero-order hold of missing inputs, start, gate, standstill, divergence and the track of
+predicted steps are here. The first
 entries of every state are [v_x, v_y, r, b_ax]; any number of others follow, and :class:`Tuning` says of each how it
 walks, starts and stands still. A filter's own file says how sigma points move and what sensors read there. Its loop is
 
@@ -16,10 +17,10 @@ targets are made the same way.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Generic, NamedTuple, Self, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,10 +29,9 @@ from pdhef_logtool.estimators.unscented import unscented_weights
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import (
     RESTART_GAP_S,
-    Release,
+    Extrapolation,
     StepColumns,
     last_stamp_ns,
-    predictable,
     step_durations_s,
 )
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
@@ -450,30 +450,14 @@ def finish_step(k, now, residual_rate, rules, memory, inputs):  # type: ignore[n
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StepOutline(StepColumns):
-    """What an output takes of posterior steps beside what is predicted from them."""
-
-    stamps_ns: IntArray
-    ready_ns: IntArray
-    inputs: FloatArray
-    nis: FloatArray
-    nis_dof: FloatArray
-    valid: BoolArray
-    diverged: BoolArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSteps(StepColumns):
     """Filter posteriors on measurement time: [K] each, state [K, n], covariance [K, n, n], inputs [K, 5].
-
-    Where nobody asks for more, the covariance is that of the last steps only, [≤K, n, n].
 
     ``prior`` [K, n] is the state before the update, NaN where the filter starts. ``residual_rate``
     [K, 2] is what is added to v̇_y and ṙ from the step on; 0 in the pure physics filter.
     """
 
     stamps_ns: IntArray
-    ready_ns: IntArray
     x: FloatArray
     P: FloatArray
     inputs: FloatArray
@@ -486,35 +470,19 @@ class PosteriorSteps(StepColumns):
     prior: FloatArray
     residual_rate: FloatArray
 
-    @property
-    def outline(self) -> StepOutline:
-        """What an output takes of them."""
-        return StepOutline(**{f.name: getattr(self, f.name) for f in fields(StepOutline)})
-
-    def _cut(self, part: slice) -> Self:
-        forgotten = len(self.x) - len(self.P)
-        start, stop, _ = part.indices(len(self.x))
-        columns = {f.name: getattr(self, f.name)[part] for f in fields(self)}
-        columns["P"] = self.P[max(start - forgotten, 0) : max(stop - forgotten, 0)]
-        return type(self)(**columns)
-
-
-Steps = TypeVar("Steps", bound=PosteriorSteps)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ShellCarry(Generic[Steps]):
-    """What a filter takes from window to window, and the steps that no output has used yet."""
+class ShellCarry:
+    """State that a filter passes from window to window."""
 
     belief: Belief
     last_stamp_ns: int | None
-    steps: Steps
     slip: SlipCarry | None
 
 
 def make_window(
     signals: Signals,
-    carry: ShellCarry[Any] | None,
+    carry: ShellCarry | None,
     residual_rate: FloatArray | None = None,
     extra_r: FloatArray | None = None,
 ) -> Window:
@@ -563,18 +531,18 @@ def make_tuning(
     )
 
 
-def resume(carry: ShellCarry[Any] | None, n: int, memory_size: int = MEMORY) -> Belief:
+def resume(carry: ShellCarry | None, n: int, memory_size: int = MEMORY) -> Belief:
     """Return the belief that a window starts with, which the kernel then moves."""
     if carry is None:
         return Belief(np.zeros(n), np.eye(n), np.zeros(memory_size))
     return Belief(*(part.copy() for part in carry.belief))
 
 
-def no_posterior(count: int, n: int, kept: int | None = None) -> Posterior:
-    """Return what a kernel writes to: ``count`` steps without an estimate, with room for ``kept`` covariances."""
+def no_posterior(count: int, n: int) -> Posterior:
+    """Return the arrays that a kernel writes ``count`` steps of ``n`` states to, with no estimate in them."""
     return Posterior(
         x=np.empty((count, n)),
-        P=np.empty((count if kept is None else kept, n, n)),
+        P=np.empty((count, n, n)),
         inputs=np.empty((count, INPUTS)),
         nis=np.full(count, np.nan),
         nis_dof=np.zeros(count),
@@ -591,32 +559,31 @@ def no_prediction(count: int, n: int) -> Predicted:
     return Predicted(*(np.full((count, *shape), np.nan) for shape in ((n,), (MOTION, MOTION), ())))
 
 
-def carry_on(
-    belief: Belief, steps: Steps, carry: ShellCarry[Steps] | None, slip: SlipCarry | None
-) -> ShellCarry[Steps]:
-    """Return the carry behind a window's steps, with none of them in it."""
-    last = last_stamp_ns(steps.stamps_ns, carry.last_stamp_ns if carry else None)
-    return ShellCarry(belief, last, steps.since(len(steps.stamps_ns)), slip)
+def carry_on(belief: Belief, stamps_ns: IntArray, carry: ShellCarry | None, slip: SlipCarry | None) -> ShellCarry:
+    """Return the state after a window with these stamps."""
+    return ShellCarry(belief, last_stamp_ns(stamps_ns, carry.last_stamp_ns if carry else None), slip)
 
 
-def released_track(
+def due(ahead: Extrapolation) -> Due:
+    """Return what a kernel is to predict."""
+    return Due(np.where(ahead.usable, ahead.step, -1), ahead.horizon_s)
+
+
+def predicted_track(
     name: str,
     stamps_ns: IntArray,
-    steps: StepOutline,
-    predict: Callable[[Due], Predicted],
+    steps: PosteriorSteps,
+    ahead: Extrapolation,
+    predicted: Predicted,
     named: Mapping[str, int] = MappingProxyType({}),
-) -> tuple[StateTrack, Release]:
-    """Predict to each scored stamp the newest step that had arrived by then.
+) -> StateTrack:
+    """Return the track of predicted states at the scored stamps [M].
 
-    ``predict`` returns what becomes of the steps in the time ahead, with their inputs held. ``named`` are the entries
-    of the state that have a column of the track.
+    ``named`` gives the entries of the state that have a column in the track.
     """
-    released, horizon_s, usable = predictable(steps.stamps_ns, steps.ready_ns, steps.valid, stamps_ns)
-    at, count = released.at, len(stamps_ns)
-    predicted = predict(Due(np.where(usable, at, -1), horizon_s))
-    x, covariance = predicted.x, predicted.P
-    usable &= np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[at, U_SPEED])
-    track = make_track(
+    at, x, covariance = ahead.step, predicted.x, predicted.P
+    usable = ahead.usable & np.isfinite(x[:, VX]) & rolls_forward(x[:, VX], steps.inputs[at, U_SPEED])
+    return make_track(
         name,
         stamps_ns,
         vx_m_s=x[:, VX].copy(),
@@ -625,7 +592,7 @@ def released_track(
         ay_m_s2=predicted.ay,
         covariance=covariance,
         sideslip_std_rad=sideslip_std(x[:, VX], x[:, VY], covariance),
-        r_scale=np.ones(count),
+        r_scale=np.ones(len(stamps_ns)),
         nis=np.where(usable, steps.nis[at], np.nan),
         nis_dof=np.where(usable, steps.nis_dof[at], 0.0),
         friction=np.where(usable, steps.inputs[at, U_FRICTION], np.nan),
@@ -633,7 +600,6 @@ def released_track(
         diverged=usable & steps.diverged[at],
         **{column: np.where(usable, x[:, i], np.nan) for column, i in named.items()},
     )
-    return track, released
 
 
 def rolls_forward(vx_m_s: FloatArray, last_speed_m_s: FloatArray) -> BoolArray:

@@ -255,7 +255,7 @@ class FrictionBank:
     def run(self, signals: Signals, carry: FrictionCarry | None) -> tuple[FrictionEstimate, FrictionCarry]:
         """Estimate over one window; windows join bit for bit. ``signals.friction`` is not looked at."""
         signals = without_impossible(signals)
-        steps, speed_carry = self._speed_filter.filter_steps(
+        steps, speed_carry = self._speed_filter.run(
             _without_friction(signals), None if carry is None else carry.speed_filter
         )
         parameters = model_parameters(self.vehicle, roll_correction=True)

@@ -49,7 +49,8 @@ from pdhef_logtool.estimators.unscented import (
     mean_and_covariance,
 )
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
+from pdhef_logtool.records.release import Extrapolation
+from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.residual_model.features import PAPER_FEATURES
 from pdhef_logtool.residual_model.service import NetworkCarry, NetworkService
@@ -87,7 +88,7 @@ class PaperCarry:
 
     physics: FilterCarry
     network: NetworkCarry
-    own: shell.ShellCarry[PaperSteps]
+    own: shell.ShellCarry
 
 
 class Parallel(NamedTuple):
@@ -309,7 +310,7 @@ class PaperHybridUkf:
         r_std = np.sqrt(self.measurement_variance)
         return shell.make_tuning(self.vehicle, self.q_std, r_std, shell.INITIAL_STD, use_speed=self.use_speed)
 
-    def run(self, signals: Signals, carry: PaperCarry | None) -> tuple[StateTrack, PaperCarry]:
+    def run(self, signals: Signals, carry: PaperCarry | None) -> tuple[PaperSteps, PaperCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
             parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
@@ -319,31 +320,28 @@ class PaperHybridUkf:
         starts = ~np.isfinite(physics.prior[:, shell.VX])
         rate, network = self.network.run(features, starts, carry.network if carry else None)
         steps, own = self._filter_steps(signals, physics, rate, carry.own if carry else None)
-        if carry is not None:
-            steps = carry.own.steps.joined(steps)
+        return steps, PaperCarry(after, network, own)
+
+    def predict(self, steps: PaperSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate steps with the nominal model and the residual held (see :class:`~.base.ModelPredictor`)."""
         held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
-
-        def predict(due: shell.Due) -> shell.Predicted:
-            predicted = shell.no_prediction(len(due.step), steps.x.shape[1])
-            _predict_outputs(due, held, steps.trust, self._tuning, self._parameters, predicted)
-            return predicted
-
-        track, released = shell.released_track(self.name, signals.stamps_ns, steps.outline, predict)
-        track = replace(
+        predicted = shell.no_prediction(len(stamps_ns), steps.x.shape[1])
+        _predict_outputs(shell.due(ahead), held, steps.trust, self._tuning, self._parameters, predicted)
+        track = shell.predicted_track(self.name, stamps_ns, steps, ahead, predicted)
+        return replace(
             track,
-            network_trust=np.where(track.valid, steps.trust[released.at], np.nan),
-            r_scale=np.where(track.valid, steps.r_scale[released.at], np.nan),
+            network_trust=np.where(track.valid, steps.trust[ahead.step], np.nan),
+            r_scale=np.where(track.valid, steps.r_scale[ahead.step], np.nan),
         )
-        return track, PaperCarry(after, network, replace(own, steps=steps.since(released.needed)))
 
     def _filter_steps(
         self,
         signals: Signals,
         physics: shell.PosteriorSteps,
         rate: FloatArray,
-        carry: shell.ShellCarry[PaperSteps] | None,
-    ) -> tuple[PaperSteps, shell.ShellCarry[PaperSteps]]:
-        """Filter on measurement time; the steps, and the carry with none of them in it."""
+        carry: shell.ShellCarry | None,
+    ) -> tuple[PaperSteps, shell.ShellCarry]:
+        """Filter one window; return its steps, and the state for the next one."""
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
         belief, count = shell.resume(carry, shell.STATES, MEMORY), len(signals)
@@ -354,8 +352,8 @@ class PaperHybridUkf:
         )
         window, r0 = shell.make_window(signals, carry, rate), self.measurement_variance
         _filter(window, self._tuning, r0, self._parameters, parallel, belief, out, adapted)
-        steps = PaperSteps(signals.stamps_ns, signals.ready_ns, *out, rate, *adapted)
-        return steps, shell.carry_on(belief, steps, carry, slip)
+        steps = PaperSteps(signals.stamps_ns, *out, rate, *adapted)
+        return steps, shell.carry_on(belief, signals.stamps_ns, carry, slip)
 
 
 def build(name: str, car: Car, options: Options) -> PaperHybridUkf:

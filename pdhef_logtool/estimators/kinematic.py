@@ -6,19 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pdhef_logtool.estimators.stepwise import (
-    AY,
-    VX,
-    VY,
-    YAW_RATE,
-    StepCarry,
-    advance_speed,
-    run_stepwise,
-)
+from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
+from pdhef_logtool.estimators.stepwise import StepState, advance_speed, run_stepwise
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import RESTART_GAP_S
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -61,7 +53,7 @@ class Kinematic:
     name: str = "kinematic"
     causal: bool = True
 
-    def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
+    def run(self, signals: Signals, carry: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
 
         def step(
@@ -70,7 +62,7 @@ class Kinematic:
             sensors = (dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s)
             _kinematic(sensors, self.leak_s, state, values, rates, valid)
 
-        return run_stepwise(self.name, signals, carry, 4, step, slip_gate=self.slip_gate)
+        return run_stepwise(signals, carry, 4, step, slip_gate=self.slip_gate)
 
 
 def build(name: str, car: Car, options: Options) -> Kinematic:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.direct_network import write_direct_steps
+from pdhef_logtool.estimators.base import Steps
+from pdhef_logtool.estimators.direct_network import direct_steps
 from pdhef_logtool.estimators.filter_shell import VX
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.physics import FilterCarry
-from pdhef_logtool.estimators.stepwise import StepCarry, run_stepwise
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
+from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
+from pdhef_logtool.records.signals import FloatArray, Signals
 from pdhef_logtool.residual_model.linear_model import LinearModel
 from pdhef_logtool.residual_model.low_pass import low_pass
 
@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegressionCarry:
-    """What the parallel filter, and the low-pass with the release of outputs, take from window to window."""
+    """State of the parallel filter and the low-pass between windows."""
 
     physics: FilterCarry
-    steps: StepCarry
+    sideslip: FloatArray
+    last_stamp_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,7 @@ class LinearRegression:
         """Say which file ran: run.json has the residual network's hash alone."""
         return (f"coefficients {self.model.sha256}",)
 
-    def run(self, signals: Signals, carry: RegressionCarry | None) -> tuple[StateTrack, RegressionCarry]:
+    def run(self, signals: Signals, carry: RegressionCarry | None) -> tuple[Steps, RegressionCarry]:
         """Process one window (see :class:`~.base.Estimator`)."""
         features, physics, after = run_features(
             parallel_filter(self.vehicle, use_speed=self.use_speed, slip_gate=self.slip_gate),
@@ -56,21 +57,16 @@ class LinearRegression:
         )
         known = np.asarray(np.isfinite(features).all(axis=1), dtype=np.bool_)
         starts = ~np.isfinite(physics.prior[:, VX])
-
-        def step(
-            dt: FloatArray, _s: Signals, state: FloatArray, values: FloatArray, rates: FloatArray, valid: BoolArray
-        ) -> None:
-            beta = self.model.sideslip_rad(features)[:, None]
-            # The memory starts as NaN, and anew wherever the parallel filter does.
-            since = np.where(starts, np.nan, dt)
-            state[np.isnan(state)] = 0.0
-            low_pass(beta, since, self.model.low_pass_hz, state, beta)
-            # Sideslip is an angle of the velocity: beyond 80 degrees the line has left its range.
-            vy = features[:, 0] * np.tan(np.clip(beta[:, 0], -1.4, 1.4))
-            write_direct_steps(self.vehicle, features, vy, known, values, rates, valid)
-
-        track, steps = run_stepwise(self.name, signals, carry.steps if carry else None, 1, step)
-        return track, RegressionCarry(after, steps)
+        before_ns = carry.last_stamp_ns if carry else None
+        sideslip = np.zeros(1) if carry is None else carry.sideslip.copy()
+        beta = self.model.sideslip_rad(features)[:, None]
+        # The low-pass restarts wherever the parallel filter does.
+        dt = np.where(starts, np.nan, step_durations_s(signals.stamps_ns, before_ns))
+        low_pass(beta, dt, self.model.low_pass_hz, sideslip, beta)
+        # Sideslip is an angle of the velocity: beyond 80 degrees the line has left its range.
+        vy = features[:, 0] * np.tan(np.clip(beta[:, 0], -1.4, 1.4))
+        steps = direct_steps(self.vehicle, features, vy, known)
+        return steps, RegressionCarry(after, sideslip, last_stamp_ns(signals.stamps_ns, before_ns))
 
 
 def build(name: str, car: Car, options: Options) -> LinearRegression:

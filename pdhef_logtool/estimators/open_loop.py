@@ -14,19 +14,11 @@ from pdhef_logtool.car.nominal_model import (
     substeps,
 )
 from pdhef_logtool.car.vehicle import VehicleParameters
-from pdhef_logtool.estimators.stepwise import (
-    AY,
-    VX,
-    VY,
-    YAW_RATE,
-    StepCarry,
-    advance_speed,
-    run_stepwise,
-)
+from pdhef_logtool.estimators.base import AY, VX, VY, YAW_RATE, Steps
+from pdhef_logtool.estimators.stepwise import StepState, advance_speed, run_stepwise
 from pdhef_logtool.records.compiled import njit
 from pdhef_logtool.records.release import RESTART_GAP_S
 from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -86,7 +78,7 @@ class OpenLoop:
     name: str = "open-loop"
     causal: bool = True
 
-    def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
+    def run(self, signals: Signals, carry: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
         p = model_parameters(self.vehicle)
         mu = self.vehicle.assumed_friction
@@ -98,7 +90,7 @@ class OpenLoop:
             _open_loop(inputs, mu, p, state, values, rates, valid)
 
         std = self.vehicle.sensors.speed_std_m_s
-        return run_stepwise(self.name, signals, carry, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)
+        return run_stepwise(signals, carry, 6, step, slip_gate=self.slip_gate, speed_std_m_s=std)
 
 
 def build(name: str, car: Car, options: Options) -> OpenLoop:

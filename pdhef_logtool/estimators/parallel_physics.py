@@ -95,14 +95,14 @@ def run_features(
     Parameters
     ----------
     seen : the measurements that the network may see; those of ``signals`` when None.
-    extra_r : [K, 2], as for :meth:`~.physics.PhysicsUkf.filter_steps`.
+    extra_r : [K, 2], as for :meth:`~.physics.PhysicsUkf.run`.
 
     Returns
     -------
     features : [K, 28], NaN where the filter has no state, or one that goes backwards against the speed sensor.
     steps, carry : of the filter.
     """
-    steps, after = physics.filter_steps(signals, carry, extra_r=extra_r)
+    steps, after = physics.run(signals, carry, extra_r=extra_r)
     seen = signals if seen is None else seen
     friction, predicted = steps.inputs[:, U_FRICTION], np.empty(len(signals))
     body, parameters = np.zeros((len(signals), _BODY)), np.zeros((len(signals), _PARAMETERS))

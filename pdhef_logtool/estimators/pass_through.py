@@ -2,53 +2,36 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pdhef_logtool.estimators.stepwise import StepCarry, advance_speed, run_stepwise
-from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
-from pdhef_logtool.records.tracks import StateTrack
+import numpy as np
+
+from pdhef_logtool.estimators.base import Steps, make_steps
+from pdhef_logtool.estimators.stepwise import StepState, measured_speed
+from pdhef_logtool.records.signals import Signals
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
     from pdhef_logtool.estimators.table import Options
 
 
-@njit(cache=True)
-def _pass_through(sensors, vy, state, values, valid):  # type: ignore[no-untyped-def]
-    dt, ax, ay, yaw_rate, speed = sensors
-    for k in range(dt.shape[0]):
-        advance_speed(state, dt[k], ax[k], speed[k])
-        values[k, 0] = state[0]
-        values[k, 1] = vy
-        values[k, 2] = yaw_rate[k]
-        values[k, 3] = ay[k]
-        valid[k] = math.isfinite(state[0]) and math.isfinite(yaw_rate[k])
-
-
 @dataclass(frozen=True, slots=True)
 class PassThrough:
     """Speed sensor, gyro and accelerometer passed through; ``zero`` adds v_y = 0, ``gyro`` claims no v_y.
 
-    Both carry the sensors' delay, because the newest arrived sample is what stands at the scored stamp.
+    Both have the sensors' delay: the newest sample that had arrived is held until the scored stamp.
     """
 
     name: str
     claims_zero_sideslip: bool
     causal: bool = True
 
-    def run(self, signals: Signals, carry: StepCarry | None) -> tuple[StateTrack, StepCarry]:
+    def run(self, signals: Signals, state: StepState | None) -> tuple[Steps, StepState]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        vy = 0.0 if self.claims_zero_sideslip else math.nan
-
-        def step(
-            dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, _: FloatArray, valid: BoolArray
-        ) -> None:
-            _pass_through((dt, s.ax_m_s2, s.ay_m_s2, s.yaw_rate_rad_s, s.speed_m_s), vy, state, values, valid)
-
-        return run_stepwise(self.name, signals, carry, 2, step)
+        vx, state = measured_speed(signals, state)
+        vy = np.full(len(signals), 0.0 if self.claims_zero_sideslip else np.nan)
+        return make_steps(vx, vy, signals.yaw_rate_rad_s, signals.ay_m_s2), state
 
 
 def build(name: str, car: Car, options: Options) -> PassThrough:

@@ -11,7 +11,7 @@ is in :mod:`~.filter_shell`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -46,7 +46,7 @@ from pdhef_logtool.estimators.unscented import (
     mean_and_covariance,
 )
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import StepColumns
+from pdhef_logtool.records.release import Extrapolation, StepColumns
 from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.speed_slip import believable
@@ -71,7 +71,7 @@ FORCE_SCALE_TIME_S = 2.0
 LINK_NONE, LINK_WHOLE, LINK_BIASES = 0, 1, 2
 
 #: What this filter takes from window to window.
-FilterCarry: TypeAlias = shell.ShellCarry[shell.PosteriorSteps]
+FilterCarry: TypeAlias = shell.ShellCarry
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -361,14 +361,14 @@ class PhysicsUkf:
             standstill=self.standstill,
         )
 
-    def filter_steps(
+    def run(
         self,
         signals: Signals,
         carry: FilterCarry | None,
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry]:
-        """Run the filter on measurement time only; the steps and the carry with no pending steps in it.
+        """Filter one window (see :class:`~.base.Estimator`).
 
         ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
@@ -383,7 +383,7 @@ class PhysicsUkf:
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
-        """Return what :meth:`filter_steps` does, bit for bit, and what ties the steps together."""
+        """Return what :meth:`run` returns, bit for bit, and the links between the steps."""
         return self._steps(signals, carry, residual_rate, extra_r, linked=True)
 
     def _steps(
@@ -403,35 +403,15 @@ class PhysicsUkf:
         tied = count if linked else 0
         links = LinkColumns(np.full(tied, LINK_NONE), np.zeros((tied, n, n)), np.zeros((tied, n, n)))
         _filter(window, tuning, self.layout, self._parameters, belief, out, links)
-        steps = shell.PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
-        return steps, shell.carry_on(belief, steps, carry, slip), StepLinks(*links)
+        steps = shell.PosteriorSteps(signals.stamps_ns, *out, window.residual_rate)
+        return steps, shell.carry_on(belief, signals.stamps_ns, carry, slip), StepLinks(*links)
 
-    def run(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None = None,
-        extra_r: FloatArray | None = None,
-    ) -> tuple[StateTrack, FilterCarry]:
-        """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
-        steps, after = self.filter_steps(signals, carry, residual_rate, extra_r)
-        return self.outputs(signals, carry, steps, after)
-
-    def outputs(
-        self, signals: Signals, carry: FilterCarry | None, steps: shell.PosteriorSteps, after: FilterCarry
-    ) -> tuple[StateTrack, FilterCarry]:
-        """Predict to the window's stamps what :meth:`filter_steps` returned for it; the carry keeps waiting steps."""
-        if carry is not None:
-            steps = carry.steps.joined(steps)
+    def predict(self, steps: shell.PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate steps with the nominal model (see :class:`~.base.ModelPredictor`)."""
         held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
-
-        def predict(due: shell.Due) -> shell.Predicted:
-            predicted = shell.no_prediction(len(due.step), steps.x.shape[1])
-            _predict_outputs(due, held, self._tuning, self.layout, self._parameters, predicted)
-            return predicted
-
-        track, released = shell.released_track(self.name, signals.stamps_ns, steps.outline, predict)
-        return track, replace(after, steps=steps.since(released.needed))
+        predicted = shell.no_prediction(len(stamps_ns), steps.x.shape[1])
+        _predict_outputs(shell.due(ahead), held, self._tuning, self.layout, self._parameters, predicted)
+        return shell.predicted_track(self.name, stamps_ns, steps, ahead, predicted)
 
 
 def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[float, int]:
@@ -440,7 +420,7 @@ def innovation_log_likelihood(estimator: PhysicsUkf, signals: Signals) -> tuple[
     A sample beyond the gate counts with the likelihood at the gate: a filter gains nothing by rejecting samples, and
     no single outlier decides.
     """
-    steps, _ = estimator.filter_steps(signals, None)
+    steps, _ = estimator.run(signals, None)
     return float(steps.log_likelihood.sum()), int(np.isfinite(steps.innovation).sum())
 
 

@@ -62,8 +62,8 @@ from pdhef_logtool.estimators.physics_model import (
 )
 from pdhef_logtool.estimators.unscented import ROOM, whiten, wide_root
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import predictable
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.records.release import Extrapolation
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.records.vectors import (
     LANES,
@@ -381,23 +381,17 @@ def _write_prediction(m, x, P, steer, rate_vy, places, p, predicted):  # type: i
 
 # positional: as _predict.
 @njit(cache=True)
-def _filter(window, tuning, layout, p, f, belief, out, links, due, predicted):  # type: ignore[no-untyped-def]
-    """Run over one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them.
-
-    The covariance is kept of the last steps only, as many as there is room for. ``due`` are predictions of the window's
-    steps, in their order, for what is written to ``predicted``.
-    """
+def _filter(window, tuning, layout, p, f, belief, out, links):  # type: ignore[no-untyped-def]
+    """Run over one window; ``belief`` is moved in place. ``links`` are of length 0 where nobody asks for them."""
     dt, steer, ax, ay, yaw_rate, speed, friction, residual_rate, extra_r = window
     q_std, r_std, initial_std, standstill_std, _, _, scale, rules = tuning
     belief_x, belief_P, memory = belief
     out_x, out_P, out_inputs, out_nis, out_dof, out_likelihood, out_nu, out_valid, out_diverged, out_prior = out
     out_link, out_predicted_P, out_cross = links
-    due_step, horizon_s = due
     linked = out_link.shape[0] > 0
     places = places_of(layout)
     layout = spread_layout(layout)
     x, there = _in_places(belief_x, places, 0.0), _in_places(np.ones(places.shape[0]), places, 0.0) > 0.0
-    ahead, ahead_P = _in_places(belief_x, places, 0.0), np.zeros((ROOM, ROOM))
     P, L = aligned(ROOM * ROOM).reshape((ROOM, ROOM)), aligned(ROOM * ROOM).reshape((ROOM, ROOM))
     _matrix_in_places(belief_P, places, P)
     q_std, initial_std = _in_places(q_std, places, 0.0), _in_places(initial_std, places, 0.0)
@@ -408,7 +402,6 @@ def _filter(window, tuning, layout, p, f, belief, out, links, due, predicted):  
     index, root, w = np.empty(shell.MEASUREMENTS, np.int64), np.empty_like(S), np.empty_like(nu)
     noise, constants = (q_std, aligned(ROOM), scale), _make_constants()
     factored = False  # whether L is the factor of P
-    m, forgotten = 0, dt.shape[0] - out_P.shape[0]
     for k in range(dt.shape[0]):
         sample = shell.Sample(dt[k], steer[k], ax[k], ay[k], yaw_rate[k], speed[k], friction[k])
         now = shell.begin_step(sample, rules, memory)
@@ -468,22 +461,7 @@ def _filter(window, tuning, layout, p, f, belief, out, links, due, predicted):  
                 out_link[k] = LINK_WHOLE
         shell.finish_step(k, now, residual_rate, rules, memory, out_inputs)
         _take(x, places, out_x[k])
-        if k >= forgotten:
-            _take_matrix(P, places, out_P[k - forgotten])
-        while m < due_step.shape[0] and due_step[m] <= k:
-            if due_step[m] == k and out_valid[k]:
-                if not factored:
-                    wide_root(P, places, there, L)
-                    factored = True
-                over, rate = shell.held_inputs(out_inputs, k), (residual_rate[k, 0], residual_rate[k, 1])
-                ahead[:] = x
-                if horizon_s[m] > 0.0:
-                    _draw(x, L, scale, constants, points)
-                    _predict(ahead, ahead_P, over, rate, horizon_s[m], noise, layout, p, f, constants, points, False)
-                else:
-                    ahead_P[:, :] = P
-                _write_prediction(m, ahead, ahead_P, over.steer, rate[0], places, p, predicted)
-            m += 1
+        _take_matrix(P, places, out_P[k])
     _take(x, places, belief_x)
     _take_matrix(P, places, belief_P)
 
@@ -590,14 +568,14 @@ class PhysicsFilter:
         """Return signals as this filter's vehicle corrects them, where they were read with another one."""
         return signals if self.read_with is None else corrected_anew(signals, self.read_with, self.vehicle)
 
-    def filter_steps(
+    def run(
         self,
         signals: Signals,
         carry: FilterCarry | None,
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry]:
-        """Run the filter on measurement time only; the steps and the carry with no pending steps in it.
+        """Filter one window (see :class:`~.base.Estimator`).
 
         ``residual_rate`` [N, 2]: what is added to v̇_y and ṙ from each stamp to the next, m/s² and rad/s².
         ``extra_r`` [N, 2]: variance that a_y (m²/s⁴) and yaw rate (rad²/s²) have beyond R.
@@ -612,39 +590,8 @@ class PhysicsFilter:
         residual_rate: FloatArray | None = None,
         extra_r: FloatArray | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
-        """Return what :meth:`filter_steps` does, bit for bit, and what ties the steps together."""
+        """Return what :meth:`run` returns, bit for bit, and the links between the steps."""
         return self._steps(signals, carry, residual_rate, extra_r, linked=True)
-
-    def predicted_steps(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None = None,
-        extra_r: FloatArray | None = None,
-    ) -> tuple[shell.PosteriorSteps, FilterCarry, shell.Predicted]:
-        """Return what :meth:`filter_steps` does, and of each stamp what its newest step then becomes.
-
-        A prediction begins with what the filter has at hand of its step. Covariances are those of the steps that a
-        coming stamp may ask for.
-        """
-        stamps_ns, ready_ns, waiting = signals.stamps_ns, signals.ready_ns, 0
-        if carry is not None:
-            waiting = len(carry.steps.stamps_ns)
-            stamps_ns = np.concatenate([carry.steps.stamps_ns, stamps_ns])
-            ready_ns = np.concatenate([carry.steps.ready_ns, ready_ns])
-        known = np.ones(len(stamps_ns), dtype=np.bool_)
-        released, horizon_s, near = predictable(stamps_ns, ready_ns, known, signals.stamps_ns)
-        step, predicted = np.where(near, released.at, -1), shell.no_prediction(len(signals), self.layout.size)
-        before = int(np.searchsorted(released.at, waiting))
-        if carry is not None:
-            self._predict(carry.steps, shell.Due(step[:before], horizon_s[:before]), _rows(predicted, slice(before)))
-        steps, after, _ = self._steps(
-            signals, carry, residual_rate, extra_r,
-            kept=len(signals) - max(released.needed - waiting, 0),
-            due=shell.Due(step[before:] - waiting, horizon_s[before:]),
-            predicted=_rows(predicted, slice(before, None)),
-        )  # fmt: skip
-        return steps, after, predicted
 
     # positional: what all of them take.
     def _steps(
@@ -655,73 +602,25 @@ class PhysicsFilter:
         extra_r: FloatArray | None,
         *,
         linked: bool = False,
-        kept: int | None = None,
-        due: shell.Due | None = None,
-        predicted: shell.Predicted | None = None,
     ) -> tuple[shell.PosteriorSteps, FilterCarry, StepLinks]:
         signals = self.corrected(signals)
         speed_std_m_s = self.vehicle.sensors.speed_std_m_s
         signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=self.slip_gate)
         window, tuning = shell.make_window(signals, carry, residual_rate, extra_r), self._tuning
         count, n = len(signals), self.layout.size
-        belief, out = shell.resume(carry, n), shell.no_posterior(count, n, kept)
+        belief, out = shell.resume(carry, n), shell.no_posterior(count, n)
         tied = count if linked else 0
         links = LinkColumns(np.full(tied, LINK_NONE), np.zeros((tied, n, n)), np.zeros((tied, n, n)))
-        due = due or shell.Due(np.zeros(0, dtype=np.int64), np.zeros(0))
-        predicted = predicted or shell.no_prediction(0, n)
-        _filter(window, tuning, *self.parameters, belief, out, links, due, predicted)
-        steps = shell.PosteriorSteps(signals.stamps_ns, signals.ready_ns, *out, window.residual_rate)
-        return steps, shell.carry_on(belief, steps, carry, slip), StepLinks(*links)
+        _filter(window, tuning, *self.parameters, belief, out, links)
+        steps = shell.PosteriorSteps(signals.stamps_ns, *out, window.residual_rate)
+        return steps, shell.carry_on(belief, signals.stamps_ns, carry, slip), StepLinks(*links)
 
-    def _predict(self, steps: shell.PosteriorSteps, due: shell.Due, predicted: shell.Predicted) -> None:
-        """Write what becomes of steps, all of which have a covariance."""
+    def predict(self, steps: shell.PosteriorSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate steps with the car's model (see :class:`~.base.ModelPredictor`)."""
         held = shell.Held(steps.x, steps.P, steps.inputs, steps.residual_rate)
-        _predict_outputs(due, held, self._tuning, *self.parameters, predicted)
-
-    def run(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        residual_rate: FloatArray | None = None,
-        extra_r: FloatArray | None = None,
-    ) -> tuple[StateTrack, FilterCarry]:
-        """Filter one window and predict the output to its stamps (see :class:`~.base.Estimator`)."""
-        steps, after, predicted = self.predicted_steps(signals, carry, residual_rate, extra_r)
-        return self.outputs(signals, carry, steps, after, predicted)
-
-    def outputs(
-        self,
-        signals: Signals,
-        carry: FilterCarry | None,
-        steps: shell.PosteriorSteps,
-        after: FilterCarry,
-        predicted: shell.Predicted | None = None,
-    ) -> tuple[StateTrack, FilterCarry]:
-        """Predict a window's steps to its stamps; the carry keeps waiting steps.
-
-        ``predicted`` is what :meth:`predicted_steps` returned with them; without it all steps need their covariance.
-        """
-        outline, waiting = steps.outline, 0
-        if carry is not None:
-            outline, waiting = carry.steps.outline.joined(outline), len(carry.steps.stamps_ns)
-
-        def predict(due: shell.Due) -> shell.Predicted:
-            if predicted is not None:
-                for column in predicted:
-                    column[due.step < 0] = np.nan
-                return predicted
-            found = shell.no_prediction(len(due.step), self.layout.size)
-            self._predict(steps if carry is None else carry.steps.joined(steps), due, found)
-            return found
-
-        track, released = shell.released_track(self.name, signals.stamps_ns, outline, predict, self.layout.named)
-        if carry is not None and released.needed < waiting:
-            return track, replace(after, steps=carry.steps.since(released.needed).joined(steps))
-        return track, replace(after, steps=steps.since(released.needed - waiting))
-
-
-def _rows(predicted: shell.Predicted, part: slice) -> shell.Predicted:
-    return shell.Predicted(*(column[part] for column in predicted))
+        predicted = shell.no_prediction(len(stamps_ns), self.layout.size)
+        _predict_outputs(shell.due(ahead), held, self._tuning, *self.parameters, predicted)
+        return shell.predicted_track(self.name, stamps_ns, steps, ahead, predicted, self.layout.named)
 
 
 def physics_filter(

@@ -18,7 +18,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import CURES
-from pdhef_logtool.estimators.physics import FilterCarry
+from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, of_car
 from pdhef_logtool.estimators.self_calibrated import widened
 from pdhef_logtool.records.signals import FloatArray, Signals
@@ -41,16 +41,16 @@ class PosteriorBand:
     filters: tuple[PhysicsFilter, ...]
     _window: Signals | None = None
     _vy: list[FloatArray] = field(default_factory=list)
-    _carries: tuple[FilterCarry, ...] = ()
+    _states: tuple[WindowState, ...] = ()
     _features: dict[str, FeatureCarry] = field(default_factory=dict)
 
     def add(self, track: StateTrack, signals: Signals) -> StateTrack:
         """Return the next window of a track [N] with 1-sigmas as the head of this file has them."""
         if signals is not self._window:
-            before = self._carries or [None] * len(self.filters)
-            runs = [f.run(signals, c) for f, c in zip(self.filters, before, strict=True)]
+            before = self._states or [None] * len(self.filters)
+            runs = [run_window(f, signals, b) for f, b in zip(self.filters, before, strict=True)]
             self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
-            self._carries = tuple(carry for _, carry in runs)
+            self._states = tuple(state for _, state in runs)
         vehicle = self.filters[0].vehicle
         terms, self._features[track.name] = error_terms(
             track, signals, vehicle.roll_gradient_rad_per_m_s2, self._features.get(track.name)

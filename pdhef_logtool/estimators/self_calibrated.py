@@ -17,20 +17,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pdhef_logtool.car.car import WithoutTruth
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew
-from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
-from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, predict_track, run_steps
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.records.release import Extrapolation
+from pdhef_logtool.records.signals import FloatArray, IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.watches.intervals import MAX_SIDESLIP_STD_RAD
 
 if TYPE_CHECKING:
-    from pdhef_logtool.estimators.physics import FilterCarry
     from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 
 #: Names that run on ``physics``: they take the calibrated vehicle where there is one, the others the file as it stands.
@@ -49,35 +49,43 @@ OPEN_LOOP = "open-loop-calibrated"
 OWN_SHARE, D2_SHARE = 0.25, 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class Carry:
-    """That of the estimator, and those of the physics filter on the vehicles that the band compares."""
+@dataclass(slots=True)
+class CalibratedBand:
+    """The interval above over one drive, window by window. All tracks of a window share the runs of its filters."""
 
-    estimator: Any
-    compared: tuple[FilterCarry, ...]
+    calibration: WithoutTruth
+    read_with: VehicleParameters
+    _window: Signals | None = None
+    _vy: list[FloatArray] = field(default_factory=list)
+    _states: tuple[Any, ...] = ()
+
+    def add(self, track: StateTrack, signals: Signals) -> StateTrack:
+        """Return the next window of a track [N] with wider 1-sigmas of sideslip and v_y."""
+        found = self.calibration
+        if signals is not self._window:
+            given, before = of_friction(signals, found), self._states or [None] * len(self._filters)
+            runs = [run_window(f, given, b) for f, b in zip(self._filters, before, strict=True)]
+            self._window, self._vy = signals, [t.vy_m_s for t, _ in runs]
+            self._states = tuple(state for _, state in runs)
+        d2 = found.driven_d2_m_s
+        known = math.isfinite(d2)
+        contradicted = np.full(len(track), D2_SHARE * d2 if known else 0.0)
+        slow = found.vehicle.low_speed_blend_m_s
+        return widened(track, self._vy, contradicted, slow, own_share=OWN_SHARE if known else 1.0)
+
+    @property
+    def _filters(self) -> tuple[PhysicsFilter, ...]:
+        """The physics filter on the calibrated vehicle and on its variations; none without variations."""
+        from pdhef_logtool.estimators.physics_ukf import physics_filter
+
+        found = self.calibration
+        vehicles = (found.vehicle, *found.varied) if found.varied else ()
+        return tuple(replace(physics_filter(v, found.noise), read_with=self.read_with) for v in vehicles)
 
 
-class Compared:
-    """The filters that a band compares, run once a window for all estimators of a calibration that share them."""
-
-    def __init__(self) -> None:
-        self._asked: tuple[Signals, tuple[FilterCarry, ...] | None, tuple[PhysicsFilter, ...]] | None = None
-        self._answer: tuple[list[FloatArray], tuple[FilterCarry, ...]] = ([], ())
-
-    def run(
-        self,
-        filters: tuple[PhysicsFilter, ...],
-        window: Signals,
-        signals: Signals,
-        carry: tuple[FilterCarry, ...] | None,
-    ) -> tuple[list[FloatArray], tuple[FilterCarry, ...]]:
-        """Return v_y of each filter [N] and the carries; ``window``, carry and filters tell if it was asked before."""
-        asked = self._asked
-        if asked is None or asked[0] is not window or asked[1] is not carry or asked[2] != filters:
-            runs = [f.run(signals, c) for f, c in zip(filters, carry or [None] * len(filters), strict=True)]
-            self._asked = window, carry, filters
-            self._answer = [t.vy_m_s for t, _ in runs], tuple(c for _, c in runs)
-        return self._answer
+def of_friction(signals: Signals, calibration: WithoutTruth) -> Signals:
+    """Return signals without a friction that was only estimated with the vehicle file."""
+    return signals if calibration.told_friction else replace(signals, friction=np.full(len(signals), np.nan))
 
 
 @dataclass(frozen=True)
@@ -88,14 +96,12 @@ class SelfCalibrated:
     ----------
     estimator : on the calibrated vehicle. calibration : where that comes from.
     read_with : the vehicle that the drive's signals were read with.
-    compared : what the band compares, where several estimators of one calibration share it.
     """
 
     estimator: Estimator
     calibration: WithoutTruth
     read_with: VehicleParameters
     causal: bool = False
-    compared: Compared | None = field(default=None, compare=False)
 
     @property
     def name(self) -> str:
@@ -119,44 +125,17 @@ class SelfCalibrated:
         parts += ["d2"] if math.isfinite(self.calibration.driven_d2_m_s) else []
         return f"intervals: {', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "intervals not calibrated"
 
-    def run(self, signals: Signals, carry: Carry | None, ahead: Signals | None = None) -> tuple[StateTrack, Carry]:
+    def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[Any, Any]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        window, signals = signals, self._of_friction(signals)
-        track, after = run_window(
-            self.estimator,
-            self._read(signals),
-            None if carry is None else carry.estimator,
-            None if ahead is None else self.given(ahead),
-        )
-        if self.name == OPEN_LOOP:  # it gives no interval
-            return track, Carry(after, ())
-        compared, before = self.compared or Compared(), None if carry is None else carry.compared
-        vy, carried = compared.run(self._filters, window, signals, before)
-        slow, d2 = self.calibration.vehicle.low_speed_blend_m_s, self.calibration.driven_d2_m_s
-        told = math.isfinite(d2)
-        seen = np.full(len(track), D2_SHARE * d2 if told else 0.0)
-        return widened(track, vy, seen, slow, own_share=OWN_SHARE if told else 1.0), Carry(after, carried)
+        return run_steps(self.estimator, self.given(signals), state, None if ahead is None else self.given(ahead))
 
-    @cached_property
-    def _filters(self) -> tuple[PhysicsFilter, ...]:
-        """The physics filter on the vehicle and on those away from it; none where there are none of those."""
-        from pdhef_logtool.estimators.physics_ukf import physics_filter
-
-        found = self.calibration
-        vehicles = (found.vehicle, *found.varied) if found.varied else ()
-        return tuple(replace(physics_filter(v, found.noise), read_with=self.read_with) for v in vehicles)
+    def predict(self, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate as the estimator does."""
+        return predict_track(self.estimator, steps, ahead, stamps_ns)
 
     def given(self, signals: Signals) -> Signals:
-        """Return what the estimator is given of signals that were read with the other vehicle."""
-        return self._read(self._of_friction(signals))
-
-    def _read(self, signals: Signals) -> Signals:
-        return corrected_anew(signals, self.read_with, self.calibration.vehicle)
-
-    def _of_friction(self, signals: Signals) -> Signals:
-        if self.calibration.told_friction:
-            return signals
-        return replace(signals, friction=np.full(len(signals), np.nan))
+        """Return the signals that the estimator gets, as its vehicle reads them."""
+        return corrected_anew(of_friction(signals, self.calibration), self.read_with, self.calibration.vehicle)
 
 
 def widened(

@@ -28,15 +28,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from functools import reduce
+from typing import TypeAlias
 
 import numpy as np
 
 from pdhef_logtool.estimators.adaptive_physics import (
     FORGET_S,
     AdaptivePhysics,
+    MixtureSteps,
     gather_evidence,
-    mix,
     weigh,
 )
 from pdhef_logtool.estimators.checked_inputs import CheckedInputs, InputCarry, r_scale
@@ -45,9 +46,9 @@ from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, FilterCarry
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.unscented import ROOM, wide_root
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import RESTART_GAP_S, StepColumns, step_durations_s
+from pdhef_logtool.records.release import RESTART_GAP_S, Extrapolation, StepColumns, step_durations_s
 from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals, join_signals
-from pdhef_logtool.records.tracks import StateTrack, concatenate
+from pdhef_logtool.records.tracks import StateTrack
 from pdhef_logtool.records.vectors import LANES, aligned, load, spread, store
 
 #: A step sees at least this much ahead and at most twice as much. Sensor biases remember for minutes: against a
@@ -327,7 +328,7 @@ Piece: TypeAlias = tuple[ForwardSteps, ...]
 class SmoothedCarry:
     """State of the inputs, the forward filters [H] and their evidence behind all steps that are taken; those ahead.
 
-    ``inputs`` is None where all inputs are known beforehand. The steps ahead lie in pieces, which are handed on and
+    The steps ahead lie in pieces, which are handed on and
     never joined. ``origin_ns`` is where the blocks begin; ``smoothed`` what is done already of the steps ahead, by
     filter.
     """
@@ -368,16 +369,13 @@ class SmoothedPhysics:
         signals: Signals,
         carry: SmoothedCarry | None,
         ahead: Signals | None = None,
-        known: CheckedInputs | None = None,
-    ) -> tuple[StateTrack, SmoothedCarry]:
+    ) -> tuple[MixtureSteps, SmoothedCarry]:
         """Process one window (see :class:`~.base.LookingAhead`).
 
         Parameters
         ----------
         ahead : what follows the window, at least ``look_ahead_s`` of it or all that there is; the next window begins
             with it. Without it the log ends here for all that the smoother knows.
-        known : what :meth:`~.AdaptivePhysics.inputs` returns for a whole log that is given as one window; it is then
-            not called.
         """
         given = signals if ahead is None else join_signals([signals, ahead])
         if carry is None:
@@ -390,16 +388,12 @@ class SmoothedPhysics:
             end = min(first + STEPS_AT_ONCE, len(signals))
             taken = first + (0 if carry.shared is None else len(carry.shared))
             seen = max(taken, self._seen(given.stamps_ns, end, carry.origin_ns))
-            if known is None:
-                checked, after = self.filtered.inputs(given.rows(taken, seen), carry.inputs)
-                carry = replace(carry, inputs=after)
-            else:
-                checked = known.cut(taken, seen)
-            carry = self._filtered(checked, carry)
-            part, done = self._smoothed(given.rows(first, end), carry)
+            checked, after = self.filtered.inputs(given.rows(taken, seen), carry.inputs)
+            carry = self._filtered(checked, replace(carry, inputs=after))
+            part, done = self._smoothed(end - first, carry)
             parts.append(part)
             carry = _without(carry, end - first, done)
-        return concatenate(parts), carry
+        return reduce(MixtureSteps.joined, parts), carry
 
     def _seen(self, stamps_ns: IntArray, end: int, origin_ns: int | None) -> int:
         """Return how many steps there are up to the end of the block behind that of the last of the first ``end``."""
@@ -433,45 +427,39 @@ class SmoothedPhysics:
             )
         return carry
 
-    def _smoothed(self, signals: Signals, carry: SmoothedCarry) -> tuple[StateTrack, tuple[Smoothed, ...]]:
-        """Smooth the steps of ``signals``, which are the first of those ahead, with all of them.
+    def _smoothed(self, count: int, carry: SmoothedCarry) -> tuple[MixtureSteps, tuple[Smoothed, ...]]:
+        """Smooth the first ``count`` of the steps ahead, with all of them.
 
-        Beside the track it returns by filter what is smoothed now of the steps that follow.
+        Also returns, by filter, the smoothed steps that follow, as far as they are done.
         """
-        shared, after = carry.shared, carry.forward
+        shared = carry.shared
         assert shared is not None
-        assert after is not None
-        count, block_ns, origin_ns = len(signals), round(self.block_s * 1e9), carry.origin_ns or 0
-        physics = self.filtered.physics
-        tracks, valid, following = [], [], []
-        for i, one in enumerate(self.filtered.filters):
+        block_ns, origin_ns = round(self.block_s * 1e9), carry.origin_ns or 0
+        smoothed, following = [], []
+        for i in range(len(self.filtered.filters)):
             steps = [piece[i] for piece in carry.ahead]
             done = None if carry.smoothed is None else carry.smoothed[i]
             x, P = smooth_blocks(steps, shared.stamps_ns, count, origin_ns, block_ns, done)
             following.append((x[count:].copy(), P[count:].copy()))
             posterior = _first_of([piece.posterior for piece in steps], count)
-            here = replace(posterior, x=x[:count], P=P[:count], ready_ns=signals.stamps_ns)
-            # Known at its own stamp, a step is not predicted: what comes back is the step itself.
-            track, _ = one.outputs(signals, None, here, after[i])
-            tracks.append(track)
-            valid.append(here.valid)
-        track = tracks[0]
-        told: dict[str, Any] = {}
-        if len(tracks) > 1:
-            weights = weigh(self._two_sided(shared, count, origin_ns), np.stack(valid, axis=1))
-            track = mix(weights, tracks)
-            told["mixture_weight"] = np.where(track.valid, 1.0 - weights[:, 0], np.nan)
-        whole = replace(
+            smoothed.append(replace(posterior, x=x[:count], P=P[:count]))
+        weights = np.ones((count, 1))
+        if len(smoothed) > 1:
+            valid = np.stack([one.valid for one in smoothed], axis=1)
+            weights = weigh(self._two_sided(shared, count, origin_ns), valid)
+        raised = r_scale(shared.extra_r[:count], self.filtered.physics.measurement_std)
+        return MixtureSteps(tuple(smoothed), weights, raised, shared.reason[:count]), tuple(following)
+
+    def predict(self, steps: MixtureSteps, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Mix the smoothed steps, each at its own stamp (see :class:`~.base.ModelPredictor`)."""
+        track, count = self.filtered.predict(steps, ahead, stamps_ns), len(stamps_ns)
+        return replace(
             track,
             name=self.name,
-            network_trust=np.where(track.valid, self.filtered.trust, np.nan),
-            r_scale=np.where(track.valid, r_scale(shared.extra_r[:count], physics.measurement_std), 1.0),
             nis=np.full(count, np.nan),  # a smoothed state has no innovation
             nis_dof=np.zeros(count),
-            reason=shared.reason[:count],
-            **told,
+            mixture_weight=track.mixture_weight if len(steps.filters) > 1 else np.empty(0),
         )
-        return whole, tuple(following)
 
     def _two_sided(self, shared: SharedSteps, count: int, origin_ns: int) -> FloatArray:
         """Return Λ + Λ' [count, H]."""

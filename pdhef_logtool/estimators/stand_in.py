@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, run_window
-from pdhef_logtool.records.signals import Signals
+from pdhef_logtool.estimators.base import Estimator, look_ahead_of, notes_of, predict_track, run_steps
+from pdhef_logtool.records.release import Extrapolation
+from pdhef_logtool.records.signals import IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
 
 
@@ -40,7 +41,10 @@ class StandIn:
         """What its intervals are made of, where no calibrated ones are to take their place."""
         return getattr(self.estimator, "intervals_note", "")
 
-    def run(self, signals: Signals, carry: Any | None, ahead: Signals | None = None) -> tuple[StateTrack, Any]:
+    def run(self, signals: Signals, state: Any | None, ahead: Signals | None = None) -> tuple[Any, Any]:
         """Process one window (see :class:`~.base.Estimator`)."""
-        track, carry = run_window(self.estimator, signals, carry, ahead)
-        return replace(track, name=self.name), carry
+        return run_steps(self.estimator, signals, state, ahead)
+
+    def predict(self, steps: Any, ahead: Extrapolation, stamps_ns: IntArray) -> StateTrack:
+        """Extrapolate as the other estimator does."""
+        return replace(predict_track(self.estimator, steps, ahead, stamps_ns), name=self.name)

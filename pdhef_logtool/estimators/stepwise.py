@@ -1,4 +1,4 @@
-"""Shared by the simple baselines: measured speed between its samples, and release of steps at the scored stamps."""
+"""Loop shared by the simple baselines, and the measured speed between its samples."""
 
 from __future__ import annotations
 
@@ -8,37 +8,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pdhef_logtool.estimators.base import VX, Steps
 from pdhef_logtool.records.compiled import njit
-from pdhef_logtool.records.release import StepColumns, last_stamp_ns, predictable, step_durations_s
-from pdhef_logtool.records.signals import BoolArray, FloatArray, IntArray, Signals
-from pdhef_logtool.records.tracks import StateTrack, make_track
+from pdhef_logtool.records.release import last_stamp_ns, step_durations_s
+from pdhef_logtool.records.signals import BoolArray, FloatArray, Signals
 from pdhef_logtool.watches.speed_slip import ASSUMED_STD_M_S, SlipCarry, believable
 
 #: A speed sample is carried on by a_x for this long.
 SPEED_HOLD_S = 0.5
 
-# Entries of a step's values and of their time derivatives.
-VX, VY, YAW_RATE, AY = 0, 1, 2, 3
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Steps(StepColumns):
-    """Estimates on measurement time: values and rates [K, 4] over [v_x, v_y, r, a_y]; NaN is allowed."""
-
-    stamps_ns: IntArray
-    ready_ns: IntArray
-    values: FloatArray
-    rates: FloatArray
-    valid: BoolArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StepCarry:
-    """Memory of a baseline between windows: its own state vector and the steps that outputs still need."""
+class StepState:
+    """State of a baseline between windows: its own state vector."""
 
     state: FloatArray
     last_stamp_ns: int | None
-    steps: Steps
     slip: SlipCarry | None = None
 
 
@@ -47,46 +32,48 @@ StepFunction = Callable[[FloatArray, Signals, FloatArray, FloatArray, FloatArray
 
 
 def run_stepwise(
-    name: str,
     signals: Signals,
-    carry: StepCarry | None,
+    before: StepState | None,
     state_size: int,
     step: StepFunction,
     *,
     slip_gate: bool = False,
     speed_std_m_s: float = ASSUMED_STD_M_S,
-) -> tuple[StateTrack, StepCarry]:
-    """Run ``step`` over a window and extrapolate the newest arrived step to each scored stamp, to first order.
+) -> tuple[Steps, StepState]:
+    """Run ``step`` over a window.
 
-    ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_gate`` the dead-reckoned speed stands
-    in place of that of slipping wheels.
+    ``state`` starts as NaN; ``dt[0]`` is NaN at the start of a log. With ``slip_gate`` the speed of slipping wheels is
+    replaced by the dead-reckoned speed.
     """
-    signals, slip = believable(signals, speed_std_m_s, carry.slip if carry else None, gate=slip_gate, reckoned=True)
+    signals, slip = believable(signals, speed_std_m_s, before.slip if before else None, gate=slip_gate, reckoned=True)
     count = len(signals)
-    state = np.full(state_size, np.nan) if carry is None else carry.state.copy()
-    before_ns = carry.last_stamp_ns if carry else None
+    state = np.full(state_size, np.nan) if before is None else before.state.copy()
+    before_ns = before.last_stamp_ns if before else None
     dt = step_durations_s(signals.stamps_ns, before_ns)
     values = np.full((count, 4), np.nan)
     rates = np.zeros((count, 4))
     valid = np.zeros(count, dtype=np.bool_)
     step(dt, signals, state, values, rates, valid)
-    steps = Steps(signals.stamps_ns, signals.ready_ns, values, rates, valid)
-    if carry is not None:
-        steps = carry.steps.joined(steps)
-    released, horizon_s, usable = predictable(steps.stamps_ns, steps.ready_ns, steps.valid, signals.stamps_ns)
-    out = steps.values[released.at] + steps.rates[released.at] * horizon_s[:, None]
-    out[~usable] = np.nan
-    track = make_track(
-        name,
-        signals.stamps_ns,
-        vx_m_s=out[:, VX].copy(),
-        vy_m_s=out[:, VY].copy(),
-        yaw_rate_rad_s=out[:, YAW_RATE].copy(),
-        ay_m_s2=out[:, AY].copy(),
-        valid=usable,
-    )
-    last = last_stamp_ns(signals.stamps_ns, before_ns)
-    return track, StepCarry(state, last, steps.since(released.needed), slip)
+    return Steps(values, rates, valid), StepState(state, last_stamp_ns(signals.stamps_ns, before_ns), slip)
+
+
+def measured_speed(signals: Signals, before: StepState | None) -> tuple[FloatArray, StepState]:
+    """Return the measured speed at each stamp, [K]: carried on by a_x between samples (:func:`advance_speed`)."""
+
+    def step(
+        dt: FloatArray, s: Signals, state: FloatArray, values: FloatArray, _rates: FloatArray, _valid: BoolArray
+    ) -> None:
+        _advance_speeds(dt, s.ax_m_s2, s.speed_m_s, state, values)
+
+    steps, after = run_stepwise(signals, before, 2, step)
+    return steps.values[:, VX], after
+
+
+@njit(cache=True)
+def _advance_speeds(dt, ax, speed, state, values):  # type: ignore[no-untyped-def]
+    for k in range(dt.shape[0]):
+        advance_speed(state, dt[k], ax[k], speed[k])
+        values[k, VX] = state[0]
 
 
 @njit(cache=True)

@@ -5,16 +5,20 @@ A name is a preset: ``build`` makes of it, for a car and options, the algorithm 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Literal
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FORMER_FILTERS
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, Compared, SelfCalibrated
+from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.records.errors import UsageError
+from pdhef_logtool.records.shown import shown
 from pdhef_logtool.residual_model.bundle import NOMINAL_MODEL
 
 if TYPE_CHECKING:
@@ -32,13 +36,11 @@ class Options:
     use_speed : False is the paper's ``esp`` suite for the filters: the speed sensor only starts them (METHOD §1).
     trust : of the hybrid filters, in [0, 1]; None: what the car's evidence allows.
     network : of the car, ready to run, where several estimators share it; None: made anew.
-    compared : what the bands of estimators on a self-calibrated car compare, shared as well.
     """
 
     use_speed: bool = True
     trust: float | None = None
     network: NetworkService | None = field(default=None, compare=False)
-    compared: Compared = field(default_factory=Compared, compare=False)
 
     def service(self, car: Car) -> NetworkService:
         """Return the car's network, ready to run."""
@@ -54,8 +56,8 @@ class Spec:
 
     Attributes
     ----------
-    build : ``module:function`` under :mod:`pdhef_logtool.estimators`, or a whole dotted path; called with the name,
-        the :class:`Car` and :class:`Options`, imported when it is first needed.
+    build : called with the name, the :class:`Car` and :class:`Options`: a function, or ``module:function`` under
+        :mod:`pdhef_logtool.estimators`, imported when it is first needed.
     needs : aligned signals without which it cannot run.
     colour : 0xRRGGBB in every plot, tellable apart with any colour vision (Okabe and Ito 2008; Tol's muted scheme).
     causal : whether an estimate at t uses only what had arrived by t.
@@ -67,7 +69,7 @@ class Spec:
 
     name: str
     text: str
-    build: str
+    build: str | Callable[[str, Car, Options], Estimator]
     needs: frozenset[str]
     colour: int
     causal: bool = True
@@ -109,21 +111,24 @@ class Spec:
         """
         if reason := self.missing(car):
             raise UsageError(expected="a car that has what it needs", got=reason, where=self.name)
-        module, _, function = self.build.partition(":")
-        module = module if "." in module else f"{__package__}.{module}"
-        build = getattr(import_module(module), function)
+        build = self.build
+        if isinstance(build, str):
+            module, _, function = build.partition(":")
+            build = getattr(import_module(f"{__package__}.{module}"), function)
         if car.self_calibrated is None or self.name not in {OPEN_LOOP, *SELF_CALIBRATED}:
             estimator: Estimator = build(self.name, car, options)
             return estimator
         estimator = build(self.name, car.calibrated_car, options)
-        return SelfCalibrated(estimator, car.self_calibrated, car.vehicle, compared=options.compared)
+        return SelfCalibrated(estimator, car.self_calibrated, car.vehicle)
 
 
+#: Estimators of other packages: each entry point names a :class:`Spec`.
+ENTRY_POINTS = "pdhef.estimators"
 #: What the fork server of workers that filter has loaded.
 FILTERS = ("pdhef_logtool.estimators.*", "pdhef_logtool.records.compiled:load_kept")
 #: In place of names: every estimator that the car suits.
 ALL_ESTIMATORS = "all"
-#: In the order of the tables.
+#: Those of this package, in the order of the tables.
 SPECS: tuple[Spec, ...] = (
     Spec(
         "zero", "sideslip 0; speed, yaw rate and lateral acceleration from the sensors", "pass_through:build",
@@ -202,17 +207,43 @@ class Skipped:
         return self.spec.name
 
 
+@cache
+def all_specs() -> tuple[Spec, ...]:
+    """Return the estimators of this package, then those that installed packages add by entry point.
+
+    An entry point that cannot be loaded, or adds a name that exists, is left out with a warning on stderr.
+    """
+    specs = list(SPECS)
+    for entry in sorted(entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
+        reason = ""
+        try:
+            spec = entry.load()
+        except Exception as error:  # noqa: BLE001 (code of another package may raise anything)
+            reason = f"{type(error).__name__}: {error}"
+        else:
+            if not isinstance(spec, Spec):
+                reason = f"got {type(spec).__name__}, expected {Spec.__module__}.Spec"
+            elif spec.name in {s.name for s in specs}:
+                reason = f"an estimator named {spec.name} exists"
+        if reason:
+            where = f"entry point {entry.name} = {entry.value} ({ENTRY_POINTS})"
+            sys.stderr.write(f"pdhef: {shown(f'{where} is not used: {reason}')}\n")
+        else:
+            specs.append(spec)
+    return tuple(specs)
+
+
 def spec_of(name: str) -> Spec:
     """Return the line of a name; raises UsageError if there is none."""
     check_names((name,))
-    return next(s for s in SPECS if s.name == name)
+    return next(s for s in all_specs() if s.name == name)
 
 
 def check_names(names: Sequence[str]) -> None:
     """Raise UsageError if a name is unknown or occurs twice, or there is none; :data:`ALL_ESTIMATORS` stands alone."""
     if tuple(names) == (ALL_ESTIMATORS,):
         return
-    known = [s.name for s in SPECS]
+    known = [s.name for s in all_specs()]
     wrong = [n for n in names if n not in known] + sorted({n for n in names if names.count(n) > 1})
     if wrong or not names:
         raise UsageError(
@@ -233,7 +264,7 @@ def all_names(car: Car) -> tuple[str, ...]:
 
     Baselines and physics first, then what rests on a network.
     """
-    suited = [s for s in SPECS if s.in_all and not s.missing(car)]
+    suited = [s for s in all_specs() if s.in_all and not s.missing(car)]
     return tuple(s.name for s in sorted(suited, key=lambda s: bool(s.network)))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping as MappingABC
 
-from pdhef_logtool.estimators.table import SPECS, spec_of
+from pdhef_logtool.estimators.table import all_specs, spec_of
 from pdhef_logtool.mapping import Mapping
 from pdhef_logtool.records.signals import WHEELS
 
@@ -33,7 +33,7 @@ def usable_signals(mapping: Mapping) -> frozenset[str]:
 def what_it_is_good_for(mapping: Mapping) -> str:
     """Return what can be done with a log that is mapped so."""
     have = usable_signals(mapping)
-    names = [s.name for s in SPECS if s.needs <= have and not s.network and not s.needs_noise]
+    names = [s.name for s in all_specs() if s.needs <= have and not s.network and not s.needs_noise]
     uses = []
     if spec_of(_MAIN).needs <= have:
         against = _scored(mapping)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,12 +17,12 @@ RESTART_GAP_S = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StepColumns:
-    """Base of records whose fields are arrays over the same steps, [K, ...], or such records themselves."""
+    """Base of records whose fields are arrays over the same steps, [K, ...], such records, or tuples of them."""
 
     def joined(self, other: Self) -> Self:
         """Append the steps of the next window."""
         pairs = [(getattr(self, f.name), getattr(other, f.name)) for f in fields(self)]
-        return type(self)(*(a.joined(b) if isinstance(a, StepColumns) else np.concatenate([a, b]) for a, b in pairs))
+        return type(self)(*(_joined(a, b) for a, b in pairs))
 
     def since(self, index: int) -> Self:
         """Keep the steps from ``index`` on."""
@@ -33,8 +33,19 @@ class StepColumns:
         return self._cut(slice(index))
 
     def _cut(self, part: slice) -> Self:
-        columns = [getattr(self, f.name) for f in fields(self)]
-        return type(self)(*(c._cut(part) if isinstance(c, StepColumns) else c[part] for c in columns))
+        return type(self)(*(_cut(getattr(self, f.name), part) for f in fields(self)))
+
+
+def _joined(a: Any, b: Any) -> Any:
+    if isinstance(a, tuple):
+        return tuple(_joined(x, y) for x, y in zip(a, b, strict=True))
+    return a.joined(b) if isinstance(a, StepColumns) else np.concatenate([a, b])
+
+
+def _cut(column: Any, part: slice) -> Any:
+    if isinstance(column, tuple):
+        return tuple(_cut(x, part) for x in column)
+    return column._cut(part) if isinstance(column, StepColumns) else column[part]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,13 +89,27 @@ def last_stamp_ns(stamps_ns: IntArray, before_ns: int | None) -> int | None:
     return int(stamps_ns[-1]) if len(stamps_ns) else before_ns
 
 
-def predictable(
-    steps_ns: IntArray, ready_ns: IntArray, valid: BoolArray, stamps_ns: IntArray
-) -> tuple[Release, FloatArray, BoolArray]:
-    """Return the release of steps [K], how far each scored stamp [M] is ahead of its step in s, and where that may be.
+@dataclass(frozen=True, slots=True, eq=False)
+class Extrapolation:
+    """From which step, and how far, the state at each scored stamp is extrapolated, [M].
 
-    ``valid`` [K] are the steps with an estimate; a stamp without a step has NaN for the horizon.
+    Attributes
+    ----------
+    step : int64, newest step whose data had arrived by the stamp; 0 where there is none.
+    arrived : whether there is one.
+    horizon_s : from the step to the stamp; NaN where there is none.
+    usable : whether the step is valid and at most ``MAX_PREDICTION_S`` old.
     """
-    released = release(ready_ns, stamps_ns)
-    horizon_s = np.where(released.arrived, (stamps_ns - steps_ns[released.at]) * 1e-9, np.nan)
-    return released, horizon_s, (horizon_s <= MAX_PREDICTION_S) & valid[released.at]
+
+    step: IntArray
+    arrived: BoolArray
+    horizon_s: FloatArray
+    usable: BoolArray
+
+
+def extrapolation(steps_ns: IntArray, ready_ns: IntArray, valid: BoolArray, stamps_ns: IntArray) -> Extrapolation:
+    """Choose the step for each scored stamp [M] from steps [K] with stamps, availability times and validity."""
+    chosen = release(ready_ns, stamps_ns)
+    horizon_s = np.where(chosen.arrived, (stamps_ns - steps_ns[chosen.at]) * 1e-9, np.nan)
+    usable = (horizon_s <= MAX_PREDICTION_S) & valid[chosen.at]
+    return Extrapolation(chosen.at, chosen.arrived, horizon_s, usable)

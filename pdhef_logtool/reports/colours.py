@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pdhef_logtool.estimators.table import SPECS
+from pdhef_logtool.estimators.table import all_specs
 from pdhef_logtool.sinks.base import TRUTH
 from pdhef_logtool.sinks.palette import colour_rgb
 
@@ -11,14 +11,13 @@ INK = "#1a1a1a"
 FAULT, NOTE, PLAIN = "#b2182b", "#7a5195", "#6b7785"
 #: Of lines on white, as WCAG 2.1 asks of graphics.
 _LEAST_CONTRAST = 3.0
-_COLOURS = {s.name: s.colour for s in SPECS}
 
 
 def colour(name: str) -> str:
     """Return ``#rrggbb`` of an estimator or of the truth, the same on every page."""
     if name == TRUTH:
         return INK
-    rgb = colour_rgb(name, _COLOURS)
+    rgb = colour_rgb(name, {s.name: s.colour for s in all_specs()})
     while contrast(rgb) < _LEAST_CONTRAST:
         rgb = (rgb[0] * 15 // 16, rgb[1] * 15 // 16, rgb[2] * 15 // 16)
     return "#{:02x}{:02x}{:02x}".format(*rgb)

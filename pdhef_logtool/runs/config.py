@@ -65,6 +65,7 @@ class RunConfig:
     friction : ``auto`` is the log's own, else the car's, else estimated; ``file``, ``estimate``, or a number.
     prefer_truth : which truth counts in a simulated log that has both.
     window_s : length of the windows that the log is processed in; changes no number.
+    clock : ``arrival`` takes a sample as known when it arrived, as in a car; ``stamp`` at its stamp (not causal).
     budget : factor on what reading a log may cost before its claims count as damage.
     msgs : folder with definitions of message types that a log does not define.
     network : instead of the car's: a folder, ``default``, ``many-cars`` (the shipped one for any car), ``none``.
@@ -89,6 +90,7 @@ class RunConfig:
     friction: Literal["auto", "file", "estimate"] | Friction = "auto"
     prefer_truth: Literal["perfect", "rtk"] = "perfect"
     window_s: Annotated[float, Field(ge=1, le=1e9)] = WINDOW_S
+    clock: Literal["arrival", "stamp"] = "arrival"
     budget: Annotated[float, Field(gt=0, le=1e6)] = 1.0
     msgs: Path | None = None
     thresholds: Path | None = None

@@ -23,6 +23,7 @@ import numpy as np
 from pdhef_logtool.car.vehicle import AxleTyre, VehicleParameters
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.records.geometry import wrap_angle
 from pdhef_logtool.records.readings import POSSIBLE_FRICTION
@@ -79,7 +80,7 @@ class _Case:
 
     def estimate(self) -> StateTrack:
         """Return what the filter says; it runs where it has not."""
-        return self.physics.run(self.signals, None)[0] if self.ran is None else self.ran
+        return run_window(self.physics, self.signals)[0] if self.ran is None else self.ran
 
     def with_vehicle(self, **changes: Any) -> _Case:
         """Return the case with entries of the filter's vehicle changed; its signals stay."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -13,8 +12,10 @@ from pdhef_logtool.drive.reading import Drive, WholeDrive, no_samples
 from pdhef_logtool.drive.truth import valid_as_a_whole
 from pdhef_logtool.drive.windows import with_look_ahead
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import Estimator, look_ahead_of, run_window
-from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED
+from pdhef_logtool.estimators.base import Estimator, look_ahead_of
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.latency_compensation import WindowState, run_window
+from pdhef_logtool.estimators.self_calibrated import SELF_CALIBRATED, CalibratedBand
 from pdhef_logtool.records.geometry import DeadReckoner
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -43,6 +44,7 @@ def estimate_windows(
     watched: bool = True,
     drawn: bool = True,
     intervals: TrackCalibrator | None = None,
+    causality: CausalityCheck | None = None,
 ) -> Iterator[Estimated]:
     """Run estimators over a drive window by window; joined, the windows give the same bits as one over all.
 
@@ -50,6 +52,7 @@ def estimate_windows(
     ----------
     watched : complete ``diverged`` by the watch on wrong branches. drawn : dead-reckon poses.
     intervals : calibrates them; None leaves them as the estimators give them.
+    causality : collects the estimators that declare themselves causal and look ahead; None does not check.
 
     Raises
     ------
@@ -59,7 +62,7 @@ def estimate_windows(
     from pdhef_logtool.watches.divergence import DivergenceWatch
 
     watch = DivergenceWatch(drive.plan.vehicle) if watched else None
-    carries: dict[str, Any] = {}
+    states: dict[str, WindowState] = {}
     poses = {e.name: DeadReckoning() for e in estimators}
     truth_pose = DeadReckoning()
     start: tuple[float, float, float] | None = None
@@ -75,7 +78,8 @@ def estimate_windows(
             drawn_truth = valid_as_a_whole(drawn_truth, drive.plan.derivation, drive.plan.vehicle.standstill_m_s)
         tracks = []
         for estimator in estimators:
-            track, carries[estimator.name] = run_window(estimator, signals, carries.get(estimator.name), ahead)
+            before = states.get(estimator.name)
+            track, states[estimator.name] = run_window(estimator, signals, before, ahead, causality)
             track = track if watch is None else watch.add(track, signals)
             track = track if intervals is None else intervals.add(track, signals)
             track = track.without_sideslip_below(drive.plan.vehicle.standstill_m_s)
@@ -94,9 +98,12 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
 
     algorithms, own, posterior = {}, {}, {}
     band = posterior_band(car, use_speed=all(resolve(e).use_speed for e in estimators))
+    calibrated = None if car.self_calibrated is None else CalibratedBand(car.self_calibrated, car.vehicle)
     for estimator in estimators:
         if note := getattr(estimator, "intervals_note", ""):
             own[estimator.name] = note
+            if calibrated is not None:
+                posterior[estimator.name] = calibrated.add
             continue
         other = getattr(estimator, "calibrated_as", None)
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]

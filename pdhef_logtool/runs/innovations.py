@@ -69,10 +69,10 @@ def _innovations(estimator: Estimator, signals: Signals) -> FloatArray | None:
     if isinstance(estimator, AdaptivePhysics):
         checked, _ = estimator.inputs(signals, None)
         rate = estimator.trust * checked.rate
-        steps, _ = estimator.filters[0].filter_steps(checked.faults.filtered, None, rate, checked.faults.extra_r)
+        steps, _ = estimator.filters[0].run(checked.faults.filtered, None, rate, checked.faults.extra_r)
         return steps.innovation
     if isinstance(estimator, PhysicsUkf | PhysicsFilter):
-        return estimator.filter_steps(signals, None)[0].innovation
+        return estimator.run(signals, None)[0].innovation
     return None
 
 

@@ -17,8 +17,9 @@ from pdhef_logtool.drive.friction import FrictionSource
 from pdhef_logtool.drive.reading import Drive, lost_texts
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.base import Estimator, notes_of
+from pdhef_logtool.estimators.causality_check import CausalityCheck
 from pdhef_logtool.estimators.stand_in import StandIn
-from pdhef_logtool.estimators.table import ALL_ESTIMATORS, SPECS, Options, Skipped, runnable
+from pdhef_logtool.estimators.table import ALL_ESTIMATORS, Options, Skipped, all_specs, runnable
 from pdhef_logtool.logs.discovery import RUN_FILE, LogInput
 from pdhef_logtool.mapping import Mapping, merge_losses
 from pdhef_logtool.records.errors import (
@@ -310,7 +311,9 @@ def _run_estimators(
     intervals = calibrator(car, ready)
     with outputs.begin(log_place(drive.name), stale=STALE_FILES) as change, ExitStack() as opened:
         store = opened.enter_context(TrackStore(change.scratch / "tracks"))
-        signals = _estimate(drive, ready, intervals, store, progress)
+        causality = CausalityCheck()
+        signals = _estimate(drive, ready, intervals, store, progress, causality)
+        ready = _without_failed(drive, ready, causality.failed)
         sensors = log_sensors(drive.car.vehicle, job.calibration)
         found = evaluate(drive, [e.name for e in ready], store.read, signals, sensors)
         if drive.friction.bank is not None:
@@ -325,25 +328,28 @@ def _run_estimators(
         details = drive_details(drive, ready, main.name, store.read, signals, limits, brief=config.kept != "full")
         shown = _shown(main, [e.name for e in ready])
         sinks = opened.enter_context(_open_sinks(change, drive, config, car, shown, outputs.path))
-        _write(store, sinks)
+        _write(store, sinks, frozenset(causality.failed))
         digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
         rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in found.rows]
         events = found.events
         if not found.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
         silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
-        losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent])
+        failed = [Loss("estimator-failed", f"{name} {text}", drive.name) for name, text in causality.failed.items()]
+        losses = merge_losses([drive.losses, *(sink.lost for sink in sinks), silent, failed])
         ran = [
             EstimatorFacts(
                 e.name,
-                causal=e.causal,
-                notes=notes_of(e),
+                causal=e.causal and not drive.not_causal,
+                notes=(*notes_of(e), *([drive.not_causal] if drive.not_causal else [])),
                 intervals=intervals.notes(e.name),
                 reasons=found.reasons[e.name],
                 algorithm={"sha256": a.sha256, **a.model_dump(mode="json")},
             )
-            for e, a in zip(ready, algorithms.values(), strict=True)
+            for e in ready
+            for a in (algorithms[e.name],)
         ]
+        ran += [EstimatorFacts(name, causal=False, failed=text) for name, text in causality.failed.items()]
         left_out = [EstimatorFacts(s.name, causal=s.spec.causal, skipped=s.reason) for s in job.skipped]
         facts = report_facts(drive, car, [*ran, *left_out], rows, events, losses)
         calibration = None if job.calibration is None else job.calibration.to_dict()
@@ -414,7 +420,7 @@ def _open_sinks(
     from pdhef_logtool.sinks.parquet import EstimatesSink
 
     sinks: list[Sink] = []
-    colours = {s.name: s.colour for s in SPECS}
+    colours = {s.name: s.colour for s in all_specs()}
     try:
         if config.kept != "metrics":
             sinks.append(EstimatesSink(change.file(ESTIMATES_FILE)))
@@ -473,9 +479,10 @@ def _estimate(
     intervals: TrackCalibrator,
     store: TrackStore,
     progress: Progress,
+    causality: CausalityCheck,
 ) -> Signals:
     """Run all estimators over the drive into the store; return the drive's signals for segments."""
-    for window in estimate_windows(drive, estimators, intervals=intervals):
+    for window in estimate_windows(drive, estimators, intervals=intervals, causality=causality):
         store.append_signals(window.signals)
         if window.truth is not None:
             store.append(window.truth)
@@ -488,13 +495,26 @@ def _estimate(
     return store.signals()
 
 
-def _write(store: TrackStore, sinks: Sequence[Sink]) -> None:
-    """Feed the outputs with what is stored, in the windows that it came in."""
+def _without_failed(drive: Drive, ready: Sequence[Estimator], failed: dict[str, str]) -> Sequence[Estimator]:
+    """Return the estimators whose estimates count; raises EstimatorError if none is left."""
+    for name, text in failed.items():
+        drive.tell(f"{name} {text}")
+    left = [e for e in ready if e.name not in failed]
+    if not left:
+        raise EstimatorError(
+            expected="an estimator that runs as it declares", got="; ".join(failed.values()), where=str(drive.path)
+        )
+    return left
+
+
+def _write(store: TrackStore, sinks: Sequence[Sink], left_out: frozenset[str]) -> None:
+    """Write the stored windows to the outputs, without the tracks of ``left_out`` estimators."""
     for signals, tracks in store.windows():
         for sink in sinks:
             sink.append_signals(signals)
             for track in tracks:
-                sink.append(track)
+                if track.name not in left_out:
+                    sink.append(track)
 
 
 def friction_events(friction: FrictionSource, signals: Signals) -> list[Event]:

@@ -13,7 +13,8 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters
 from pdhef_logtool.drive.cached import read_cached
 from pdhef_logtool.drive.reading import Drive
-from pdhef_logtool.estimators.base import Estimator, run_window
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP, SELF_CALIBRATED
 from pdhef_logtool.estimators.table import ALL_ESTIMATORS, make_estimator
 from pdhef_logtool.logs.discovery import LogInput

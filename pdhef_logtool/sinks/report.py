@@ -86,8 +86,9 @@ class SourceFacts:
 
 @dataclass(frozen=True, slots=True)
 class EstimatorFacts:
-    """One estimator that was asked for: ``skipped`` holds the reason if it did not run.
+    """One estimator that was asked for.
 
+    ``skipped`` is the reason if it did not run, ``failed`` the reason if its estimates are not used.
     ``notes``: what it has to say of itself. ``intervals``: what its 95 % intervals are made of, empty without.
     ``reasons``: why it did not use its sensors as usual; None if it does not look. ``algorithm``: what ran under the
     name, with its digest; None if it did not run.
@@ -96,6 +97,7 @@ class EstimatorFacts:
     name: str
     causal: bool
     skipped: str | None = None
+    failed: str | None = None
     notes: Sequence[str] = ()
     intervals: Sequence[str] = ()
     reasons: Sequence[ReasonFacts] | None = None
@@ -259,8 +261,8 @@ def build_report(facts: ReportFacts) -> dict[str, Any]:
             {
                 "name": e.name,
                 "causal": e.causal,
-                "outcome": "ran" if e.skipped is None else "skipped",
-                "reason": e.skipped,
+                "outcome": "failed" if e.failed else "ran" if e.skipped is None else "skipped",
+                "reason": e.failed or e.skipped,
                 "algorithm": e.algorithm,
                 "notes": list(e.notes),
                 "intervals": list(e.intervals),

@@ -79,7 +79,7 @@ def log_likelihood(drives: list[TuningDrive], build: Build, q_std: Q) -> float:
     """Return the criterion: Gaussian log-likelihood per scalar innovation, the mean over manoeuvres."""
     total: dict[str, tuple[float, int]] = {}
     for drive in drives:
-        steps, _ = build(drive.vehicle, q_std).filter_steps(drive.signals, None)
+        steps, _ = build(drive.vehicle, q_std).run(drive.signals, None)
         value, count = total.get(drive.manoeuvre, (0.0, 0))
         value += float(steps.log_likelihood.sum())
         total[drive.manoeuvre] = value, count + int(np.isfinite(steps.innovation).sum())

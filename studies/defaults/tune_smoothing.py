@@ -19,6 +19,7 @@ import numpy as np
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics, for_smoothing
 from pdhef_logtool.records.files import write_bytes
@@ -52,7 +53,7 @@ def ratios(car: Car, one: Simulated) -> list[float]:
     physics = of_car(car)
 
     def rmse(estimator: Estimator) -> float:
-        return root_mean_square(one.error(estimator.run(one.drive.signals, None)[0]))
+        return root_mean_square(one.error(run_window(estimator, one.drive.signals)[0]))
 
     filtered = rmse(AdaptivePhysics(physics))
     return [rmse(SmoothedPhysics(AdaptivePhysics(for_smoothing(physics, p)))) / filtered for p in PAIRS]

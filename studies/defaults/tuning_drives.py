@@ -18,6 +18,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.records.signals import FloatArray, Signals
 from studies.condition_drives import as_logged
 from studies.pages import ROOT
@@ -74,7 +75,7 @@ def sideslip_rmse_deg(drive: TuningDrive, estimator: Estimator | None) -> float:
     """Return the sideslip RMSE of a drive in degrees; None stands for no sideslip at all."""
     error = drive.sideslip_rad
     if estimator is not None:
-        track, _ = estimator.run(drive.signals, None)
+        track, _ = run_window(estimator, drive.signals)
         error = (track.sideslip_rad - drive.sideslip_rad)[track.valid]
     return float(np.rad2deg(np.sqrt(np.nanmean(error**2))))
 

@@ -15,7 +15,7 @@ from pdhef_logtool.logs.open_log import open_log
 
 def test_the_peer_filter_has_our_posteriors() -> None:
     signals = filtering.drive(300)
-    ours, _ = PhysicsUkf(default_vehicle(), q_std=PHY_UKF_Q_STD, r_std=filtering.R_STD).filter_steps(signals, None)
+    ours, _ = PhysicsUkf(default_vehicle(), q_std=PHY_UKF_Q_STD, r_std=filtering.R_STD).run(signals, None)
     np.testing.assert_allclose(ours.x, filtering.run_filterpy(signals, ours.x[0], 300), rtol=1e-6, atol=1e-6)
 
 

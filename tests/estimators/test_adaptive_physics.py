@@ -17,6 +17,7 @@ from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import CURES, LEAST_WEIGHT, AdaptivePhysics, mix, weigh
 from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
 from pdhef_logtool.records.signals import Signals
@@ -113,8 +114,8 @@ def rough() -> Signals:
 @pytest.mark.parametrize("trust", [0.0, 0.4, 1.0])
 def test_without_noise_and_error_it_is_the_fixed_filter_to_the_bit(made, trust):
     signals = replace(made.signals, friction=np.full(len(made.signals), 0.85))
-    a, _ = adaptive(trust=trust, physics=PLAIN).run(signals, None)
-    b, _ = fixed(trust=trust).run(signals, None)
+    a, _ = run_window(adaptive(trust=trust, physics=PLAIN), signals)
+    b, _ = run_window(fixed(trust=trust), signals)
     assert same(a, b)
     assert set(a.network_trust[a.valid]) == {trust}
 
@@ -123,8 +124,8 @@ def test_with_noise_it_is_the_fixed_filter_but_for_a_few_samples(made):
     """Clean drives: the mechanism costs next to nothing."""
     for seed in range(5):
         signals = noisy(made, seed)
-        a, _ = adaptive().run(signals, None)
-        b, _ = fixed().run(signals, None)
+        a, _ = run_window(adaptive(), signals)
+        b, _ = run_window(fixed(), signals)
         away = np.abs(a.sideslip_rad - b.sideslip_rad)[a.valid]
         assert np.median(away) < np.radians(0.001)
         assert np.sqrt(np.mean(away**2)) < np.radians(0.01)
@@ -142,17 +143,17 @@ def test_a_burst_raises_r_for_its_time_and_costs_less(made):
         ay_m_s2=clean.ay_m_s2 + burst * 2.4 * rng.standard_normal(len(t)),
         yaw_rate_rad_s=clean.yaw_rate_rad_s + burst * 0.08 * rng.standard_normal(len(t)),
     )
-    track, _ = adaptive().run(bad, None)
+    track, _ = run_window(adaptive(), bad)
     assert np.median(track.r_scale[(t > 4.1) & burst]) > 50
     assert (track.r_scale[t > 6.7] == 1.0).all()
-    error = {e.name: np.abs(e.run(bad, None)[0].sideslip_rad - made.sideslip) for e in (adaptive(), fixed())}
+    error = {e.name: np.abs(run_window(e, bad)[0].sideslip_rad - made.sideslip) for e in (adaptive(), fixed())}
     assert error["pd-hef"][burst].mean() < 0.5 * error["pd-hef-fixed-r"][burst].mean()
 
 
 def test_a_slow_model_error_leaves_r_alone(weak):
-    track, _ = adaptive().run(noisy(weak), None)
+    track, _ = run_window(adaptive(), noisy(weak), None)
     assert (track.r_scale == 1.0).mean() > 0.99
-    innovation = PLAIN.filter_steps(noisy(weak), None)[0].innovation[:, 0]
+    innovation = PLAIN.run(noisy(weak), None)[0].innovation[:, 0]
     assert np.sqrt(np.nanmean(innovation**2)) > 2 * VEHICLE.sensors.ay_std_m_s2, "there was an error to be misread"
 
 
@@ -163,7 +164,7 @@ def test_a_gyro_that_fails_does_not_take_the_filter_with_it(made, how):
     held = signals.yaw_rate_rad_s[np.argmax(bad)] if how == "stuck" else 0.0
     faulty = replace(signals, yaw_rate_rad_s=np.where(bad, held, signals.yaw_rate_rad_s))
     error = {
-        e.name: np.sqrt(np.nanmean((e.run(faulty, None)[0].sideslip_rad - made.sideslip)[bad] ** 2))
+        e.name: np.sqrt(np.nanmean((run_window(e, faulty)[0].sideslip_rad - made.sideslip)[bad] ** 2))
         for e in (adaptive(), fixed())
     }
     assert error["pd-hef"] < np.radians(0.1)
@@ -174,21 +175,21 @@ def test_a_gyro_that_fails_does_not_take_the_filter_with_it(made, how):
 
 
 def weights(estimator: AdaptivePhysics, signals: Signals) -> np.ndarray:
-    return np.nan_to_num(estimator.run(signals, None)[0].mixture_weight)
+    return np.nan_to_num(run_window(estimator, signals)[0].mixture_weight)
 
 
 def test_forces_that_are_wrong_in_proportion_are_scaled(weak):
     signals = noisy(weak)
     assert weights(adaptive(), signals)[150:].mean() > 0.8
     error = {
-        e.name: np.sqrt(np.nanmean((e.run(signals, None)[0].sideslip_rad - weak.sideslip)[150:] ** 2))
+        e.name: np.sqrt(np.nanmean((run_window(e, signals)[0].sideslip_rad - weak.sideslip)[150:] ** 2))
         for e in (adaptive(), fixed())
     }
     assert error["pd-hef"] < 0.7 * error["pd-hef-fixed-r"]
 
 
 def rmse(estimator: AdaptivePhysics, signals: Signals, made) -> float:
-    return float(np.sqrt(np.nanmean((estimator.run(signals, None)[0].sideslip_rad - made.sideslip)[100:] ** 2)))
+    return float(np.sqrt(np.nanmean((run_window(estimator, signals)[0].sideslip_rad - made.sideslip)[100:] ** 2)))
 
 
 def test_cures_of_nothing_cost_little(made):
@@ -214,12 +215,12 @@ def test_a_banked_road_is_taken_for_one(made):
     """The bend leans: a part of what holds the car in it is its weight, which no accelerometer feels."""
     leaning = drive(slalom(0.035, 0.5), 12.0, speed=22.0, side_pull_m_s2=-9.80665 * 0.08)
     signals = noisy(leaning, 7)
-    lone, _ = fixed().run(signals, None)
-    track, _ = adaptive().run(signals, None)
+    lone, _ = run_window(fixed(), signals)
+    track, _ = run_window(adaptive(), signals)
     assert np.nanmean(track.bank_rad[600:]) > 0.03
     errors = [np.sqrt(np.nanmean((x.sideslip_rad - leaning.sideslip)[600:] ** 2)) for x in (track, lone)]
     assert errors[0] < 0.6 * errors[1]
-    flat, _ = adaptive().run(noisy(made, 7), None)
+    flat, _ = run_window(adaptive(), noisy(made, 7), None)
     assert abs(np.nanmean(flat.bank_rad)) < 0.01
 
 
@@ -269,10 +270,10 @@ def test_the_mixture_has_the_moments_of_its_samples():
 def test_trust_scales_the_network_in_all_filters(made):
     wrong = NetworkService(_bundle((0.5, 0.2)))
     signals = noisy(made)
-    a, _ = adaptive(wrong, trust=0.0).run(signals, None)
-    b, _ = adaptive(SILENT, trust=1.0).run(signals, None)
+    a, _ = run_window(adaptive(wrong, trust=0.0), signals)
+    b, _ = run_window(adaptive(SILENT, trust=1.0), signals)
     assert same(a, b)
-    assert not same(adaptive(wrong).run(signals, None)[0], b)
+    assert not same(run_window(adaptive(wrong), signals)[0], b)
 
 
 def test_its_noise_comes_from_the_car():
@@ -293,10 +294,10 @@ def test_its_noise_comes_from_the_car():
 @given(st.lists(st.integers(0, 701), max_size=8))
 def test_windows_of_any_cut_join_bit_for_bit(rough, inner):
     estimator = adaptive(NETWORK)
-    whole, _ = estimator.run(rough, None)
+    whole, _ = run_window(estimator, rough)
     parts, carry = [], None
     for first, end in pairwise([0, *sorted(inner), len(rough)]):
-        track, carry = estimator.run(cut(rough, first, end), carry)
+        track, carry = run_window(estimator, cut(rough, first, end), carry)
         parts.append(track)
     assert same(concatenate(parts), whole, ADAPTIVE)
     assert whole.reason.any()
@@ -313,7 +314,7 @@ def test_nothing_that_arrives_later_changes_an_output(rough, j, seed):
         for c in ("ay_m_s2", "yaw_rate_rad_s", "steer_rad")
     }
     estimator = adaptive(NETWORK)
-    a, b = estimator.run(rough, None)[0], estimator.run(replace(rough, **columns), None)[0]
+    a, b = run_window(estimator, rough)[0], run_window(estimator, replace(rough, **columns), None)[0]
     before = int(np.searchsorted(rough.stamps_ns, rough.ready_ns[j], side="left"))
     for column in ADAPTIVE:
         np.testing.assert_array_equal(getattr(a, column)[:before], getattr(b, column)[:before])
@@ -321,7 +322,7 @@ def test_nothing_that_arrives_later_changes_an_output(rough, j, seed):
 
 def test_left_and_right_are_mirrored(rough):
     mirrored = replace(rough, **{c: -getattr(rough, c) for c in ("steer_rad", "ay_m_s2", "yaw_rate_rad_s")})
-    a, b = adaptive().run(rough, None)[0], adaptive().run(mirrored, None)[0]
+    a, b = run_window(adaptive(), rough)[0], run_window(adaptive(), mirrored)[0]
     np.testing.assert_allclose(b.vy_m_s, -a.vy_m_s, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(b.sideslip_std_rad, a.sideslip_std_rad, rtol=1e-6)
 
@@ -331,14 +332,14 @@ def test_bad_signals_leave_it_finite_and_its_covariance_definite(rough):
     nothing = {c: np.full(len(rough), np.nan) for c in ("ay_m_s2", "yaw_rate_rad_s", "friction", "ax_m_s2")}
     spiked = {"ay_m_s2": np.where(np.arange(len(rough)) % 50 == 0, 1e6, rough.ay_m_s2)}
     for change in ({}, nothing, spiked):
-        track, _ = adaptive(NETWORK).run(replace(rough, **change), None)
+        track, _ = run_window(adaptive(NETWORK), replace(rough, **change), None)
         assert track.valid[20:].mean() > 0.9
         ok = track.valid
         for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "ay_m_s2", "sideslip_std_rad"):
             assert np.isfinite(getattr(track, column)[ok]).all(), column
             assert np.isnan(getattr(track, column)[~ok]).all(), column
         assert (np.linalg.eigvalsh(track.covariance[ok]) > 0).all()
-    assert len(adaptive().run(cut(rough, 0, 0), None)[0]) == 0
+    assert len(run_window(adaptive(), cut(rough, 0, 0), None)[0]) == 0
 
 
 def test_another_tyre_is_not_noise():

@@ -16,7 +16,8 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise
 from pdhef_logtool.car.vehicle import AxleTyre, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.table import SPECS, Options, check_names, make_estimator, runnable, spec_of
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import Options, all_specs, check_names, make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.readings import without_impossible
 from pdhef_logtool.records.release import MAX_PREDICTION_S, released_steps
@@ -29,7 +30,7 @@ pytestmark = pytest.mark.slow
 NOISE = FilterNoise(q_std=(0.05, 0.02, 0.02), r_std={"ay_m_s2": 0.8})
 VEHICLE = default_vehicle()
 #: What a log calibrated is another estimator in a wrapper (test_self_calibrated.py).
-NAMES = tuple(s.name for s in SPECS if not s.network and s.name != "open-loop-calibrated")
+NAMES = tuple(s.name for s in all_specs() if not s.network and s.name != "open-loop-calibrated")
 #: Those that claim a lateral velocity by a model or by integration.
 FILTERS = ("phy-ukf", "physics", "phy-ukf-tuned")
 CLAIMING = ("kinematic", "open-loop", *FILTERS)
@@ -50,7 +51,7 @@ def car_of(vehicle: VehicleParameters = VEHICLE) -> Car:
 
 
 def run(name: str, signals: Signals, **options) -> StateTrack:
-    return make_estimator(name, car_of(), Options(**options)).run(signals, None)[0]
+    return run_window(make_estimator(name, car_of(), Options(**options)), signals)[0]
 
 
 def same_bits(a: StateTrack, b: StateTrack, upto: int | None = None) -> None:
@@ -88,11 +89,11 @@ def rough() -> Signals:
 def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
     inner = data.draw(st.lists(st.integers(0, len(rough)), max_size=12))
     estimator = make_estimator(name, car_of())
-    whole, _ = estimator.run(rough, None)
+    whole, _ = run_window(estimator, rough)
     edges = [0, *sorted(inner), len(rough)]
     parts, carry = [], None
     for first, end in pairwise(edges):
-        track, carry = estimator.run(cut(rough, first, end), carry)
+        track, carry = run_window(estimator, cut(rough, first, end), carry)
         assert len(track) == end - first
         parts.append(track)
     same_bits(concatenate(parts), whole)
@@ -102,9 +103,9 @@ def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
 def test_a_carry_can_be_used_twice(name, rough):
     """An estimator is immutable: what it handed out is not changed by running on."""
     estimator = make_estimator(name, car_of())
-    _, carry = estimator.run(cut(rough, 0, 100), None)
-    first, _ = estimator.run(cut(rough, 100, 300), carry)
-    again, _ = estimator.run(cut(rough, 100, 300), carry)
+    _, carry = run_window(estimator, cut(rough, 0, 100), None)
+    first, _ = run_window(estimator, cut(rough, 100, 300), carry)
+    again, _ = run_window(estimator, cut(rough, 100, 300), carry)
     same_bits(first, again)
 
 
@@ -293,7 +294,7 @@ def check_sane(track: StateTrack, name: str, signals: Signals) -> None:
         assert np.isfinite(track.sideslip_std_rad[ok]).all()
         estimator = make_estimator(name, car_of())
         one = estimator.physics if isinstance(estimator, AdaptivePhysics) else estimator
-        steps, _ = one.filter_steps(signals, None)
+        steps, _ = one.run(signals, None)
         full = steps.P[steps.valid]
         np.testing.assert_array_equal(full, np.swapaxes(full, 1, 2))
         # scaled to correlations, so that 1e6 m/s beside 1 mrad/s is no matter of rounding
@@ -315,7 +316,7 @@ def plain() -> Signals:
 def test_no_fault_breaks_an_estimator(name, fault, plain):
     faulty = FAULTS[fault](plain)
     for vehicle in (VEHICLE, STIFFNESS_VEHICLE):
-        track, _ = make_estimator(name, car_of(vehicle)).run(faulty, None)
+        track, _ = run_window(make_estimator(name, car_of(vehicle)), faulty)
         assert len(track) == len(faulty)
         check_sane(track, name, faulty)
     if len(faulty) > 1:
@@ -351,8 +352,8 @@ def test_a_vehicle_that_no_step_can_follow_claims_nothing_infinite(name, delay_s
     """A yaw inertia in the wrong unit makes the model faster than any step: the state runs away, and is dropped."""
     toy = VEHICLE.model_copy(update={"yaw_inertia_kg_m2": 0.001})
     sparse = keep(plain, np.arange(len(plain)) % 20 == 0)
-    track, _ = make_estimator(name, car_of(toy)).run(
-        replace(sparse, ready_ns=sparse.stamps_ns + round(delay_s * 1e9)), None
+    track, _ = run_window(
+        make_estimator(name, car_of(toy)), replace(sparse, ready_ns=sparse.stamps_ns + round(delay_s * 1e9)), None
     )
     assert not track.valid[5:].all()
     for column in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "ay_m_s2"):
@@ -412,7 +413,7 @@ def test_an_estimator_runs_on_what_it_needs_alone(name, plain):
     assert estimator.causal
     dt = np.diff(plain.stamps_ns) * 1e-9
     bare = make_signals(dt, **{c: getattr(plain, c) for c in spec_of(name).needs})
-    track, _ = estimator.run(bare, None)
+    track, _ = run_window(estimator, bare)
     assert track.valid[5:].all()
     assert np.isfinite(track.vx_m_s[5:]).all()
     assert np.isfinite(track.yaw_rate_rad_s[5:]).all()

@@ -17,6 +17,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.fuzzy_trust import RULES, fuzzy_trust, memberships
 from pdhef_logtool.estimators.hybrid_paper import PaperHybridUkf, adapted_noise
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.parallel_physics import parallel_filter, run_features
 from pdhef_logtool.estimators.table import check_names, runnable
 from pdhef_logtool.records.errors import UsageError
@@ -120,7 +121,7 @@ def test_noise_never_falls_below_the_sensors(c, nu, predicted, r0):
 
 
 def test_noise_rises_in_a_burst_and_only_then(weaving):
-    track, _ = paper_filter().run(weaving, None)
+    track, _ = run_window(paper_filter(), weaving)
     assert (track.r_scale[track.valid] >= 1.0).all()
     assert track.r_scale[240:262].max() > 10.0
     assert track.r_scale[20:100].max() < track.r_scale[240:262].max() / 3
@@ -223,7 +224,7 @@ def numpy_reference(signals: Signals, bundle: ModelBundle) -> dict[str, np.ndarr
 def test_it_is_the_papers_equations_in_plain_numpy(weaving):
     bundle = make_bundle()
     want = numpy_reference(weaving, bundle)
-    track, _ = PaperHybridUkf(VEHICLE, NetworkService(bundle)).run(weaving, None)
+    track, _ = run_window(PaperHybridUkf(VEHICLE, NetworkService(bundle)), weaving)
     got = {
         "vx": track.vx_m_s, "vy": track.vy_m_s, "r": track.yaw_rate_rad_s, "beta": track.network_trust,
         "r_scale": track.r_scale, "ay": track.ay_m_s2, "vy_var": track.vy_std_m_s**2,
@@ -236,10 +237,10 @@ def test_it_is_the_papers_equations_in_plain_numpy(weaving):
 
 def test_windows_join_bit_for_bit(weaving):
     estimator = paper_filter()
-    whole, _ = estimator.run(weaving, None)
+    whole, _ = run_window(estimator, weaving)
     carry, parts = None, []
     for a, b in pairwise((0, 1, 1, 90, 122, 123, 300, len(weaving))):
-        part, carry = estimator.run(cut(weaving, a, b), carry)
+        part, carry = run_window(estimator, cut(weaving, a, b), carry)
         parts.append(part)
     joined = concatenate(parts)
     for column in ("vx_m_s", "vy_m_s", "ay_m_s2", "covariance", "network_trust", "r_scale", "nis", "valid"):
@@ -257,7 +258,7 @@ def test_a_missing_accelerometer_leaves_trust_where_it_was(weaving):
     ay = weaving.ay_m_s2.copy()
     ay[200:300] = np.nan
     on_time = replace(weaving, ay_m_s2=ay, ready_ns=weaving.stamps_ns)
-    track, _ = paper_filter().run(on_time, None)
+    track, _ = run_window(paper_filter(), on_time)
     assert track.valid[200:300].all()
     np.testing.assert_array_equal(track.network_trust[200:300], track.network_trust[199])
     assert np.isfinite(track.vy_m_s[200:]).all()

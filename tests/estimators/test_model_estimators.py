@@ -16,6 +16,7 @@ from reference_car import cut, drive, keep, make_signals, slalom, with_noise
 
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator, runnable, spec_of
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.release import MAX_PREDICTION_S
@@ -60,7 +61,7 @@ MODEL = replace(
 
 
 def run(name: str, signals: Signals, vehicle=VEHICLE) -> StateTrack:
-    return make_estimator(name, Car.of(vehicle, network=MODEL)).run(signals, None)[0]
+    return run_window(make_estimator(name, Car.of(vehicle, network=MODEL)), signals)[0]
 
 
 @pytest.fixture(scope="module")
@@ -81,10 +82,10 @@ def rough() -> Signals:
 def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
     inner = data.draw(st.lists(st.integers(0, len(rough)), max_size=8))
     estimator = make_estimator(name, Car.of(VEHICLE, network=MODEL))
-    whole, _ = estimator.run(rough, None)
+    whole, _ = run_window(estimator, rough)
     parts, carry = [], None
     for first, end in pairwise([0, *sorted(inner), len(rough)]):
-        track, carry = estimator.run(cut(rough, first, end), carry)
+        track, carry = run_window(estimator, cut(rough, first, end), carry)
         parts.append(track)
     properties.same_bits(concatenate(parts), whole)
 
@@ -92,9 +93,9 @@ def test_windows_of_any_cut_join_bit_for_bit(name, rough, data):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_carry_can_be_used_twice(name, rough):
     estimator = make_estimator(name, Car.of(VEHICLE, network=MODEL))
-    _, carry = estimator.run(cut(rough, 0, 100), None)
-    first, _ = estimator.run(cut(rough, 100, 300), carry)
-    again, _ = estimator.run(cut(rough, 100, 300), carry)
+    _, carry = run_window(estimator, cut(rough, 0, 100), None)
+    first, _ = run_window(estimator, cut(rough, 100, 300), carry)
+    again, _ = run_window(estimator, cut(rough, 100, 300), carry)
     properties.same_bits(first, again)
 
 
@@ -136,9 +137,9 @@ def test_it_runs_on_what_it_needs_alone_and_not_on_what_is_too_late(name):
     hashes = {"pure-lstm": MODEL.pure_lstm.sha256, "linear-regression": REGRESSION.sha256}
     assert name not in hashes or hashes[name] in estimator.notes[0]
     bare = make_signals(np.diff(plain.stamps_ns) * 1e-9, **{c: getattr(plain, c) for c in spec_of(name).needs})
-    assert estimator.run(bare, None)[0].valid[5:].all()
+    assert run_window(estimator, bare)[0].valid[5:].all()
     late = replace(plain, ready_ns=plain.stamps_ns + round((MAX_PREDICTION_S + 0.02) * 1e9))
-    assert not estimator.run(late, None)[0].valid.any()
+    assert not run_window(estimator, late)[0].valid.any()
 
 
 def test_pure_lstm_says_what_its_network_says_and_predicts_it_over_the_delay():
@@ -152,12 +153,12 @@ def test_pure_lstm_says_what_its_network_says_and_predicts_it_over_the_delay():
     made = drive(slalom(0.02, 0.5), 4.0)
     gain = 1.0 + 9.80665 * VEHICLE.roll_gradient_rad_per_m_s2
     on_time = replace(made.signals, ay_m_s2=gain * made.ay)
-    track, _ = make_estimator("pure-lstm", Car.of(VEHICLE, network=model)).run(on_time, None)
+    track, _ = run_window(make_estimator("pure-lstm", Car.of(VEHICLE, network=model)), on_time)
     np.testing.assert_allclose(track.vy_m_s, 0.25, rtol=1e-6)
     np.testing.assert_array_equal(track.yaw_rate_rad_s, made.r)
     np.testing.assert_allclose(track.ay_m_s2, made.ay, rtol=1e-12, atol=1e-12)
     late = replace(on_time, ready_ns=on_time.stamps_ns + 20_000_000)
-    track, _ = make_estimator("pure-lstm", Car.of(VEHICLE, network=model)).run(late, None)
+    track, _ = run_window(make_estimator("pure-lstm", Car.of(VEHICLE, network=model)), late)
     expected = 0.25 + 0.02 * (made.ay - made.vx * made.r)[:-2]
     np.testing.assert_allclose(track.vy_m_s[2:], expected, atol=1e-3)
     assert np.ptp(track.vy_m_s[2:]) > 0.01
@@ -172,10 +173,10 @@ def test_linear_regression_is_its_equation():
         speed_m_s=np.full(n, 20.0),
     )  # fmt: skip
     model = replace(MODEL, linear_regression=LinearModel(("ay_m_s2", "yaw_rate_rad_s"), (-0.01, 0.2), 0.004, 2.0))
-    track, _ = make_estimator("linear-regression", Car.of(VEHICLE, network=model)).run(signals, None)
+    track, _ = run_window(make_estimator("linear-regression", Car.of(VEHICLE, network=model)), signals)
     assert track.sideslip_rad[-1] == pytest.approx(0.004 - 0.03 + 0.03, abs=1e-9)
     step = replace(signals, ay_m_s2=np.where(np.arange(n) < 1000, 3.0, 1.0))
-    after, _ = make_estimator("linear-regression", Car.of(VEHICLE, network=model)).run(step, None)
+    after, _ = run_window(make_estimator("linear-regression", Car.of(VEHICLE, network=model)), step)
     share = 1.0 - math.exp(-2.0 * math.pi * 2.0 * 0.01 * 8)  # eight steps behind the jump
     assert after.sideslip_rad[1007] == pytest.approx(0.004 + 0.02 * share, abs=1e-9)
 

@@ -38,11 +38,11 @@ def test_bias_states_find_the_sensor_that_is_allowed_to_be_wrong(column, state, 
     tight = {"ay_bias_std_m_s2": 0.01, "yaw_rate_bias_std_rad_s": 1e-4, "steer_bias_std_rad": 1e-4}
     vehicle = VEHICLE.model_copy(update={"sensors": Sensors(**(tight | prior))})
     plain = PhysicsUkf(vehicle, q_std=Q_STD)
-    steps = replace(plain, bias_states=True).filter_steps(biased, None)[0]
+    steps = replace(plain, bias_states=True).run(biased, None)[0]
     assert steps.x[-500:, state].mean() == pytest.approx(bias, rel=0.25)
     late = good.time_s > 15.0
     error = rms((steps.x[:, 1] - good.vy)[late])
-    assert error < share * rms((plain.filter_steps(biased, None)[0].x[:, 1] - good.vy)[late])
+    assert error < share * rms((plain.run(biased, None)[0].x[:, 1] - good.vy)[late])
 
 
 def test_the_force_scale_is_found():
@@ -52,17 +52,15 @@ def test_the_force_scale_is_found():
     good = drive(slalom(0.05), duration_s=20.0, tyre=stronger)
     noisy = with_noise(good.signals, seed=2)
     plain = PhysicsUkf(VEHICLE, q_std=Q_STD)
-    steps = replace(plain, force_scale=True).filter_steps(noisy, None)[0]
+    steps = replace(plain, force_scale=True).run(noisy, None)[0]
     late = good.time_s > 5.0
     assert steps.x[late, 4].mean() == pytest.approx(0.08, abs=0.03)
-    assert rms((steps.x[:, 1] - good.vy)[late]) < 0.7 * rms(
-        (plain.filter_steps(noisy, None)[0].x[:, 1] - good.vy)[late]
-    )
+    assert rms((steps.x[:, 1] - good.vy)[late]) < 0.7 * rms((plain.run(noisy, None)[0].x[:, 1] - good.vy)[late])
 
 
 def test_without_force_the_scale_keeps_its_spread():
     straight = drive(lambda _t: 0.0, duration_s=10.0)
-    steps = PhysicsUkf(VEHICLE, force_scale=True).filter_steps(straight.signals, None)[0]
+    steps = PhysicsUkf(VEHICLE, force_scale=True).run(straight.signals, None)[0]
     np.testing.assert_allclose(np.sqrt(steps.P[-1, 4, 4]), FORCE_SCALE_STD, rtol=0.02)
 
 
@@ -72,8 +70,8 @@ def test_extra_variance_takes_a_channel_out():
     extra[200:300, 1] = 1e8
     missing = good.signals.yaw_rate_rad_s.copy()
     missing[200:300] = np.nan
-    a = PhysicsUkf(VEHICLE).filter_steps(good.signals, None, None, extra)[0]
-    b = PhysicsUkf(VEHICLE).filter_steps(replace(good.signals, yaw_rate_rad_s=missing), None)[0]
+    a = PhysicsUkf(VEHICLE).run(good.signals, None, None, extra)[0]
+    b = PhysicsUkf(VEHICLE).run(replace(good.signals, yaw_rate_rad_s=missing), None)[0]
     np.testing.assert_allclose(a.x, b.x, atol=1e-5)
 
 
@@ -96,6 +94,6 @@ def test_a_reference_friction_keeps_stiffness_and_scales_the_peak(front):
     assert kept.magic_formula(front, 0.85) == pytest.approx(plain.magic_formula(front, 0.85))
     # The compiled model agrees: a small steering step at low friction meets the same force.
     signals = drive(lambda _t: 0.002, duration_s=2.0, mu=0.3).signals
-    a = PhysicsUkf(kept).filter_steps(signals, None)[0].x[-1]
-    b = PhysicsUkf(plain).filter_steps(replace(signals, friction=np.full(len(signals), 0.85)), None)[0].x[-1]
+    a = PhysicsUkf(kept).run(signals, None)[0].x[-1]
+    b = PhysicsUkf(plain).run(replace(signals, friction=np.full(len(signals), 0.85)), None)[0].x[-1]
     assert math.isclose(a[1], b[1], rel_tol=0.05)

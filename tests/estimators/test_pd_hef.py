@@ -16,6 +16,7 @@ from reference_car import FRICTION
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.latency_compensation import compensate, run_window
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import make_estimator, runnable
 from pdhef_logtool.records.errors import UsageError
@@ -84,23 +85,23 @@ def hybrid(*parts: str, network: ModelBundle | None = None, trust: float = 1.0) 
 def test_without_trust_it_is_physics_to_the_bit(parts: tuple[str, ...]) -> None:
     signals = _signals()
     trusted = hybrid(*parts)
-    physics, _ = AdaptivePhysics(trusted.physics, name="physics").run(signals, None)
+    physics, _ = run_window(AdaptivePhysics(trusted.physics, name="physics"), signals)
     for change in ({"trust": 0.0}, {"network": NetworkService(_bundle((0.0, 0.0)))}):
-        track, _ = replace(trusted, **change).run(signals, None)
+        track, _ = run_window(replace(trusted, **change), signals)
         for f in fields(StateTrack):
             if f.name not in ("name", "network_trust"):
                 np.testing.assert_array_equal(getattr(track, f.name), getattr(physics, f.name), err_msg=f.name)
-    assert not _same(trusted.run(signals, None)[0], physics)
+    assert not _same(run_window(trusted, signals)[0], physics)
 
 
 def test_windows_join_bit_for_bit() -> None:
     estimator = hybrid("lag", "roll", "biases", "bank")
     signals = _signals()
-    whole, _ = estimator.run(signals, None)
+    whole, _ = run_window(estimator, signals)
     carry = None
     parts = []
     for a, b in pairwise((0, 3, 250, 257, 600, 800)):
-        part, carry = estimator.run(_cut(signals, a, b), carry)
+        part, carry = run_window(estimator, _cut(signals, a, b), carry)
         parts.append(part)
     assert _same(concatenate(parts), whole)
 
@@ -111,8 +112,8 @@ def test_nothing_that_arrives_later_changes_an_output() -> None:
     later = {"ay_m_s2": signals.ay_m_s2.copy(), "steer_rad": signals.steer_rad.copy()}
     for column in later.values():
         column[500:] += 0.1
-    before, _ = estimator.run(signals, None)
-    after, _ = estimator.run(replace(signals, **later), None)
+    before, _ = run_window(estimator, signals)
+    after, _ = run_window(estimator, replace(signals, **later), None)
     seen = signals.stamps_ns < signals.ready_ns[500]
     assert np.array_equal(before.vy_m_s[seen], after.vy_m_s[seen], equal_nan=True)
     assert not np.array_equal(before.vy_m_s, after.vy_m_s, equal_nan=True)
@@ -140,7 +141,7 @@ def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None
     )  # fmt: skip
     error = {}
     for trust in (0.0, 0.5, 1.0):
-        track, _ = hybrid(network=_bundle((force, 0.0)), trust=trust).run(signals, None)
+        track, _ = run_window(hybrid(network=_bundle((force, 0.0)), trust=trust), signals)
         error[trust] = float(np.abs(track.vy_m_s - truth[:, 0])[500:].mean())
         if trust == 1.0:
             assert track.ay_m_s2[500:] == pytest.approx(ay[500:], abs=0.003)
@@ -150,8 +151,8 @@ def test_a_right_residual_removes_the_error_that_a_missing_force_makes() -> None
 
 def test_below_the_dynamic_range_the_residual_counts_for_nothing() -> None:
     slow = replace(_signals(speed=1.0), ay_m_s2=np.zeros(800))
-    a, _ = hybrid(network=_bundle((2.0, 1.0))).run(slow, None)
-    b, _ = hybrid(trust=0.0).run(slow, None)
+    a, _ = run_window(hybrid(network=_bundle((2.0, 1.0))), slow)
+    b, _ = run_window(hybrid(trust=0.0), slow)
     assert _same(a, b)
 
 
@@ -162,7 +163,7 @@ def test_a_dead_accelerometer_and_gaps_stay_finite() -> None:
     stamps = signals.stamps_ns.copy()
     stamps[600:] += 3_000_000_000
     faulty = replace(signals, ay_m_s2=ay, stamps_ns=stamps, ready_ns=stamps + 10_000_000)
-    track, _ = hybrid().run(faulty, None)
+    track, _ = run_window(hybrid(), faulty)
     assert np.isfinite(track.vy_m_s[track.valid]).all()
     assert track.valid[150:400].all()
 
@@ -203,7 +204,7 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
     rate = np.tile([0.8, 0.15], (len(signals), 1))
     errors = []
     for told in (None, rate, 0.5 * rate):
-        track, _ = physics.run(signals, None, told)
+        track, _ = compensate(physics, signals, physics.run(signals, None, told)[0])
         errors.append(np.sqrt(np.mean((track.vy_m_s - made.vy)[200:] ** 2)))
     assert errors[1] < 0.05 * errors[0]
     assert errors[1] < errors[2] < errors[0]
@@ -211,9 +212,9 @@ def test_a_residual_in_the_model_is_what_the_car_does_with_it() -> None:
 
 def test_what_is_estimated_stands_in_the_track_and_only_that() -> None:
     signals = _signals()
-    track, _ = hybrid("roll", "bank", "biases", "force_scale").run(signals, None)
+    track, _ = run_window(hybrid("roll", "bank", "biases", "force_scale"), signals)
     for name in ESTIMATED_COLUMNS:  # a filter without such a state takes it to be 0
         assert np.isfinite(getattr(track, name)[track.valid]).all(), name
-    static, _ = replace(hybrid(), adaptive=False).run(signals, None)
+    static, _ = run_window(replace(hybrid(), adaptive=False), signals)
     assert [n for n in ESTIMATED_COLUMNS if len(getattr(static, n))] == []
     assert not {"roll_rad", "force_scale"} & static.columns().keys()

@@ -34,6 +34,7 @@ from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, ph
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Tyres, VehicleParameters, correct_signals
 from pdhef_logtool.estimators.algorithm import resolve
 from pdhef_logtool.estimators.filter_shell import Meanwhile
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics import LINK_NONE, LINK_WHOLE, PhysicsUkf
 from pdhef_logtool.estimators.physics_model import (
     CORE,
@@ -428,7 +429,7 @@ def test_posteriors_agree_with_filterpy(names):
     s = replace(s, speed_m_s=np.where(np.arange(len(s)) % 3 == 0, s.speed_m_s, np.nan))
     oracle = Oracle(parts(*names), imu=(0.4, 0.0))  # no r²: what is read is then linear, and both updates are one
     estimator = PhysicsFilter(oracle.as_vehicle(), r_std=R_STD)
-    steps, _ = estimator.filter_steps(s, None)
+    steps, _ = estimator.run(s, None)
     x, P, nis = filterpy_run(s, estimator, oracle)
     assert np.nanmax(nis) < 36.0, "the drive must stay inside the gate, which filterpy does not have"
     assert np.ptp(x[:, 1]) > 0.3, "the drive must excite the lateral motion"
@@ -452,7 +453,7 @@ def noisy() -> Signals:
 @every_set
 def test_linked_steps_are_the_steps_and_what_ties_them(names, noisy):
     estimator = PhysicsFilter(Oracle(parts(*names), imu=IMU).as_vehicle())
-    steps, _ = estimator.filter_steps(noisy, None)
+    steps, _ = estimator.run(noisy, None)
     linked, _, links = estimator.linked_steps(noisy, None)
     for column in ("x", "P", "nis", "nis_dof", "log_likelihood", "innovation", "valid", "diverged", "prior"):
         np.testing.assert_array_equal(getattr(linked, column), getattr(steps, column))
@@ -495,10 +496,10 @@ COLUMNS = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s", "sideslip_rad", "covariance", "
 )
 def test_windows_of_any_cut_join_bit_for_bit(noisy, names, inner):
     estimator = physics_filter(vehicle(*names))
-    whole, _ = estimator.run(noisy, None)
+    whole, _ = run_window(estimator, noisy)
     found, carry = [], None
     for first, end in pairwise([0, *sorted(min(i, len(noisy)) for i in inner), len(noisy)]):
-        track, carry = estimator.run(cut(noisy, first, end), carry)
+        track, carry = run_window(estimator, cut(noisy, first, end), carry)
         found.append(track)
     joined = concatenate(found)
     for column in COLUMNS:
@@ -510,15 +511,15 @@ def test_a_gap_starts_it_anew_and_a_delay_is_predicted_over(names):
     made = drive(slalom(0.03, 0.5), 10.0)
     mask = (made.time_s < 4.0) | (made.time_s > 4.8)
     estimator = physics_filter(vehicle(*names, roll_gradient_rad_per_m_s2=0.0))
-    steps, _ = estimator.filter_steps(keep(made.signals, mask), None)
+    steps, _ = estimator.run(keep(made.signals, mask), None)
     at = int(np.argmax(np.diff(made.time_s[mask]) > 0.5)) + 1
     assert steps.x[at, 0] == made.vx[mask][at]
     assert steps.x[at, 1] == pytest.approx(REAR_M * made.r[mask][at], abs=1e-12)
     assert (steps.x[at, 4 + 2 :] == 0.0).all()
     assert steps.valid.all()
     late = replace(made.signals, ready_ns=made.signals.stamps_ns + 80_000_000)
-    track, _ = estimator.run(late, None)
-    whole, _ = estimator.filter_steps(made.signals, None)
+    track, _ = run_window(estimator, late)
+    whole, _ = estimator.run(made.signals, None)
     use = made.time_s > 1.0
     assert np.abs(track.sideslip_rad - np.arctan2(whole.x[:, 1], whole.x[:, 0]))[use].max() < 0.004
     assert (track.covariance[use, 1, 1] > whole.P[np.flatnonzero(use) - 8, 1, 1]).all()
@@ -534,13 +535,13 @@ def test_a_standstill_teaches_the_gyro_bias_and_holds_the_rest():
     wheels = np.where(still & np.isfinite(s.speed_m_s), 0.0, s.speed_m_s)
     s = replace(s, speed_m_s=wheels, yaw_rate_rad_s=s.yaw_rate_rad_s + 0.004)
     v = vehicle("biases", "roll", "lag")
-    steps, _ = physics_filter(v).filter_steps(s, None)
+    steps, _ = physics_filter(v).run(s, None)
     standing = (made.time_s > 5.5) & (made.time_s <= 15.0)
     assert (steps.x[standing][:, [0, 1, 2, 4, 5, 6, 7]] == 0.0).all()
     assert steps.x[1450, layout_of(v).sensor_bias + 1] == pytest.approx(0.004, abs=0.0006)
     going = made.time_s > 15.5
     assert np.abs(steps.x[going, 0] - made.vx[going]).max() < 0.4
-    moving, _ = replace(physics_filter(v), standstill=False).filter_steps(s, None)
+    moving, _ = replace(physics_filter(v), standstill=False).run(s, None)
     assert (moving.x[standing, 2] != 0.0).all()
 
 
@@ -548,7 +549,7 @@ def test_a_standstill_teaches_the_gyro_bias_and_holds_the_rest():
 
 
 def sideslip_rmse(estimator, made: Drive, signals: Signals) -> float:
-    track, _ = estimator.run(signals, None)
+    track, _ = run_window(estimator, signals)
     late = made.time_s > 1.0
     assert track.valid[late].all()
     return float(np.sqrt(np.mean((track.sideslip_rad - made.sideslip)[late] ** 2)))
@@ -577,7 +578,7 @@ def test_forces_of_the_axles_are_found():
     v = oracle.as_vehicle()
     weak = v.tyres.front.model_copy(update={"D_n": 7600.0 / 1.5})
     v = v.model_copy(update={"tyres": Tyres(front=weak, rear=v.tyres.rear)})
-    steps, _ = PhysicsFilter(v, q_std=(*PHYSICS_Q_STD[:4], 10.0, 10.0)).filter_steps(made.signals, None)
+    steps, _ = PhysicsFilter(v, q_std=(*PHYSICS_Q_STD[:4], 10.0, 10.0)).run(made.signals, None)
     total = steps.x[:, 4] * np.cos(made.signals.steer_rad) + steps.x[:, 5]
     error = (total - made.ay)[made.time_s > 1.0]
     assert np.sqrt(np.mean(error**2)) < 0.1 * np.sqrt(np.mean(made.ay**2))
@@ -593,7 +594,7 @@ def test_a_bias_is_found_and_its_removal_helps(bias):
     v = oracle.as_vehicle(physics=parts("lag", "biases"))
     layout = layout_of(v)
     entry = {"ay_m_s2": layout.sensor_bias, "steer_rad": layout.steer_bias}[next(iter(bias))]
-    found = physics_filter(v).filter_steps(biased, None)[0].x[-500:, entry].mean()
+    found = physics_filter(v).run(biased, None)[0].x[-500:, entry].mean()
     assert 0.3 < found / next(iter(bias.values())) < 1.3
     without = physics_filter(oracle.as_vehicle())
     assert sideslip_rmse(physics_filter(v), made, biased) < 0.75 * sideslip_rmse(without, made, biased)
@@ -606,7 +607,7 @@ def test_what_comes_and_goes_is_found(part, entry, value):
     made = oracle.drive(slalom(0.035, 0.6), 4.0, **{entry: value})
     noisy = with_noise(made.signals, 5)
     v, without = oracle.as_vehicle(), oracle.as_vehicle(physics=parts("lag"))
-    steps, _ = physics_filter(v).filter_steps(noisy, None)
+    steps, _ = physics_filter(v).run(noisy, None)
     fading = value * np.exp(-made.time_s / {"bank": 5.0, "force_scale": 2.0}[part])
     middle = (made.time_s > 0.5) & (made.time_s < 2.5)
     found = steps.x[:, getattr(layout_of(v), part)]
@@ -651,9 +652,9 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     assert (estimator.vehicle, estimator.read_with) == (fitted, own)
     assert resolve(adaptive).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
     assert resolve(estimator).structure == resolve(physics_filter(fitted)).structure
-    ours, _ = estimator.run(correct_signals(noisy, own), None)
+    ours, _ = run_window(estimator, correct_signals(noisy, own), None)
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)
-    want, _ = physics_filter(fitted).run(correct_signals(raw, fitted), None)
+    want, _ = run_window(physics_filter(fitted), correct_signals(raw, fitted), None)
     np.testing.assert_allclose(ours.sideslip_rad, want.sideslip_rad, rtol=1e-9, atol=1e-12)
 
 

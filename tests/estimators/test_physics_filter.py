@@ -25,6 +25,7 @@ from reference_car import (
 from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.filter_shell import sideslip_std
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics import PhysicsUkf, innovation_log_likelihood
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.table import Options, make_estimator
@@ -39,7 +40,7 @@ DEGREE = math.radians(1.0)
 
 
 def posteriors(signals: Signals, estimator: PhysicsUkf = UKF):
-    return estimator.filter_steps(signals, None)[0]
+    return estimator.run(signals, None)[0]
 
 
 def edited(signals: Signals, column: str, where, value) -> Signals:
@@ -262,7 +263,7 @@ def test_a_short_gap_is_filtered_through():
 def test_nothing_is_claimed_before_speed_and_steering_are_known(good):
     signals = edited(good.signals, "speed_m_s", good.time_s < 1.0, np.nan)
     signals = edited(signals, "steer_rad", good.time_s < 2.0, np.nan)
-    track, _ = UKF.run(signals, None)
+    track, _ = run_window(UKF, signals)
     assert not track.valid[good.time_s < 1.999].any()
     assert track.valid[good.time_s > 2.02].all()
 
@@ -305,8 +306,8 @@ def test_the_random_walk_covers_exactly_the_steps_without_acceleration(good):
 
 def test_a_prediction_without_acceleration_is_as_uncertain_as_its_random_walk(good):
     late = replace(good.signals, ready_ns=good.signals.stamps_ns + 100_000_000)
-    blind, _ = UKF.run(replace(late, ax_m_s2=np.full(len(late), np.nan)), None)
-    now, _ = UKF.run(replace(good.signals, ax_m_s2=np.full(len(late), np.nan)), None)
+    blind, _ = run_window(UKF, replace(late, ax_m_s2=np.full(len(late), np.nan)), None)
+    now, _ = run_window(UKF, replace(good.signals, ax_m_s2=np.full(len(late), np.nan)), None)
     at = 500
     assert blind.vx_std_m_s[at] ** 2 - now.vx_std_m_s[at - 10] ** 2 == pytest.approx(3.0**2 * 0.1, rel=0.1)
 
@@ -314,14 +315,14 @@ def test_a_prediction_without_acceleration_is_as_uncertain_as_its_random_walk(go
 def test_esp_suite_ignores_the_speed_after_the_start(good):
     esp = make_estimator("phy-ukf", Car.of(VEHICLE), Options(use_speed=False))
     garbled = edited(good.signals, "speed_m_s", slice(1, None), 3.0)
-    a, b = esp.run(good.signals, None)[0], esp.run(garbled, None)[0]
+    a, b = run_window(esp, good.signals)[0], run_window(esp, garbled)[0]
     np.testing.assert_array_equal(a.vx_m_s, b.vx_m_s)
     np.testing.assert_array_equal(a.covariance, b.covariance)
     assert a.valid.all()
     other_start = edited(good.signals, "speed_m_s", 0, 20.0)
-    assert abs(esp.run(other_start, None)[0].vx_m_s[5] - 20.0) < 0.5
+    assert abs(run_window(esp, other_start)[0].vx_m_s[5] - 20.0) < 0.5
     assert np.abs(a.vx_m_s - good.vx).max() < 3.0
-    full, _ = make_estimator("phy-ukf", Car.of(VEHICLE)).run(good.signals, None)
+    full, _ = run_window(make_estimator("phy-ukf", Car.of(VEHICLE)), good.signals)
     assert a.vx_std_m_s[-1] > 3 * full.vx_std_m_s[-1]
 
 
@@ -338,8 +339,8 @@ def test_friction_comes_from_the_log_where_it_is_known():
     assert error(made.signals) > 10 * error(known)
     sparse = edited(known, "friction", np.arange(len(known)) % 100 != 0, np.nan)  # the last value is kept
     assert error(sparse) < 0.02 * DEGREE
-    assert (UKF.run(sparse, None)[0].friction[1:] == 0.4).all()
-    assert (UKF.run(made.signals, None)[0].friction == FRICTION).all()
+    assert (run_window(UKF, sparse)[0].friction[1:] == 0.4).all()
+    assert (run_window(UKF, made.signals)[0].friction == FRICTION).all()
 
 
 # --- divergence and consistency --------------------------------------------------------------------------------------
@@ -348,7 +349,7 @@ def test_friction_comes_from_the_log_where_it_is_known():
 @pytest.mark.parametrize("amplitude", [0.0, 0.03, 0.05])
 def test_a_good_drive_is_not_flagged(amplitude):
     made = drive(slalom(amplitude, 0.5), 10.0, tyre=tanh_tyre)
-    track, _ = UKF.run(with_noise(made.signals, 6), None)
+    track, _ = run_window(UKF, with_noise(made.signals, 6), None)
     assert not track.diverged.any()
 
 
@@ -356,7 +357,7 @@ def test_a_good_drive_is_not_flagged(amplitude):
 def test_a_hopelessly_wrong_model_is_flagged(column):
     made = drive(slalom(0.05, 0.5), 10.0)
     signals = with_noise(made.signals, 6)
-    track, _ = UKF.run(replace(signals, **{column: -getattr(signals, column)}), None)
+    track, _ = run_window(UKF, replace(signals, **{column: -getattr(signals, column)}), None)
     assert track.diverged[300:].mean() > 0.6
 
 
@@ -364,14 +365,14 @@ def test_the_flag_goes_when_the_fault_has_gone():
     made = drive(slalom(0.05, 0.5), 20.0)
     signals = with_noise(made.signals, 6)
     faulty = replace(signals, steer_rad=np.where(made.time_s < 5, -1, 1) * signals.steer_rad)
-    track, _ = UKF.run(faulty, None)
+    track, _ = run_window(UKF, faulty)
     assert track.diverged[made.time_s < 5].any()
     assert not track.diverged[made.time_s > 12].any()
 
 
 def test_one_spike_is_no_divergence(good):
     spike = edited(good.signals, "yaw_rate_rad_s", 400, 40.0)
-    assert not UKF.run(spike, None)[0].diverged.any()
+    assert not run_window(UKF, spike)[0].diverged.any()
 
 
 def simulate_from_the_filters_own_model(q_std, r_std, seconds, seed):
@@ -461,7 +462,7 @@ def test_sideslip_std_is_the_first_order_band():
 
 
 def test_sideslip_band_is_the_delta_method_of_its_covariance(good):
-    track, _ = UKF.run(good.signals, None)
+    track, _ = run_window(UKF, good.signals)
     rng = np.random.default_rng(0)
     for k in (300, 555):
         draws = rng.multivariate_normal([track.vx_m_s[k], track.vy_m_s[k]], track.covariance[k, :2, :2], 40_000)

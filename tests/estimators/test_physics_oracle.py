@@ -70,7 +70,7 @@ def noisy_signals():
 
 def test_posteriors_agree_with_filterpy(noisy_signals):
     estimator = PhysicsUkf(default_vehicle(), q_std=Q_STD, r_std=R_STD)
-    steps, _ = estimator.filter_steps(noisy_signals, None)
+    steps, _ = estimator.run(noisy_signals, None)
     x, P, nis, log_likelihood = filterpy_run(noisy_signals)
 
     assert np.nanmax(nis) < 36.0, "the drive must stay inside the gate, which filterpy does not have"
@@ -88,8 +88,8 @@ def test_sensor_level_noise_comes_from_the_vehicle_file(noisy_signals):
     )
     by_file = PhysicsUkf(default_vehicle().model_copy(update={"sensors": sensors}), q_std=Q_STD)
     given = PhysicsUkf(default_vehicle(), q_std=Q_STD, r_std=R_STD)
-    a, b = by_file.filter_steps(noisy_signals, None)[0], given.filter_steps(noisy_signals, None)[0]
+    a, b = by_file.run(noisy_signals, None)[0], given.run(noisy_signals, None)[0]
     np.testing.assert_array_equal(a.x, b.x)
     assert by_file.measurement_std.tolist() == list(R_STD)
     louder = PhysicsUkf(default_vehicle(), q_std=Q_STD, r_std=(0.5, 0.004, 0.08))
-    assert not np.array_equal(louder.filter_steps(noisy_signals, None)[0].x, b.x)
+    assert not np.array_equal(louder.run(noisy_signals, None)[0].x, b.x)

@@ -14,7 +14,7 @@ from pdhef_logtool.car.flat import flat_toml, vehicle_toml
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise, FittedPhysics, FittedValues, IntervalEntry, Intervals
 from pdhef_logtool.car.vehicle import PhysicsParts, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import physics_filter
 from pdhef_logtool.estimators.posterior_band import OWN_SHARE
 from pdhef_logtool.estimators.table import make_estimator
@@ -52,7 +52,7 @@ def banded(car: Car, *windows: Signals, name: str = "physics") -> tuple[list[Sta
     applied = calibrator(car, [estimator])
     plain, wide = [], []
     for window in windows:
-        track, carry = run_window(estimator, window, carry, None)
+        track, carry = run_window(estimator, window, carry)
         plain.append(track)
         wide.append(applied.add(track, window))
     return plain, wide
@@ -78,7 +78,7 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     assert vehicles[2].steer_offset_rad == pytest.approx(0.005)
     assert {v.yaw_inertia_kg_m2 for v in vehicles} == {1700.0}
     filters = [replace(physics_filter(v, NOISE), read_with=OWN) for v in vehicles]
-    middle, *others = (f.run(signals, None)[0].vy_m_s for f in filters)
+    middle, *others = (run_window(f, signals)[0].vy_m_s for f in filters)
     terms, _ = error_terms(plain, signals, car.physics_vehicle.roll_gradient_rad_per_m_s2, None)
     seen = terms[:, TERMS.index("kinematic")] * plain.vx_m_s
     expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + seen**2 + sum((vy - middle) ** 2 for vy in others)
@@ -96,7 +96,7 @@ def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> No
     for name, note in (("physics", POSTERIOR_NOTE), ("phy-ukf", "intervals not calibrated")):
         estimator = make_estimator(name, car)
         applied = calibrator(car, [estimator])
-        track, _ = run_window(estimator, signals, None, None)
+        track, _ = run_window(estimator, signals, None)
         assert (applied.add(track, signals) is track) == (name == "phy-ukf")
         assert applied.notes(name) == (note,)
 
@@ -104,7 +104,7 @@ def test_only_what_runs_on_physics_has_it_and_it_is_told(signals: Signals) -> No
 def test_calibrated_intervals_come_first(signals: Signals) -> None:
     car = identified()
     estimator = make_estimator("physics", car)
-    track, _ = run_window(estimator, signals, None, None)
+    track, _ = run_window(estimator, signals, None)
     inflation = make_inflation((0.0, 9.0, *(0.0,) * (len(TERMS) - 2)), (9.0,) * 3)
     entry = IntervalEntry(estimator="physics", algorithm=resolve(estimator), inflation=inflation)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=(entry,))

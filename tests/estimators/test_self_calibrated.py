@@ -13,11 +13,11 @@ from pdhef_logtool.car.car import Car, WithoutTruth
 from pdhef_logtool.car.parts import FilterNoise, IntervalEntry, Intervals
 from pdhef_logtool.car.vehicle import VehicleParameters, corrected_anew, default_vehicle
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import run_window
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter, physics_filter
 from pdhef_logtool.estimators.self_calibrated import D2_SHARE, OPEN_LOOP, OWN_SHARE, SELF_CALIBRATED, SelfCalibrated
 from pdhef_logtool.estimators.stand_in import StandIn
-from pdhef_logtool.estimators.table import SPECS, Options, all_names, make_estimator
+from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
 from pdhef_logtool.records.errors import UsageError
 from pdhef_logtool.records.signals import Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -60,10 +60,11 @@ def signals() -> Signals:
 
 
 def tracks(name: str, car: Car, *parts: Signals) -> list[StateTrack]:
-    estimator, carry, found = make_estimator(name, car), None, []
+    estimator, state, found = make_estimator(name, car), None, []
+    intervals = calibrator(car, [estimator])
     for part in parts:
-        track, carry = run_window(estimator, part, carry, None)
-        found.append(track)
+        track, state = run_window(estimator, part, state)
+        found.append(intervals.add(track, part))
     return found
 
 
@@ -133,15 +134,16 @@ def test_estimators_of_a_run_share_what_their_bands_compare(signals: Signals, mo
     alone = {name: tracks(name, car, *windows) for name in names}
     run, asked = PhysicsFilter.run, []
     monkeypatch.setattr(PhysicsFilter, "run", lambda *given: (asked.append(given[0]), run(*given))[1])
-    options = Options()
-    estimators, carries = [make_estimator(name, car, options) for name in names], [None, None]
+    estimators, states = [make_estimator(name, car) for name in names], [None, None]
+    intervals = calibrator(car, estimators)
     for number, window in enumerate(windows):
         for i, estimator in enumerate(estimators):
-            track, carries[i] = run_window(estimator, window, carries[i], None)
-            expected = alone[names[i]][number]
+            track, states[i] = run_window(estimator, window, states[i])
+            track, expected = intervals.add(track, window), alone[names[i]][number]
             np.testing.assert_array_equal(track.sideslip_std_rad, expected.sideslip_std_rad)
             np.testing.assert_array_equal(track.vy_m_s, expected.vy_m_s)
-    assert len(asked) == 3 * len(windows), "three filters a window, not a window and estimator"
+    own = len(names)  # each estimator is one filter
+    assert len(asked) == (own + 3) * len(windows), "three compared filters per window, not per window and estimator"
 
 
 def test_the_band_changes_no_estimate(signals: Signals) -> None:
@@ -168,7 +170,7 @@ def test_the_band_is_the_sum_of_its_parts(signals: Signals) -> None:
     assert found is not None
     read = [corrected_anew(signals, OWN, v) for v in (FOUND, *found.varied)]
     filters = [physics_filter(v, NOISE) for v in (FOUND, *found.varied)]
-    middle, *others = (f.run(s, None)[0].vy_m_s for f, s in zip(filters, read, strict=True))
+    middle, *others = (run_window(f, s)[0].vy_m_s for f, s in zip(filters, read, strict=True))
     away = sum((vy - middle) ** 2 for vy in others)
     expected = (OWN_SHARE * plain.vy_std_m_s) ** 2 + away
     fast = plain.vx_m_s > OWN.low_speed_blend_m_s
@@ -192,7 +194,9 @@ def test_intervals_of_other_driving_are_not_taken(signals: Signals) -> None:
     entries = tuple(IntervalEntry(estimator="e", algorithm=a, inflation=inflation) for a in algorithms)
     intervals = Intervals(car="c", physics_sha256="ab" * 32, roll_gradient_rad_per_m_s2=0.0, entries=entries)
     for one in (estimator, StandIn(estimator, "pd-hef", "why")):
-        track, _ = run_window(one, signals, None, None)
+        track, _ = run_window(one, signals)
         applied = calibrator(replace(with_band(), intervals=intervals), [one])
-        assert applied.add(track, signals) is track
+        without = calibrator(with_band(), [one]).add(track, signals)
+        np.testing.assert_array_equal(applied.add(track, signals).sideslip_std_rad, without.sideslip_std_rad)
+        assert (without.sideslip_std_rad != track.sideslip_std_rad).any()
         assert applied.notes(one.name) == ("intervals: own, parameters and d2",)

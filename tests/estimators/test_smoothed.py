@@ -27,9 +27,9 @@ from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveWindow, with_look_ahead
 from pdhef_logtool.estimators import smoothed
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
-from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of, run_window
-from pdhef_logtool.estimators.checked_inputs import CheckedInputs
+from pdhef_logtool.estimators.base import LookingAhead, look_ahead_of
 from pdhef_logtool.estimators.filter_shell import AX_BIAS, PosteriorSteps
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics import LINK_BIASES, LINK_NONE, LINK_WHOLE, PhysicsUkf, StepLinks
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.estimators.smoothed import SmoothedPhysics, smooth_steps
@@ -85,7 +85,7 @@ def linear_steps(x, P, prior, predicted, cross, kind=None) -> tuple[PosteriorSte
     nan, no = np.full(count, np.nan), np.zeros(count, dtype=bool)
     stamps = np.arange(count) * 10_000_000
     steps = PosteriorSteps(
-        stamps, stamps, x, P, np.zeros((count, 4)), nan, nan, nan, np.zeros((count, 3)), ~no, no, prior,
+        stamps, x, P, np.zeros((count, 4)), nan, nan, nan, np.zeros((count, 3)), ~no, no, prior,
         np.zeros((count, 2)),
     )  # fmt: skip
     if kind is None:
@@ -290,7 +290,7 @@ def in_windows(estimator: SmoothedPhysics, signals: Signals, edges: list[int]) -
     for first, end in pairwise(edges):
         limit = signals.stamps_ns[end - 1] + round(estimator.look_ahead_s * NS) if end else signals.stamps_ns[-1]
         until = max(end, int(np.searchsorted(signals.stamps_ns, limit, side="right")))
-        track, carry = estimator.run(cut(signals, first, end), carry, cut(signals, end, until))
+        track, carry = run_window(estimator, cut(signals, first, end), carry, cut(signals, end, until))
         assert len(track) == end - first
         parts.append(track)
     return concatenate(parts)
@@ -301,7 +301,7 @@ def in_windows(estimator: SmoothedPhysics, signals: Signals, edges: list[int]) -
 def test_windows_of_any_cut_join_bit_for_bit(faulty, data, block_s):
     inner = data.draw(st.lists(st.integers(0, len(faulty)), max_size=8))
     estimator = smoother(block_s)
-    whole, _ = estimator.run(faulty, None)
+    whole, _ = run_window(estimator, faulty)
     kinds = (STUCK_YAW_RATE, BURST_AY, BURST_YAW_RATE, SPIKE_AY, MISSING_AY, MISSING_YAW_RATE)
     assert all((whole.reason & kind).any() for kind in kinds), "the cuts must fall into faults"
     properties.same_bits(in_windows(estimator, faulty, [0, *sorted(inner), len(faulty)]), whole)
@@ -309,32 +309,23 @@ def test_windows_of_any_cut_join_bit_for_bit(faulty, data, block_s):
 
 def test_steps_at_once_change_no_bit(faulty, monkeypatch):
     estimator = smoother(0.4)
-    whole, carry = estimator.run(cut(faulty, 0, 400), None, cut(faulty, 400, 600))
+    whole, carry = run_window(estimator, cut(faulty, 0, 400), None, cut(faulty, 400, 600))
     monkeypatch.setattr(smoothed, "STEPS_AT_ONCE", 37)
-    again, _ = estimator.run(cut(faulty, 0, 400), None, cut(faulty, 400, 600))
+    again, _ = run_window(estimator, cut(faulty, 0, 400), None, cut(faulty, 400, 600))
     properties.same_bits(again, whole)
     block = (faulty.stamps_ns - faulty.stamps_ns[0]) // round(0.4 * NS)
     ahead = int(np.searchsorted(block[:600], block[399] + 2)) - 400
-    assert len(carry.shared) == ahead > 0, "what was filtered ahead is kept, and no more than is needed"
-    assert carry.ahead[-1][0].posterior.stamps_ns[-1] == faulty.stamps_ns[399 + ahead]
+    state = carry.estimator
+    assert len(state.shared) == ahead > 0, "what was filtered ahead is kept, and no more than is needed"
+    assert state.ahead[-1][0].posterior.stamps_ns[-1] == faulty.stamps_ns[399 + ahead]
 
 
 def test_a_carry_can_be_used_twice(faulty):
     estimator = smoother(0.4)
-    _, carry = estimator.run(cut(faulty, 0, 100), None, cut(faulty, 100, 250))
-    first, _ = estimator.run(cut(faulty, 100, 400), carry)
-    again, _ = estimator.run(cut(faulty, 100, 400), carry)
+    _, carry = run_window(estimator, cut(faulty, 0, 100), None, cut(faulty, 100, 250))
+    first, _ = run_window(estimator, cut(faulty, 100, 400), carry)
+    again, _ = run_window(estimator, cut(faulty, 100, 400), carry)
     properties.same_bits(first, again)
-
-
-def test_inputs_that_are_known_are_those_that_it_makes_itself(faulty, monkeypatch):
-    estimator = smoother(0.4)
-    whole, _ = estimator.run(faulty, None)
-    checked, _ = estimator.filtered.inputs(faulty, None)
-    monkeypatch.setattr(smoothed, "STEPS_AT_ONCE", 37)
-    monkeypatch.setattr(AdaptivePhysics, "inputs", None)
-    again, _ = estimator.run(faulty, None, known=checked)
-    properties.same_bits(again, whole)
 
 
 def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):
@@ -342,8 +333,8 @@ def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):
     j = 150
     ay = rough.ay_m_s2.copy()
     ay[j] = 1.0
-    a, _ = estimator.run(rough, None)
-    b, _ = estimator.run(replace(rough, ay_m_s2=ay), None)
+    a, _ = run_window(estimator, rough)
+    b, _ = run_window(estimator, replace(rough, ay_m_s2=ay), None)
     differs = np.flatnonzero(a.vy_m_s != b.vy_m_s)
     ahead = (rough.stamps_ns[j] - rough.stamps_ns[differs.min()]) * 1e-9
     assert 0.5 <= ahead < 1.0
@@ -352,7 +343,7 @@ def test_it_sees_one_to_two_blocks_ahead_and_no_further(rough):
 def test_blocks_of_a_minute_are_as_good_as_the_whole_drive():
     s = with_noise(drive(slalom(0.02, 0.3), 90.0, step_s=0.02).signals, seed=1)
     blocks, whole = smoother(20.0, parts=()), smoother(parts=())
-    a, b = blocks.run(s, None)[0], whole.run(s, None)[0]
+    a, b = run_window(blocks, s)[0], run_window(whole, s)[0]
     assert not np.array_equal(a.vy_m_s, b.vy_m_s)
     np.testing.assert_allclose(a.vy_m_s, b.vy_m_s, atol=1e-5)
 
@@ -360,7 +351,7 @@ def test_blocks_of_a_minute_are_as_good_as_the_whole_drive():
 def test_left_and_right_are_mirrored(rough):
     estimator = smoother(trust=0.0)  # a network with random weights knows no left and right
     mirrored = replace(rough, **{c: sign * getattr(rough, c) for c, sign in properties.SIGNS.items()})
-    a, b = estimator.run(rough, None)[0], estimator.run(mirrored, None)[0]
+    a, b = run_window(estimator, rough)[0], run_window(estimator, mirrored)[0]
     for c in properties.MIRRORED:
         np.testing.assert_allclose(getattr(a, c), -getattr(b, c), atol=1e-9, err_msg=c)
 
@@ -385,7 +376,7 @@ def test_the_covariance_is_never_larger_than_the_filters(which, parts, request):
 
 
 def test_a_standstill_stands_and_does_not_pull_what_was_before(stopping):
-    track, _ = smoother().run(stopping, None)
+    track, _ = run_window(smoother(), stopping)
     t = (stopping.stamps_ns - stopping.stamps_ns[0]) * 1e-9
     stands = (t > 4.6) & (t < 6.9)
     assert np.abs(track.vx_m_s[stands]).max() < 0.02
@@ -396,11 +387,11 @@ def test_a_standstill_stands_and_does_not_pull_what_was_before(stopping):
 
 def test_nothing_behind_a_gap_tells_of_before(rough):
     gap = int(np.argmax(np.diff(rough.stamps_ns))) + 1
-    whole, _ = smoother().run(rough, None)
-    before, _ = smoother().run(cut(rough, 0, gap), None)
+    whole, _ = run_window(smoother(), rough)
+    before, _ = run_window(smoother(), cut(rough, 0, gap), None)
     properties.same_bits(whole, before, gap)
     stretch = replace(cut(rough, 0, gap), ready_ns=rough.stamps_ns[:gap])
-    filtered, _ = smoother().filtered.run(stretch, None)
+    filtered, _ = run_window(smoother().filtered, stretch)
     assert before.vy_m_s[-1] == filtered.vy_m_s[-1], "at the end of a stretch it is the filter"
 
 
@@ -411,8 +402,8 @@ def test_it_is_nearer_to_the_truth_than_its_filter(parts):
         made = drive(slalom(0.03, 0.4 + 0.1 * seed), 10.0, 20.0 + seed, step_s=0.01)
         signals = with_noise(made.signals, seed=seed)
         estimator = flat_smoother(parts)
-        filtered, _ = estimator.filtered.run(replace(signals, ready_ns=signals.stamps_ns), None)
-        track, _ = estimator.run(signals, None)
+        filtered, _ = run_window(estimator.filtered, replace(signals, ready_ns=signals.stamps_ns), None)
+        track, _ = run_window(estimator, signals)
         both = filtered.valid & track.valid
         errors.append([np.mean((e.sideslip_rad - made.sideslip)[both] ** 2) for e in (track, filtered)])
         inside = np.abs(track.vy_m_s - made.vy) < 1.96 * track.vy_std_m_s
@@ -433,25 +424,28 @@ def flat_smoother(parts: tuple[str, ...] = (), **filter_options) -> SmoothedPhys
     return SmoothedPhysics(AdaptivePhysics(PhysicsFilter(VEHICLE.model_copy(update=update), **filter_options)))
 
 
+class Unchecked(AdaptivePhysics):
+    """Without the detector: signals as they are, no extra noise."""
+
+    def inputs(self, signals, carry):
+        return AdaptivePhysics.inputs(replace(self, adaptive=False), signals, carry)
+
+
 def unchecked(estimator: SmoothedPhysics, signals: Signals) -> StateTrack:
-    """The estimate without the detector: signals as they are, no extra noise."""
-    checked, _ = estimator.filtered.inputs(signals, None)
-    faults = replace(
-        checked.faults, filtered=signals, extra_r=np.zeros((len(signals), 2)), reason=np.zeros(len(signals), np.int64)
-    )
-    rate = replace(estimator.filtered, adaptive=False).inputs(signals, None)[0].rate
-    return estimator.run(signals, None, known=CheckedInputs(faults, rate))[0]
+    """The estimate without the detector."""
+    filtered = Unchecked(**{f.name: getattr(estimator.filtered, f.name) for f in fields(AdaptivePhysics)})
+    return run_window(replace(estimator, filtered=filtered), signals)[0]
 
 
 def test_without_a_fault_it_is_what_it_is_without_the_detector(slalom_drive):
     estimator = smoother()  # with network
-    track, _ = estimator.run(slalom_drive.signals, None)
+    track, _ = run_window(estimator, slalom_drive.signals)
     assert not track.reason.any()
     assert (track.r_scale == 1.0).all()
     properties.same_bits(track, unchecked(estimator, slalom_drive.signals))
     for seed in range(4):  # false alarms cost next to nothing
         signals = with_noise(slalom_drive.signals, seed)
-        a, _ = estimator.run(signals, None)
+        a, _ = run_window(estimator, signals)
         away = np.abs(a.sideslip_rad - unchecked(estimator, signals).sideslip_rad)
         assert np.sqrt(np.mean(away**2)) < np.radians(0.01)
 
@@ -470,7 +464,7 @@ def test_a_faulty_gyro_costs_little_and_is_told(slalom_drive, kind):
     }[kind]
     signals = replace(clean, yaw_rate_rad_s=np.where(during, bad, clean.yaw_rate_rad_s))
     estimator = flat_smoother()
-    track, before = estimator.run(signals, None)[0], unchecked(estimator, signals)
+    track, before = run_window(estimator, signals)[0], unchecked(estimator, signals)
     told = track.reason & bit > 0
     assert told[during & (t > 5.5)].mean() > 0.9
     assert not told[(t < 3.9) | (t > 8.0)].any()
@@ -482,8 +476,8 @@ def test_a_faulty_gyro_costs_little_and_is_told(slalom_drive, kind):
 def test_it_starts_from_what_the_adaptive_filter_starts_from(faulty):
     """The reasons are those of pd-hef, at the step itself; a factor on R is over this filter's own."""
     estimator = smoother(r_std=(0.5, 0.006, 0.08))
-    track, _ = estimator.run(faulty, None)
-    adaptive, _ = estimator.filtered.run(replace(faulty, ready_ns=faulty.stamps_ns), None)
+    track, _ = run_window(estimator, faulty)
+    adaptive, _ = run_window(estimator.filtered, replace(faulty, ready_ns=faulty.stamps_ns), None)
     np.testing.assert_array_equal(track.reason, adaptive.reason)
     np.testing.assert_array_equal(track.r_scale, adaptive.r_scale)
     assert track.r_scale.max() > 5.0
@@ -495,13 +489,13 @@ def test_its_weights_know_what_comes_later():
     signals = with_noise(made.signals, 0)
     signals.friction[:] = 0.85
     estimator = flat_smoother(("force_scale",))
-    weights = [e.run(signals, None)[0].mixture_weight for e in (estimator, estimator.filtered)]
+    weights = [run_window(e, signals)[0].mixture_weight for e in (estimator, estimator.filtered)]
     assert weights[1][:10].max() < 0.6
     assert weights[0].min() > 0.99
 
 
 def test_links_cost_the_filter_no_bit(rough):
-    plain, after = PhysicsUkf(VEHICLE).filter_steps(rough, None)
+    plain, after = PhysicsUkf(VEHICLE).run(rough, None)
     steps, again, links = PhysicsUkf(VEHICLE).linked_steps(rough, None)
     for name in (f.name for f in fields(PosteriorSteps)):
         np.testing.assert_array_equal(getattr(plain, name), getattr(steps, name))
@@ -525,7 +519,7 @@ def test_what_it_says_of_itself(rough):
     assert "not causal" in estimator.notes[0]
     assert look_ahead_of(estimator) == 240.0
     assert look_ahead_of(make_estimator("phy-ukf", trusted)) == 0.0
-    track, _ = run_window(estimator, rough, None, None)
+    track, _ = run_window(estimator, rough, None)
     assert track.valid[0], "it needs no arrival"
     assert np.isnan(track.nis).all()
     assert not track.nis_dof.any()

@@ -24,13 +24,15 @@ from pdhef_logtool.car.parts import (
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
 from pdhef_logtool.estimators.algorithm import resolve
-from pdhef_logtool.estimators.base import LookingAhead, run_window
+from pdhef_logtool.estimators.base import LookingAhead
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import PHYSICS_Q_STD
 from pdhef_logtool.estimators.self_calibrated import OPEN_LOOP
 from pdhef_logtool.estimators.table import (
     SPECS,
     Options,
     all_names,
+    all_specs,
     check_names,
     make_estimator,
     runnable,
@@ -59,7 +61,7 @@ VEHICLE = default_vehicle()
 NOISE = FilterNoise(q_std=(0.1, 0.2, 0.1), r_std={"ay_m_s2": 0.9})
 EVIDENCE = Trust(trust_cap=1.0, evidence="a drive of 300 s")
 #: But for what runs on a car that its log has calibrated (``test_self_calibrated``).
-LINES = tuple(s for s in SPECS if s.name != OPEN_LOOP)
+LINES = tuple(s for s in all_specs() if s.name != OPEN_LOOP)
 every_spec = pytest.mark.parametrize("spec", LINES, ids=lambda spec: spec.name)
 
 
@@ -95,7 +97,7 @@ def signals() -> Signals:
 
 
 def run(name: str, signals: Signals, car: Car = CAR) -> StateTrack:
-    return run_window(make_estimator(name, car), signals, None, None)[0]
+    return run_window(make_estimator(name, car), signals, None)[0]
 
 
 def same(a: StateTrack, b: StateTrack, upto: int | None = None) -> bool:
@@ -271,7 +273,7 @@ def intervals_for(*algorithms: Algorithm, factor: float = 2.0) -> Intervals:
 def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[float, Sequence[str]]:
     """Return by how much the intervals widen the sideslip's 1-sigma of pd-hef, and what is said of it."""
     estimator = make_estimator("pd-hef", car)
-    track, _ = estimator.run(signals, None)
+    track, _ = run_window(estimator, signals)
     applied = calibrator(replace(car, intervals=intervals), [estimator])
     ratio = applied.add(track, signals).sideslip_std_rad / track.sideslip_std_rad
     return float(np.nanmedian(ratio)), applied.notes("pd-hef")
@@ -311,5 +313,5 @@ def test_trust_changes_no_physics_so_that_the_notes_of_other_filters_stay(signal
     for car in (BARE, CAR):
         estimator = make_estimator("phy-ukf", car)
         applied = calibrator(replace(car, intervals=entries), [estimator])
-        applied.add(estimator.run(signals, None)[0], signals)
+        applied.add(run_window(estimator, signals)[0], signals)
         assert applied.notes("phy-ukf") == ("intervals calibrated on car for friction and vehicle as told",)

@@ -19,6 +19,7 @@ from pdhef_logtool.car.car import Car, read_history
 from pdhef_logtool.car.parts import FilterNoise, Inflation, LearntOn, SideslipCoefficients, YawRateCoefficients
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.drive.reading import WholeDrive
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.learning import drives as learning_drives
 from pdhef_logtool.learning.drives import (
     DriveRecord,
@@ -602,7 +603,7 @@ def test_a_bench_keeps_drives_by_number_and_scores_filters(monkeypatch: pytest.M
 
     own = spec_of("phy-ukf-tuned").make(car.with_noise("phy-ukf-tuned", noise), Options(use_speed=False))
     assert WHOLE.truth is not None
-    assert found == {"phy-ukf-tuned": {3: drive_error(own.run(WHOLE.signals, None)[0], WHOLE.truth, 3.0)}}
+    assert found == {"phy-ukf-tuned": {3: drive_error(run_window(own, WHOLE.signals)[0], WHOLE.truth, 3.0)}}
     assert DriveBench(TuneSetup(SALOON, car, None, ("physics",)))._options.use_speed
 
 

@@ -17,6 +17,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics, FittedValues, TriedParts
 from pdhef_logtool.car.vehicle import AxleTyre, PhysicsParts, Sensors, Tyres, VehicleParameters, default_vehicle
 from pdhef_logtool.drive.options import ReadOptions
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
 from pdhef_logtool.estimators.physics_ukf import physics_filter
@@ -329,7 +330,7 @@ def test_errors_are_the_filters_at_20_hz_after_it_has_settled() -> None:
     steps = replace(DRIVE, truth=replace(DRIVE.truth, sideslip_rad=beta))
     ((error, weight),) = identify._sideslip_errors([steps], CAR, priors, theta)
     vehicle, noise = build_vehicle(CAR, priors, theta)
-    track = physics_ukf_tuned(vehicle, noise).run(DRIVE.signals, None)[0]
+    track = run_window(physics_ukf_tuned(vehicle, noise), DRIVE.signals)[0]
     expected = (track.sideslip_rad - DRIVE.truth.sideslip_rad)[::5]
     used = np.arange(0, 601, 5) > 300  # 3 s
     used[102] = False
@@ -517,13 +518,13 @@ def test_scores_are_over_all_stamps_of_all_drives() -> None:
 
     drives = (DRIVE, other)
     assert score.zero_deg == pytest.approx(rmse(*(replace(d.truth, sideslip_rad=0 * d.truth.vx_m_s) for d in drives)))
-    assert score.start_file_deg == pytest.approx(rmse(*(PhysicsUkf(CAR).run(d.signals, None)[0] for d in drives)))
+    assert score.start_file_deg == pytest.approx(rmse(*(run_window(PhysicsUkf(CAR), d.signals)[0] for d in drives)))
     tuned = physics_ukf_tuned(identified, noise)
     seen = [replace(d.signals, steer_rad=d.signals.steer_rad * 16 / 15 - 0.002) for d in drives]
-    assert score.identified_deg == pytest.approx(rmse(*(tuned.run(s, None)[0] for s in seen)))
+    assert score.identified_deg == pytest.approx(rmse(*(run_window(tuned, s)[0] for s in seen)))
     seen = [replace(d.signals, steer_rad=d.signals.steer_rad * 16 / 14 - 0.003) for d in drives]
     physics = physics_filter(strongest.vehicle, strongest.noise)
-    assert score.physics_deg == pytest.approx(rmse(*(physics.run(s, None)[0] for s in seen)))
+    assert score.physics_deg == pytest.approx(rmse(*(run_window(physics, s)[0] for s in seen)))
     assert score.seconds == pytest.approx(10.0)
     rounded = PartScore("fit", 1.23456, 2.00004, 3.00006, 4.123449, 0.12344).to_dict()
     assert rounded == {"seconds": 1.2346, "zero_deg": 2.0, "starting_car_deg": 3.0001, "identified_deg": 4.1234,

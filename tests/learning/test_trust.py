@@ -22,6 +22,7 @@ from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.parts import LearntOn
 from pdhef_logtool.drive.options import ReadOptions
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.physics_ukf import of_car
 from pdhef_logtool.evaluation.bootstrap import block_bootstrap_difference
 from pdhef_logtool.evaluation.metrics import signal_error
@@ -273,7 +274,7 @@ def test_the_errors_are_those_of_pd_hef_at_each_trust(sample_logs_dir: Path, mon
     assert len(passes) == 1
     for row, share in zip(blocks.squares, TRUSTS, strict=True):
         estimator = AdaptivePhysics(of_car(car), NetworkService(bundle), share)
-        track = estimator.run(signals, None)[0]
+        track = run_window(estimator, signals)[0]
         error = signal_error(track, truth, "sideslip_rad", vehicle.low_speed_blend_m_s)
         assert row.sum() == pytest.approx(np.nansum(error**2), rel=1e-12)
     assert len({float(row.sum()) for row in blocks.squares}) == len(TRUSTS)

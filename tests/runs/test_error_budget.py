@@ -12,6 +12,7 @@ from reference_car import Drive, drive, slalom, with_noise
 
 from pdhef_logtool.car.vehicle import VehicleParameters, default_vehicle
 from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.pass_through import PassThrough
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
 from pdhef_logtool.evaluation.metrics import signal_error
@@ -41,7 +42,7 @@ def truth_of(made: Drive) -> StateTrack:
 
 def budget(signals: Signals, truth: StateTrack, vehicle: VehicleParameters = VEHICLE) -> ErrorBudget:
     estimator = physics(vehicle)
-    error = signal_error(estimator.run(signals, None)[0], truth, "sideslip_rad", SLOW)
+    error = signal_error(run_window(estimator, signals)[0], truth, "sideslip_rad", SLOW)
     sample = sample_drive(signals, truth, error**2)
     assert sample is not None
     return error_budget(estimator, sample, SLOW)

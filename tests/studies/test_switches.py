@@ -52,7 +52,7 @@ def line(on: list[float], off: list[float], *, default: bool = True) -> switches
 
 def test_without_prediction_the_newest_arrived_step_stands_as_it_is(drive: ConditionDrive) -> None:
     ukf = PhysicsUkf(VEHICLE)
-    steps, _ = ukf.filter_steps(drive.signals, None)
+    steps, _ = ukf.run(drive.signals, None)
     track = switches.run_unpredicted(ukf, drive)
     np.testing.assert_array_equal(track.vy_m_s[LATE_STEPS:], steps.x[:-LATE_STEPS, 1])
     assert not track.valid[:LATE_STEPS].any()

@@ -23,6 +23,7 @@ from pdhef_logtool.car.flat import load_vehicle
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, VehicleParameters, default_vehicle
 from pdhef_logtool.cli.run_tables import render_run
 from pdhef_logtool.drive.windows import DriveReader, plan_drive
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import make_estimator
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.mapping import auto_map
@@ -274,7 +275,7 @@ def test_the_filter_itself_sees_it_later(sweep: Path, sample_logs_dir: Path) -> 
     """What the watch adds: its flag stands before that of the filter's own innovations."""
     vehicle = load_vehicle(sample_logs_dir / "vehicle_mu03.toml")
     signals = read_signals(sweep, vehicle)
-    track, _ = make_estimator("phy-ukf", Car.of(vehicle)).run(signals, None)
+    track, _ = run_window(make_estimator("phy-ukf", Car.of(vehicle)), signals)
     own, seen = (int(np.flatnonzero(f)[0]) for f in (track.diverged, flags(track, signals, vehicle)))
     assert (signals.stamps_ns[own] - signals.stamps_ns[seen]) * 1e-9 > 0.3
 

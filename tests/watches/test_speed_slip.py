@@ -13,6 +13,7 @@ from reference_car import cut, drive, rolling_drive, slalom, with_noise
 from pdhef_logtool.car.vehicle import default_vehicle
 from pdhef_logtool.estimators.filter_shell import U_SPEED
 from pdhef_logtool.estimators.kinematic import Kinematic
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.open_loop import OpenLoop
 from pdhef_logtool.estimators.physics import PhysicsUkf
 from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
@@ -83,8 +84,8 @@ def test_spinning_wheels_are_not_believed(good, size):
 @pytest.mark.slow
 def test_all_estimators_heed_it_and_can_do_without(good, name):
     slipping = replace(good.signals, speed_m_s=good.signals.speed_m_s + spin(good.time_s))
-    gated = ESTIMATORS[name].run(slipping, None)[0]
-    plain = replace(ESTIMATORS[name], slip_gate=False).run(slipping, None)[0]
+    gated = run_window(ESTIMATORS[name], slipping)[0]
+    plain = run_window(replace(ESTIMATORS[name], slip_gate=False), slipping)[0]
 
     def worst(track):
         return np.nanmax(np.abs(track.vx_m_s - good.vx)[good.time_s > 0.5])
@@ -92,9 +93,9 @@ def test_all_estimators_heed_it_and_can_do_without(good, name):
     assert worst(gated) < 1.5
     assert worst(plain) > 5.0
     assert gated.valid.sum() >= plain.valid.sum()
-    same = ESTIMATORS[name].run(good.signals, None)[0]
+    same = run_window(ESTIMATORS[name], good.signals)[0]
     np.testing.assert_array_equal(
-        same.vy_m_s, replace(ESTIMATORS[name], slip_gate=False).run(good.signals, None)[0].vy_m_s
+        same.vy_m_s, run_window(replace(ESTIMATORS[name], slip_gate=False), good.signals)[0].vy_m_s
     )
 
 
@@ -110,7 +111,7 @@ def test_locked_wheels_are_not_believed_however_long_it_takes():
     assert np.isnan(out[sliding & np.isfinite(locked.speed_m_s)]).all()
     stands = made.time_s > 14.0
     np.testing.assert_array_equal(out[stands], locked.speed_m_s[stands])
-    track = PhysicsUkf(VEHICLE).run(locked, None)[0]
+    track = run_window(PhysicsUkf(VEHICLE), locked)[0]
     assert np.abs(track.vx_m_s - made.vx)[sliding].max() < 1.0
     assert np.abs(track.vx_m_s[-100:]).max() < 0.02
 
@@ -192,11 +193,11 @@ def test_an_estimate_that_runs_backwards_against_the_speed_is_not_valid(maker, g
         ax_m_s2=np.where(silent, -4.0, signals.ax_m_s2),
     )
     estimator = maker(VEHICLE)
-    steps, _ = estimator.filter_steps(signals, None)
+    steps, _ = estimator.run(signals, None)
     back = steps.x[:, 0] < 0.0
     assert back[-500:].all()
     assert (steps.inputs[back & silent, U_SPEED] > 0.5).all()
-    track = estimator.run(signals, None)[0]
+    track = run_window(estimator, signals)[0]
     assert not track.valid[back & silent].any()
     assert track.valid[~back & (good.time_s > 0.5)].all()
 

@@ -21,6 +21,7 @@ import numpy as np
 from pdhef_logtool.car.parts import FilterNoise, FittedPhysics
 from pdhef_logtool.car.prior import Prior
 from pdhef_logtool.car.vehicle import GRAVITY_M_S2, AxleTyre, PhysicsParts, Tyres, VehicleParameters
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.pass_through import PassThrough
 from pdhef_logtool.estimators.physics import PHY_UKF_Q_STD, PhysicsUkf
 from pdhef_logtool.estimators.physics_tuned import physics_ukf_tuned
@@ -412,7 +413,7 @@ def _sideslip_errors(
     estimator = physics_ukf_tuned(vehicle, noise)
     parts = []
     for drive in drives:
-        steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
+        steps, _ = estimator.run(signals_of(drive, start, vehicle), None)
         error, use, each_s = sampled_errors(drive, start, steps, SETTLE_S)
         parts.append((error, np.where(use, math.sqrt(each_s / CORRELATION_S), 0.0)))
     return parts
@@ -436,10 +437,10 @@ def _score(
     for drive in drives:
         before = signals_of(drive, start, start)
         tracks = (
-            PassThrough("zero", claims_zero_sideslip=True).run(before, None)[0],
-            PhysicsUkf(start).run(before, None)[0],
-            physics_ukf_tuned(identified, noise).run(signals_of(drive, start, identified), None)[0],
-            physics_filter(physics.vehicle, physics.noise).run(signals_of(drive, start, physics.vehicle), None)[0],
+            run_window(PassThrough("zero", claims_zero_sideslip=True), before)[0],
+            run_window(PhysicsUkf(start), before)[0],
+            run_window(physics_ukf_tuned(identified, noise), signals_of(drive, start, identified))[0],
+            run_window(physics_filter(physics.vehicle, physics.noise), signals_of(drive, start, physics.vehicle))[0],
         )
         for i, track in enumerate(tracks):
             error = signal_error(track, drive.truth, "sideslip_rad", slow)

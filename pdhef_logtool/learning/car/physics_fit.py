@@ -199,7 +199,7 @@ def drive_errors(
     estimator = physics_filter(vehicle, noise)
     found = []
     for drive in drives:
-        steps, _ = estimator.filter_steps(signals_of(drive, start, vehicle), None)
+        steps, _ = estimator.run(signals_of(drive, start, vehicle), None)
         known = steps.nis_dof > 0
         nis = float(np.minimum(steps.nis[known], 50.0).sum() / max(steps.nis_dof[known].sum(), 1.0))
         found.append(DriveError.of(drive, start, steps, max(nis, 1e-3)))

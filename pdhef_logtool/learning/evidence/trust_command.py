@@ -14,6 +14,7 @@ from pdhef_logtool.car.flat import part_toml
 from pdhef_logtool.car.parts import LearntOn, Trust
 from pdhef_logtool.car.store import Change, write_change
 from pdhef_logtool.drive.reading import Drive, Tell, WholeDrive
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import Options, spec_of
 from pdhef_logtool.evaluation.metrics import signal_error
 from pdhef_logtool.learning.drives import (
@@ -199,7 +200,7 @@ def errors_by_trust(car: Car, drive: WholeDrive, *, use_speed: bool) -> BlockErr
     errors = []
     for share in TRUSTS:
         estimator = spec_of("pd-hef").make(car, Options(use_speed, share, network))
-        errors.append(signal_error(estimator.run(signals, None)[0], truth, "sideslip_rad", slow))
+        errors.append(signal_error(run_window(estimator, signals)[0], truth, "sideslip_rad", slow))
     excited: BoolArray = np.abs(truth.vx_m_s * signals.yaw_rate_rad_s) > EXCITED_M_S2
     return block_errors(np.stack(errors), truth.sideslip_rad, signals.stamps_ns, excited)
 

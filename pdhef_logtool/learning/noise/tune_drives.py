@@ -16,6 +16,7 @@ from pdhef_logtool.car.car import Car
 from pdhef_logtool.car.parts import PHYSICS, FilterNoise
 from pdhef_logtool.drive.reading import MAX_BYTES, too_big
 from pdhef_logtool.drive.reading import Drive as ReadDrive
+from pdhef_logtool.estimators.latency_compensation import run_window
 from pdhef_logtool.estimators.table import FILTERS, SPECS, Options, former, spec_of
 from pdhef_logtool.learning.drives import DriveRecord, load_drive
 from pdhef_logtool.learning.noise.search import DriveError, drive_error
@@ -117,7 +118,7 @@ class DriveBench:
         for name, noise in tunings.items():
             estimator = spec_of(name).make(self._setup.car.with_noise(name, noise), self._options)
             errors[name] = {
-                index: drive_error(estimator.run(drive.signals, None)[0], drive.truth, slow)
+                index: drive_error(run_window(estimator, drive.signals)[0], drive.truth, slow)
                 for index, drive in self._drives.items()
             }
         return errors

@@ -1,0 +1,90 @@
+"""Check in every run that an estimator which declares itself causal does not look ahead.
+
+The harness compensates latency (:mod:`~.latency_compensation`), so that an estimate can only see the future through its
+steps: step k of a causal estimator is the same, whatever follows sample k. The check runs a window again from the same
+state with the samples behind a few stamps masked, and compares the steps before them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from pdhef_logtool.estimators.base import Estimator
+from pdhef_logtool.records.release import StepColumns
+from pdhef_logtool.records.signals import Signals
+
+#: A window is checked at two stamps: one anywhere, one among its first samples, which costs little.
+SHORT_CUT = 256
+#: Largest relative change of a step that counts as rounding: matrix products may depend on the window's length.
+RELATIVE_TOLERANCE = 1e-9
+
+
+@dataclass(slots=True)
+class CausalityCheck:
+    """The check over one drive; ``failed`` has the reason by estimator."""
+
+    failed: dict[str, str] = field(default_factory=dict)
+    _windows: dict[str, int] = field(default_factory=dict)
+
+    def state_before(self, estimator: Estimator, state: Any) -> Any:
+        """Return a copy of the state to check the next window from; None where that window is not checked."""
+        number = self._windows[estimator.name] = self._windows.get(estimator.name, 0) + 1
+        # Windows 1, 4, 16, 64, ...: look-ahead that the first does not show has more chances, at a falling cost.
+        is_checked = number & (number - 1) == 0 and number.bit_length() % 2 == 1
+        if not estimator.causal or not is_checked or estimator.name in self.failed:
+            return None
+        return (deepcopy(state),)
+
+    def check(self, estimator: Estimator, signals: Signals, before: Any, steps: Any) -> None:
+        """Compare the ``steps`` of a window with those of the same window cut short; ``before`` as returned above."""
+        if before is None or len(signals) < 2:
+            return
+        for count in _cuts(len(signals), self._windows[estimator.name]):
+            again, _ = estimator.run(signals.rows(0, count), deepcopy(before[0]))
+            change = largest_change(steps.until(count), again)
+            if change > RELATIVE_TOLERANCE:
+                self.failed[estimator.name] = (
+                    "failed the causality check: it declares that it is causal, but its steps up to "
+                    f"{signals.stamps_ns[count - 1]} ns change (by {change:.2g} of their size) when the samples that "
+                    "follow are masked; declare causal = False, or use no later sample"
+                )
+                return
+
+
+def _cuts(count: int, number: int) -> Iterator[int]:
+    """Yield how many samples of a window of ``count`` are kept, the same in every run."""
+    random = np.random.default_rng((count, number))
+    for most in (min(count, SHORT_CUT), count):
+        yield int(random.integers(1, most))
+
+
+def largest_change(a: Any, b: Any) -> float:
+    """Return the largest difference of two records of steps, relative to each column's largest value; inf for NaN."""
+    return max((_change(x, y) for x, y in zip(_columns(a), _columns(b), strict=True)), default=0.0)
+
+
+def _change(a: Any, b: Any) -> float:
+    if a.shape != b.shape:
+        return np.inf
+    known = np.isfinite(a) & np.isfinite(b)
+    if not np.array_equal(a[~known], b[~known], equal_nan=True):
+        return np.inf
+    difference = np.abs(a[known].astype(float) - b[known].astype(float))
+    size = max(float(np.abs(a[known]).max(initial=0.0)), np.finfo(float).tiny)
+    return float(difference.max(initial=0.0)) / size
+
+
+def _columns(record: Any) -> Iterator[Any]:
+    if isinstance(record, StepColumns):
+        for entry in fields(record):
+            yield from _columns(getattr(record, entry.name))
+    elif isinstance(record, tuple):
+        for part in record:
+            yield from _columns(part)
+    else:
+        yield np.asarray(record)

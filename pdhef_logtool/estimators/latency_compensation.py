@@ -1,0 +1,73 @@
+"""Latency compensation of all estimators: which step had arrived by a scored stamp, and its extrapolation to it.
+
+A sample arrives later than it was measured. What a receiver knows at a scored stamp t is the newest step k whose data,
+and those of all steps before it, had arrived by t (``Signals.ready_ns``). The estimate at t is that step extrapolated
+over the whole latency t - t_k. An estimator returns steps and has no part in this choice.
+
+An estimator that looks ahead is not causal: it knows each step at the step's own stamp.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from pdhef_logtool.estimators.base import Estimator, look_ahead_of, predict_track, run_steps
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.records.release import StepColumns, extrapolation, release
+from pdhef_logtool.records.signals import IntArray, Signals
+from pdhef_logtool.records.tracks import StateTrack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PendingSteps(StepColumns):
+    """Steps that a coming stamp may still be extrapolated from, with their stamps and availability times, [K]."""
+
+    stamps_ns: IntArray
+    ready_ns: IntArray
+    steps: Any
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowState:
+    """What passes from window to window: the estimator's own state, and its pending steps."""
+
+    estimator: Any
+    pending: PendingSteps
+
+
+def run_window(
+    estimator: Estimator,
+    signals: Signals,
+    before: WindowState | None = None,
+    ahead: Signals | None = None,
+    causality: CausalityCheck | None = None,
+) -> tuple[StateTrack, WindowState]:
+    """Run an estimator over one window; return its track at the window's stamps, and the state for the next window.
+
+    Parameters
+    ----------
+    before : state that the previous window returned, None at the start of a log.
+    ahead : signals that follow the window, for an estimator that looks ahead.
+    causality : checks the steps of an estimator that declares itself causal.
+    """
+    state = None if before is None else before.estimator
+    copied = None if causality is None else causality.state_before(estimator, state)
+    steps, state = run_steps(estimator, signals, state, ahead)
+    if causality is not None:
+        causality.check(estimator, signals, copied, steps)
+    track, pending = compensate(estimator, signals, steps, None if before is None else before.pending)
+    return track, WindowState(state, pending)
+
+
+def compensate(
+    estimator: Estimator, signals: Signals, steps: Any, before: PendingSteps | None = None
+) -> tuple[StateTrack, PendingSteps]:
+    """Return the track of an estimator's steps of a window at its stamps, and the steps that stay pending."""
+    ready_ns = signals.stamps_ns if look_ahead_of(estimator) else signals.ready_ns
+    pending = PendingSteps(signals.stamps_ns, ready_ns, steps)
+    if before is not None:
+        pending = before.joined(pending)
+    chosen = extrapolation(pending.stamps_ns, pending.ready_ns, pending.steps.valid, signals.stamps_ns)
+    track = predict_track(estimator, pending.steps, chosen, signals.stamps_ns)
+    return track, pending.since(release(pending.ready_ns, signals.stamps_ns).needed)
