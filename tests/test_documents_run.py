@@ -7,16 +7,9 @@ import importlib
 import re
 import subprocess
 import sys
-import types
 from pathlib import Path
 
-import numpy as np
-import polars as pl
 import pytest
-
-from pdhef_logtool.estimators import table
-from pdhef_logtool.runs.config import RunConfig
-from pdhef_logtool.runs.fleet import run_logs
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.slow
@@ -25,31 +18,6 @@ pytestmark = pytest.mark.slow
 def blocks(document: str) -> list[str]:
     text = (ROOT / document).read_text(encoding="utf-8")
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-
-
-def test_an_estimator_added_as_architecture_says_runs_under_its_name_as_itself(
-    monkeypatch: pytest.MonkeyPatch, sample_logs_dir: Path, tmp_path: Path
-) -> None:
-    code, line = blocks("ARCHITECTURE.md")
-    module = types.ModuleType("pdhef_logtool.estimators.half_slip")
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    exec(code, module.__dict__)
-    needs, spec = line.split("\n", 1)
-    names = {"Spec": table.Spec}
-    exec(needs, names)
-    monkeypatch.setattr(table, "SPECS", (*table.SPECS, eval(spec.strip(), names)))
-    config = RunConfig(car=Path("saloon"), estimators=("zero", "half-slip"), annotate="none")
-    result = run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, config)
-    (report,) = (r.report for r in result.results)
-    assert report is not None
-    ran = {e["name"]: e["algorithm"]["algorithm"] for e in report["estimators"]}
-    assert ran == {"zero": "pass-through", "half-slip": "half-slip"}
-    rows = pl.read_parquet(tmp_path / "logs" / "dlc" / "estimates.parquet").filter(estimator="half-slip")
-    valid = rows.filter("valid")
-    assert len(valid) > 900
-    assert np.abs(valid["vy_m_s"].to_numpy()).max() > 0.05
-    scored = {r.metric for r in result.results[0].rows if r.estimator == "half-slip" and r.signal == "sideslip_rad"}
-    assert "rmse" in scored
 
 
 def test_the_api_page_runs_as_it_stands(sample_logs_dir: Path, tmp_path: Path) -> None:

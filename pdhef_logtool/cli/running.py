@@ -44,8 +44,8 @@ _MOST_VERDICTS = 50
     "1e15 or more), or RFC 3339 (2026-01-31T12:00:00Z).\n\n"
     'cars.toml, its cars and folders beside it: [folders] "fleet/golf" = "cars/golf"; [logs] "run_*.mcap" = '
     '"mini.toml"; [metadata.vehicle_id] "WVW-1" = "cars/golf"; default = "saloon" above them.',
-    shared="cars estimators annotate keep cache sensors friction thresholds config_file network intervals calibrate "
-    "waived model calibration",
+    shared="cars estimators annotate keep cache sensors clock friction thresholds config_file network intervals "
+    "calibrate waived model calibration",
     car="Your car (default: a sedan)",
 )
 def run(  # positional: one an option of the command line

@@ -497,12 +497,13 @@ def _estimate(
 
 def _without_failed(drive: Drive, ready: Sequence[Estimator], failed: dict[str, str]) -> Sequence[Estimator]:
     """Return the estimators whose estimates count; raises EstimatorError if none is left."""
-    for name, text in failed.items():
-        drive.tell(f"{name} {text}")
+    texts = [f"{name} {text}" for name, text in failed.items()]
+    for text in texts:
+        drive.tell(text)
     left = [e for e in ready if e.name not in failed]
     if not left:
         raise EstimatorError(
-            expected="an estimator that runs as it declares", got="; ".join(failed.values()), where=str(drive.path)
+            expected="an estimator that runs as it declares", got="; ".join(texts), where=str(drive.path)
         )
     return left
 

@@ -1,0 +1,257 @@
+"""No estimator is scored that declares itself causal and looks ahead; the harness alone compensates latency."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+import pytest
+from half_slip_package import example_code, install
+from reference_car import cut, drive, slalom, with_noise
+
+from pdhef_logtool.car.car import Car
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators import table
+from pdhef_logtool.estimators.base import Steps, make_steps
+from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.estimators.latency_compensation import run_window
+from pdhef_logtool.estimators.table import Spec, make_estimator
+from pdhef_logtool.records.errors import EXIT_FAILURE, EXIT_OK, EXIT_PARTIAL, EstimatorError
+from pdhef_logtool.records.signals import FloatArray, Signals
+from pdhef_logtool.runs.config import RunConfig
+from pdhef_logtool.runs.fleet import run_logs
+
+ROOT = Path(__file__).resolve().parents[2]
+NEEDS = frozenset({"speed_m_s", "yaw_rate_rad_s"})
+
+
+def peek(rate: FloatArray) -> FloatArray:
+    """Return each sample's follower."""
+    return np.append(rate[1:], rate[-1])
+
+
+def centred(rate: FloatArray) -> FloatArray:
+    """Return a centred mean of 5 samples."""
+    return np.convolve(rate, np.full(5, 0.2), mode="same")
+
+
+def over_window(rate: FloatArray) -> FloatArray:
+    """Take off the mean of the window."""
+    return rate - rate.mean()
+
+
+def past(rate: FloatArray) -> FloatArray:
+    """Return each sample's predecessor."""
+    return np.append(rate[:1], rate[:-1])
+
+
+@dataclass(frozen=True)
+class Cheat:
+    """Yaw rate passed through a function of the window, or one of this module by name (an option is a plain value)."""
+
+    of: Any
+    name: str = "cheat"
+    causal: bool = True
+
+    def run(self, signals: Signals, state: None) -> tuple[Steps, None]:
+        rate = (globals()[self.of] if isinstance(self.of, str) else self.of)(signals.yaw_rate_rad_s)
+        return make_steps(np.full(len(rate), 20.0), 0.0 * rate, rate), None
+
+
+@pytest.fixture(scope="module")
+def signals() -> Signals:
+    s = with_noise(drive(slalom(0.03, 0.5), 4.0, speed=22.0).signals, seed=3)
+    return replace(s, ready_ns=s.stamps_ns + 16_000_000)
+
+
+def reason(estimator: Any, signals: Signals, *windows: tuple[int, int]) -> str:
+    check, state = CausalityCheck(), None
+    for first, end in windows or ((0, len(signals)),):
+        _, state = run_window(estimator, cut(signals, first, end), state, causality=check)
+    return check.failed.get(estimator.name, "")
+
+
+@pytest.mark.parametrize("of", [peek, centred, over_window])
+def test_an_estimator_that_looks_ahead_fails(of: Any, signals: Signals) -> None:
+    found = reason(Cheat(of), signals)
+    assert re.search(r"causality check: .* steps up to \d+ ns change .* declare causal = False", found), found
+
+
+def test_looking_ahead_that_begins_late_is_found_in_a_later_window(signals: Signals) -> None:
+    late = Cheat(lambda rate: peek(rate) if len(rate) == 77 else rate)
+    starts = [0, 100, 110, 120]
+    windows = [*zip(starts, [*starts[1:], 197], strict=True)]
+    assert windows[3][1] - windows[3][0] == 77
+    assert reason(late, signals, *windows)
+
+
+@pytest.mark.parametrize("of", [past, lambda rate: rate, np.cumsum])
+def test_a_causal_estimator_passes(of: Any, signals: Signals) -> None:
+    assert reason(Cheat(of), signals) == ""
+
+
+def test_an_estimator_that_declares_that_it_is_not_causal_is_not_checked(signals: Signals) -> None:
+    assert reason(Cheat(peek, causal=False), signals) == ""
+
+
+def test_rounding_is_no_looking_ahead(signals: Signals) -> None:
+    """Sums of another length round differently; a real dependence is larger by far."""
+    assert reason(Cheat(lambda rate: rate * (1.0 + 1e-13 * len(rate))), signals) == ""
+    assert reason(Cheat(lambda rate: rate * (1.0 + 1e-6 * len(rate))), signals)
+
+
+def test_the_check_leaves_the_estimates_and_a_state_that_is_changed_in_place_alone(signals: Signals) -> None:
+    @dataclass(frozen=True)
+    class Sum:
+        name: str = "sum"
+        causal: bool = True
+
+        def run(self, s: Signals, state: FloatArray | None) -> tuple[Steps, FloatArray]:
+            state = np.zeros(1) if state is None else state
+            total = state[0] + np.cumsum(s.yaw_rate_rad_s)
+            state[0] = total[-1]
+            return make_steps(np.full(len(s), 20.0), 0.0 * total, total), state
+
+    checked, plain = [], []
+    for tracks, check in ((checked, CausalityCheck()), (plain, None)):
+        state = None
+        for first, end in ((0, 150), (150, 300), (300, 400)):
+            track, state = run_window(Sum(), cut(signals, first, end), state, causality=check)
+            tracks.append(track.yaw_rate_rad_s)
+        assert check is None or not check.failed
+    np.testing.assert_array_equal(np.concatenate(checked), np.concatenate(plain))
+
+
+def test_every_shipped_estimator_is_what_it_declares(signals: Signals) -> None:
+    car = Car.of(default_vehicle())
+    for name in table.all_names(car):
+        estimator = make_estimator(name, car)
+        assert reason(estimator, signals, (0, 150), (150, len(signals))) == "", name
+
+
+def test_the_newest_step_that_had_arrived_is_scored_and_no_newer_one(signals: Signals) -> None:
+    """Samples come each 10 ms and arrive 16 ms late: at a stamp, the step of two samples before is the newest."""
+    rate = np.arange(len(signals), dtype=np.float64)
+    track, _ = run_window(Cheat(lambda _: rate), signals)
+    assert not track.valid[:2].any()
+    np.testing.assert_array_equal(track.yaw_rate_rad_s[2:], rate[:-2])
+
+
+# --- in a run --------------------------------------------------------------------------------------------------------
+
+
+def _spec(name: str, of: str) -> Spec:
+    return Spec(name, f"the test's {name}", lambda name, _car, _options: Cheat(of, name), NEEDS, 0x123456)
+
+
+@pytest.fixture
+def plugged(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    specs = (*table.SPECS, _spec("peeks", "peek"), _spec("honest", "past"))
+    monkeypatch.setattr(table, "all_specs", lambda: specs)
+    yield
+
+
+def _run(tmp_path: Path, sample_logs_dir: Path, *names: str, annotate: str = "none") -> Any:
+    config = RunConfig(car=Path("saloon"), estimators=names, annotate=annotate)  # type: ignore[arg-type]
+    return run_logs([str(sample_logs_dir / "dlc.mcap")], tmp_path, config)
+
+
+@pytest.mark.slow
+def test_a_run_leaves_out_what_looks_ahead_says_why_and_ends_with_3(
+    plugged: None, tmp_path: Path, sample_logs_dir: Path
+) -> None:
+    result = _run(tmp_path / "a", sample_logs_dir, "zero", "peeks", "honest")
+    report = result.results[0].report
+    outcomes = {e["name"]: e["outcome"] for e in report["estimators"]}
+    assert outcomes == {"zero": "ran", "honest": "ran", "peeks": "failed"}
+    failed = next(e for e in report["estimators"] if e["name"] == "peeks")
+    assert "causality check" in failed["reason"]
+    assert result.exit_code == EXIT_PARTIAL
+    assert any("peeks" in text and "causality check" in text for text in result.results[0].outcome.lost)
+    assert {r.estimator for r in result.results[0].rows} & {"zero", "honest", "peeks"} == {"zero", "honest"}
+    rows = pl.read_parquet(tmp_path / "a/logs/dlc/estimates.parquet")
+    assert set(rows["estimator"].unique()) == {"zero", "honest", "truth"}
+    sound = _run(tmp_path / "b", sample_logs_dir, "zero", "honest")
+    assert sound.exit_code == EXIT_OK
+    assert rows.equals(pl.read_parquet(tmp_path / "b/logs/dlc/estimates.parquet"))
+
+
+@pytest.mark.slow
+def test_a_run_of_nothing_else_fails(plugged: None, tmp_path: Path, sample_logs_dir: Path) -> None:
+    with pytest.raises(EstimatorError, match="peeks failed the causality check") as failed:
+        _run(tmp_path, sample_logs_dir, "peeks")
+    assert failed.value.exit_code == EXIT_FAILURE
+    assert not (tmp_path / "logs/dlc").exists()
+
+
+# --- estimators of other packages ------------------------------------------------------------------------------------
+
+
+def _python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}", "OMP_NUM_THREADS": "1"}
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.slow
+def test_the_example_of_architecture_passes_all_tests_of_estimators(tmp_path: Path) -> None:
+    code = example_code()
+    assert len(code.splitlines()) <= 40
+    done = _python(install(tmp_path, code), "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests/estimators",
+                   "-k", "half-slip")  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:]
+    assert int(re.search(r"(\d+) passed", done.stdout)[1]) >= 50  # type: ignore[index]
+
+
+@pytest.mark.slow
+def test_an_estimator_of_another_package_runs_under_its_name(tmp_path: Path, sample_logs_dir: Path) -> None:
+    install(tmp_path, example_code())
+    out = tmp_path / "out"
+    done = _python(tmp_path, "-m", "pdhef_logtool", "run", str(sample_logs_dir / "dlc.mcap"), "-o", str(out),
+                   "--car", "saloon", "--estimators", "zero,half-slip", "--no-report")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    report = json.loads((out / "logs/dlc/report.json").read_text(encoding="utf-8"))
+    algorithms = {e["name"]: e["algorithm"]["algorithm"] for e in report["estimators"]}
+    assert algorithms == {"zero": "pass-through", "half-slip": "half-slip"}
+    rows = pl.read_parquet(out / "logs/dlc/estimates.parquet").filter(pl.col("estimator") == "half-slip")
+    valid = rows.filter("valid")
+    assert len(valid) > 900
+    assert np.abs(valid["vy_m_s"].to_numpy()).max() > 0.05
+    listed = _python(tmp_path, "-m", "pdhef_logtool", "estimators")
+    assert "half-slip" in listed.stdout
+
+
+@pytest.mark.parametrize(
+    ("code", "why"),
+    [
+        ("raise OSError('no licence')", "OSError: no licence"),
+        ("SPEC = 3", "got int, expected pdhef_logtool.estimators.table.Spec"),
+        (example_code().replace('"half-slip"', '"zero"'), "an estimator named zero exists"),
+    ],
+)
+def test_a_package_that_cannot_be_used_is_named_and_left_out(
+    code: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(install(tmp_path, code, "broken_plugin")))
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    table.all_specs.cache_clear()
+    try:
+        assert table.all_specs() == table.SPECS
+    finally:
+        sys.modules.pop("broken_plugin", None)
+        table.all_specs.cache_clear()
+    told = sys.stderr.getvalue()  # type: ignore[attr-defined]
+    assert told.count("\n") == 1
+    assert "broken_plugin" in told
+    assert why in told
