@@ -19,7 +19,15 @@ from pdhef_logtool.logs.drive_log import DriveLog
 from pdhef_logtool.logs.open_log import open_log
 from pdhef_logtool.logs.remote_place import LogPlace, RemotePlace
 from pdhef_logtool.logs.slim_log import SlimLog
-from pdhef_logtool.mapping import ChosenMapping, Mapping, check_mapping, choose_mapping, merge_losses
+from pdhef_logtool.mapping import (
+    ChosenMapping,
+    ClockModel,
+    Mapping,
+    check_mapping,
+    choose_mapping,
+    clock_key,
+    merge_losses,
+)
 from pdhef_logtool.records.checks import Check
 from pdhef_logtool.records.errors import EstimatorError, UsageError
 from pdhef_logtool.records.ledger import SampleCount, damage
@@ -121,10 +129,14 @@ class Drive:
     @property
     def not_causal(self) -> str:
         """Why no estimate of this drive is causal, whatever the estimator; empty if an estimator decides it."""
-        if not (late := self.plan.alignment.by_stamp):
+        names = [c.name for c in self.plan.alignment.channels if c.clock == "stamp" or not self._delay_known(c.name)]
+        if not names:
             return ""
-        names = "all signals" if self.options.clock == "stamp" else ", ".join(c.name for c in late)
-        return f"not causal: {names} read by stamp, not by arrival"
+        shown = "all signals" if len(names) == len(self.plan.alignment.channels) else ", ".join(names)
+        return f"not causal: {shown} read by stamp, not by arrival"
+
+    def _delay_known(self, signal: str) -> bool:
+        return self.plan.clocks.get(clock_key(self.mapping.signals[signal]), ClockModel()).delay_known
 
     @property
     def checks(self) -> tuple[Check, ...]:
