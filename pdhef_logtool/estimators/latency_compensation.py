@@ -14,6 +14,7 @@ from typing import Any
 
 from pdhef_logtool.estimators.base import Estimator, look_ahead_of, predict_track, run_steps
 from pdhef_logtool.estimators.causality_check import CausalityCheck
+from pdhef_logtool.records.errors import EstimatorError
 from pdhef_logtool.records.release import StepColumns, extrapolation, release
 from pdhef_logtool.records.signals import IntArray, Signals
 from pdhef_logtool.records.tracks import StateTrack
@@ -63,7 +64,17 @@ def run_window(
 def compensate(
     estimator: Estimator, signals: Signals, steps: Any, before: PendingSteps | None = None
 ) -> tuple[StateTrack, PendingSteps]:
-    """Return the track of an estimator's steps of a window at its stamps, and the steps that stay pending."""
+    """Return the track of an estimator's steps of a window at its stamps, and the steps that stay pending.
+
+    Raises
+    ------
+    EstimatorError
+        The estimator did not return one step per sample.
+    """
+    if len(steps.valid) != len(signals):
+        raise EstimatorError(
+            expected=f"one step per sample, {len(signals)}", got=str(len(steps.valid)), where=estimator.name
+        )
     ready_ns = signals.stamps_ns if look_ahead_of(estimator) else signals.ready_ns
     pending = PendingSteps(signals.stamps_ns, ready_ns, steps)
     if before is not None:

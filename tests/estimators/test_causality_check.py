@@ -147,6 +147,16 @@ def test_the_newest_step_that_had_arrived_is_scored_and_no_newer_one(signals: Si
     np.testing.assert_array_equal(track.yaw_rate_rad_s[2:], rate[:-2])
 
 
+def test_an_estimator_that_skips_samples_is_refused(signals: Signals) -> None:
+    @dataclass(frozen=True)
+    class Sparse(Cheat):
+        def run(self, signals: Signals, state: None) -> tuple[Steps, None]:
+            return super().run(cut(signals, 0, len(signals) // 2), state)
+
+    with pytest.raises(EstimatorError, match=r"cheat: expected one step per sample, 401, got 200"):
+        run_window(Sparse(past), signals)
+
+
 # --- in a run --------------------------------------------------------------------------------------------------------
 
 
