@@ -35,6 +35,10 @@ class PassThrough:
     Both carry the sensors' delay, because the newest arrived sample is what stands at the scored stamp.
     """
 
+    algorithm = "pass-through"
+    version = 1
+    options = ("claims_zero_sideslip",)
+
     name: str
     claims_zero_sideslip: bool
     causal: bool = True

@@ -91,6 +91,10 @@ class SelfCalibrated:
     compared : what the band compares, where several estimators of one calibration share it.
     """
 
+    algorithm = "self-calibrated"
+    version = 1
+    options = ("estimator",)
+
     estimator: Estimator
     calibration: WithoutTruth
     read_with: VehicleParameters

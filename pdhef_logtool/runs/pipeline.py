@@ -329,6 +329,8 @@ def _run_estimators(
         digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
         rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in found.rows]
         events = found.events
+        if void := [text for e in ready if (text := intervals.mismatch(e.name))]:
+            drive.tell("; ".join(void))
         if not found.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
         silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]

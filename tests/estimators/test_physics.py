@@ -650,7 +650,7 @@ def test_a_fitted_car_runs_on_its_values_and_on_signals_that_were_read_with_othe
     fitted = values.applied_to(own)
     assert (estimator.vehicle, estimator.read_with) == (fitted, own)
     assert resolve(adaptive).physics_sha256 == physics_sha256(fitted) != physics_sha256(own)
-    assert resolve(estimator).structure == resolve(physics_filter(fitted)).structure
+    assert resolve(estimator).identity == resolve(physics_filter(fitted)).identity
     ours, _ = estimator.run(correct_signals(noisy, own), None)
     raw = replace(noisy, steer_rad=noisy.steer_rad * own.steering_ratio / 15.0)
     want, _ = physics_filter(fitted).run(correct_signals(raw, fitted), None)
