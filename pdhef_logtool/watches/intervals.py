@@ -93,7 +93,10 @@ class TrackCalibrator:
         found = self._found(name)
         if self.intervals is None or found is None:
             other = self.mismatch(name)
-            return (POSTERIOR_NOTE if name in self.posterior else "intervals not calibrated", *([other] if other else []))
+            return (
+                POSTERIOR_NOTE if name in self.posterior else "intervals not calibrated",
+                *([other] if other else []),
+            )
         made = self.intervals
         of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
         then, now = found[0].algorithm, found[1]
