@@ -235,6 +235,8 @@ class _Place(caching.FunctionCache):  # type: ignore[misc]
     def __init__(self, function: Any, folder: Path) -> None:
         self._impl_class = functools.partial(_Code, folder=folder)
         super().__init__(function)
+        locator = self._impl.locator
+        self._cache_file = _File(self._cache_path, self._impl.filename_base, locator.get_source_stamp())
 
     def signatures(self, codegen: Any) -> list[Any]:
         try:
@@ -242,6 +244,20 @@ class _Place(caching.FunctionCache):  # type: ignore[misc]
         except Exception:  # noqa: BLE001 (whatever a pickle that was cut short may raise)
             return []
         return [key[0] for key in index if key == self._index_key(key[0], codegen)]
+
+
+class _File(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """Numba's files of one function, which several processes may write at once.
+
+    Numba numbers the files of machine code by the index that it has read: two processes could give one number to the
+    code for different arguments. Here the name depends on these; what one process misses in the index of another is
+    compiled again.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        name = f"{Path(self._index_name).stem}.{hashlib.sha256(repr(key).encode()).hexdigest()[:12]}.nbc"
+        self._save_data(name, data)
+        self._save_index({**self._load_index(), key: name})
 
 
 class _Code(caching.CompileResultCacheImpl):  # type: ignore[misc]
@@ -285,6 +301,12 @@ def is_kept(name: str) -> bool:
 
 #: Whether somebody has said that compiling begins.
 announced = False
+
+
+def be_silent() -> None:
+    """Say nothing in this process and in those that are forked from it, for which another one has."""
+    global announced
+    announced = True
 
 
 def announce() -> None:

@@ -6,10 +6,8 @@ A part is compiled by running it over two seconds of a straight road that nobody
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -19,9 +17,8 @@ from pdhef_logtool.estimators.table import Options, all_names, make_estimator
 from pdhef_logtool.records.signals import ALIGNED_SIGNALS, Signals
 from pdhef_logtool.records.supervisor import Tell, supervise
 
-#: Parts that are no estimators: the filter of ``physics``, what runs beside it over every drive, a simulated drive, and
-#: a run of that with a car of which nothing is known.
-_FILTER, _CHECKS, _SIMULATION, _UNKNOWN_CAR = "filter", "checks", "simulation", "unknown car"
+#: Parts that are no estimators: the filter of ``physics``, and what runs beside it over every drive.
+_FILTER, _CHECKS = "filter", "checks"
 #: The estimators that are made of the filter.
 _FILTERED = ("physics", "pd-hef", "pd-hef-smoothed", "pd-hef-fixed-r", "pd-hef-trust1")
 #: By part the function that is compiled last. The longest parts come first.
@@ -33,7 +30,6 @@ _LAST = {
     _CHECKS: "error_features._advance",
 }
 _STEP_NS, _STEPS = 10_000_000, 100
-_DRIVE = "banked-road"
 
 
 def compile_for(names: Sequence[str]) -> None:
@@ -46,65 +42,50 @@ def compile_for(names: Sequence[str]) -> None:
         compile_parts(parts)
 
 
-def compile_all() -> None:
-    """Compile what runs and simulations of any kind use."""
-    others = [name for name in all_names(Car.load("saloon")) if name not in _LAST]
-    compile_parts([*_LAST, _SIMULATION, *others, _UNKNOWN_CAR])
+def all_parts() -> tuple[str, ...]:
+    """Return all parts, the longest first."""
+    return (*_LAST, *(name for name in all_names(Car.load("saloon")) if name not in _LAST))
 
 
-def compile_parts(parts: Sequence[str]) -> None:
-    """Compile parts, in as many processes as there are processors; an error shows where the part is used."""
+def compile_part(part: str, tell: Tell) -> None:
+    """Compile one part."""
+    del tell
+    if part == _FILTER:
+        _compile_filter()
+    elif part == _CHECKS:
+        _compile_checks()
+    else:
+        estimator, carry = make_estimator(part, Car.load("saloon")), None
+        for window in _windows():
+            _, carry = run_window(estimator, window, carry, None)
+
+
+def compile_parts(parts: Sequence[str], work: Callable[[str, Tell], None] = compile_part) -> None:
+    """Compile parts in as many processes as there are processors; an error shows where the part is used."""
     from pdhef_logtool.records import compiled
 
     compiled.announce()
     jobs = min(_processors(), len(parts)) if hasattr(os, "fork") else 1
-    for _ in supervise(compile_part, parts, jobs=jobs, preload=("pdhef_logtool.estimators.*", __name__)):
+    preload = ("pdhef_logtool.estimators.*", "pdhef_logtool.records.compiled:be_silent", work.__module__)
+    for _ in supervise(work, parts, jobs=jobs, preload=preload):
         pass
 
 
-def compile_part(part: str, _: Tell) -> None:
-    """Compile one part."""
-    from pdhef_logtool.records import compiled
+def _compile_filter() -> None:
+    from pdhef_logtool.estimators.physics_ukf import of_car
 
-    compiled.announced = True  # by the process that this one works for
-    car, windows = Car.load("saloon"), _windows()
-    if part == _FILTER:
-        from pdhef_logtool.estimators.physics_ukf import of_car
-
-        # The gate of the wheels' speed is one of the checks.
-        replace(of_car(car), slip_gate=False).filter_steps(windows[0], None)
-    elif part == _CHECKS:
-        _compile_checks(car, windows[0])
-    elif part == _SIMULATION:
-        from truthsim.drive import simulate_drive
-
-        simulate_drive(_DRIVE)
-    elif part == _UNKNOWN_CAR:
-        _run_unknown_car()
-    else:
-        estimator, carry = make_estimator(part, car), None
-        for window in windows:
-            _, carry = run_window(estimator, window, carry, None)
+    # The gate of the wheels' speed is one of the checks.
+    replace(of_car(Car.load("saloon")), slip_gate=False).filter_steps(_windows()[0], None)
 
 
-def _run_unknown_car() -> None:
-    from pdhef_logtool.runs.config import RunConfig
-    from pdhef_logtool.runs.fleet import run_logs
-    from truthsim.drive import simulate_drive, write_drive
-
-    with TemporaryDirectory() as folder:
-        log = Path(folder) / "drive.mcap"
-        write_drive(simulate_drive(_DRIVE), log)
-        run_logs([str(log)], Path(folder) / "out", RunConfig(friction="estimate", keep="metrics"), report=False)
-
-
-def _compile_checks(car: Car, signals: Signals) -> None:
+def _compile_checks() -> None:
     from pdhef_logtool.residual_model.features import FEATURES
     from pdhef_logtool.watches.divergence import wrong_branch
     from pdhef_logtool.watches.error_features import error_terms
     from pdhef_logtool.watches.sensor_faults import find_faults
     from pdhef_logtool.watches.speed_slip import without_slip
 
+    car, signals = Car.load("saloon"), _windows()[0]
     _compile_algebra()
     without_slip(signals, car.vehicle.sensors.speed_std_m_s, None)
     find_faults(signals, car.vehicle, None)

@@ -116,8 +116,22 @@ def test_a_full_disk_ends_no_call(module_file: Path, monkeypatch: pytest.MonkeyP
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile._save_data", full)
     assert _load(module_file).more(1) == 2
+
+
+def test_two_processes_that_save_at_once_never_take_each_others_code(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "numba.core.caching.IndexDataCacheFile._load_index", lambda _: {}
+        )  # of neither has the other read
+        function = _load(module_file).more
+        assert (function(1), function(1.5)) == (2, 2.5)
+    assert [p.suffix for p in _code_files(module_file.parent)].count(".nbc") == 2
+    again = _load(module_file).more
+    assert (again(1), again(1.5)) == (2, 2.5)
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="users and permissions of POSIX")
