@@ -13,8 +13,8 @@ ENV PIP_NO_CACHE_DIR=1 PIP_ROOT_USER_ACTION=ignore PIP_DISABLE_PIP_VERSION_CHECK
 COPY dist/*.whl /tmp/dist/
 RUN pip install ${TORCH_INDEX:+--extra-index-url "$TORCH_INDEX"} /tmp/dist/*.whl && rm -r /tmp/dist
 
-# Compiles the filters, once, into the installation. On a processor of another kind they are compiled anew at first use,
-# into the cache of whoever runs them.
+# Compiles the filters, once, into the installation. On a processor of another kind they are compiled again at first use,
+# into the cache of the user who runs them.
 RUN pdhef compile
 
 # Nobody in particular: --user makes outputs belong to whoever runs it, who then has no home of his own here.

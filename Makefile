@@ -65,10 +65,8 @@ demo: $(VENV)/installed $(VENV)/compiled
 	@echo "  logs/<log>/recording.rrd    open it with: $(BIN)/pdhef view $(OUT)"
 	@echo "  logs/<log>/report.json, estimates.parquet; metrics.parquet and run.json for the whole run"
 
-# Numba's cache watches the file of a compiled function, not those of the functions that it calls: after an edit of any
-# of our sources all of it goes.
+# Compiled code is kept under a digest of its sources: after an edit the next run compiles anew, or this does beforehand.
 $(VENV)/compiled: $(VENV)/installed $(wildcard pdhef_logtool/*.py pdhef_logtool/*/*.py pdhef_logtool/*/*/*.py truthsim/*.py)
-	@find pdhef_logtool truthsim -name '*.nb[ic]' -delete
 	$(BIN)/pdhef compile
 	@touch $@
 

@@ -30,6 +30,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pdhef_logtool.records.compiled_sources import sources_digest
+
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = "pdhef_logtool"
 #: By package that is mutated, the folders of the tests that know it best.
@@ -264,19 +266,22 @@ def mutated(source: bytes, mutant: Mutant) -> bytes:
 def apply(mutant: Mutant, tree: Path) -> None:
     """Put the fault into a copy of the tree, and forget what was compiled from what it changes.
 
-    The compiler's cache knows a file by its content, and never looks at the files of the functions that a compiled one
-    calls: for a fault in a compiled function the caches of its module and of all that import it, directly or not, go.
+    All compiled code belongs to one digest of all sources, and a fault would have all of it compiled again. For a fault
+    in a compiled function the code of its module and of all that import it, directly or not, goes; the rest is kept
+    under the new digest.
     """
-    path = tree / mutant.file
+    path, digest = tree / mutant.file, sources_digest(tree)
     before = path.stat()
     path.write_bytes(mutated(path.read_bytes(), mutant))
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
     for compiled in path.parent.glob(f"__pycache__/{path.stem}.*.pyc"):
         compiled.unlink()
-    if mutant.compiled:
-        for module in _importers(path, tree):
-            for cached in module.parent.glob(f"__pycache__/{module.stem}.*.nb[ic]"):
+    stems = {module.stem for module in _importers(path, tree)} if mutant.compiled else set()
+    for folder in (tree / SOURCES / "__pycache__/compiled").glob(f"{digest}-*"):
+        for cached in folder.glob("*.nb[ic]"):
+            if cached.name.partition(".")[0] in stems:
                 cached.unlink()
+        folder.rename(folder.with_name(folder.name.replace(digest, sources_digest(tree))))
 
 
 def _importers(path: Path, tree: Path) -> set[Path]:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import ast
+import shutil
 from collections import Counter
 from pathlib import Path
 
 import mutants
 import pytest
 from mutants import FOLDERS, ROOT, Mutant
+
+from pdhef_logtool.records.compiled_sources import sources_digest
 
 pytestmark = pytest.mark.slow
 
@@ -78,30 +81,45 @@ def act(a: int, b: int) -> int:
 
 def test_a_fault_in_a_compiled_function_forgets_all_that_may_hold_it(tmp_path: Path) -> None:
     code = {
-        "low.py": '"""Low level, made for the test."""\nfrom numba import njit\n\n\n'
+        "low.py": '"""Low level, made for the test."""\nfrom pdhef_logtool.records.compiled import njit\n\n\n'
         "@njit(cache=True)\ndef half(x):\n    return x / 2.0\n\n\ndef plain(x):\n    return x - 1.0\n",
         "high.py": '"""High."""\nfrom pdhef_logtool.made.low import half\n',
         "top.py": '"""Top."""\nfrom pdhef_logtool.made import high\n',
         "apart.py": '"""Apart."""\n',
     }
     package = tmp_path / "pdhef_logtool" / "made"
-    cache = package / "__pycache__"
+    cache, compiled = package / "__pycache__", tmp_path / "pdhef_logtool" / "__pycache__" / "compiled"
     cache.mkdir(parents=True)
     for name, text in code.items():
         (package / name).write_text(text)
-        (cache / f"{name[:-3]}.f-5.py311.nbi").touch()
         (cache / f"{name[:-3]}.cpython-311.pyc").touch()
+
+    def kept() -> list[str]:
+        """Return the files of the one folder, which is named after what the sources are now."""
+        (folder,) = compiled.iterdir()
+        assert folder.name == f"{sources_digest(tmp_path)}-0"
+        return sorted(p.name.partition(".")[0] for p in folder.iterdir())
+
+    def keep() -> None:
+        folder = compiled / f"{sources_digest(tmp_path)}-0"
+        folder.mkdir(parents=True)
+        for name in code:
+            (folder / f"{name[:-3]}.f-5.py311.nbi").touch()
+
+    keep()
     by_name = {m.function: m for m in mutants.possible("made", tmp_path) if m.kind == "sign"}
     times = (package / "low.py").stat().st_mtime_ns
 
     mutants.apply(by_name["plain"], tmp_path)  # nothing compiled changes
-    assert len(list(cache.glob("*.nbi"))) == 4
+    assert kept() == ["apart", "high", "low", "top"]
     assert not list(cache.glob("low.*.pyc"))
     assert (package / "low.py").stat().st_mtime_ns == times
 
     (package / "low.py").write_text(code["low.py"])
+    shutil.rmtree(compiled)
+    keep()
     mutants.apply(by_name["half"], tmp_path)
-    assert [p.name for p in cache.glob("*.nbi")] == ["apart.f-5.py311.nbi"]
+    assert kept() == ["apart"]
     assert "return (x * 2.0)" in (package / "low.py").read_text()
 
 

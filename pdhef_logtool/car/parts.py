@@ -44,6 +44,19 @@ SMOOTHING = (0.5, 3.0)
 #: Measurements that ``r_std`` is about.
 MEASUREMENTS = ("ay_m_s2", "yaw_rate_rad_s", "speed_m_s")
 
+#: Defaults of the options of algorithms before these had a version: car folders then listed every option. Frozen.
+_FORMER_DEFAULTS: dict[str, Any] = {
+    "adaptive": True,
+    "bias_states": False,
+    "block_s": 120.0,
+    "force_scale": False,
+    "network": None,
+    "roll_correction": False,
+    "slip_gate": True,
+    "standstill": True,
+    "trust": 0.0,
+}
+
 #: Entries of a vehicle file that change no estimate.
 _NOT_PHYSICS = {"name", "truth_position_m"}
 
@@ -279,17 +292,23 @@ class Inflation(Record):
     grip_factors: Annotated[tuple[NonNegative, NonNegative, NonNegative], Field(strict=False)] = (1.0, 1.0, 1.0)
 
 
+def _is_former_default(name: str, value: Any) -> bool:
+    return name in _FORMER_DEFAULTS and bool(value == _FORMER_DEFAULTS[name])
+
+
 class Algorithm(Record):
     """What really runs under a name; names are presets, and may stand for another algorithm on another car.
 
     Attributes
     ----------
-    algorithm : for example ``adaptive-physics``. options : that change its structure.
+    algorithm : for example ``adaptive-physics``. version : of the algorithm.
+    options : those that differ from their defaults.
     noise : process and measurement 1-sigma. use_speed : whether the speed sensor enters after the start.
     physics_sha256, network_sha256 : of what of the car it uses; None: nothing.
     """
 
     algorithm: str
+    version: Annotated[int, Field(ge=1)] = 1
     options: dict[str, Any] = Field(default_factory=dict)
     noise: dict[str, Any] = Field(default_factory=dict)
     use_speed: bool = True
@@ -302,9 +321,19 @@ class Algorithm(Record):
         return digest(self.model_dump(mode="json"))
 
     @property
-    def structure(self) -> str:
-        """Digest of algorithm and options: what intervals are filed under; the rest is their basis."""
-        return digest([self.algorithm, self.options])
+    def identity(self) -> str:
+        """Algorithm, version and options as text, which calibrated intervals belong to; the rest is their basis."""
+        options = ", ".join(f"{name}={self.options[name]}" for name in sorted(self.options))
+        return f"{self.algorithm} {self.version}{options and f' ({options})'}"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_former(cls, given: Any) -> Any:
+        """Remove the options that have their defaults from an entry without a version, which lists every option."""
+        if not isinstance(given, dict) or "version" in given or not isinstance(given.get("options"), dict):
+            return given
+        options = given["options"].items()
+        return {**given, "options": {k: v for k, v in options if not _is_former_default(k.rpartition(".")[2], v)}}
 
 
 class IntervalEntry(Record):

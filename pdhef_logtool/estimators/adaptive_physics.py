@@ -229,6 +229,10 @@ class AdaptivePhysics:
     notes : what the report says of it, such as the reason for its trust.
     """
 
+    algorithm = "adaptive-physics"
+    version = 1
+    options = ("physics", "trust", "adaptive")
+
     physics: PhysicsFilter
     network: NetworkService | None = None
     trust: float = 0.0

@@ -1,50 +1,69 @@
-"""What an estimator really is, read from the object that runs: nothing that it was asked to be can differ from it."""
+"""The identity of an estimator: the algorithm that its class declares, and how this instance differs from the default.
+
+An estimator class has two class attributes: ``algorithm``, a name that never changes, and ``version``, an integer that
+is raised whenever the class returns other estimates from the same inputs. A third, ``options``, names the fields that
+select a variant of the algorithm. An option counts only where it differs from the default of its field, so that a new
+option with a default changes no identity. An option that is an algorithm itself counts with its own name and options.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import re
 from typing import Any
 
 from pdhef_logtool.car.parts import Algorithm, physics_sha256
-from pdhef_logtool.car.vehicle import VehicleParameters
 from pdhef_logtool.estimators.base import Estimator
-from pdhef_logtool.residual_model.linear_model import LinearModel
-from pdhef_logtool.residual_model.service import NetworkService
+from pdhef_logtool.records.errors import UsageError
 
-#: Fields of an estimator that are no option: what it is called and told of it, what its signals come back from, and
-#: what it shares with others.
-_TOLD = {"name", "causal", "notes", "read_with", "calibration", "reason"}
-_NOISE = {"q_std", "r_std"}
+_NOISE = ("q_std", "r_std")
+_NETWORKS = ("network", "model")
 
 
 def resolve(estimator: Estimator) -> Algorithm:
-    """Return the algorithm, options, noise and digests of an estimator; parts that are records are looked into."""
-    found: dict[str, Any] = {"options": {}, "noise": {}}
-    _gather(estimator, "", found)
-    return Algorithm(algorithm=_kind(estimator), **found)
+    """Return the identity of an estimator, with its noise and the digests of the physics and network that it uses.
+
+    Raises
+    ------
+    UsageError
+        Its class does not declare an algorithm and a version.
+    """
+    kind = type(estimator).__name__
+    name, version = getattr(estimator, "algorithm", None), getattr(estimator, "version", None)
+    if not (isinstance(name, str) and isinstance(version, int)):
+        raise UsageError(
+            expected="an estimator class with the attributes algorithm (a name) and version (an integer)",
+            got=f"algorithm {name!r}, version {version!r}",
+            where=kind,
+            remedy=f'write algorithm = "my-algorithm" and version = 1 in class {kind}',
+        )
+    facts: dict[str, Any] = {"options": {}, "noise": {}}
+    _describe(estimator, "", facts)
+    return Algorithm(algorithm=name, version=version, **facts)
 
 
-def _gather(part: Any, prefix: str, found: dict[str, Any]) -> None:
-    for entry in dataclasses.fields(part):
-        value, name = getattr(part, entry.name), prefix + entry.name
-        if entry.name in _TOLD:
-            continue
-        if isinstance(value, VehicleParameters):
-            found["physics_sha256"] = physics_sha256(value)
-        elif isinstance(value, NetworkService | LinearModel):
-            found["network_sha256"] = value.bundle.sha256 if isinstance(value, NetworkService) else value.sha256
-        elif entry.name == "use_speed":
-            found["use_speed"] = value
-        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
-            found["options"][name] = _kind(value)
-            _gather(value, f"{name}.", found)
-        else:
-            found["noise" if entry.name in _NOISE else "options"][name] = (
-                list(value) if isinstance(value, tuple) else value
-            )
+def _describe(part: Any, prefix: str, facts: dict[str, Any]) -> None:
+    """Add the options, noise and digests of an algorithm and of the algorithms that it contains."""
+    for name in _NOISE:
+        if hasattr(part, name):
+            facts["noise"][prefix + name] = _plain(getattr(part, name))
+    if (vehicle := getattr(part, "vehicle", None)) is not None:
+        facts["physics_sha256"] = physics_sha256(vehicle)
+    for name in _NETWORKS:
+        if (network := getattr(part, name, None)) is not None:
+            facts["network_sha256"] = network.sha256
+    if hasattr(part, "use_speed"):
+        facts["use_speed"] = part.use_speed
+    defaults = {f.name: f.default for f in dataclasses.fields(part)} if dataclasses.is_dataclass(part) else {}
+    for name in getattr(part, "options", ()):
+        value, key = getattr(part, name), prefix + name
+        if hasattr(value, "algorithm"):
+            facts["options"][key] = value.algorithm
+            if value.version != 1:
+                facts["options"][f"{key}.version"] = value.version
+            _describe(value, f"{key}.", facts)
+        elif name not in defaults or value != defaults[name]:
+            facts["options"][key] = _plain(value)
 
 
-def _kind(part: Any) -> str:
-    """Return the name of an algorithm: that of its class, in lower case with hyphens."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", type(part).__name__).lower()
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

@@ -67,6 +67,16 @@ class Estimator(Protocol):
     """Turns aligned signals into steps; immutable, so that its only memory is the state that it returns."""
 
     @property
+    def algorithm(self) -> str:
+        """Stable name of the algorithm, a class attribute, for example ``physics-ukf`` (:mod:`~.algorithm`)."""
+        ...
+
+    @property
+    def version(self) -> int:
+        """Version of the algorithm, a class attribute: raised whenever the same inputs give other estimates."""
+        ...
+
+    @property
     def name(self) -> str:
         """Name in the tables, for example ``phy-ukf``."""
         ...

@@ -57,6 +57,10 @@ class DirectCarry:
 class DirectNetwork:
     """The estimator of this file; ``network`` is one whose target is the lateral velocity."""
 
+    algorithm = "direct-network"
+    version = 1
+    options = ("slip_gate",)
+
     vehicle: VehicleParameters
     network: NetworkService
     use_speed: bool = True

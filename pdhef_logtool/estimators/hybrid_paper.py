@@ -276,6 +276,10 @@ class PaperHybridUkf:
     slip_gate : as for ``phy-ukf``: leave out the speed of wheels that spin or lock.
     """
 
+    algorithm = "paper-hybrid-ukf"
+    version = 1
+    options = ("slip_gate",)
+
     vehicle: VehicleParameters
     network: NetworkService
     q_std: tuple[float, float, float, float] = PHY_UKF_Q_STD

@@ -48,6 +48,10 @@ def _kinematic(sensors, leak_s, state, values, rates, valid):  # type: ignore[no
 class Kinematic:
     """The integrator of this file as an estimator; needs no vehicle at all."""
 
+    algorithm = "kinematic"
+    version = 1
+    options = ("leak_s", "slip_gate")
+
     leak_s: float = LEAK_S
     slip_gate: bool = True
     name: str = "kinematic"

@@ -36,6 +36,10 @@ class RegressionCarry:
 class LinearRegression:
     """The estimator of this file: v_y = v_x tan β, the rest as in ``pure-lstm``."""
 
+    algorithm = "linear-regression"
+    version = 1
+    options = ("slip_gate",)
+
     vehicle: VehicleParameters
     model: LinearModel
     use_speed: bool = True

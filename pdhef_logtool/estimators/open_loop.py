@@ -73,6 +73,10 @@ def _open_loop(inputs, default_friction, p, state, values, rates, valid):  # typ
 class OpenLoop:
     """The model of this file as an estimator."""
 
+    algorithm = "open-loop"
+    version = 1
+    options = ("slip_gate",)
+
     vehicle: VehicleParameters
     slip_gate: bool = True
     name: str = "open-loop"

@@ -23,6 +23,10 @@ class PassThrough:
     Both have the sensors' delay: the newest sample that had arrived is held until the scored stamp.
     """
 
+    algorithm = "pass-through"
+    version = 1
+    options = ("claims_zero_sideslip",)
+
     name: str
     claims_zero_sideslip: bool
     causal: bool = True

@@ -316,6 +316,10 @@ class PhysicsUkf:
     standstill : hold v_x, v_y and r at zero while the car stands.
     """
 
+    algorithm = "physics-ukf"
+    version = 1
+    options = ("roll_correction", "bias_states", "force_scale", "slip_gate", "standstill")
+
     vehicle: VehicleParameters
     q_std: tuple[float, float, float, float] = PHY_UKF_Q_STD
     r_std: tuple[float, float, float] | None = None

@@ -509,6 +509,10 @@ class PhysicsFilter:
     read_with : the vehicle with which its signals were read and corrected, where that is another; None: its own.
     """
 
+    algorithm = "physics-filter"
+    version = 1
+    options = ("slip_gate", "standstill")
+
     vehicle: VehicleParameters
     q_std: tuple[float, ...] = PHYSICS_Q_STD
     r_std: tuple[float, float, float] | None = None

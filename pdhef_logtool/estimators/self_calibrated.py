@@ -98,6 +98,10 @@ class SelfCalibrated:
     read_with : the vehicle that the drive's signals were read with.
     """
 
+    algorithm = "self-calibrated"
+    version = 1
+    options = ("estimator",)
+
     estimator: Estimator
     calibration: WithoutTruth
     read_with: VehicleParameters

@@ -353,6 +353,10 @@ class SmoothedPhysics:
     notes : what the report says of it.
     """
 
+    algorithm = "smoothed-physics"
+    version = 1
+    options = ("filtered", "block_s")
+
     filtered: AdaptivePhysics
     block_s: float = BLOCK_S
     name: str = "pd-hef-smoothed"

@@ -15,6 +15,10 @@ from pdhef_logtool.records.tracks import StateTrack
 class StandIn:
     """An estimator under another name; ``reason`` is why. It was chosen on the whole log: not causal."""
 
+    algorithm = "stand-in"
+    version = 1
+    options = ("estimator",)
+
     estimator: Estimator
     name: str
     reason: str

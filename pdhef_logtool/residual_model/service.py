@@ -29,6 +29,11 @@ class NetworkService:
 
     bundle: ModelBundle
 
+    @property
+    def sha256(self) -> str:
+        """Digest of the bundle."""
+        return self.bundle.sha256
+
     @cached_property
     def _network(self) -> ForwardPass:
         return ForwardPass.of(self.bundle.weights, self.bundle.layers, self.bundle.head)

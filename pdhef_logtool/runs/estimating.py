@@ -109,7 +109,8 @@ def calibrator(car: Car, estimators: Sequence[Estimator]) -> TrackCalibrator:
         algorithms[estimator.name] = [resolve(e) for e in (estimator, other) if e is not None]
         if band is not None and estimator.name in SELF_CALIBRATED:
             posterior[estimator.name] = band.add
-    return TrackCalibrator(car.intervals, algorithms, own, posterior)
+    of_car = car.intervals is not None and car.intervals.physics_sha256 == car.physics_sha256
+    return TrackCalibrator(car.intervals, algorithms, own, posterior, of_car=of_car)
 
 
 class DeadReckoning:

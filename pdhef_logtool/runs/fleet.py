@@ -68,7 +68,7 @@ from pdhef_logtool.runs.pipeline import (
 )
 from pdhef_logtool.runs.self_calibrating import calibrate_pool
 from pdhef_logtool.runs.stored_output import StoredEnd, StoredOutput, stored_drive
-from pdhef_logtool.sinks.report import LogOutcome, build_run, tool_versions, write_json
+from pdhef_logtool.sinks.report import LogOutcome, build_run, run_versions, tool_versions, write_json
 
 if TYPE_CHECKING:
     from pdhef_logtool.car.car import Car
@@ -374,13 +374,15 @@ def _run_alone(  # positional: what `run_logs` has made of its arguments
     warn: Callable[[str], None],
 ) -> RunResult:
     """Run one log, whose error is that of the run."""
+    from pdhef_logtool.runs.compiling import compile_for
+
     car = cars.of_log(log)
     pool = calibrate_pool([log], car, mapping, config) if config.calibrate == "pool" else None
     with OutputFolder(output, (LOGS,)) as outputs:
         try:
             result = run_log(
                 log, outputs, config, car, mapping,
-                pool=pool, thresholds=thresholds, progress=progress, warn=warn,
+                pool=pool, thresholds=thresholds, prepare=compile_for, progress=progress, warn=warn,
             )  # fmt: skip
         except Exception:
             raise
@@ -740,7 +742,7 @@ class _Fleet:
         }
         only = networks.pop() if len(networks) == 1 else None
         network = None if only is None else {"name": only[0], "sha256": only[1]}
-        run = build_run(tool_versions(), self.config.to_dict(), network, [r.outcome for r in results], remaining)
+        run = build_run(run_versions(), self.config.to_dict(), network, [r.outcome for r in results], remaining)
         write_json(self.output / RUN_FILE, run)
         if remaining:
             (self.output / PAGE_FILE).unlink(missing_ok=True)  # it is of other drives

@@ -62,6 +62,7 @@ from pdhef_logtool.sinks.report import (
     brief_report,
     build_report,
     build_run,
+    run_versions,
     tool_versions,
     write_json,
 )
@@ -240,6 +241,7 @@ def run_log(
     *,
     pool: SelfCalibration | None = None,
     thresholds: Sequence[Threshold] | None = None,
+    prepare: Callable[[Sequence[str]], None] = lambda _names: None,
     progress: Progress = lambda _text, _share: None,
     warn: Callable[[str], None] = lambda _text: None,
 ) -> LogResult:
@@ -249,6 +251,7 @@ def run_log(
     ----------
     pool : what all logs of the run together say of the car; None: the log says it, if it is asked.
     thresholds : what the report's verdicts name; None: there are none.
+    prepare : called with the names of the estimators before they run.
 
     Raises
     ------
@@ -260,6 +263,7 @@ def run_log(
         calibration = checked(drive, pool if pool is not None else calibrate_drive(drive, config))
         car = self_calibrated(drive, calibration)
         ready, skipped = _choose_estimators(drive, config, car)
+        prepare([e.name for e in ready])
         job = _Job(drive, car, calibration, ready, skipped, tuple(thresholds or ()))
         try:
             # What driving with truth showed of a car is worth more than d2, and its estimate stays causal.
@@ -332,6 +336,8 @@ def _run_estimators(
         digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
         rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in found.rows]
         events = found.events
+        if void := [text for e in ready if (text := intervals.mismatch(e.name))]:
+            drive.tell("; ".join(void))
         if not found.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
         silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
@@ -592,7 +598,7 @@ def report_facts(
         warnings=drive.notes,
         remarks=drive.remarks,
         checks=drive.checks,
-        versions=tool_versions(),
+        versions=run_versions(),
     )
 
 
@@ -645,4 +651,4 @@ def write_run(output: Path, config: dict[str, Any], result: LogResult, car: Car 
     known = None if car is None else car.network
     network = None if known is None or car is None else {"name": Path(car.network_name).name, "sha256": known.sha256}
     write_metrics(output / METRICS_FILE, result.rows)
-    write_json(output / RUN_FILE, build_run(tool_versions(), config, network, [result.outcome]))
+    write_json(output / RUN_FILE, build_run(run_versions(), config, network, [result.outcome]))

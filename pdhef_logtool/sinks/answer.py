@@ -231,7 +231,8 @@ def _assumed(report: Report, main: MainFacts) -> list[str]:
         said.append(f"friction {_friction(friction)}")
     if main.distrusted:
         said.append(main.why)
-    trust = (own["algorithm"] or {"options": {}})["options"].get("trust")
+    algorithm = own["algorithm"] or {"options": {}}
+    trust = algorithm["options"].get("trust", 0.0 if algorithm.get("algorithm") == "adaptive-physics" else None)
     if trust is not None:
         found = f"network trusted at {trust:g} by the car's evidence"
         said.append(found if trust else "no network, for want of evidence that it helps")

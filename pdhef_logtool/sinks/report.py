@@ -20,6 +20,7 @@ from pdhef_logtool.evaluation.reasons import ReasonFacts, SensorFault
 from pdhef_logtool.evaluation.standing import Standing
 from pdhef_logtool.logs.byte_account import ByteLedger
 from pdhef_logtool.records.checks import Check
+from pdhef_logtool.records.compiled_sources import compiled_digest
 from pdhef_logtool.records.documents import jsonable
 from pdhef_logtool.records.files import write_bytes
 from pdhef_logtool.records.ledger import SampleCount
@@ -226,6 +227,11 @@ class LogOutcome:
 def tool_versions() -> dict[str, str]:
     """Return the versions of Python and of the installed distributions that decide what a run computes."""
     return {"python": platform.python_version(), **{name: found for name in VERSIONED if (found := _installed(name))}}
+
+
+def run_versions() -> dict[str, str]:
+    """Return the same and the digest that compiled code is kept under."""
+    return {**tool_versions(), "compiled": compiled_digest()}
 
 
 @cache

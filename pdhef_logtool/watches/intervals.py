@@ -54,7 +54,8 @@ class TrackCalibrator:
     """Applies intervals, or none, to the tracks of a drive window by window.
 
     ``algorithms`` says by name what ran, then what else its intervals may be taken from. Intervals are found by the
-    structure of what ran, never by its name; what else they rest on (noise, physics, network) is compared and told.
+    identity of what ran, never by its name; what else they rest on (noise, physics, network) is compared and told.
+    ``of_car``: whether the intervals were calibrated for this car, and not for the shipped one.
     ``own`` says by name what is told of intervals that stay as they are. ``posterior`` widens, by name, what the car
     has no intervals for.
     """
@@ -63,6 +64,7 @@ class TrackCalibrator:
     algorithms: Mapping[str, Sequence[Algorithm]]
     own: Mapping[str, str] = field(default_factory=dict)
     posterior: Mapping[str, Widening] = field(default_factory=dict)
+    of_car: bool = True
     _carries: dict[str, FeatureCarry] = field(default_factory=dict)
     _has_interval: set[str] = field(default_factory=set)
 
@@ -90,7 +92,11 @@ class TrackCalibrator:
             return (self.own[name],)
         found = self._found(name)
         if self.intervals is None or found is None:
-            return (POSTERIOR_NOTE if name in self.posterior else "intervals not calibrated",)
+            other = self.mismatch(name)
+            return (
+                POSTERIOR_NOTE if name in self.posterior else "intervals not calibrated",
+                *([other] if other else []),
+            )
         made = self.intervals
         of = f"wrong by {made.spread:g}" if made.spread > 0.0 else "as told"
         then, now = found[0].algorithm, found[1]
@@ -107,12 +113,25 @@ class TrackCalibrator:
         but = f", but with other {' and '.join(others)}" if others else ""
         return (f"intervals calibrated on {made.car} for friction and vehicle {of}{but}",)
 
+    def mismatch(self, name: str) -> str:
+        """Return why the intervals that the car has for an estimator are not applied to it, empty if that is not so."""
+        ran = self.algorithms.get(name)
+        if self.intervals is None or not self.of_car or not ran or self._found(name) is not None:
+            return ""
+        made = [e.algorithm.identity for e in self.intervals.entries if e.estimator == name]
+        if not made:
+            return ""
+        return (
+            f"the calibrated intervals of {name} are not applied: expected {made[0]}, got {ran[0].identity}; "
+            "run pdhef calibrate"
+        )
+
     def _found(self, name: str) -> tuple[IntervalEntry, Algorithm] | None:
         """Return the entry for a name and the algorithm that it was found by."""
-        entries = {} if self.intervals is None else {e.algorithm.structure: e for e in self.intervals.entries}
+        entries = {} if self.intervals is None else {e.algorithm.identity: e for e in self.intervals.entries}
         for algorithm in self.algorithms.get(name, ()):
-            if algorithm.structure in entries:
-                return entries[algorithm.structure], algorithm
+            if algorithm.identity in entries:
+                return entries[algorithm.identity], algorithm
         return None
 
 

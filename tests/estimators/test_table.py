@@ -211,11 +211,11 @@ def other(**changes: Any) -> VehicleParameters:
 
 
 def test_names_stand_for_different_algorithms() -> None:
-    structures: dict[str, list[str]] = {}
+    identities: dict[str, list[str]] = {}
     for spec in LINES:
-        structures.setdefault(ran(spec.name).structure, []).append(spec.name)
+        identities.setdefault(ran(spec.name).identity, []).append(spec.name)
     # CAR allows all of the trust.
-    assert [n for n in structures.values() if len(n) > 1] == [["pd-hef", "pd-hef-trust1"]]
+    assert [n for n in identities.values() if len(n) > 1] == [["pd-hef", "pd-hef-trust1"]]
 
 
 @every_spec
@@ -224,7 +224,7 @@ def test_the_name_of_a_car_changes_no_algorithm_and_its_physics_do(spec: Any) ->
     for changes in ({"name": "ours"}, {"truth_position_m": (1.0, 0.0, 0.0)}):
         assert ran(spec.name, replace(CAR, vehicle=other(**changes))) == was
     heavier = ran(spec.name, replace(CAR, vehicle=other(mass_kg=1500.0)))
-    assert heavier.structure == was.structure  # intervals are found, and their note says what is other
+    assert heavier.identity == was.identity  # intervals are found, and their note says what is other
     assert (heavier.physics_sha256 != was.physics_sha256) == (spec.name not in SENSORS_ALONE)
     assert (heavier.sha256 != was.sha256) == (spec.name not in SENSORS_ALONE)
     assert (was.physics_sha256 is None) == (spec.name in SENSORS_ALONE)
@@ -235,24 +235,24 @@ def test_another_network_is_another_basis_of_what_has_one(spec: Any) -> None:
     was, is_now = ran(spec.name), ran(spec.name, replace(CAR, network=make_model(2)))
     assert (was.network_sha256 is None) == (not spec.network)
     assert (was.sha256 != is_now.sha256) == (was.network_sha256 != is_now.network_sha256) == bool(spec.network)
-    assert was.structure == is_now.structure
+    assert was.identity == is_now.identity
 
 
 @pytest.mark.parametrize("name", ["phy-ukf-tuned", "physics", "pd-hef", "pd-hef-smoothed"])
-def test_other_noise_is_another_basis_of_the_same_structure(name: str) -> None:
+def test_other_noise_is_another_basis_of_the_same_identity(name: str) -> None:
     of = name if name == "phy-ukf-tuned" else "physics"
     was = ran(name, CAR.with_noise(of, NOISE))
     for change in ({"q_std": (0.1, 0.2, 0.2)}, {"r_std": {"ay_m_s2": 1.0}}):
         is_now = ran(name, CAR.with_noise(of, NOISE.model_copy(update=change)))
         assert is_now.noise != was.noise
         assert is_now.sha256 != was.sha256
-        assert is_now.structure == was.structure
+        assert is_now.identity == was.identity
     told = ran(name, CAR.with_noise(of, NOISE.model_copy(update={"score_deg": 0.1, "trial": 3})))
     assert told == was
 
 
 def test_trust_and_speed_sensor_are_told() -> None:
-    assert len({ran("pd-hef", trust=t).structure for t in (0.0, 0.5, 1.0)}) == 3
+    assert len({ran("pd-hef", trust=t).identity for t in (0.0, 0.5, 1.0)}) == 3
     assert ran("pd-hef", trust=0.5).options["trust"] == 0.5
     full, esp = ran("phy-ukf"), ran("phy-ukf", use_speed=False)
     assert (full.use_speed, esp.use_speed) == (True, False)
@@ -282,7 +282,7 @@ def with_intervals(car: Car, intervals: Intervals, signals: Signals) -> tuple[fl
 def test_evidence_decides_what_pd_hef_is() -> None:
     trusted, cautious = make_estimator("pd-hef", CAR), make_estimator("pd-hef", BARE)
     assert trusted.name == cautious.name == "pd-hef"
-    assert resolve(trusted).structure != resolve(cautious).structure
+    assert resolve(trusted).identity != resolve(cautious).identity
     assert resolve(cautious) == ran("physics", BARE)
     without = replace(CAR, network=None)
     assert ran("pd-hef", without) == ran("physics", without)
@@ -292,9 +292,10 @@ def test_evidence_decides_what_pd_hef_is() -> None:
 
 def test_intervals_of_the_one_are_never_put_on_the_other(signals: Signals) -> None:
     hybrid, cautious = ran("pd-hef"), ran("pd-hef", BARE)
-    uncalibrated = (1.0, ("intervals not calibrated",))
-    assert with_intervals(BARE, intervals_for(hybrid), signals) == uncalibrated
-    assert with_intervals(CAR, intervals_for(cautious), signals) == uncalibrated
+    for car, algorithm in ((BARE, hybrid), (CAR, cautious)):
+        ratio, notes = with_intervals(car, intervals_for(algorithm), signals)
+        assert (ratio, notes[0]) == (1.0, "intervals not calibrated")
+        assert f"expected {algorithm.identity}, got" in notes[1]
     for car, algorithm in ((CAR, hybrid), (BARE, cautious)):
         ratio, notes = with_intervals(car, intervals_for(algorithm), signals)
         assert ratio == pytest.approx(2.0)

@@ -9,13 +9,15 @@ import stat
 import subprocess
 import sys
 import tempfile
+import venv
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
 
-from pdhef_logtool.records import compiled, processes
+from pdhef_logtool.records import compiled, compiled_sources, processes
 
 _ROOT = Path(__file__).parents[2]
 _CODE = "from pdhef_logtool.records.compiled import njit\n\n\n@njit(cache=True)\ndef more(x):\n    return x + 1\n"
@@ -23,14 +25,16 @@ _CODE = "from pdhef_logtool.records.compiled import njit\n\n\n@njit(cache=True)\
 
 @pytest.fixture
 def module_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A module with one compiled function, and a user and temporary folders of its own."""
+    """A module with one compiled function, and an installation, a user and temporary folders of its own."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(compiled, "_announced", [])
+    monkeypatch.setattr(compiled, "announced", False)
     (tmp_path / "tmp").mkdir()
-    (tmp_path / "package").mkdir()
-    file = tmp_path / "package" / "module.py"
+    file = tmp_path / "installed" / "pdhef_logtool" / "module.py"
+    file.parent.mkdir(parents=True)
     file.write_text(_CODE)
+    compiled_sources.compiled_digest()  # that of the real sources
+    monkeypatch.setattr(compiled_sources, "ROOT", tmp_path / "installed")
     compiled.kept_in.cache_clear()
     yield file
     compiled.kept_in.cache_clear()
@@ -60,7 +64,8 @@ def _code_files(folder: Path) -> list[Path]:
 def test_the_first_folder_that_can_be_written_keeps_the_code(
     module_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    installed, home, tmp = module_file.parent, tmp_path / "home", tmp_path / "tmp"
+    installed, home, tmp = tmp_path / "installed", tmp_path / "home", tmp_path / "tmp"
+    writable = compiled._writable
     for closed, keeps in [((), installed), ((installed,), home), ((installed, home), tmp)]:
         _close(monkeypatch, *closed)
         assert _load(module_file).more(1) == 2
@@ -68,11 +73,9 @@ def test_the_first_folder_that_can_be_written_keeps_the_code(
         assert "compiling, once, about" in capsys.readouterr().err
         assert _load(module_file).more(1) == 2
         assert capsys.readouterr().err == ""  # warm: nothing is compiled
-        monkeypatch.undo()
-        monkeypatch.setattr(compiled, "_announced", [])
-        monkeypatch.setattr(tempfile, "tempdir", str(tmp))
-        monkeypatch.setenv("XDG_CACHE_HOME", str(home))
-        shutil.rmtree(installed / "__pycache__", ignore_errors=True)
+        monkeypatch.setattr(compiled, "_writable", writable)
+        monkeypatch.setattr(compiled, "announced", False)
+        shutil.rmtree(module_file.parent / "__pycache__", ignore_errors=True)
     assert stat.S_IMODE(next(tmp.glob("pdhef-compiled*")).stat().st_mode) == 0o700
 
 
@@ -91,7 +94,7 @@ def test_what_an_installation_brings_along_serves_where_nobody_can_write_it(
     _load(module_file).more(1)
     capsys.readouterr()
     _close(monkeypatch, tmp_path)
-    monkeypatch.setattr(compiled, "_announced", [])
+    monkeypatch.setattr(compiled, "announced", False)
     assert _load(module_file).more(1) == 2
     assert capsys.readouterr().err == ""
 
@@ -100,6 +103,7 @@ def test_what_an_installation_brings_along_serves_where_nobody_can_write_it(
 def test_a_file_that_was_cut_short_is_compiled_anew(module_file: Path, length: int) -> None:
     _load(module_file).more(1)
     files = _code_files(module_file.parent)
+    assert {p.parent.name for p in files} == {compiled_sources.compiled_digest()}
     assert {p.suffix for p in files} == {".nbi", ".nbc"}
     for damaged in files:
         with damaged.open("r+b") as file:
@@ -112,8 +116,22 @@ def test_a_full_disk_ends_no_call(module_file: Path, monkeypatch: pytest.MonkeyP
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile._save_data", full)
     assert _load(module_file).more(1) == 2
+
+
+def test_two_processes_that_save_at_once_never_take_each_others_code(
+    module_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            "numba.core.caching.IndexDataCacheFile._load_index", lambda _: {}
+        )  # of neither has the other read
+        function = _load(module_file).more
+        assert (function(1), function(1.5)) == (2, 2.5)
+    assert [p.suffix for p in _code_files(module_file.parent)].count(".nbc") == 2
+    again = _load(module_file).more
+    assert (again(1), again(1.5)) == (2, 2.5)
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="users and permissions of POSIX")
@@ -185,7 +203,7 @@ def test_kept_code_is_loaded_before_it_is_called(
     assert first.more(1) == 2
     assert first.more(1.5) == 2.5
     capsys.readouterr()
-    monkeypatch.setattr(compiled, "_announced", [])
+    monkeypatch.setattr(compiled, "announced", False)
     monkeypatch.setattr(compiled, "_kept", [])
     again = _load(module_file)
     assert compiled.load_kept()
@@ -205,3 +223,162 @@ def test_of_the_workers_only_the_first_says_that_it_compiles(
     monkeypatch.setattr(processes, "worker_number", 2)
     assert _load(module_file).more(1) == 2
     assert capsys.readouterr().err == ""
+
+
+def test_the_code_of_other_sources_of_this_installation_is_removed_and_no_other(
+    module_file: Path, tmp_path: Path
+) -> None:
+    digest, places = compiled_sources.compiled_digest(), list(compiled._places())
+    of_sources, of_processor = digest.split("-")
+    former = module_file.parent / "records/__pycache__/shown.f-5.py311.nbi"
+    stale = [module_file.parent / "__pycache__/compiled" / f"{'0' * 16}-{of_processor}" / "a.nbi", former]
+    others = [
+        places[0] / f"{of_sources}-{'0' * 8}" / "a.nbi",  # another processor
+        places[1].with_name(f"pdhef_logtool_{'0' * 16}")
+        / f"{'0' * 16}-{of_processor}"
+        / "a.nbi",  # installed elsewhere
+        places[0] / "notes" / "a.nbi",
+    ]
+    for file in (*stale, *others):
+        file.parent.mkdir(parents=True)
+        file.touch()
+    assert _load(module_file).more(1) == 2
+    assert [f.exists() for f in stale] == [False, False]
+    assert all(f.exists() for f in others)
+
+
+def test_what_compiled_code_is_made_of() -> None:
+    names = {p.relative_to(_ROOT).as_posix() for p in compiled_sources.compiled_sources()}
+    assert {
+        "pdhef_logtool/estimators/physics_ukf.py",
+        "truthsim/motion.py",
+        "pdhef_logtool/records/vectors.py",
+    } <= names
+    assert "pdhef_logtool/records/signals.py" in names  # constants
+    assert "pdhef_logtool/records/compiled.py" in names
+    assert not names & {"pdhef_logtool/cli/app.py", "pdhef_logtool/records/supervisor.py"}
+    assert all(
+        p.relative_to(_ROOT).as_posix() in names
+        for package in compiled_sources.PACKAGES
+        for p in (_ROOT / package).rglob("*.py")
+        if "njit" in p.read_text() and p.name != "compiled_sources.py"
+    )
+
+
+def test_another_compiler_or_processor_is_another_digest(monkeypatch: pytest.MonkeyPatch) -> None:
+    def digest() -> str:
+        compiled_sources.compiled_digest.cache_clear()
+        return compiled_sources.compiled_digest()
+
+    usual = digest()
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    assert digest().split("-")[0] == usual.split("-")[0] and digest() != usual
+    monkeypatch.delenv("NUMBA_CPU_NAME")
+    for changed in ("numba", "llvmlite"):
+        monkeypatch.setattr(compiled_sources, "version", lambda name, c=changed: "0" if name == c else "1")
+        assert digest().split("-")[0] != usual.split("-")[0]
+    monkeypatch.undo()
+    assert digest() == usual
+
+
+#: Calls a compiled function whose compiled callee lies in another file; prints where it is from and what it returns.
+_USE = """
+import numpy as np
+from pdhef_logtool.car.nominal_model import model_parameters
+from pdhef_logtool.car.vehicle import default_vehicle
+from pdhef_logtool.estimators.parallel_physics import __file__, _nominal_ay
+ay = np.zeros(1)
+_nominal_ay(np.array([[20.0, 0.1, 0.2, 0.0]]), np.full((1, 5), 0.05), model_parameters(default_vehicle()), ay)
+print(__file__, ay[0])
+"""
+_CALLEE, _LINE = "pdhef_logtool/car/nominal_model.py", "    return (1.0 + p.ay_roll_gain) * ay"
+
+
+def _used(python: str | Path, **environment: str) -> tuple[Path, float]:
+    """Return the file of the module in use and what its function returns."""
+    done = subprocess.run(
+        [python, "-c", _USE], capture_output=True, text=True, cwd="/", env={"PATH": os.environ["PATH"], **environment}
+    )
+    assert done.returncode == 0, done.stderr
+    file, value = done.stdout.split()
+    return Path(file), float(value)
+
+
+def _copied(folder: Path) -> Path:
+    """Return a copy of the sources."""
+    for package in compiled_sources.PACKAGES:
+        shutil.copytree(_ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__", "models"))
+    return folder
+
+
+def _change_the_callee(folder: Path) -> None:
+    text = (folder / _CALLEE).read_text()
+    assert text.count(_LINE) == 1
+    (folder / _CALLEE).write_text(text.replace(_LINE, f"{_LINE} + 1.0"))
+
+
+def _folders(place: Path) -> list[str]:
+    return sorted({p.parent.name for p in _code_files(place)})
+
+
+@pytest.mark.slow
+def test_an_edit_of_a_callee_in_another_file_counts(tmp_path: Path) -> None:
+    sources = _copied(tmp_path / "sources")
+    environment = {"PYTHONPATH": os.pathsep.join([str(sources), *filter(None, sys.path)])}
+    environment["NUMBA_CACHE_DIR"] = str(tmp_path / "cache")
+    file, before = _used(sys.executable, **environment)
+    assert file.is_relative_to(sources)
+    folders = _folders(tmp_path / "cache")
+    _change_the_callee(sources)
+    assert _used(sys.executable, **environment)[1] == pytest.approx(before + 1.0)
+    assert len(_folders(tmp_path / "cache")) == 1 and _folders(tmp_path / "cache") != folders
+
+
+def _wheel(sources: Path, version: str) -> Path:
+    """Return a wheel of sources, with no more than pip needs."""
+    about = f"pdhef_logtool-{version}.dist-info"
+    files = {f.relative_to(sources).as_posix(): f.read_text() for p in ("*.py", "*.toml") for f in sources.rglob(p)}
+    files[f"{about}/METADATA"] = f"Metadata-Version: 2.1\nName: pdhef-logtool\nVersion: {version}\n"
+    files[f"{about}/WHEEL"] = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    files[f"{about}/RECORD"] = "".join(f"{name},,\n" for name in [*files, f"{about}/RECORD"])
+    path = sources.parent / f"pdhef_logtool-{version}-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as wheel:
+        for name, text in files.items():
+            wheel.writestr(name, text)
+    return path
+
+
+@pytest.mark.slow
+def test_an_upgrade_by_pip_runs_the_new_code_and_leaves_none_of_the_old(tmp_path: Path) -> None:
+    venv.create(tmp_path / "venv", with_pip=False)
+    python = tmp_path / "venv" / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+    packages = subprocess.check_output(
+        [python, "-c", "import site; print(site.getsitepackages()[0])"], text=True
+    ).strip()
+    (Path(packages) / "dependencies.pth").write_text("\n".join(p for p in sys.path if p.endswith("site-packages")))
+    sources = _copied(tmp_path / "sources")
+
+    def installed(version: str) -> tuple[Path, float]:
+        pip = [
+            sys.executable,
+            "-m",
+            "pip",
+            "--python",
+            str(python),
+            "install",
+            "--no-deps",
+            "--no-index",
+            "--no-compile",
+        ]
+        wheel = _wheel(sources, version)
+        done = subprocess.run([*pip, "--upgrade", str(wheel)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return _used(python)
+
+    file, before = installed("0.1.0")
+    assert file.is_relative_to(packages)
+    folders = _folders(Path(packages) / "pdhef_logtool")
+    _change_the_callee(sources)
+    assert installed("0.2.0")[1] == pytest.approx(before + 1.0)
+    assert len(_folders(Path(packages) / "pdhef_logtool")) == 1
+    assert _folders(Path(packages) / "pdhef_logtool") != folders

@@ -264,7 +264,15 @@ def test_without_an_entry_a_track_stays_as_it_is() -> None:
     for intervals, ran in ((None, ALGORITHM), (_intervals(entries=()), ALGORITHM), (_intervals(), other)):
         calibrator = _calibrator(intervals, ran)
         assert calibrator.add(track, signals) is track
-        assert calibrator.notes("e") == ("intervals not calibrated",)
+        assert calibrator.notes("e")[0] == "intervals not calibrated"
+        assert calibrator.notes("e")[1:] == ((calibrator.mismatch("e"),) if ran is other else ())
+    assert calibrator.mismatch("e") == (
+        "the calibrated intervals of e are not applied: expected physics-ukf 1 (roll_correction=True), "
+        "got physics-filter 1 (roll_correction=True); run pdhef calibrate"
+    )
+    # Those of the shipped car were never this car's.
+    assert TrackCalibrator(_intervals(), {"e": [other]}, of_car=False).mismatch("e") == ""
+    assert _calibrator(_intervals(), ALGORITHM).mismatch("e") == ""
     assert _calibrator(None).notes("zero") == ()
 
 

@@ -141,11 +141,11 @@ def calibrate(
         records.append(replace(record, split=splits.get(log_input.stem)))
         tell_drive(record, warn)
         for name, algorithm, part in found:
-            ran.setdefault(algorithm.structure, (name, algorithm))
-            samples.setdefault(algorithm.structure, []).append(part)
+            ran.setdefault(algorithm.identity, (name, algorithm))
+            samples.setdefault(algorithm.identity, []).append(part)
     entries: list[IntervalEntry] = []
-    for number, (structure, parts) in enumerate(samples.items()):
-        name, algorithm = ran[structure]
+    for number, (identity, parts) in enumerate(samples.items()):
+        name, algorithm = ran[identity]
         progress(f"fitting {name}", RUNNING + (1.0 - RUNNING) * number / len(samples))
         joined = join_samples(parts)
         count = int(np.unique(joined.drive[~joined.wrong]).size)

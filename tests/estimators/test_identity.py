@@ -1,0 +1,132 @@
+"""What identifies an algorithm, frozen for the shipped presets: a change here is a new version of the algorithm."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass, fields, is_dataclass, make_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pdhef_logtool.car.car import INTERVALS_FILE, SHIPPED_CARS, Car
+from pdhef_logtool.car.parts import Algorithm
+from pdhef_logtool.estimators.adaptive_physics import AdaptivePhysics
+from pdhef_logtool.estimators.algorithm import resolve
+from pdhef_logtool.estimators.physics_ukf import PhysicsFilter
+from pdhef_logtool.estimators.table import SPECS, all_names, make_estimator
+from pdhef_logtool.records.errors import UsageError
+from tests.command_line import pdhef
+
+_HYBRID = "adaptive-physics 1 (physics=physics-filter, trust=0.75)"
+#: Identity and digest of the presets on the shipped car. The digest covers noise, physics and network as well.
+SHIPPED = {
+    "zero": ("pass-through 1 (claims_zero_sideslip=True)", "138e43c5f7aa"),
+    "gyro": ("pass-through 1 (claims_zero_sideslip=False)", "5ba63001dd67"),
+    "kinematic": ("kinematic 1", "6a7d76af0e93"),
+    "open-loop": ("open-loop 1", "5afc5962fabb"),
+    "linear-regression": ("linear-regression 1", "9de17837d3ad"),
+    "phy-ukf": ("physics-ukf 1", "50fddfe0bbfa"),
+    "physics": ("adaptive-physics 1 (physics=physics-filter)", "12c85100356c"),
+    "phy-ukf-tuned": ("physics-ukf 1 (roll_correction=True)", "28232f13c924"),
+    "pure-lstm": ("direct-network 1", "4441758f4188"),
+    "pd-hef": (_HYBRID, "a29a14dbfbf0"),
+    "pd-hef-fixed-r": ("adaptive-physics 1 (adaptive=False, physics=physics-filter, trust=1.0)", "9045ef1e00d9"),
+    "pd-hef-smoothed": (
+        "smoothed-physics 1 (filtered=adaptive-physics, filtered.physics=physics-filter, filtered.trust=0.75)",
+        "88c546b80f30",
+    ),
+    "pd-hef-paper": ("paper-hybrid-ukf 1", "c13712e0df29"),
+}
+#: Fields that are no option: names and texts, and what counts as noise, physics or network.
+ROLES = {"name", "causal", "notes", "vehicle", "read_with", "network", "model", "q_std", "r_std", "use_speed"}
+#: The entry of pd-hef as the versions without versions of algorithms wrote it.
+FORMER = {
+    "algorithm": "adaptive-physics",
+    "options": {
+        "adaptive": True,
+        "physics": "physics-filter",
+        "physics.slip_gate": True,
+        "physics.standstill": True,
+        "trust": 0.75,
+    },
+}
+
+
+@pytest.fixture(scope="module")
+def saloon() -> Car:
+    return Car.load("saloon")
+
+
+def test_the_identities_of_the_shipped_presets_are_frozen(saloon: Car) -> None:
+    found = {name: resolve(make_estimator(name, saloon)) for name in all_names(saloon)}
+    assert {name: (a.identity, a.sha256[:12]) for name, a in found.items()} == SHIPPED
+
+
+def test_a_new_option_at_its_default_changes_no_identity(saloon: Car) -> None:
+    estimator = make_estimator("pd-hef", saloon)
+    assert isinstance(estimator, AdaptivePhysics)
+    kind = make_dataclass("PhysicsFilter", [("probe", bool, False)], bases=(PhysicsFilter,), frozen=True)
+    kind.options = (*PhysicsFilter.options, "probe")  # type: ignore[attr-defined]
+    values = {f.name: getattr(estimator.physics, f.name) for f in fields(PhysicsFilter)}
+    assert resolve(replace(estimator, physics=kind(**values))) == resolve(estimator)
+    changed = resolve(replace(estimator, physics=kind(**values, probe=True)))
+    assert changed.identity == "adaptive-physics 1 (physics=physics-filter, physics.probe=True, trust=0.75)"
+    kind.version = 2  # type: ignore[attr-defined]
+    assert "physics.version=2" in resolve(replace(estimator, physics=kind(**values))).identity
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)
+def test_every_field_of_an_estimator_is_an_option_or_has_a_role(spec: Any, saloon: Car) -> None:
+    if spec.missing(saloon):
+        assert spec.name == "open-loop-calibrated"  # the class of open-loop
+        return
+    parts: list[Any] = [make_estimator(spec.name, saloon)]
+    while parts:
+        part = parts.pop()
+        assert {f.name for f in fields(part)} <= {*part.options, *ROLES}, type(part).__name__
+        parts += [p for name in part.options if is_dataclass(p := getattr(part, name))]
+
+
+def test_a_class_without_an_identity_is_refused() -> None:
+    @dataclass(frozen=True)
+    class Nameless:
+        name: str = "nameless"
+        causal: bool = True
+
+    with pytest.raises(UsageError, match="version = 1 in class Nameless"):
+        resolve(Nameless())  # type: ignore[arg-type]
+
+
+def test_an_entry_of_an_older_version_is_the_same_algorithm_without_its_defaults() -> None:
+    assert Algorithm.model_validate(FORMER).identity == _HYBRID
+    for changes in ({"trust": 0.5}, {"physics.slip_gate": False}, {"other": True}):
+        former = {**FORMER, "options": {**FORMER["options"], **changes}}  # type: ignore[dict-item]
+        assert Algorithm.model_validate(former).identity != _HYBRID
+    written = Algorithm.model_validate(FORMER)
+    assert Algorithm.model_validate(written.model_dump(mode="json")) == written
+
+
+@pytest.mark.slow
+def test_intervals_that_do_not_apply_are_named_on_stderr_and_in_the_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    car = Path(shutil.copytree(SHIPPED_CARS["saloon"], tmp_path / "car"))
+    document = json.loads((car / INTERVALS_FILE).read_text())
+    (entry,) = (e for e in document["entries"] if e["estimator"] == "phy-ukf")
+    entry["algorithm"]["options"]["standstill"] = False
+    (car / INTERVALS_FILE).write_text(json.dumps(document))
+    log = Path(__file__).parents[2] / "sample_logs/dlc.mcap"
+    arguments = ("--car", car, "-e", "phy-ukf,zero", "--annotate", "none", "--no-report", "--start", "2", "--end", "4")
+    pdhef("run", log, "-o", tmp_path / "out", *arguments)
+    message = (
+        "the calibrated intervals of phy-ukf are not applied: expected physics-ukf 1 (standstill=False), "
+        "got physics-ukf 1; run pdhef calibrate"
+    )
+    assert "".join(capsys.readouterr().err.split()).count("".join(message.split())) == 1
+    report = json.loads((tmp_path / "out/logs/dlc/report.json").read_text())
+    (told,) = (e for e in report["estimators"] if e["name"] == "phy-ukf")
+    assert told["intervals"] == ["intervals not calibrated", message]
+    assert (told["algorithm"]["algorithm"], told["algorithm"]["version"]) == ("physics-ukf", 1)
+    assert message in report["warnings"]
