@@ -59,6 +59,10 @@ def past(rate: FloatArray) -> FloatArray:
 class Cheat:
     """Yaw rate passed through a function of the window, or one of this module by name (an option is a plain value)."""
 
+    algorithm = "cheat"
+    version = 1
+    options = ("of",)
+
     of: Any
     name: str = "cheat"
     causal: bool = True
