@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -39,7 +40,8 @@ def compile_for(names: Sequence[str]) -> None:
     wanted = {*names, _CHECKS, *([_FILTER] if set(names) & set(_FILTERED) else [])}
     parts = [part for part, last in _LAST.items() if part in wanted and not compiled.is_kept(last)]
     if min(len(parts), _processors()) > 1 and compiled.kept_in() is not None and hasattr(os, "fork"):
-        compile_parts(parts)
+        with suppress(OSError, RuntimeError):  # the run compiles in its own process where no others can be started
+            compile_parts(parts)
 
 
 def all_parts() -> tuple[str, ...]:

@@ -75,7 +75,10 @@ def estimate(drive: Drive, names: Sequence[str] | None = None) -> Estimates:
     estimators, skipped = choose(drive, names)
     parts: dict[str, list[StateTrack]] = {}
     signals: list[Signals] = []
-    for window in estimate_windows(drive, estimators, intervals=calibrator(drive.car, estimators)):
+    intervals = calibrator(drive.car, estimators)
+    if intervals.warning and intervals.warning not in drive.notes:
+        drive.tell(intervals.warning)
+    for window in estimate_windows(drive, estimators, intervals=intervals):
         signals.append(window.signals)
         for track in (*((window.drawn_truth,) if window.drawn_truth is not None else ()), *window.tracks):
             parts.setdefault(track.name, []).append(track)

@@ -336,8 +336,8 @@ def _run_estimators(
         digests = {name: a.sha256[:SHOWN_DIGITS] for name, a in algorithms.items()}
         rows = [replace(r, algorithm=digests.get(r.estimator, "")) for r in found.rows]
         events = found.events
-        if void := [text for e in ready if (text := intervals.mismatch(e.name))]:
-            drive.tell("; ".join(void))
+        if intervals.warning:
+            drive.tell(intervals.warning)
         if not found.moves:
             drive.tell(_NEVER_MOVES.format(car.vehicle.low_speed_blend_m_s))
         silent = [Loss("no-valid-row", _SILENT.format(name), drive.name) for name in found.silent]
@@ -371,7 +371,12 @@ def _run_estimators(
 
             write_metrics(change.file(METRICS_FILE), rows)
         write_json(change.file(REPORT_FILE), report, brief=config.kept == "metrics")
-    outcome = replace(outcome_of(drive, losses), car=_car_facts(drive.car), main=None if main is None else main.name)
+    outcome = replace(
+        outcome_of(drive, losses),
+        car=_car_facts(drive.car),
+        main=None if main is None else main.name,
+        algorithms={name: a.identity for name, a in algorithms.items()},
+    )
     if len(found.silent) == len(ready):
         outcome = replace(outcome, failed=_ALL_SILENT)
     failed_checks = sum(c.verdict == "failed" and not c.waived for c in drive.checks)

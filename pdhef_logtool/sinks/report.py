@@ -202,6 +202,7 @@ class LogOutcome:
 
     ``failed`` is the one-line reason if nothing came out; ``lost`` says what of the log could not be used.
     ``main``: the estimator that is the answer. ``folder`` of the log, below the one that holds all logs of the run.
+    ``algorithms``: the identity of each estimator that ran.
     """
 
     log: str
@@ -215,6 +216,7 @@ class LogOutcome:
     mapping_sha256: str | None = None
     main: str | None = None
     folder: str = ""
+    algorithms: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def outcome(self) -> str:
@@ -316,8 +318,8 @@ def _detailed(details: DriveDetails) -> dict[str, Any]:
 def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
     """Return a report of a few kB, of many drives: figures that tables show, and no list that grows with the log.
 
-    All figures stand in metrics.parquet. Of topics those that were mapped stay, of algorithms the digest, of segments
-    the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
+    All figures stand in metrics.parquet. Of topics those that were mapped stay, of algorithms all but the noise, of
+    segments the sideslip answer's own, and of the rest the first :data:`_MOST_LISTED`.
     """
     answer = report["answer"]
     told = {answer["main"], answer["naive"], PHYSICS} if answer else set()
@@ -338,7 +340,7 @@ def brief_report(report: Mapping[str, Any]) -> dict[str, Any]:
 
 def _brief_estimator(estimator: Mapping[str, Any], told: Container[str | None]) -> dict[str, Any]:
     algorithm, own = estimator["algorithm"], estimator["name"] in told
-    digest = None if algorithm is None else {k: v for k, v in algorithm.items() if k not in ("options", "noise")}
+    digest = None if algorithm is None else {k: v for k, v in algorithm.items() if k != "noise"}
     kept = estimator["notes"] if own else []
     return {**estimator, "algorithm": digest, "notes": kept, "reasons": estimator["reasons"] if own else None}
 
@@ -394,6 +396,7 @@ def build_run(
                 "mapping_sha256": o.mapping_sha256,
                 "outcome": o.outcome,
                 "main": o.main,
+                "algorithms": o.algorithms,
                 "car": o.car,
             }
             for o in outcomes

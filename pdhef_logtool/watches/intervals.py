@@ -113,6 +113,11 @@ class TrackCalibrator:
         but = f", but with other {' and '.join(others)}" if others else ""
         return (f"intervals calibrated on {made.car} for friction and vehicle {of}{but}",)
 
+    @property
+    def warning(self) -> str:
+        """Which intervals of the car are not applied, and why; empty if there are none."""
+        return "; ".join(filter(None, map(self.mismatch, self.algorithms)))
+
     def mismatch(self, name: str) -> str:
         """Return why the intervals that the car has for an estimator are not applied to it, empty if that is not so."""
         ran = self.algorithms.get(name)

@@ -270,6 +270,7 @@ def test_without_an_entry_a_track_stays_as_it_is() -> None:
         "the calibrated intervals of e are not applied: expected physics-ukf 1 (roll_correction=True), "
         "got physics-filter 1 (roll_correction=True); run pdhef calibrate"
     )
+    assert calibrator.warning == calibrator.mismatch("e")
     # Those of the shipped car were never this car's.
     assert TrackCalibrator(_intervals(), {"e": [other]}, of_car=False).mismatch("e") == ""
     assert _calibrator(_intervals(), ALGORITHM).mismatch("e") == ""
