@@ -1,6 +1,6 @@
 """Tables of the documentation that are made of the code when the site is built: a hook of MkDocs.
 
-<!-- table: metrics -->
+In a page, ``<!-- table: metrics -->`` becomes the table of all metrics, ``<!-- table: checks -->`` that of all checks.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from pdhef_logtool.evaluation.metrics.registry import registered
+from pdhef_logtool.drive.checks import registry as checks
+from pdhef_logtool.evaluation.metrics import registry as metrics
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -20,9 +21,17 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 def _metrics() -> Iterator[str]:
     yield "| metric | label | unit | best | definition |"
     yield "| --- | --- | --- | --- | --- |"
-    for m in registered().values():
+    for m in metrics.registered().values():
         unit = "that of the signal" if m.unit is None else m.unit
         yield f"| `{m.name}` | {m.label} | {unit} | {m.direction or '–'} | {m.definition} |"
 
 
-_TABLES: dict[str, Callable[[], Iterator[str]]] = {"metrics": _metrics}
+def _checks() -> Iterator[str]:
+    yield "| check | compares | fails where | remedy |"
+    yield "| --- | --- | --- | --- |"
+    for kind in checks.registered().values():
+        remedy = re.sub(r"{\w+(:[^}]*)?}", "…", kind.remedy)
+        yield f"| `{kind.name}` | {kind.compares} | {kind.fails} | {'–' if remedy == '…' else remedy} |"
+
+
+_TABLES: dict[str, Callable[[], Iterator[str]]] = {"metrics": _metrics, "checks": _checks}
