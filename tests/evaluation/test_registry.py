@@ -42,7 +42,7 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         patch.setattr(metrics, "__path__", [*metrics.__path__, str(folder)])
         patch.setattr(registry, "MODULES", (*registry.MODULES, NAME))
         yield NAME
-    sys.modules.pop(f"{metrics.__name__}.{NAME}")
+    sys.modules.pop(f"{metrics.__name__}.{NAME}", None)
 
 
 @pytest.fixture(scope="module")
